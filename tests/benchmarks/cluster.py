@@ -2,7 +2,7 @@
 
 Both sides record the same episodes with as many workers as cores, in turns. Told apart are the start (until the first
 episode is over) and the rate from there to the last; a cluster's own start is told by itself. Then with one worker. Then
-the parts that do not grow with the number of machines: a message through the post, a result at the process that deals,
+the parts that do not grow with the number of machines: a message through the broker, a result at the process that deals,
 one in the job file, the files that travel.
 
     python tests/benchmarks/cluster.py --write    # also into web_assets/docs/jobs/cluster.md
@@ -27,11 +27,11 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from workbench.jobs.job_file import JobFile, JobKey
 from workbench.jobs.local_processes import Processes
-from workbench.jobs.ray_cluster import Cluster, Post
+from workbench.jobs.ray_cluster import Cluster, MessageBroker
 from workbench.jobs.ray_connection import connected
-from workbench.jobs.scheduler import Deal, Executor, Work
-from workbench.jobs.worker_files import pack_baggage
-from workbench.jobs.worker_messages import Gives, Listener
+from workbench.jobs.scheduler import Executor, Scheduler, Work
+from workbench.jobs.worker_files import pack_worker_files
+from workbench.jobs.worker_messages import ItemResult, Listener
 from workbench.machine.processes.wire import Unpacker, pack, pack_message
 from workbench.record.job import Recorded, record
 from workbench.record.job_worker import RecordOptions, Written
@@ -89,38 +89,40 @@ def recorded(options: Options, executor: Executor, episodes: int) -> tuple[Run, 
 
 def post_costs(ray: Any) -> tuple[float, float]:
     """Seconds of a request for a chunk and its answer, and messages a second that one post takes."""
-    post = ray.remote(num_cpus=0)(Post).remote()
-    ray.get(post.put.remote(0, []))
+    broker = ray.remote(num_cpus=0)(MessageBroker).remote()
+    ray.get(broker.put.remote(0, []))
     trips: list[float] = []
     for _ in range(300):
         began = time.perf_counter()
-        asked = post.ask.remote(0, [b"asks"])
-        ray.get(post.take.remote(0.1))
-        post.answer.remote(0, None)
+        asked = broker.ask.remote(0, [b"asks"])
+        ray.get(broker.take.remote(0.1))
+        broker.answer.remote(0, None)
         ray.get(asked)
         trips.append(time.perf_counter() - began)
 
     @ray.remote(num_cpus=0)
-    def talk(post: Any, count: int) -> None:
-        ray.get([post.put.remote(0, [b"x" * 300]) for _ in range(count)])
+    def talk(broker: Any, count: int) -> None:
+        ray.get([broker.put.remote(0, [b"x" * 300]) for _ in range(count)])
 
-    ray.get([talk.remote(post, 1) for _ in range(2)])
+    ray.get([talk.remote(broker, 1) for _ in range(2)])
     began = time.perf_counter()
-    ray.get([talk.remote(post, 3000) for _ in range(2)])
+    ray.get([talk.remote(broker, 3000) for _ in range(2)])
     rate = 6000 / (time.perf_counter() - began)
-    ray.kill(post)
+    ray.kill(broker)
     return statistics.median(trips), rate
 
 
 def result_cost(one: Written) -> tuple[int, float, float]:
     """Bytes of a result, and seconds that it takes at the process that deals, and in the job file."""
     count = 2000
-    packed = [pack_message(Gives(number, pack(one))) for number in range(count)]
-    deal: Deal[Written | None, None] = Deal(range(count), lambda number, result: None, chunk=count)
+    packed = [pack_message(ItemResult(number, pack(one))) for number in range(count)]
+    scheduler: Scheduler[Written | None, None] = Scheduler(
+        range(count), lambda number, result: None, chunk=count
+    )
     work = Work(lambda setup, queue: None, None, Written | None, None, "that records")
-    listener = Listener("a worker", work, deal, lambda text: None)
-    unpacker = Unpacker((Gives,))
-    deal.next(0)
+    listener = Listener("a worker", work, scheduler, lambda text: None)
+    unpacker = Unpacker((ItemResult,))
+    scheduler.next(0)
     began = time.perf_counter()
     for raw in packed:
         listener.take(0, unpacker.message(raw))
@@ -159,7 +161,7 @@ def text(options: Options) -> Iterator[str]:
     }
     size, taken, kept = result_cost(one)
     began = time.perf_counter()
-    baggage = pack_baggage([ROOT / "tasks"])
+    worker_files = pack_worker_files([ROOT / "tasks"])
     packed = time.perf_counter() - began
     local, cluster, alone = middle["local"], middle["ray"], middle["one"]
     yield (
@@ -183,11 +185,11 @@ def text(options: Options) -> Iterator[str]:
     yield ""
     print(
         f"{local.rate / alone.rate:.2f} times the rate of one core on {CORES}\n"
-        f"{1000 * trip:.1f} ms: a request for a chunk through the post, and its answer\n"
-        f"{messages:,.0f} messages a second that the post takes, from two senders on these cores\n"
+        f"{1000 * trip:.1f} ms: a request for a chunk through the broker, and its answer\n"
+        f"{messages:,.0f} messages a second that the broker takes, from two senders on these cores\n"
         f"{1e6 * taken:.0f} µs: a result ({size} bytes) at the process that deals\n"
         f"{1000 * kept:.1f} ms: a result in the job file, on disk\n"
-        f"{1000 * packed:.0f} ms: the files that travel ({len(baggage.data) / 1e6:.1f} MB, the examples in `tasks/`), packed"
+        f"{1000 * packed:.0f} ms: the files that travel ({len(worker_files.data) / 1e6:.1f} MB, the examples in `tasks/`), packed"
     )
     yield from on_paper(cluster.rate / CORES, messages, taken, kept, options.num_envs)
 
@@ -201,13 +203,13 @@ def on_paper(rate: float, messages: float, taken: float, kept: float, envs: int)
     results = MANY * rate
     parts = {
         # Each worker says once a second what it has made.
-        "the post": messages * rate,
+        "the broker": messages * rate,
         "the process that deals": 1 / taken,
         "the job file": 1 / kept,
     }
     name, most = min(parts.items(), key=lambda pair: pair[1])
     yield (
-        f"Computed for {MANY:,} cores: {results:,.0f} such episodes a second. The post carries {parts['the post']:,.0f}, the "
+        f"Computed for {MANY:,} cores: {results:,.0f} such episodes a second. The post carries {parts['the broker']:,.0f}, the "
         f"process that deals takes {parts['the process that deals']:,.0f}, the job file keeps {parts['the job file']:,.0f}. "
         f"The first limit is {name}, from {most / rate:,.0f} cores on. Beyond it use `--shard`, one driver for each part, and "
         f"`merge`. Give each worker ten chunks of {envs} envs or more: the last chunk ends alone."

@@ -44,7 +44,7 @@ from workbench.app.pages import Pages
 from workbench.app.session import Session
 from workbench.commands import COMMANDS
 from workbench.page.door.gated_server import ServerOptions, open_server
-from workbench.page.scene.viewpoint import FOV, Stage
+from workbench.page.scene.viewpoint import FOV, View3D
 from workbench.page.widgets.visitors import Visitors
 from workbench.task.description import TaskOptions
 
@@ -131,7 +131,7 @@ def measure(played: Played, options: Options) -> str:
             recordings=Path(folder) / "kept",
             make_worker=partial(Playing, played, made),  # type: ignore[arg-type]
         )
-        stage = Stage(gated.server)
+        stage = View3D(gated.server)
         page = Page(gated.server, Visitors(gated.server, COMMANDS), session, stage=stage)
         pages = Pages(gated.server, stage, lambda which, dark: page)
         wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")

@@ -42,7 +42,7 @@ from workbench.envs import action_vector as actions
 from workbench.envs.step_result import StepResult
 from workbench.live.messages import Status
 from workbench.page.door.gated_server import ServerOptions, open_server
-from workbench.page.scene.viewpoint import FOV, Stage
+from workbench.page.scene.viewpoint import FOV, View3D
 from workbench.page.widgets.visitors import Visitors
 from workbench.task.description import Stepped, TaskDescription, TaskOptions
 from workbench.task.open import open_task
@@ -155,7 +155,7 @@ def measure(played: Played, options: Options, exact: bool) -> Update:
     others = set(threading.enumerate())
     gated = open_server(ServerOptions(port=0))
     (sender,) = set(threading.enumerate()) - others
-    stage = Stage(gated.server, clock)
+    stage = View3D(gated.server, clock)
     with tempfile.TemporaryDirectory() as folder:
         session = Session(
             str(Path(folder) / "push.py"),

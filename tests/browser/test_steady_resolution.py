@@ -16,7 +16,7 @@ from tests.ui.scenes import table_scene
 from workbench.commands import COMMANDS
 from workbench.envs.scene.shapes import Mesh
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
-from workbench.page.scene.bodies import Looks
+from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import lay_out
 from workbench.page.scene.software_rendering import InSoftware
 from workbench.page.widgets.visitors import PATH, Visitors
@@ -136,14 +136,14 @@ def test_shapes_are_simpler_only_while_every_page_draws_in_software(
     mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32))
     geometry = replace(geometry, visuals=tuple(replace(visual, mesh=mesh) for visual in geometry.visuals))
     layout = lay_out(geometry, poses)
-    until(lambda: in_software.looks(Looks(), geometry, layout, alone=False).error > 0, "simpler shapes")
-    assert in_software.looks(Looks(), geometry, layout, alone=True) == Looks()
-    assert in_software.looks(Looks(1_000_000), geometry, layout, alone=False).error == 0
+    until(lambda: in_software.looks(DrawStyle(), geometry, layout, alone=False).error > 0, "simpler shapes")
+    assert in_software.looks(DrawStyle(), geometry, layout, alone=True) == DrawStyle()
+    assert in_software.looks(DrawStyle(1_000_000), geometry, layout, alone=False).error == 0
     other = show(A_CARD)
     until(lambda: len(gated_server.server.get_clients()) == 2, "the other page")
     assert in_software.all_pages
     until(lambda: not in_software.all_pages, "the other page has said nothing for long enough")
-    assert in_software.looks(Looks(), geometry, layout, alone=False) == Looks()
+    assert in_software.looks(DrawStyle(), geometry, layout, alone=False) == DrawStyle()
     other.close()
     until(lambda: in_software.all_pages, "the other page is gone")
     page.close()

@@ -30,7 +30,7 @@ from workbench.live.messages import (
     WarmUp,
 )
 from workbench.live.process.heartbeat import Busy
-from workbench.live.process.supervisor import Death, Supervisor, Vitals, WorkerOptions
+from workbench.live.process.supervisor import Death, ProcessMemory, Supervisor, WorkerOptions
 from workbench.live.process.worker_process import Output
 from workbench.task.description import Restored, Stepped, TaskDescription
 
@@ -49,7 +49,7 @@ class ScriptedWorker:
 
     pid = None
     load_pending = False
-    vitals = Vitals()
+    vitals = ProcessMemory()
     goes_back = True
     """Whether it comes to the recorded states that it is asked for; they look as it does where it stands."""
 

@@ -29,7 +29,7 @@ from workbench.live.commands import PauseRun, SetSeed, Step
 from workbench.live.events import MomentShown, PastPicturesWanted
 from workbench.live.history.moments import History, Moment
 from workbench.live.messages import Event, Inspect, Loaded, ReloadReport, Request, Status
-from workbench.live.process.supervisor import Death, End, Supervisor, Vitals, WorkerOptions
+from workbench.live.process.supervisor import Death, End, ProcessMemory, Supervisor, WorkerOptions
 from workbench.live.timeline_commands import StepBack, StepForward
 from workbench.live.view import SessionView
 from workbench.rescore.recording_jobs import Rescorer
@@ -76,7 +76,7 @@ class ToldWorker:
 
     pid = None
     load_pending = False
-    vitals = Vitals()
+    vitals = ProcessMemory()
 
     def __init__(self, options: WorkerOptions, warm_up: object, **callbacks: Any) -> None:
         self.first_requests: Callable[[], list[Request]] = callbacks["first_requests"]
@@ -86,7 +86,7 @@ class ToldWorker:
         self.replaced = 0
 
     def start(self) -> None:
-        """The first requests are asked for by `Told.greet`."""
+        """The first requests are asked for by `SliderAction.greet`."""
 
     def send(self, request: Request) -> None:
         self.sent.append(request)
@@ -211,7 +211,7 @@ def told_session(
     worker: type[ToldWorker] = ToldWorker,
     **more: Any,
 ) -> Iterator[Told]:
-    """Without a process: see `Told`. `more` as `Session` takes it."""
+    """Without a process: see `SliderAction`. `more` as `Session` takes it."""
     made: list[ToldWorker] = []
 
     def make_worker(*arguments: Any, **named: Any) -> Supervisor:

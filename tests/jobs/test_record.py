@@ -30,7 +30,7 @@ from workbench.episodes.episode import Episode
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.recorded_source import options_of
 from workbench.jobs.local_processes import Processes
-from workbench.jobs.scheduler import Deal, Executor, Work
+from workbench.jobs.scheduler import Executor, Scheduler, Work
 from workbench.record.job import Recorded, RecordProgress, record
 from workbench.record.job_worker import RecordOptions, Written
 from workbench.task.description import TaskOptions
@@ -189,12 +189,12 @@ class InAnyOrder:
         self.good, self.slots, self.data = good, slots, data
         self.elsewhere = False
 
-    def run(self, work: Work, deal: Deal) -> None:
+    def run(self, work: Work, scheduler: Scheduler) -> None:
         (what,) = work.setup.wanted
         running: list[int] = []
         while True:
-            running = [number for number in running if number < deal.limit()]
-            while len(running) < self.slots and (chunk := deal.next("a worker")) is not None:
+            running = [number for number in running if number < scheduler.limit()]
+            while len(running) < self.slots and (chunk := scheduler.next("a worker")) is not None:
                 running += chunk.numbers
             if not running:
                 return
@@ -203,9 +203,9 @@ class InAnyOrder:
             if self.good[number] or what.successes is None:
                 for suffix in (".rrd", ".h5", ".json"):
                     path.with_suffix(suffix).touch()
-                deal.result("a worker", number, Written(number, path, number, 1, 0.0, self.good[number]))
+                scheduler.result("a worker", number, Written(number, path, number, 1, 0.0, self.good[number]))
             else:
-                deal.result("a worker", number, None)
+                scheduler.result("a worker", number, None)
 
 
 @given(

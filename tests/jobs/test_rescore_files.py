@@ -29,8 +29,8 @@ from workbench.cli.share import export_in_terminal
 from workbench.episodes.lerobot.export import ExportOptions
 from workbench.episodes.reader.reading import find_all_sources
 from workbench.episodes.row import UnreadableRecording
-from workbench.jobs.scheduler import Deal, ThisProcess, Work
-from workbench.jobs.worker_files import pack_baggage, relocated
+from workbench.jobs.scheduler import Scheduler, ThisProcess, Work
+from workbench.jobs.worker_files import pack_worker_files, relocated
 from workbench.live.timeline_commands import StopRescoring
 from workbench.record.job import record
 from workbench.record.job_worker import RecordOptions
@@ -257,9 +257,9 @@ class Elsewhere:
     elsewhere = True
     work: Work[Any, Any, Any]
 
-    def run(self, work: Work[Any, Any, Any], deal: Deal[Any, Any]) -> None:
+    def run(self, work: Work[Any, Any, Any], scheduler: Scheduler[Any, Any]) -> None:
         self.work = work
-        ThisProcess().run(work, deal)
+        ThisProcess().run(work, scheduler)
 
 
 def test_recordings_travel_to_other_machines_unless_they_are_large(
@@ -282,10 +282,10 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
     assert list(executor.work.folders) == [tmp_path / "author"]
     assert executor.work.setup.items[0].travels == source.path
     # Recordings beside the task do not travel with it, but on their own.
-    baggage = pack_baggage(executor.work.folders, executor.work.files)
+    worker_files = pack_worker_files(executor.work.folders, executor.work.files)
     (tmp_path / "there").mkdir()
     here = Path.cwd()
-    places = baggage.unpack(tmp_path / "there")
+    places = worker_files.unpack(tmp_path / "there")
     os.chdir(here)
     assert relocated(source.path, places).is_file() and len(places) == 1
 
@@ -295,7 +295,7 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
     assert executor.work.setup.items[0].travels is None
     (tmp_path / "author" / "recordings").rename(tmp_path / "gone")
     with pytest.raises(FileNotFoundError, match="does not see the recordings in .*, which are too large"):
-        executor.run(executor.work, Deal([0], lambda number, result: None))
+        executor.run(executor.work, Scheduler([0], lambda number, result: None))
 
 
 # --- in the terminal ---------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from workbench.episodes.document import write_into_description
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.recorded_source import recorded_source, reference_of
-from workbench.episodes.seal import KEY_FILE, MadeHere, made_here
+from workbench.episodes.seal import KEY_FILE, InstallationSeal, made_here
 from workbench.episodes.writing.finish import recover
 from workbench.machine.folders import user_folder
 from workbench.review.recorded_scene import SceneError, SceneProcess
@@ -103,7 +103,7 @@ def edit(recording: Path, **values: Any) -> None:
 
 
 def test_what_was_recorded_here_is_not_asked_about_also_with_another_text_today(recording: Path) -> None:
-    assert made_here(info_of(recording)) is MadeHere.CONTENT_AND_PLACE
+    assert made_here(info_of(recording)) is InstallationSeal.CONTENT_AND_PLACE
     file = recording.parents[1] / "push.py"
     file.write_text(f"{TEXT}# edited since\n")
     assert Clearances().clear(todays(recording)) == str(file)
@@ -257,7 +257,7 @@ def test_arguments_from_elsewhere_name_no_files(
 def test_an_edited_recording_has_lost_its_seal(recording: Path, values: dict[str, Any]) -> None:
     assert json.loads(recording.read_bytes())["workbench"]["made_here"]["content"]
     edit(recording, **values)
-    assert made_here(info_of(recording)) is MadeHere.NO
+    assert made_here(info_of(recording)) is InstallationSeal.NO
     if "source" in values:
         assert len(asked(as_recorded(recording))) == 1
 
@@ -269,7 +269,7 @@ def test_one_that_comes_back_with_another_file_beside_it_is_asked_about(
     shutil.copytree(recording.parents[1], back)
     returned = back / "recordings" / recording.name
     shutil.rmtree(recording.parents[1])
-    assert made_here(info_of(returned)) is MadeHere.CONTENT
+    assert made_here(info_of(returned)) is InstallationSeal.CONTENT
     cleared = Clearances().clear(todays(returned))
     assert isinstance(cleared, RecordedTask) and cleared.file == str(back / "push.py"), (
         "it says what was recorded here"
@@ -290,7 +290,7 @@ def test_a_journal_that_came_with_a_folder_from_elsewhere_is_recovered_without_a
         if not is_ours:
             another_user(tmp_path / "third", monkeypatch)
         (files,) = recover(tmp_path / who)
-        assert (made_here(info_of(files.json)) is not MadeHere.NO) is is_ours
+        assert (made_here(info_of(files.json)) is not InstallationSeal.NO) is is_ours
 
 
 def test_a_side_file_that_could_be_imported_does_not_get_beside_the_recorded_text(recording: Path) -> None:
@@ -315,7 +315,7 @@ def test_without_its_key_a_recording_is_anybodys_and_the_next_has_a_new_one(
     path.unlink() if key is None else path.write_text(key)
     assert len(asked(todays(recording))) == 1
     again = write(tmp_path / "again", made(2), pictures=False)
-    assert made_here(info_of(again)) is not MadeHere.NO and len(path.read_text()) == 64
+    assert made_here(info_of(again)) is not InstallationSeal.NO and len(path.read_text()) == 64
     assert path.with_name(f"{KEY_FILE}.broken").exists() is (key is not None)
 
 

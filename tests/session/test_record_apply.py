@@ -53,9 +53,9 @@ from workbench.record.state import (
     LiveRecording,
     RecordEffect,
     RecordingWanted,
+    RunningEpisodes,
     StepRecorded,
     TakeStep,
-    UnderWay,
 )
 from workbench.rescore import state as of_rescoring
 from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreEffect, RescoreView, RescoringTold
@@ -107,7 +107,7 @@ EVENTS = st.one_of(
         numbers,
         st.just(0),
         envs,
-        st.builds(UnderWay, numbers, numbers, numbers),
+        st.builds(RunningEpisodes, numbers, numbers, numbers),
         st.none() | st.text(min_size=1, max_size=5),
     ),
     st.builds(EpisodeEnded, st.booleans()),
@@ -236,7 +236,7 @@ def test_steps_that_wait_for_the_disk_are_bounded(monkeypatch: pytest.MonkeyPatc
 def test_what_an_older_recording_or_job_says_changes_nothing_but_the_bytes_that_wait() -> None:
     state, _ = after(loaded(), RESET, STEP, Asked(ToggleRecording()), Asked(RecordNextEpisode()))
     assert state.recording.number == 2
-    said, effects = apply_of_these(state, StepRecorded(1, 10, (), UnderWay(1, 1, 1), "it failed"))
+    said, effects = apply_of_these(state, StepRecorded(1, 10, (), RunningEpisodes(1, 1, 1), "it failed"))
     assert effects == [] and said.recording == replace(state.recording, waiting_bytes=-10)
     state, effects = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveWanted((1,)))
     assert [type(effect) for effect in effects] == [BeginSaving]

@@ -25,7 +25,7 @@ from workbench.episodes.recorded_source import (
 from workbench.episodes.side_files import side_files_text
 from workbench.live.commands import PauseRun
 from workbench.live.panels.banners import is_busy_for_long
-from workbench.machine.loop import Aside, begin, do
+from workbench.machine.loop import BlockingPool, begin, do
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.notices import tell_all
@@ -115,9 +115,9 @@ class GoLive:
         self._own: tuple[Session, Path | None] | None = None
         self.recorded_source, self.everywhere = False, False
         self._way: _Way | None = None
-        self._opening = Aside("go-live")
+        self._opening = BlockingPool("go-live")
         """Asks for consent, and opens sessions."""
-        self._ending = Aside("end-session")
+        self._ending = BlockingPool("end-session")
 
     def go(self, id: str, state: int) -> None:
         """Continue live from a state of an opened recording; if that is in progress, cancel it."""

@@ -46,7 +46,7 @@ from workbench.live.panels.view_panel import ViewPanel
 from workbench.live.timeline_commands import Seek
 from workbench.live.view import SessionView
 from workbench.machine.kept_choices import close_hints
-from workbench.machine.loop import Aside, post
+from workbench.machine.loop import BlockingPool, post
 from workbench.page.command import Command
 from workbench.page.commands import (
     CloseDialog,
@@ -60,14 +60,14 @@ from workbench.page.commands import (
     ToggleTable,
     ToggleTheme,
 )
-from workbench.page.scene.bodies import Looks
+from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
-from workbench.page.scene.viewpoint import FOV, Stage, Viewpoint, frame_all, frame_one
+from workbench.page.scene.viewpoint import FOV, View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.hotkeys import add_hints, key_rows, register
 from workbench.page.widgets.open_tabs import OpenTabs
-from workbench.page.widgets.parts import Clock, DrawDue, PagePart, Parts
+from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart, Parts
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Done, Visitor, Visitors
@@ -135,7 +135,7 @@ class Page:
         dark: bool = True,
         on_review: Callable[[], object] = lambda: None,
         on_look: Callable[[Path], None] = lambda path: None,
-        stage: Stage | None = None,
+        stage: View3D | None = None,
         also: frozenset[type[Command]] = frozenset(),
         clock: Clock = time.monotonic,
         editor: str = "",
@@ -149,14 +149,14 @@ class Page:
         self._visitors_counted = -1
         self._watched: tuple[CameraRequest, ...] = ()
         """Pictures that the session was asked for."""
-        self._choices = Aside("choices")
+        self._choices = BlockingPool("choices")
         """Keeps what a person chose for later runs."""
-        self._panels_due = DrawDue(PANELS_EVERY, clock)
+        self._panels_due = DrawThrottle(PANELS_EVERY, clock)
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
-        self._built: tuple[bool, Looks] | None = None
+        self._built: tuple[bool, DrawStyle] | None = None
         self._waits_for_human = False
-        stage = stage or Stage(server)
+        stage = stage or View3D(server)
         self._scene, self._framing, self._view_choice = stage.scene, stage.framing, stage.choice
 
         server.gui.main_panel.dock_right()
@@ -471,7 +471,7 @@ class Page:
 
 
 def _shown_of(view: SessionView) -> tuple[object, object]:
-    """Keys of what the panels show and of what a person waits for in it, as `DrawDue` takes them."""
+    """Keys of what the panels show and of what a person waits for in it, as `DrawThrottle` takes them."""
     steps_go_on = view.playing and view.state == "running" and view.timeline.shown is None
     waited_for = (
         view.settings,

@@ -11,7 +11,7 @@ from workbench.app.session import KeptWork, Session
 from workbench.app.shared import Shared
 from workbench.live.commands import PauseRun
 from workbench.machine.folders import example_tasks
-from workbench.machine.loop import Aside, begin, result_of
+from workbench.machine.loop import BlockingPool, begin, result_of
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.page.widgets.notices import tell_all
 from workbench.page.widgets.templates import sentence
@@ -72,7 +72,7 @@ class OpenTask:
         """Reference of the task that a person opened, as `Entry.lasting` has it."""
         self._wish: Entry | None = None
         self._opening: asyncio.Task[None] | None = None
-        self._aside = Aside("open-task")
+        self._aside = BlockingPool("open-task")
         self._doing = ""
         self._closing = False
         self._ran: set[str] = set()

@@ -15,9 +15,9 @@ import viser
 from workbench.machine.loop import do
 from workbench.machine.processes.watched_thread import watched_thread
 from workbench.page.command import Command, Refused
-from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.door.viser_private import wait_until_taken
-from workbench.page.scene.viewpoint import Stage
+from workbench.page.scene.viewpoint import View3D
 from workbench.page.widgets.notices import tell_all
 from workbench.page.widgets.visitors import Done, Visitor
 
@@ -79,7 +79,7 @@ class Pages:
     """Shows one page of several on the same server, and draws it again whenever there is something new to show.
 
     viser has one page a server, so a page is removed whole and the other is built in its place; every open browser
-    follows. The session and the review live on meanwhile, the bodies in the 3-D view stay (`Stage`), and nothing is
+    follows. The session and the review live on meanwhile, the bodies in the 3-D view stay (`View3D`), and nothing is
     sent before the new page was drawn once, so that no empty control is ever seen.
 
     A page that cannot be drawn says so in every open browser and is tried again: a page that looks alive and stands
@@ -92,7 +92,7 @@ class Pages:
     """
 
     def __init__(
-        self, server: viser.ViserServer, stage: Stage, make: Callable[[Which, bool], ShownPage]
+        self, server: viser.ViserServer, stage: View3D, make: Callable[[Which, bool], ShownPage]
     ) -> None:
         self._server, self._stage, self._make = server, stage, make
         self._wishes: queue.SimpleQueue[_Wish] = queue.SimpleQueue()
@@ -101,7 +101,7 @@ class Pages:
         """The page that is shown."""
         self._page: ShownPage | None = None
         self._dark = True
-        self._told = RareLog()
+        self._told = RateLimitedLog()
         self._thread = watched_thread("pages", self._run)
 
     def start(self, which: Which) -> None:

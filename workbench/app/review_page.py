@@ -47,7 +47,7 @@ from workbench.page.commands import (
 )
 from workbench.page.widgets.hotkeys import key_rows, register
 from workbench.page.widgets.open_tabs import OpenTabs
-from workbench.page.widgets.parts import Clock, DrawDue, PagePart, Parts
+from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart, Parts
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Done, Visitor
@@ -143,7 +143,7 @@ class ReviewPage:
         self._other_folded = False
         self._unfolded = "", 0.0
         """Name of the panel (library or rerun) that was unfolded last, and when, until the width was checked."""
-        self._told = DrawDue(TOLD_EVERY, clock)
+        self._told = DrawThrottle(TOLD_EVERY, clock)
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH)

@@ -28,7 +28,7 @@ from workbench.live.events import (
     FollowPolicy,
     InterruptWorker,
     LoadDone,
-    LoadGaveWay,
+    LoadPreempted,
     Now,
     PolicySaved,
     ReplaceWorker,
@@ -43,13 +43,13 @@ from workbench.live.history.env_table import EnvRows
 from workbench.live.loading import files_at_fault, first_requests, watched_files
 from workbench.live.messages import Answer, Event, Loaded, LoadFailed, Progress, Request, Settings, WarmUp
 from workbench.live.policies import ListPolicies, PolicySearch
-from workbench.live.process.ask import Asker, Background
+from workbench.live.process.ask import Background, QuestionClient
 from workbench.live.process.captured_output import PrintedLine, PrintedLog
 from workbench.live.process.supervisor import Death, Supervisor, WorkerOptions
 from workbench.live.run import Run, first_run
 from workbench.live.view import SessionView, view_of
 from workbench.machine.kept_choices import keep_check_after_save
-from workbench.machine.loop import Aside, ChangeCounter, do, later, on_loop, wait_for_disk
+from workbench.machine.loop import BlockingPool, ChangeCounter, do, later, on_loop, wait_for_disk
 from workbench.machine.processes.watched_thread import listen, report_failure, stop_listening
 from workbench.page.command import Command
 from workbench.record.live_recorder import LiveRecorder
@@ -135,7 +135,7 @@ class Session:
         self._notify = self._changes.notify
         self._enter_numbers = itertools.count(1)
         self._printed = PrintedLog(self._on_lines)
-        self._aside = Aside("follow")
+        self._aside = BlockingPool("follow")
         """Begins to watch files, for which they are read."""
         self._watcher = SourceWatcher(self._on_files_changed)
         self._policy_file = PolicyFile(self._on_policy_saved)
@@ -156,7 +156,7 @@ class Session:
         self._plans = PlanJobs(self._happen)
         self._seeds = SeedsJobs(recordings, self._happen)
         self._policies = PolicySearch(self._happen)
-        self._asker = Asker(self._send)
+        self._asker = QuestionClient(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
         # Last: what it recovers happens at once.
         self._recorder = LiveRecorder(recordings, self._happen, on_notice)
@@ -421,7 +421,7 @@ class Session:
         """
         match event:
             case LoadFailed() if self._worker.load_pending and event.problem.interrupted:
-                self._happen(LoadGaveWay(event))
+                self._happen(LoadPreempted(event))
                 return False  # interrupted because a newer version waits: no failure to report
             case Loaded():
                 self._on_loaded(event, on_disk)

@@ -14,9 +14,9 @@ from workbench.app.session import Session
 from workbench.commands import COMMANDS
 from workbench.episodes.reader.reading import recover_confined, recovered_text
 from workbench.library.folder import Library
-from workbench.machine.loop import Aside
+from workbench.machine.loop import BlockingPool
 from workbench.page.door.gated_server import GatedServer
-from workbench.page.scene.viewpoint import Stage
+from workbench.page.scene.viewpoint import View3D
 from workbench.page.widgets.visitors import PATH, Visitors
 from workbench.review.playback import Review
 from workbench.review.recorded_scene import SceneProcess
@@ -65,7 +65,7 @@ class Shared:
         """Recording that the first review opens."""
         self.looks_at = False
         """Whether the next review page is for a recording that a person chose on another page."""
-        self._recovering = Aside("recover")
+        self._recovering = BlockingPool("recover")
         self.visitors = Visitors(self.server, COMMANDS)
         gated_server.add_channel(PATH, self.visitors.serve)
         self.session = session
@@ -73,7 +73,7 @@ class Shared:
         self.home = session
         """The session that a person opened, by command or from the list. `session` is another one while a recording of
         another task is continued."""
-        self.stage = Stage(self.server)
+        self.stage = View3D(self.server)
         self.pages = Pages(self.server, self.stage, make_page)
 
     @property

@@ -68,7 +68,7 @@ from workbench.envs.camera_data import CameraKey, why_no_camera
 from workbench.live.effects import Asked
 from workbench.live.events import FileOpened, FileSaved, Now, Send, VersionLoaded, WorkerDied
 from workbench.live.messages import LoadFailed, PlaceCamera, Placed
-from workbench.live.process.ask import Asker, Background
+from workbench.live.process.ask import Background, QuestionClient
 from workbench.live.process.background_jobs import JobProgress, Jobs
 from workbench.live.run import Run
 from workbench.machine.loop import do
@@ -306,7 +306,7 @@ class StudioJobs:
 
     def __init__(
         self,
-        asker: Asker,
+        asker: QuestionClient,
         background: Background,
         on_change: Callable[[], None],
         happen: Callable[[StudioEvent | FileOpened], object],

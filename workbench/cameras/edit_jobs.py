@@ -35,10 +35,10 @@ from workbench.cameras.view import EditRequest, EditStage, EditState
 from workbench.envs.camera_data import CameraKey, CameraSettings, differences
 from workbench.live.events import FileOpened
 from workbench.live.messages import Load
-from workbench.live.process.ask import Asker
+from workbench.live.process.ask import QuestionClient
 from workbench.live.process.background_jobs import Job, JobFailed
 from workbench.live.run import Run
-from workbench.machine.loop import Aside, begin, do, result_of
+from workbench.machine.loop import BlockingPool, begin, do, result_of
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.page.command import Command, Refused
 from workbench.source.parsed import RefusedEdit, plain_line_ends
@@ -328,12 +328,15 @@ class FileEdits:
     """
 
     def __init__(
-        self, asker: Asker, happen: Callable[[StudioEvent | FileOpened], object], patience: float = 60.0
+        self,
+        asker: QuestionClient,
+        happen: Callable[[StudioEvent | FileOpened], object],
+        patience: float = 60.0,
     ) -> None:
         self._asker, self._happen, self._patience = asker, happen, patience
         self._stopped = threading.Event()
         """Cancels the present question."""
-        self._aside = Aside("edits")
+        self._aside = BlockingPool("edits")
         self._closing = False
 
     def begin(self, effect: FindPlan | ChangeFile | CopyToFolder) -> None:

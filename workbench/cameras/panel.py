@@ -31,7 +31,7 @@ from workbench.page.widgets.images import (
     in_colours,
     narrowed,
 )
-from workbench.page.widgets.parts import Clock, DrawDue
+from workbench.page.widgets.parts import Clock, DrawThrottle
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
 
@@ -140,7 +140,7 @@ class CamerasPanel:
         self._ticked: dict[tuple[CameraKind, str, str], bool] = {}
         """Whether each modality of each camera is ticked; cameras that are gone are kept, since they may come back."""
         self._cameras_serial = -1
-        self._due = DrawDue(PICTURE_PERIOD, clock)
+        self._due = DrawThrottle(PICTURE_PERIOD, clock)
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task has loaded."))
         hint = "Draw these cameras, with their pictures, in the 3D view."
         self._frustums = tick(server, "Show in 3D view", ShowFrustums, "on", True, hint=hint)

@@ -36,7 +36,7 @@ from workbench.cameras.view import MeasuredMoment, PickedPixel
 from workbench.envs.camera_data import CameraInfo, CameraSettings, Picture, why_no_camera
 from workbench.live.history.moments import ShownMoment
 from workbench.live.messages import Load, Reset
-from workbench.live.process.ask import Asker, Background
+from workbench.live.process.ask import Background, QuestionClient
 from workbench.live.process.background_jobs import Job
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
@@ -183,7 +183,9 @@ def _draw_sheet(studio: Studio, run: Run) -> Change:
 class CameraReports:
     """Asks the questions of which reports consist. Used on the loop."""
 
-    def __init__(self, asker: Asker, background: Background, happen: Callable[[StudioEvent], object]) -> None:
+    def __init__(
+        self, asker: QuestionClient, background: Background, happen: Callable[[StudioEvent], object]
+    ) -> None:
         """
         Args:
             asker, background: ask the worker that plays, and the background process.
@@ -223,7 +225,7 @@ class CameraReports:
     async def _measure(
         self,
         job: Job,
-        asker: Asker,
+        asker: QuestionClient,
         wanted: MeasureLive | MeasureSeeds,
         reports: list[CameraReport],
         cases: Iterable[Case],

@@ -23,7 +23,7 @@ from workbench.checks.run_rules import RULES_OVER_SEEDS, core_results, over_seed
 from workbench.checks.silencing import Comment, comments_without_effect
 from workbench.envs.gpu_rules import DEGREES, FailOn, Finding, fails
 from workbench.jobs.local_processes import Processes
-from workbench.jobs.scheduler import Deal, Executor, Failure, ThisProcess, Work
+from workbench.jobs.scheduler import Executor, Failure, Scheduler, ThisProcess, Work
 from workbench.task.problem import TaskError
 
 _TRIES = 3
@@ -106,7 +106,7 @@ def check(
         workers = min(cores if what.workers is None else what.workers, plan.chunks)
         executor = ThisProcess() if workers == 1 else Processes(workers)
     found = _Results(what, on_activity, on_result, on_progress)
-    deal: Deal[ItemOutcome, CheckUpdate] = Deal(
+    scheduler: Scheduler[ItemOutcome, CheckUpdate] = Scheduler(
         plan.items, found.take, found.hear, stop, chunk=plan.chunk, tries=_TRIES, on_failure=found.fail
     )
     needed = needed_by(what.task, what.actions, what.options.imports)
@@ -119,8 +119,8 @@ def check(
         folders=needed.folders,
         files=needed.files,
     )
-    executor.run(work, deal)
-    deal.require_results()
+    executor.run(work, scheduler)
+    scheduler.require_results()
     return found.report(began, stop())
 
 

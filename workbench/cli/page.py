@@ -26,7 +26,7 @@ from workbench.episodes.reader.reading import start_reading
 from workbench.live.messages import Event, Loaded, LoadFailed
 from workbench.live.process.supervisor import WorkerOptions
 from workbench.machine.kept_choices import kept_choices
-from workbench.machine.loop import Aside, loop_in_main, on_signal
+from workbench.machine.loop import BlockingPool, loop_in_main, on_signal
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 from workbench.page.door.listening_socket import ServerError
@@ -264,7 +264,7 @@ def _serve(
 
 def _close(app: App, gated_server: GatedServer) -> None:
     """Close all that is open. What takes longer than `_CLOSING_SECONDS` is left, unless episodes are written meanwhile."""
-    closing = Aside("closing").begin(app.close)
+    closing = BlockingPool("closing").begin(app.close)
     written = _episodes_written(app)
     while not futures.wait([closing], _CLOSING_SECONDS).done:
         if written == (written := _episodes_written(app)):

@@ -139,7 +139,7 @@ MOST_LINES = MOST_BYTES
 """A line has at least a byte; a recording with more was not written by the workbench."""
 CUT_MESSAGE = "not recorded from here on: it changes too often"
 
-Line = tuple[int, bytes]
+PageConnection = tuple[int, bytes]
 """First state of a text, and its value in the journal. A plain pair: a reader of rows must not import the journal's
 module, since Arrow would start a thread in the process that forks."""
 
@@ -170,7 +170,7 @@ class TextWriter:
         """Whether the previous state had no texts."""
         return not self._last
 
-    def changes(self, state: int, others: Mapping[str, OtherEntry]) -> list[Line]:
+    def changes(self, state: int, others: Mapping[str, OtherEntry]) -> list[PageConnection]:
         """Lines for the entries that differ from the previous state; `others` as in an `EpisodeRow`."""
         if not others and not self._last:
             return []
@@ -179,7 +179,7 @@ class TextWriter:
             for name, entry in others.items()
             if entry.numbers is None
         }
-        found: list[Line] = []
+        found: list[PageConnection] = []
         for name, entry in now.items():
             if name in self._cut or self._last.get(name) == entry:
                 continue
@@ -196,11 +196,11 @@ class TextWriter:
         return found
 
 
-def _line(state: int, name: str, entry: TextEntry | None) -> Line:
+def _line(state: int, name: str, entry: TextEntry | None) -> PageConnection:
     return state, json.dumps([name, None if entry is None else astuple(entry)]).encode()
 
 
-def text_tracks(lines: Sequence[Line]) -> dict[str, TextTrack]:
+def text_tracks(lines: Sequence[PageConnection]) -> dict[str, TextTrack]:
     """The tracks of an episode whose journal has these lines."""
     found: dict[str, list[tuple[int, TextEntry | None]]] = {}
     for state, value in lines:

@@ -25,7 +25,7 @@ _COVERED = {*SHARED, "seed", "source"} - {"acted_by", "pictures", "moved_cameras
 _logged: set[str] = set()
 
 
-class MadeHere(Enum):
+class InstallationSeal(Enum):
     """Who made a recording, by its seal: a keyed hash (HMAC-SHA256) with a random key that only this user can read.
 
     It covers what decides which code runs when the recording is rescored or entered (task, text, keywords), and the
@@ -55,22 +55,22 @@ def seal(description: Description, source_file: str | None) -> SealJson | None:
     return SealJson(_mac(key, "content", content), _mac(key, "place", source_file or ""))
 
 
-def made_here(info: EpisodeInfo) -> MadeHere:
+def made_here(info: EpisodeInfo) -> InstallationSeal:
     """Check the seal of the recording that `info` was read from."""
     found = info.seal
     if found is None:
-        return MadeHere.NO
+        return InstallationSeal.NO
     values = {name: getattr(info, name) for name in _COVERED}
     values["seed"] = info.seed if info.seed >= 0 else None
     try:
         content = _content(values, found.main, found.files, info.acted_by)
     except (TypeError, ValueError, RecursionError):
-        return MadeHere.NO
+        return InstallationSeal.NO
     if not is_sealed(content, found.content, "content"):
-        return MadeHere.NO
+        return InstallationSeal.NO
     place = info.source_file
     there = place is not None and os.path.isabs(place) and is_sealed(place, found.place, "place")
-    return MadeHere.CONTENT_AND_PLACE if there else MadeHere.CONTENT
+    return InstallationSeal.CONTENT_AND_PLACE if there else InstallationSeal.CONTENT
 
 
 def seal_text(text: str, what: str = "text") -> str | None:

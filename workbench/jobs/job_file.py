@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from workbench.jobs.scheduler import Deal, Executor, Result, Setup, Shard, Update, Work
+from workbench.jobs.scheduler import Executor, Result, Scheduler, Setup, Shard, Update, Work
 from workbench.machine.files import open_regular_file
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack
 from workbench.machine.versions import package_versions
@@ -173,13 +173,13 @@ class Kept:
     def elsewhere(self) -> bool:
         return self.executor.elsewhere
 
-    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
-        deal.take_part(self.shard)
+    def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:
+        scheduler.take_part(self.shard)
         if self.file is not None:
             known = {n: one for n, one in self.file.results(work.result).items() if self.is_there(one)}
-            deal.go_on(known, self.file.keep)
-        if deal.count_left(1):
-            self.executor.run(work, deal)
+            scheduler.go_on(known, self.file.keep)
+        if scheduler.count_left(1):
+            self.executor.run(work, scheduler)
 
 
 # --- parts put together ----------------------------------------------------------------------------------

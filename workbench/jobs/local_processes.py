@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from workbench.jobs.scheduler import NO_LIMIT, Chunk, Deal, PoolError, Result, Setup, Update, Work
-from workbench.jobs.worker_messages import MESSAGES, Asks, Listener, Message, WorkerQueue, work_on
+from workbench.jobs.scheduler import NO_LIMIT, Chunk, PoolError, Result, Scheduler, Setup, Update, Work
+from workbench.jobs.worker_messages import MESSAGES, ChunkRequest, Listener, Message, WorkerQueue, work_on
 from workbench.machine.processes.child_python import child_environment, python_command, quick_imports
 from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.family import describe_exit, end_family
@@ -43,8 +43,8 @@ class Processes:
         """
         self._workers, self._on_death = workers, on_death
 
-    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
-        pool = _ProcessPool(work, deal, self._workers, self._on_death)
+    def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:
+        pool = _ProcessPool(work, scheduler, self._workers, self._on_death)
         try:
             pool.serve()
         finally:
@@ -66,19 +66,21 @@ class _Process:
 class _ProcessPool:
     """Starts the processes of one run, deals to them, and replaces those that fail."""
 
-    def __init__(self, work: Work, deal: Deal, workers: int, on_death: Callable[[str], None]) -> None:
-        self._work, self._deal = work, deal
-        self._workers = max(1, deal.count_left(workers))
-        self._listener = Listener("a process", work, deal, on_death)
+    def __init__(
+        self, work: Work, scheduler: Scheduler, workers: int, on_death: Callable[[str], None]
+    ) -> None:
+        self._work, self._scheduler = work, scheduler
+        self._workers = max(1, scheduler.count_left(workers))
+        self._listener = Listener("a process", work, scheduler, on_death)
         self._processes: list[_Process] = []
 
     def serve(self) -> None:
-        sent_limit, stopped = self._deal.limit(), 0.0
+        sent_limit, stopped = self._scheduler.limit(), 0.0
         failure: TaskError | PoolError | None = None
         for place in range(self._workers):
             self._start(place)
         while busy := self._busy():
-            if (limit := self._deal.limit()) != sent_limit:
+            if (limit := self._scheduler.limit()) != sent_limit:
                 sent_limit = limit
                 for process in busy:
                     self._send(process, limit)
@@ -94,9 +96,9 @@ class _ProcessPool:
                 except (TaskError, PoolError) as error:
                     self._leave(process)
                     failure = failure or error
-                    self._deal.lower(0)
+                    self._scheduler.lower(0)
             # Also for a chunk that was given back when the others had ended.
-            if not self._busy() and self._deal.count_left(1):
+            if not self._busy() and self._scheduler.count_left(1):
                 self._start(0)
         if failure is not None:
             raise failure
@@ -137,7 +139,7 @@ class _ProcessPool:
     def _replace(self, process: _Process) -> None:
         """End a process that failed, and start another one for the remaining chunks."""
         self._leave(process)
-        if self._deal.count_left(1):
+        if self._scheduler.count_left(1):
             self._start(process.place)
 
     def _receive(self, process: _Process) -> None:
@@ -150,7 +152,7 @@ class _ProcessPool:
             while process.heard and (message := process.line.receive(0)) is not None:
                 news = self._listener.take(process, message)
                 if news == "asks":
-                    self._send(process, self._deal.next(process))
+                    self._send(process, self._scheduler.next(process))
                 elif news == "failed":
                     self._replace(process)
                 elif news == "done":
@@ -186,7 +188,7 @@ class _SocketQueue(WorkerQueue):
         self._limit = NO_LIMIT
 
     def next(self) -> Chunk | None:
-        self.send(Asks())
+        self.send(ChunkRequest())
         while isinstance(message := self._connection.recv(), int):
             self._limit = message
         return message

@@ -1,7 +1,7 @@
 """Runs a job's work on a Ray cluster: one that is there, or one of this machine alone.
 
 A worker is a Ray actor that runs the same function as a local process. What it says goes as bytes of `wire` through one
-more actor, the post, which the process that deals asks: so a worker waits for nobody, and a pickle that the author's code
+more actor, the broker, which the process that deals asks: so a worker waits for nobody, and a pickle that the author's code
 made is never read here. When Ray says that an actor is gone, its chunk is dealt again.
 """
 
@@ -23,10 +23,10 @@ from typing import Any
 
 import psutil
 
-from workbench.jobs.ray_connection import AUTO, BREAKPOINT, ClusterLost, NoCluster, Pulse, connected
-from workbench.jobs.scheduler import NO_LIMIT, Chunk, Deal, PoolError, Result, Setup, Update, Work
-from workbench.jobs.worker_files import Baggage, pack_baggage, relocated
-from workbench.jobs.worker_messages import MESSAGES, Asks, Listener, Message, WorkerQueue, work_on
+from workbench.jobs.ray_connection import AUTO, BREAKPOINT, ClusterHealth, ClusterLost, NoCluster, connected
+from workbench.jobs.scheduler import NO_LIMIT, Chunk, PoolError, Result, Scheduler, Setup, Update, Work
+from workbench.jobs.worker_files import WorkerFiles, pack_worker_files, relocated
+from workbench.jobs.worker_messages import MESSAGES, ChunkRequest, Listener, Message, WorkerQueue, work_on
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
@@ -35,9 +35,9 @@ from workbench.task.problem import TaskError, treat_ctrl_c_as_error
 
 _LOOK_SECONDS = 0.1
 _ANSWER_SECONDS = 1.0
-"""Seconds to wait for the post before the cluster is checked; a post that has ended never answers."""
+"""Seconds to wait for the broker before the cluster is checked; a broker that has ended never answers."""
 _SAY_SECONDS = 1.0
-"""Seconds between two messages of a worker: the post takes some thousand messages a second from all workers."""
+"""Seconds between two messages of a worker: the broker takes some thousand messages a second from all workers."""
 _END_SECONDS = 120.0
 """Seconds that a stopped worker may take to write the items that have ended."""
 _EXIT_SECONDS = 10.0
@@ -62,19 +62,19 @@ class Cluster:
     def elsewhere(self) -> bool:
         return True
 
-    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+    def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:
         """Run the work on the cluster; see `Executor.run`.
 
         Raises:
             NoCluster: as `connected`; or the cluster has no room for a worker.
             PoolError: a machine has other versions of the packages; the cluster ended; or as `Executor.run`.
-            TooMuch: as `pack_baggage`.
+            TooMuch: as `pack_worker_files`.
         """
-        baggage = pack_baggage(work.folders, work.files)
+        worker_files = pack_worker_files(work.folders, work.files)
         with connected(self.address) as ray:
             try:
-                with closing(Pulse()) as pulse:
-                    pool = _ActorPool(ray, self, work, deal, baggage, pulse)
+                with closing(ClusterHealth()) as health:
+                    pool = _ActorPool(ray, self, work, scheduler, worker_files, health)
                     try:
                         pool.serve()
                     finally:
@@ -117,15 +117,15 @@ class _ActorPool:
         ray: Any,
         how: Cluster,
         work: Work[Any, Any, Any],
-        deal: Deal[Any, Any],
-        baggage: Baggage,
-        pulse: Pulse,
+        scheduler: Scheduler[Any, Any],
+        worker_files: WorkerFiles,
+        health: ClusterHealth,
     ) -> None:
-        self._ray, self._how, self._work, self._deal, self._pulse = ray, how, work, deal, pulse
-        self._listener = Listener("a worker", work, deal, how.on_death)
+        self._ray, self._how, self._work, self._scheduler, self._health = ray, how, work, scheduler, health
+        self._listener = Listener("a worker", work, scheduler, how.on_death)
         self._read = Unpacker(MESSAGES).message
-        self._post = ray.remote(num_cpus=0)(Post).remote()
-        self._baggage = ray.put(baggage)
+        self._broker = ray.remote(num_cpus=0)(MessageBroker).remote()
+        self._worker_files = ray.put(worker_files)
         self._work_bytes = pickle.dumps((work.run, work.setup))
         self._actor = ray.remote(
             num_cpus=how.cpus_per_worker, num_gpus=how.gpus_per_worker, max_restarts=0, max_task_retries=0
@@ -136,15 +136,15 @@ class _ActorPool:
         self._started = 0
 
     def serve(self) -> None:
-        for _ in range(self._deal.count_left(self._how.workers or self._room())):
+        for _ in range(self._scheduler.count_left(self._how.workers or self._room())):
             self._start()
-        sent_limit, stopped = self._deal.limit(), 0.0
+        sent_limit, stopped = self._scheduler.limit(), 0.0
         failure: TaskError | PoolError | None = None
         while self._busy:
-            self._pulse.check()
-            if (limit := self._deal.limit()) != sent_limit:
+            self._health.check()
+            if (limit := self._scheduler.limit()) != sent_limit:
                 sent_limit = limit
-                self._post.set_limit.remote(limit)
+                self._broker.set_limit.remote(limit)
             if limit == 0:
                 stopped = stopped or time.monotonic()
                 if time.monotonic() - stopped > _END_SECONDS:
@@ -156,7 +156,7 @@ class _ActorPool:
             self._reap()
             for number in self._gone():
                 failure = self._guarded(number, failure, lambda number=number: self._died(number))
-            if not self._busy and self._deal.count_left(1):
+            if not self._busy and self._scheduler.count_left(1):
                 self._start()
         if failure is not None:
             raise failure
@@ -169,13 +169,13 @@ class _ActorPool:
             self._ray.wait(ended, num_returns=len(ended), timeout=_EXIT_SECONDS)
         for actor in (*self._busy.values(), *self._ending):
             self._ray.kill(actor.handle)
-        self._ray.kill(self._post)
+        self._ray.kill(self._broker)
 
     def _said(self, seconds: float) -> list[tuple[int, bytes]]:
-        """Messages of the workers since the last call; see `Post.take`. Raises ClusterLost."""
-        said = self._post.take.remote(seconds)
+        """Messages of the workers since the last call; see `MessageBroker.take`. Raises ClusterLost."""
+        said = self._broker.take.remote(seconds)
         while not self._ray.wait([said], timeout=_ANSWER_SECONDS)[0]:
-            self._pulse.check()
+            self._health.check()
         return self._ray.get(said)
 
     def _reap(self) -> None:
@@ -195,7 +195,7 @@ class _ActorPool:
             act()
         except (TaskError, PoolError) as error:
             self._leave(number)
-            self._deal.lower(0)
+            self._scheduler.lower(0)
             return failure or error
         return failure
 
@@ -219,8 +219,8 @@ class _ActorPool:
     def _start(self) -> None:
         number = self._started
         self._started += 1
-        handle = self._actor.remote(self._post, number, self._how.cpus_per_worker)
-        ended = handle.run.remote(self._work_bytes, self._baggage, versions_here())
+        handle = self._actor.remote(self._broker, number, self._how.cpus_per_worker)
+        ended = handle.run.remote(self._work_bytes, self._worker_files, versions_here())
         self._busy[number] = _Started(handle, ended)
 
     def _leave(self, number: int) -> None:
@@ -235,10 +235,10 @@ class _ActorPool:
         except Unreadable as error:
             raise PoolError(f"a worker {self._work.name} sent what cannot be read ({error})") from error
         if news == "asks":
-            self._post.answer.remote(number, self._deal.next(number))
+            self._broker.answer.remote(number, self._scheduler.next(number))
         elif news in ("failed", "done"):
             self._ending.append(self._busy.pop(number))
-            if news == "failed" and self._deal.count_left(1):
+            if news == "failed" and self._scheduler.count_left(1):
                 self._start()
 
     def _gone(self) -> list[int]:
@@ -269,11 +269,11 @@ class _ActorPool:
             how = f"is gone ({type(error).__name__})"
         self._leave(number)
         self._listener.died(number, how, None)
-        if self._deal.count_left(1):
+        if self._scheduler.count_left(1):
             self._start()
 
 
-class Post:
+class MessageBroker:
     """Actor that passes messages between the workers and the dealing process. It keeps messages until they are taken."""
 
     def __init__(self) -> None:
@@ -321,12 +321,12 @@ class Post:
 class RayWorker:
     """A worker, in its own process."""
 
-    def __init__(self, post: Any, number: int, cpus: float) -> None:
+    def __init__(self, broker: Any, number: int, cpus: float) -> None:
         # Without this the software renderer starts a thread for each core of the machine.
         os.environ["LP_NUM_THREADS"] = str(max(1, int(cpus)))
-        self._post, self._number = post, number
+        self._broker, self._number = broker, number
 
-    def run(self, work: bytes, baggage: Baggage, versions: Mapping[str, str]) -> None:
+    def run(self, work: bytes, worker_files: WorkerFiles, versions: Mapping[str, str]) -> None:
         """Do the work.
 
         Args:
@@ -346,8 +346,8 @@ class RayWorker:
         _remove_left_folders()
         folder = Path(tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}-"))
         try:
-            places = baggage.unpack(folder)
-            queue = _PostQueue(self._post, self._number, {str(folder): ""})
+            places = worker_files.unpack(folder)
+            queue = _BrokerQueue(self._broker, self._number, {str(folder): ""})
             with quick_imports():
                 run, setup = pickle.loads(work)
             work_on(run, relocated(setup, places), queue)
@@ -376,22 +376,22 @@ def _require_versions(versions: Mapping[str, str]) -> None:
         raise OtherVersions(f"{platform.node()} has {'; '.join(told)}: install the same on all machines")
 
 
-class _PostQueue(WorkerQueue):
+class _BrokerQueue(WorkerQueue):
     """The chunks of an actor."""
 
-    def __init__(self, post: Any, worker: int, origin: Mapping[str, str]) -> None:
-        self._post, self._worker, self.origin = post, worker, origin
+    def __init__(self, broker: Any, worker: int, origin: Mapping[str, str]) -> None:
+        self._broker, self._worker, self.origin = broker, worker, origin
         self._waiting: list[bytes] = []
         self._said = 0.0
         self._limit: int = NO_LIMIT
         self._put: Any = None
-        """Ray reference to the last `Post.put` call; its value is the limit at that time."""
+        """Ray reference to the last `MessageBroker.put` call; its value is the limit at that time."""
 
     def next(self) -> Chunk | None:
         import ray
 
-        messages, self._waiting = [*self._waiting, pack_message(Asks())], []
-        chunk, self._limit = ray.get(self._post.ask.remote(self._worker, messages))
+        messages, self._waiting = [*self._waiting, pack_message(ChunkRequest())], []
+        chunk, self._limit = ray.get(self._broker.ask.remote(self._worker, messages))
         return chunk
 
     def limit(self) -> int:
@@ -418,5 +418,5 @@ class _PostQueue(WorkerQueue):
 
     def _send(self) -> None:
         messages, self._waiting = self._waiting, []
-        self._put = self._post.put.remote(self._worker, messages)
+        self._put = self._broker.put.remote(self._worker, messages)
         self._said = time.monotonic()

@@ -34,7 +34,7 @@ class ClusterLost(OSError):
     """The cluster ended while it was used; the text gives what is known of the reason."""
 
 
-class Pulse:
+class ClusterHealth:
     """Notices that the daemons of the cluster that is connected to are gone.
 
     Ray itself goes on for seconds, then ends this process from native code, without an exception.

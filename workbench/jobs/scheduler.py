@@ -127,7 +127,7 @@ class _Held:
     """Wanted items that have no result yet."""
 
 
-class Deal(Generic[Result, Update]):
+class Scheduler(Generic[Result, Update]):
     """The chunks of a job, and the callbacks for the results of its items. Used on one thread.
 
     Chunks are dealt in ascending order. From the limit on no item is needed: a caller that has enough lowers it, and stopping
@@ -417,11 +417,11 @@ class Executor(Protocol):
         """Whether workers may run on other machines."""
         ...
 
-    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+    def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:
         """Deal until no chunk is left or needed, and all items under way are finished.
 
         Raises:
-            TaskError, PoolError: as `Deal` decides; or a worker failed in our own code. The other workers were stopped
+            TaskError, PoolError: as `Scheduler` decides; or a worker failed in our own code. The other workers were stopped
                 and dropped the items under way.
         """
         ...
@@ -434,14 +434,14 @@ class ThisProcess:
     def elsewhere(self) -> bool:
         return False
 
-    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+    def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:
         while True:
             try:
-                work.run(work.setup, _OwnQueue(deal))
-                return deal.ended(None)
+                work.run(work.setup, _OwnQueue(scheduler))
+                return scheduler.ended(None)
             except TaskError as error:
-                deal.failed(None, error)
-            if not deal.count_left(1):
+                scheduler.failed(None, error)
+            if not scheduler.count_left(1):
                 return
 
 
@@ -449,17 +449,17 @@ class ThisProcess:
 class _OwnQueue:
     """The chunks of the process that deals."""
 
-    deal: Deal[Any, Any]
+    scheduler: Scheduler[Any, Any]
     origin: Mapping[str, str] = field(default_factory=dict)
 
     def next(self) -> Chunk | None:
-        return self.deal.next(None)
+        return self.scheduler.next(None)
 
     def limit(self) -> int:
-        return self.deal.limit()
+        return self.scheduler.limit()
 
     def send_result(self, number: int, result: Any) -> None:
-        self.deal.result(None, number, result)
+        self.scheduler.result(None, number, result)
 
     def send_update(self, update: Any) -> None:
-        self.deal.update(update)
+        self.scheduler.update(update)

@@ -26,7 +26,7 @@ class TooMuch(ValueError):
 
 
 @dataclass(frozen=True)
-class Baggage:
+class WorkerFiles:
     """Folders and files of the submitting side, as one zip."""
 
     roots: tuple[str, ...]
@@ -55,7 +55,7 @@ class Baggage:
         return {root: f"{folder}{root}" for root in self.roots}
 
 
-def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage:
+def pack_worker_files(folders: Iterable[Path], files: Iterable[Path] = ()) -> WorkerFiles:
     """Pack the files that a job needs.
 
     Args:
@@ -83,7 +83,7 @@ def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage
         for file in sizes:
             archive.writestr(zipfile.ZipInfo(str(file).lstrip("/")), read_regular_file(file, MOST_BYTES))
     outside = sorted(file for file in alone if not any(file.is_relative_to(root) for root in roots))
-    return Baggage(tuple(map(str, (*roots, *outside))), str(Path.cwd()), data.getvalue())
+    return WorkerFiles(tuple(map(str, (*roots, *outside))), str(Path.cwd()), data.getvalue())
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:

@@ -8,19 +8,19 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from workbench.jobs.scheduler import Chunk, Deal, ItemQueue, PoolError, Setup, Work
+from workbench.jobs.scheduler import Chunk, ItemQueue, PoolError, Scheduler, Setup, Work
 from workbench.jobs.worker_files import relocated
 from workbench.machine.processes.wire import Unpacker, pack
 from workbench.task.problem import Problem, TaskError
 
 
 @dataclass(frozen=True)
-class Asks:
+class ChunkRequest:
     """A request for a chunk."""
 
 
 @dataclass(frozen=True)
-class Updates:
+class ItemUpdate:
     """Progress of a worker."""
 
     value: bytes
@@ -28,7 +28,7 @@ class Updates:
 
 
 @dataclass(frozen=True)
-class Gives:
+class ItemResult:
     """The result of an item."""
 
     number: int
@@ -37,7 +37,7 @@ class Gives:
 
 
 @dataclass(frozen=True)
-class Ended:
+class WorkerEnded:
     """The last message of a worker: it does no further work."""
 
     why: str = ""
@@ -46,7 +46,7 @@ class Ended:
     """Exception of the author's code, if that is the reason."""
 
 
-Message = Asks | Updates | Gives | Ended
+Message = ChunkRequest | ItemUpdate | ItemResult | WorkerEnded
 MESSAGES = get_args(Message)
 
 
@@ -66,32 +66,32 @@ class WorkerQueue(ABC):
     def send(self, message: Message) -> None: ...
 
     def send_result(self, number: int, result: Any) -> None:
-        self.send(Gives(number, pack(relocated(result, self.origin))))
+        self.send(ItemResult(number, pack(relocated(result, self.origin))))
 
     def send_update(self, update: Any) -> None:
-        self.send(Updates(pack(relocated(update, self.origin))))
+        self.send(ItemUpdate(pack(relocated(update, self.origin))))
 
 
 def work_on(run: Callable[[Setup, ItemQueue], None], setup: Setup, queue: WorkerQueue) -> None:
     """Call `Work.run`, and send how it ended."""
     try:
         run(setup, queue)
-        queue.send(Ended())
+        queue.send(WorkerEnded())
     except TaskError as error:
         problem = relocated(error.problem, queue.origin)
-        queue.send(Ended(str(error) or "TaskError", problem))
+        queue.send(WorkerEnded(str(error) or "TaskError", problem))
     except (OSError, ValueError, RuntimeError) as error:
-        queue.send(Ended(relocated(str(error), queue.origin) or type(error).__name__))
+        queue.send(WorkerEnded(relocated(str(error), queue.origin) or type(error).__name__))
 
 
 @dataclass(frozen=True)
 class Listener:
-    """Handles the messages of workers for a deal."""
+    """Handles the messages of workers for a scheduler."""
 
     kind: str
     """Name of a worker in messages: "*a process* that records was killed"."""
     work: Work[Any, Any, Any]
-    deal: Deal[Any, Any]
+    scheduler: Scheduler[Any, Any]
     on_death: Callable[[str], None]
     """Called with a sentence when a worker has died and the job goes on."""
     _unpacker: Unpacker = field(default_factory=Unpacker)
@@ -106,31 +106,31 @@ class Listener:
             TaskError, PoolError: it failed, and the job is over.
             Unreadable: what it sent is not what the work gives.
         """
-        if isinstance(message, Asks):
+        if isinstance(message, ChunkRequest):
             return "asks"
-        if isinstance(message, Updates):
-            self.deal.update(self._unpacker.unpack(message.value, self.work.update))
+        if isinstance(message, ItemUpdate):
+            self.scheduler.update(self._unpacker.unpack(message.value, self.work.update))
             return "goes on"
-        if isinstance(message, Gives):
+        if isinstance(message, ItemResult):
             result = self._unpacker.unpack(message.value, self.work.result)
-            self._named(lambda: self.deal.result(worker, message.number, result))
+            self._named(lambda: self.scheduler.result(worker, message.number, result))
             return "goes on"
         if message.problem is not None:
-            self.deal.failed(worker, TaskError(message.problem))
+            self.scheduler.failed(worker, TaskError(message.problem))
             return "failed"
         if message.why:
             raise PoolError(message.why)
-        self._named(lambda: self.deal.ended(worker))
+        self._named(lambda: self.scheduler.ended(worker))
         return "done"
 
     def died(self, worker: Hashable, how: str, code: int | None) -> None:
         """Handle the death of a worker. Raises PoolError if the job is over."""
-        self._named(lambda: self.deal.died(worker, how, code))
-        if self.deal.limit():
+        self._named(lambda: self.scheduler.died(worker, how, code))
+        if self.scheduler.limit():
             self.on_death(f"{self.kind} {self.work.name} {how}; what it had begun is dealt again")
 
     def _named(self, act: Callable[[], None]) -> None:
-        """Call `act`; prefix a PoolError of the deal with the name of the worker."""
+        """Call `act`; prefix a PoolError of the scheduler with the name of the worker."""
         try:
             act()
         except PoolError as error:

@@ -10,7 +10,7 @@ import viser
 from workbench.episodes.row import LONGEST_NOTE, LibraryRow, clean_tags
 from workbench.library.folder import Library, LibraryError
 from workbench.library.rows import in_words
-from workbench.machine.loop import Aside, begin
+from workbench.machine.loop import BlockingPool, begin
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.page.commands import AnswerDialog, CloseDialog, TypeAnswer
 from workbench.page.widgets.dialog import Dialog
@@ -46,7 +46,7 @@ class LibraryEdits:
     def __init__(self, server: viser.ViserServer, library: Library) -> None:
         self._server, self._library = server, library
         self._question: _Question | None = None
-        self._disk = Aside("library-edits")
+        self._disk = BlockingPool("library-edits")
 
     def close(self) -> bool:
         """Close the dialog; False if there is none."""

@@ -48,7 +48,7 @@ from workbench.library.rows import (
     job_text,
     none_like_that,
 )
-from workbench.machine.loop import Aside, begin, on_loop, post
+from workbench.machine.loop import BlockingPool, begin, on_loop, post
 from workbench.page.command import Command
 from workbench.page.commands import AnswerDialog, TypeAnswer
 from workbench.page.widgets.fields import Field, choice
@@ -131,7 +131,7 @@ class LibraryPanel(PagePart[object]):
         self._table = server.gui.add_html("")
         self._trash = server.gui.add_html("")
 
-        self._disk = Aside("thumbnails")
+        self._disk = BlockingPool("thumbnails")
         self._reading: asyncio.Task[None] | None = None
         self._pictured: tuple[LibraryRow, ...] = ()
         """Rows whose thumbnails are read, or were read last."""

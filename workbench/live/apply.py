@@ -41,7 +41,7 @@ from workbench.live.events import (
     FollowPolicy,
     InterruptWorker,
     LoadDone,
-    LoadGaveWay,
+    LoadPreempted,
     MomentShown,
     Now,
     OptionsApplied,
@@ -82,10 +82,10 @@ from workbench.live.messages import (
     ReadPolicyAgain,
     Reset,
     RulesBroken,
+    SetSliderAction,
     SingleStep,
+    SliderAction,
     Status,
-    Tell,
-    Told,
 )
 from workbench.live.past import Past
 from workbench.live.reading import read, schedule
@@ -179,7 +179,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
             return load_failed(run, event, now)
         case LoadDone() if run.to_enter is not None:
             return _enter(replace(run, to_enter=None), run.to_enter)
-        case LoadGaveWay():
+        case LoadPreempted():
             return try_next(run, event.failed)
         case NewProcessNeeded():
             return replace(run, needed=event), []
@@ -190,7 +190,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
             return replace(run, failed_cameras={**run.failed_cameras, event.key: event.why}), []
         case Placed():
             return _placed(run, event), []
-        case Told():
+        case SliderAction():
             return replace(run, told=event.action), []
         case Inspection():
             return replace(run, inspection=event), []
@@ -228,7 +228,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
             if run.task is None:
                 return run, []
             envs = tuple(range(run.num_envs)) if event.env_idx is None else event.env_idx
-            return _show_live(run), [Send(Tell(envs, event.dimensions, event.values))]
+            return _show_live(run), [Send(SetSliderAction(envs, event.dimensions, event.values))]
         case ReadingChosen(sections=sections):
             return replace(run, read_sections=sections), []
         case ReadingDue():

@@ -56,7 +56,7 @@ class LoadDone:
 
 
 @dataclass(frozen=True)
-class LoadGaveWay:
+class LoadPreempted:
     """A load was interrupted because a newer version waits."""
 
     failed: LoadFailed
@@ -174,7 +174,7 @@ RunEvent = (
     | Asked
     | VersionLoaded
     | LoadDone
-    | LoadGaveWay
+    | LoadPreempted
     | WorkerDied
     | WorkerBusy
     | FileSaved

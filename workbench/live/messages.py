@@ -115,7 +115,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Tell:
+class SetSliderAction:
     """Set values of the action of envs, while `Settings.action_source` is ``sliders``; other dimensions keep their
     value."""
 
@@ -267,7 +267,7 @@ Request = (
     | SingleStep
     | Reset
     | Settings
-    | Tell
+    | SetSliderAction
     | ReadPolicyAgain
     | FollowPlan
     | PlaceCamera
@@ -477,7 +477,7 @@ class Status:
 
 
 @dataclass(frozen=True)
-class Told:
+class SliderAction:
     """The action that sliders send next, while they are the source of actions; sent whenever it may have changed."""
 
     action: NDArray[np.float32]
@@ -510,7 +510,7 @@ Event = (
     | Inspection
     | Answer
     | Progress
-    | Told
+    | SliderAction
     | Status
     | RulesBroken
 )

@@ -13,7 +13,7 @@ from workbench.actions.policy import NoPolicy, find_policy, list_policies
 from workbench.live.process.background_jobs import Job, Jobs
 from workbench.live.run import Run
 from workbench.machine.kept_choices import keep_policy, used_policies
-from workbench.machine.loop import Aside, do
+from workbench.machine.loop import BlockingPool, do
 
 LIST_SECONDS = 5.0
 """Seconds between two searches for policies, which read many files."""
@@ -72,7 +72,7 @@ class PolicySearch:
     def __init__(self, happen: Callable[[PoliciesListed], object]) -> None:
         self._happen = happen
         self._here = Path.cwd()
-        self._disk = Aside("policies")
+        self._disk = BlockingPool("policies")
         self._jobs = Jobs(lambda: None, lambda failure: None)
 
     def perform(self, effect: ListPolicies) -> None:

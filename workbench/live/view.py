@@ -18,7 +18,7 @@ from workbench.live.messages import ReloadReport, RulesBroken, Settings
 from workbench.live.past import TimelineView
 from workbench.live.process.captured_output import NOTHING_PRINTED, Printed
 from workbench.live.process.heartbeat import Busy
-from workbench.live.process.supervisor import Vitals
+from workbench.live.process.supervisor import ProcessMemory
 from workbench.live.run import PastLoad, Run, RunState
 from workbench.task.description import TaskDescription, TaskOptions
 from workbench.task.problem import Problem
@@ -97,7 +97,7 @@ class SessionView:
     """As `Run.inspection`."""
     printed: Printed = NOTHING_PRINTED
     """The last lines that the author's code printed."""
-    vitals: Vitals = Vitals()
+    vitals: ProcessMemory = ProcessMemory()
     """Memory of the processes."""
     known_policies: tuple[str, ...] = ()
     """Policies to choose from, as they were listed last."""

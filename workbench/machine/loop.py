@@ -2,7 +2,7 @@
 
 What pages ask for, what a worker says and what jobs come to are changes, made one after the other, each whole. So no lock
 guards what they change, and what is read is of one moment. Nothing on the loop blocks: what does (a disk, another process)
-is awaited, or done by an `Aside`. Commands that serve pages run the loop in the main thread (`loop_in_main`); elsewhere a
+is awaited, or done by an `BlockingPool`. Commands that serve pages run the loop in the main thread (`loop_in_main`); elsewhere a
 daemon thread runs it from the first use on, as long as the process lasts.
 """
 
@@ -66,7 +66,7 @@ def loop_in_main(command: Callable[Args, Value]) -> Callable[Args, Value]:
             assert _begun is None, "the loop runs on another thread already"
             loop = _begun = _new_loop()
         work = functools.partial(command, *args, **kwargs)
-        task = loop.create_task(Aside("command").run(work))
+        task = loop.create_task(BlockingPool("command").run(work))
         # Else Python raises it in whatever change the loop is making.
         loop.add_signal_handler(signal.SIGINT, task.cancel)
         try:
@@ -167,7 +167,7 @@ def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lamb
 
 
 def wait_for_disk(done: futures.Future[Any] | None) -> None:
-    """Wait for the result of an `Aside`, at most one second: a disk may hang. Called on another thread than the loop."""
+    """Wait for the result of an `BlockingPool`, at most one second: a disk may hang. Called on another thread than the loop."""
     if done is not None and not is_here():
         futures.wait([done], timeout=1.0)
 
@@ -199,7 +199,7 @@ class ChangeCounter:
             self._changed.notify_all()
 
 
-class Aside:
+class BlockingPool:
     """A thread that runs blocking calls one after the other. It begins with the first use, and the end of the process
     does not wait for it: a call into a disk that hangs cannot be ended."""
 

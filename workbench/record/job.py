@@ -14,7 +14,7 @@ from workbench.envs.broken_rule import warn_of
 from workbench.envs.gpu_rules import Finding
 from workbench.episodes.writing.upload import remove_uploaded
 from workbench.jobs.local_processes import Processes
-from workbench.jobs.scheduler import Deal, Executor, Failure, ItemQueue, ThisProcess, Work
+from workbench.jobs.scheduler import Executor, Failure, ItemQueue, Scheduler, ThisProcess, Work
 from workbench.record.job_worker import (
     RecordOptions,
     RecordSetup,
@@ -118,8 +118,8 @@ def record(
         executor = ThisProcess() if what.workers == 1 else Processes(what.workers)
     if isinstance(executor, ThisProcess):
         run_items = partial(record_items, given=given)
-    do_record([what], sys.maxsize, run, executor, recording.deal, run_items)
-    recording.deal.require_results()
+    do_record([what], sys.maxsize, run, executor, recording.scheduler, run_items)
+    recording.scheduler.require_results()
     return recording.so_far(stop())
 
 
@@ -137,7 +137,7 @@ def collect(what: RecordOptions, known: Mapping[int, Written | None]) -> Recorde
         lambda finding: None,
         lambda _: None,
     )
-    recording.deal.go_on(known, lambda number, written: None)
+    recording.scheduler.go_on(known, lambda number, written: None)
     return recording.so_far(stopped=False)
 
 
@@ -146,10 +146,10 @@ def do_record(
     stride: int,
     run: str,
     executor: Executor,
-    deal: Deal[Written | None, RecordUpdate],
+    scheduler: Scheduler[Written | None, RecordUpdate],
     run_items: Callable[[RecordSetup, ItemQueue], None] = record_items,
 ) -> None:
-    """Record the items of a deal, of one or several recordings. Arguments as of `RecordSetup`; raises as `record`."""
+    """Record the items of a scheduler, of one or several recordings. Arguments as of `RecordSetup`; raises as `record`."""
     run = run or uuid.uuid4().hex
     needed = [needed_by(what.task, what.actions, what.options.imports) for what in wanted]
     folders = [what.out.absolute() for what in wanted]
@@ -168,7 +168,7 @@ def do_record(
         file.parent.mkdir(parents=True, exist_ok=True)
         file.touch()
     try:
-        executor.run(work, deal)
+        executor.run(work, scheduler)
     finally:
         for file in marks:
             file.unlink(missing_ok=True)
@@ -221,19 +221,19 @@ class ToldByWorkers:
         self,
         kept: int,
         over: tuple[int, Written | None] | None,
-        deal: Deal[Written | None, RecordUpdate],
+        scheduler: Scheduler[Written | None, RecordUpdate],
         counts_parts: bool,
     ) -> RecordProgress:
         """
         Args:
             counts_parts: whether what is under way counts in part.
         """
-        limit = deal.limit()
+        limit = scheduler.limit()
         running = {number: steps for number, steps in self._running.items() if number < limit}
         part = sum(min(steps / max(self._limit, 1), 1.0) for steps in running.values())
         done = kept + (part if counts_parts else 0.0)
         return RecordProgress(
-            kept, self._steps, over, running, self._limit, done, self._failures, deal.is_going_on
+            kept, self._steps, over, running, self._limit, done, self._failures, scheduler.is_going_on
         )
 
 
@@ -262,7 +262,7 @@ class _Recording:
         most = what.episodes if what.successes is None else what.tries
         assert most is not None
         self._most = most
-        self.deal: Deal[Written | None, RecordUpdate] = Deal(
+        self.scheduler: Scheduler[Written | None, RecordUpdate] = Scheduler(
             range(most),
             self._over,
             self._on_update,
@@ -278,7 +278,7 @@ class _Recording:
         start_corrected = sum(episode.start_corrected for episode in written)
         tried = written[-1].index + 1 if enough else self._ended
         missing = 0 if enough else self._most - self._ended
-        return Recorded(written, tried, stopped, start_corrected, tuple(self.deal.failures), missing)
+        return Recorded(written, tried, stopped, start_corrected, tuple(self.scheduler.failures), missing)
 
     def _over(self, number: int, written: Written | None) -> None:
         self._ended += 1
@@ -288,7 +288,7 @@ class _Recording:
             self._kept[number] = replace(written, path=self._out / written.path.name)
         if self._wanted is not None and len(self._kept) >= self._wanted:
             last = sorted(self._kept)[self._wanted - 1]
-            self.deal.lower(last + 1)
+            self.scheduler.lower(last + 1)
             for surplus in [number for number in self._kept if number > last]:
                 self._remove(self._kept.pop(surplus))
         self._tell((number, self._kept.get(number)))
@@ -304,7 +304,7 @@ class _Recording:
 
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
         kept = len(self._kept)
-        self._on_progress(self._told.progress(kept, over, self.deal, self._wanted is None))
+        self._on_progress(self._told.progress(kept, over, self.scheduler, self._wanted is None))
 
     def _remove(self, episode: Written) -> None:
         if self._upload:

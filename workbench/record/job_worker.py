@@ -95,7 +95,7 @@ def episode_id(run: str, number: int) -> str:
 
 
 @dataclass(frozen=True)
-class Underway:
+class BatchProgress:
     """Episodes that one process runs at the moment."""
 
     steps: tuple[tuple[int, int], ...]
@@ -112,7 +112,7 @@ class RecordUpdate:
 
     activity: str = ""
     """Work that is done before the first episode."""
-    underway: Underway | None = None
+    underway: BatchProgress | None = None
     finding: Finding | None = None
     notice: str = ""
     """Notice about the task, as a sentence."""
@@ -373,7 +373,7 @@ class _Episodes:
     def _tell(self, made: int) -> None:
         """Send the progress of the episodes after `made` further control steps."""
         at = tuple((number, self._steps[env]) for env, number in self._running.items())
-        self._queue.send_update(RecordUpdate(underway=Underway(at, self._limit, made)))
+        self._queue.send_update(RecordUpdate(underway=BatchProgress(at, self._limit, made)))
 
     def _drop_from(self, limit: int) -> None:
         for env in [env for env, number in self._running.items() if number >= limit]:

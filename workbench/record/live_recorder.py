@@ -8,7 +8,7 @@ from pathlib import Path
 
 from workbench.episodes.reader.reading import recover_confined, recovered_text
 from workbench.episodes.writing.publish import RecordingError
-from workbench.machine.loop import Aside, do, post
+from workbench.machine.loop import BlockingPool, do, post
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.record.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.record.state import (
@@ -18,9 +18,9 @@ from workbench.record.state import (
     EpisodesRecovered,
     EpisodeWritten,
     RecordEvent,
+    RunningEpisodes,
     StepRecorded,
     TakeStep,
-    UnderWay,
 )
 
 
@@ -48,7 +48,7 @@ class LiveRecorder:
         """Takes the steps, on the thread of `_aside`."""
         self.finisher = EpisodeFinisher(self._written, self._recover)
         """Makes the files, including those of `PastSaver`."""
-        self._aside = Aside("recorder")
+        self._aside = BlockingPool("recorder")
 
     def perform(self, effect: BeginEpisodes | TakeStep | EndEpisodes) -> None:
         """Begin it; called on the loop."""
@@ -91,7 +91,7 @@ class LiveRecorder:
                 report_failure("A step could not be recorded", error)
             problem = f"the recording ended: {error}"
         episodes = gatherer.under_way
-        under_way = UnderWay(
+        under_way = RunningEpisodes(
             len(episodes),
             sum(episode.steps for episode in episodes),
             sum(episode.writer.bytes_written for episode in episodes),

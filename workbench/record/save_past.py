@@ -18,7 +18,7 @@ from workbench.live.history.moments import Moment
 from workbench.live.messages import PlaceCamera, Reset
 from workbench.live.process.ask import WAITING, Background
 from workbench.live.process.background_jobs import Job, JobFailed, Jobs
-from workbench.machine.loop import Aside, do, post
+from workbench.machine.loop import BlockingPool, do, post
 from workbench.record.gather import EpisodeFinisher, GatheredEpisode
 from workbench.record.questions import Captured, CaptureMoment
 from workbench.record.saving_state import (
@@ -73,7 +73,7 @@ class PastSaver:
         self._job = 0
         """Number of the running job."""
         self._jobs = Jobs(self._progressed, self._failed)
-        self._aside = Aside("keep-past")
+        self._aside = BlockingPool("keep-past")
         """Thread that writes, since the disk may be slow."""
 
     def begin(self, effect: BeginSaving, placed: tuple[PlaceCamera, ...]) -> None:

@@ -63,7 +63,7 @@ class RecordingStatus:
 
 
 @dataclass(frozen=True)
-class UnderWay:
+class RunningEpisodes:
     """The running episodes, as far as they are in their journals."""
 
     episodes: int = 0
@@ -86,7 +86,7 @@ class LiveRecording:
     since: float = 0.0
     episodes: int = 0
     """`since` and `episodes`: as `RecordingStatus` has them."""
-    under_way: UnderWay = UnderWay()
+    under_way: RunningEpisodes = RunningEpisodes()
     waiting_bytes: int = 0
     """Bytes of steps that wait for the disk, also those of recordings before."""
     being_written: int = 0
@@ -150,7 +150,7 @@ class StepRecorded:
     bytes: int
     env_idx: tuple[int, ...]
     """Envs that go on being recorded."""
-    under_way: UnderWay
+    under_way: RunningEpisodes
     problem: str | None = None
     """Why the step could not be taken."""
 
@@ -305,7 +305,11 @@ def _start(
 
 def _ended(recording: LiveRecording, problem: str | None = None) -> LiveRecording:
     return replace(
-        recording, env_idx=(), under_way=UnderWay(), problem=problem or recording.problem, continues=None
+        recording,
+        env_idx=(),
+        under_way=RunningEpisodes(),
+        problem=problem or recording.problem,
+        continues=None,
     )
 
 

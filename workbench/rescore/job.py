@@ -17,7 +17,7 @@ from workbench.envs.broken_rule import warn_of
 from workbench.envs.gpu_rules import Finding
 from workbench.episodes.recorded_source import CannotEnterRecording
 from workbench.episodes.row import Source
-from workbench.jobs.scheduler import Chunk, Deal, Executor, Failure, ItemQueue, Work
+from workbench.jobs.scheduler import Chunk, Executor, Failure, ItemQueue, Scheduler, Work
 from workbench.jobs.worker_files import MOST_BYTES
 from workbench.machine.folders import CurrentFolder
 from workbench.rescore.replay_recordings import RescoredBy, opened_code, rescore
@@ -161,7 +161,7 @@ def rescore_recordings(
             steps += update.steps
             on_progress(len(results), len(setup.items), steps)
 
-    deal: Deal[RescoredRecording, RescoreUpdate] = Deal(
+    scheduler: Scheduler[RescoredRecording, RescoreUpdate] = Scheduler(
         sorted(setup.items), take, hear, chunk=setup.chunk, tries=_TRIES, on_failure=failed
     )
     folders, files = _needed(setup)
@@ -177,7 +177,7 @@ def rescore_recordings(
         folders=folders,
         files=files,
     )
-    executor.run(work, deal)
+    executor.run(work, scheduler)
     return sorted(results.values(), key=lambda result: result.place)
 
 

@@ -27,7 +27,7 @@ from workbench.episodes.side_files import side_files_text
 from workbench.live.effects import Asked
 from workbench.live.process.ask import Background
 from workbench.live.process.background_jobs import Job, JobFailed, Jobs
-from workbench.machine.loop import Aside, do, on_loop
+from workbench.machine.loop import BlockingPool, do, on_loop
 from workbench.page.command import Command
 from workbench.rescore.state import RescoreView, Rescoring, RescoringTold, apply_to_job
 from workbench.rescore.verdict import Rescore, Rescored, Verdict
@@ -162,7 +162,7 @@ class Rescorer:
         self._rescoring = Rescoring()
         self._jobs = Jobs(lambda: None, self._failed)
         self._process = Background()
-        self._aside = Aside("rescore")
+        self._aside = BlockingPool("rescore")
         """Thread that reads recordings, and waits for answers of people."""
         self._clearances = clearances or Clearances()
         self._base = base or TaskOptions()

@@ -20,7 +20,7 @@ from workbench.library.folder import Library
 from workbench.live.effects import Asked
 from workbench.live.process.background_jobs import Job, JobFailed, Jobs
 from workbench.live.process.memory_limit import format_size, total_memory
-from workbench.machine.loop import Aside, ChangeCounter, do, on_loop, post
+from workbench.machine.loop import BlockingPool, ChangeCounter, do, on_loop, post
 from workbench.machine.processes.family import allocated_memory
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.page.command import Command
@@ -96,7 +96,7 @@ class Review:
         self._state = ReviewState()
         self._reading = Jobs(lambda: None, self._failed)
         self._checks = Jobs(lambda: None, lambda failure: self._happened(ProblemFound(f"{failure}.")))
-        self._file_checks = Aside("review-files")
+        self._file_checks = BlockingPool("review-files")
 
     @on_loop
     def view(self) -> ReviewView:
@@ -190,7 +190,7 @@ class Review:
 
     async def _open(self, number: int, rows: tuple[LibraryRow, ...], job: Job) -> None:
         # Each opening has one of its own: a disk that hangs must not keep the next.
-        aside = Aside("review-open")
+        aside = BlockingPool("review-open")
         try:
             shapes = SharedShapes()
             opened = await self._read_rows(aside, number, rows, job, shapes)
@@ -200,7 +200,7 @@ class Review:
             aside.end()
 
     async def _read_rows(
-        self, aside: Aside, number: int, rows: tuple[LibraryRow, ...], job: Job, shapes: SharedShapes
+        self, aside: BlockingPool, number: int, rows: tuple[LibraryRow, ...], job: Job, shapes: SharedShapes
     ) -> list[Opened]:
         opened: list[Opened] = []
         problem, held = "", self._memory()

@@ -17,7 +17,7 @@ from workbench.episodes.episode import CameraTrack
 from workbench.live.panels.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.machine.loop import post
 from workbench.page.command import Refused
-from workbench.page.scene.bodies import Looks
+from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import (
     EnvLayout,
     SelectionMark,
@@ -26,7 +26,7 @@ from workbench.page.scene.env_grid import (
     lay_out,
     view_label,
 )
-from workbench.page.scene.viewpoint import Stage, Viewpoint, frame_all, frame_one
+from workbench.page.scene.viewpoint import View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.templates import colour, letter
 from workbench.review.commands import SelectRecording
 from workbench.review.differences import distances
@@ -184,7 +184,7 @@ class ReviewIn3D:
         stage: The 3-D view.
     """
 
-    def __init__(self, server: viser.ViserServer, review: Review, stage: Stage) -> None:
+    def __init__(self, server: viser.ViserServer, review: Review, stage: View3D) -> None:
         self._review = review
         self.bodies, self._framing, self._in_software = stage.scene, stage.framing, stage.in_software
         self._mark = SelectionMark(server)
@@ -194,7 +194,7 @@ class ReviewIn3D:
         self._view = ReviewView()
         """View that the scene was drawn for: another recording may have been opened since."""
         self._scene_of: object = None
-        self._looks: Looks | None = None
+        self._looks: DrawStyle | None = None
         """Looks that the bodies were built with."""
         # viser awaits coroutines, although its types do not say so.
         server.scene.on_click()(self._on_click)  # type: ignore[arg-type]
@@ -203,7 +203,7 @@ class ReviewIn3D:
         self,
         view: ReviewView,
         ghosts: bool,
-        looks: Looks,
+        looks: DrawStyle,
         cameras: tuple[CameraInfo, ...],
         pictures: dict[CameraKey, Picture],
     ) -> None:

@@ -38,9 +38,9 @@ from workbench.episodes.reader.reading import read_recording
 from workbench.episodes.reader.scan import SUFFIXES
 from workbench.episodes.row import Source, UnreadableRecording
 from workbench.jobs.local_processes import Processes
-from workbench.jobs.scheduler import Deal, ItemQueue, PoolError, Work
+from workbench.jobs.scheduler import ItemQueue, PoolError, Scheduler, Work
 from workbench.machine.files import new_file
-from workbench.machine.loop import Aside, begin, on_loop, post, result_of
+from workbench.machine.loop import BlockingPool, begin, on_loop, post, result_of
 from workbench.machine.software_vulkan import ensure_render_device
 from workbench.machine.text import plain_text
 from workbench.page.widgets.templates import counted, sentence
@@ -320,7 +320,7 @@ class Making:
     def __init__(self) -> None:
         self._view = MakingView()
         self._stopped = False
-        self._aside = Aside("making")
+        self._aside = BlockingPool("making")
         """Waits for the process."""
         self._task: asyncio.Task[None] | None = None
         self._scratch: Path | None = None
@@ -380,7 +380,7 @@ class Making:
                 # A new folder each time: a file of the same name may exist from before.
                 wanted = replace(wanted, folder=Path(tempfile.mkdtemp(dir=self._scratch)))
             work = Work(_make, wanted, Made | str, tuple[float, str], "that makes it")
-            Processes(1).run(work, Deal(range(1), take, hear, lambda: self._stopped))
+            Processes(1).run(work, Scheduler(range(1), take, hear, lambda: self._stopped))
         except OSError as error:
             came.append(f"It could not be started: {error}.")
         except PoolError as error:

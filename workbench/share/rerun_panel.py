@@ -19,7 +19,7 @@ from workbench.episodes.reader.reading import read_store_id
 from workbench.episodes.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, viewer_file, viewer_is_cached
 from workbench.live.process.background_jobs import Job, JobFailed, Jobs
 from workbench.machine.folders import web_assets_folder
-from workbench.machine.loop import Aside, later, on_loop, post
+from workbench.machine.loop import BlockingPool, later, on_loop, post
 from workbench.page.command import Command, Refused
 from workbench.page.commands import TellUnfolded
 from workbench.page.door.file_response import Downloads, FileReply
@@ -63,7 +63,7 @@ class RerunPages:
         self._secret = secrets.token_bytes(32)
         self._shown: dict[str, tuple[tuple[Path, ...], Callable[[], Moments]]] = {}
         """Recordings by the random part of their address; requests read it on other threads."""
-        self.unpacking = Aside("rerun-viewer")
+        self.unpacking = BlockingPool("rerun-viewer")
         """Unpacks the viewer."""
         headers = {"Content-Security-Policy": VIEWER_POLICY, "Cache-Control": "private, max-age=604800"}
         gated_server.add_route(_VIEWER, _viewer_file, headers)

@@ -14,7 +14,7 @@ from workbench.episodes.episode import Episode
 from workbench.episodes.films import FilmEye, default_eye
 from workbench.machine.files import new_file
 from workbench.page.door.gated_server import ServerOptions, open_server
-from workbench.page.scene.bodies import Looks, SceneView
+from workbench.page.scene.bodies import DrawStyle, SceneView
 from workbench.page.scene.env_grid import lay_out
 from workbench.page.widgets.templates import counted, render
 from workbench.review.view import outcome_text
@@ -95,7 +95,7 @@ def _recorded(
     batch[env] = poses[0]
     scene = SceneView(server)
     layout = lay_out(geometry, batch)
-    scene.build(geometry, layout, batch, env, Looks(TRIANGLES))
+    scene.build(geometry, layout, batch, env, DrawStyle(TRIANGLES))
     recording = server.get_scene_serializer()
     for state, now in enumerate(poses):
         batch[env] = now

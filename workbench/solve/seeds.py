@@ -10,12 +10,12 @@ from typing import Any, Literal
 
 from workbench.checks.commands import ChooseSeeds, SolveSeeds, StopSolving
 from workbench.jobs.local_processes import Processes
-from workbench.jobs.scheduler import Deal, ItemQueue, PoolError, Work
+from workbench.jobs.scheduler import ItemQueue, PoolError, Scheduler, Work
 from workbench.live.effects import Asked
 from workbench.live.events import VersionLoaded
 from workbench.live.process.background_jobs import Job, JobFailed, Jobs
 from workbench.live.run import Run
-from workbench.machine.loop import Aside, do, post
+from workbench.machine.loop import BlockingPool, do, post
 from workbench.page.command import Command, Refused
 from workbench.planning.options import PlanOptions
 from workbench.planning.seeds_report import SolveReport, underway_text
@@ -178,7 +178,7 @@ class SeedsJobs:
         """
         self._recordings, self._happen = recordings.absolute(), happen
         self._jobs = Jobs(lambda: None, self._failed)
-        self._aside = Aside("solve-seeds")
+        self._aside = BlockingPool("solve-seeds")
 
     def perform(self, effect: SeedsEffect) -> None:
         match effect:
@@ -207,7 +207,7 @@ class SeedsJobs:
         def tell(news: SeedsTold) -> None:
             post(lambda: job.stopped or self._happen(news))
 
-        deal: Deal[SolveReport, SeedsTold] = Deal(
+        deal: Scheduler[SolveReport, SeedsTold] = Scheduler(
             range(1), lambda number, report: tell(SeedsTold(report=report)), tell, lambda: job.stopped
         )
         try:

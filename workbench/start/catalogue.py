@@ -15,7 +15,7 @@ from pathlib import Path
 
 from workbench.live.commands import MOST_ENVS
 from workbench.machine.folders import example_tasks
-from workbench.machine.loop import Aside, begin, do, on_loop
+from workbench.machine.loop import BlockingPool, begin, do, on_loop
 from workbench.machine.parse_python import parse_python
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.text import short_line
@@ -115,7 +115,7 @@ class Catalogue:
         self.folder = Path(os.path.realpath(folder))
         self.recents, self.registered, self.options = recents, registered, options
         self._recordings = recordings
-        self._aside = Aside("find-tasks")
+        self._aside = BlockingPool("find-tasks")
         self._following: asyncio.Task[None] | None = None
         self._files = TaskFileReader()
         self._numbers: dict[tuple[Section, str], int] = {}
@@ -150,7 +150,7 @@ class Catalogue:
         Raises:
             NotAPath: the file cannot be opened.
         """
-        aside = Aside("typed-path")  # one for each text: a disk that hangs must not keep the next
+        aside = BlockingPool("typed-path")  # one for each text: a disk that hangs must not keep the next
         try:
             found = await aside.run(lambda: self._find_typed(text))
         finally:

@@ -23,7 +23,7 @@ from workbench.live.process.background_jobs import JobFailed
 from workbench.live.questions import DrawTask, ListTasks
 from workbench.machine.files import read_regular_file, replace_file
 from workbench.machine.folders import cache_folder
-from workbench.machine.loop import Aside, begin, do, on_loop
+from workbench.machine.loop import BlockingPool, begin, do, on_loop
 from workbench.machine.maniskill_installed import installed_maniskills, lines_if_lacking
 from workbench.machine.processes.child_python import LOWEST
 from workbench.machine.processes.watched_thread import report_failure
@@ -107,7 +107,7 @@ class RegisteredTasks:
         self.on_change: Callable[[], None] = lambda: None
         """Called on the loop when there is another view."""
         self._folder = Path()
-        self._disk = Aside("registered-tasks")
+        self._disk = BlockingPool("registered-tasks")
         self._process = Background(niceness=LOWEST)
         self._work: asyncio.Task[None] | None = None
 

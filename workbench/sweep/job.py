@@ -17,7 +17,7 @@ from workbench.envs.broken_rule import warn_of
 from workbench.envs.gpu_rules import Finding
 from workbench.episodes.sweep_results import MOST_POINTS, SweepEpisode, SweepResults, value_text
 from workbench.jobs.local_processes import Processes
-from workbench.jobs.scheduler import Deal, Executor, Failure, ThisProcess
+from workbench.jobs.scheduler import Executor, Failure, Scheduler, ThisProcess
 from workbench.planning.options import PlanOptions
 from workbench.record.job import TRIES, RecordProgress, ToldByWorkers, chunk_of, do_record
 from workbench.record.job_worker import RecordOptions, RecordUpdate, Written, with_given_actions
@@ -236,15 +236,15 @@ def sweep(
     if executor is None:
         executor = ThisProcess() if what.workers == 1 else Processes(what.workers)
     collected = _Sweep(what, on_activity, on_progress, stop, on_finding, on_notice)
-    do_record(recordings, what.stride, run, executor, collected.deal)
-    collected.deal.require_results()
+    do_record(recordings, what.stride, run, executor, collected.scheduler)
+    collected.scheduler.require_results()
     return collected.report(stop())
 
 
 def collect_sweep(what: SweepOptions, known: Mapping[int, Written | None]) -> SweepReport:
     """Report of a sweep from the results of these episodes. Runs nothing."""
     collected = _Sweep(what, lambda _: None, lambda _: None, lambda: False, lambda _: None, lambda _: None)
-    collected.deal.go_on(known, lambda number, written: None)
+    collected.scheduler.go_on(known, lambda number, written: None)
     return collected.report(stopped=False)
 
 
@@ -266,7 +266,7 @@ class _Sweep:
         self._rows: dict[int, SweepEpisode] = {}
         self._kept = 0
         """Number of rows that are not failures."""
-        self.deal: Deal[Written | None, RecordUpdate] = Deal(
+        self.scheduler: Scheduler[Written | None, RecordUpdate] = Scheduler(
             what.items,
             self._over,
             self._on_update,
@@ -282,7 +282,7 @@ class _Sweep:
         points = tuple(point.json for point in self._points)
         results = SweepResults(what.task, what.actions, what.seeds, points, rows)
         missing = len(points) * what.seeds - len(rows)
-        return SweepReport(results, stopped, tuple(self.deal.failures), missing)
+        return SweepReport(results, stopped, tuple(self.scheduler.failures), missing)
 
     def _row(self, number: int, written: Written | None, failure: str = "") -> SweepEpisode:
         point, episode = divmod(number, self._stride)
@@ -319,4 +319,4 @@ class _Sweep:
             self._tell()
 
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
-        self._on_progress(self._told.progress(self._kept, over, self.deal, counts_parts=True))
+        self._on_progress(self._told.progress(self._kept, over, self.scheduler, counts_parts=True))

@@ -14,7 +14,7 @@ from workbench.episodes.reader.reading import read_sweep
 from workbench.episodes.row import LibraryRow, UnreadableRecording
 from workbench.episodes.sweep_results import RESULTS, PointSummary, SweepEpisode, SweepResults, value_text
 from workbench.library.folder import Library
-from workbench.machine.loop import Aside, begin, on_loop, post
+from workbench.machine.loop import BlockingPool, begin, on_loop, post
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.page.command import Command
 from workbench.page.widgets.paged import Paged
@@ -221,7 +221,7 @@ class SweepPanel(PagePart[ReviewView]):
         self._plot = server.gui.add_html("")
         self._table = server.gui.add_html("")
         self._episodes = server.gui.add_html("")
-        self._disk = Aside("sweep-results")
+        self._disk = BlockingPool("sweep-results")
         self._seen: tuple[int, int] | None = None
         """Size and time of the file that was read last."""
         self._read = LoadedSweep()

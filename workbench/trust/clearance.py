@@ -11,7 +11,7 @@ from typing import Any
 
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.recorded_source import NoRecordedSource, relative_sources
-from workbench.episodes.seal import MadeHere, made_here
+from workbench.episodes.seal import InstallationSeal, made_here
 from workbench.machine.text import short_line
 from workbench.task.content import CannotRead, TaskContent, read_content
 from workbench.task.reference import RecordedTask, TaskName, looks_like_file
@@ -259,10 +259,10 @@ class Clearances:
             self._store.trust_once(content, question.followed)
         return answer
 
-    def refused_arguments(self, info: EpisodeInfo, made: MadeHere | None = None) -> str | None:
+    def refused_arguments(self, info: EpisodeInfo, made: InstallationSeal | None = None) -> str | None:
         """Why an env must not get the arguments of this recording; None if it may. Recordings from elsewhere may name
         no files."""
-        if self._all_trusted or (made or made_here(info)) is not MadeHere.NO:
+        if self._all_trusted or (made or made_here(info)) is not InstallationSeal.NO:
             return None
         named = [_printable(text) for text in paths_in_arguments(info)]
         if not named:
@@ -282,14 +282,14 @@ class Clearances:
                 content = recorded_content(code.info)
             except NoRecordedSource as error:
                 return NotCleared(str(error))
-            trusted = made is not MadeHere.NO
+            trusted = made is not InstallationSeal.NO
         else:
             reference = code.reference
             if isinstance(reference, str):
                 return reference
             if reference.file is None:
                 return _registered(reference)
-            if made is MadeHere.CONTENT_AND_PLACE and reference.file == code.info.source_file:
+            if made is InstallationSeal.CONTENT_AND_PLACE and reference.file == code.info.source_file:
                 return str(reference)
             if _is_named(reference.file, self._named()):
                 return str(reference)
@@ -297,7 +297,7 @@ class Clearances:
                 content = read_content(Path(reference.file))
             except CannotRead as error:
                 return NotCleared(str(error))
-            trusted = made is not MadeHere.NO and _equals_recorded(content, code.info)
+            trusted = made is not InstallationSeal.NO and _equals_recorded(content, code.info)
         agreed = trusted or self._all_trusted or self._store.trusts(content)
         if agreed and (not code.followed or self._all_trusted or self._store.follows(content)):
             return _approved(code, content)

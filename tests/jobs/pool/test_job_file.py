@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from workbench.jobs.job_file import JobFile, JobFileError, JobKey, Kept, job_of, read_parts, write_whole
-from workbench.jobs.scheduler import Deal, ItemQueue, Shard, ThisProcess, Work
+from workbench.jobs.scheduler import ItemQueue, Scheduler, Shard, ThisProcess, Work
 from workbench.record.job_worker import RecordOptions
 from workbench.task.description import TaskOptions
 
@@ -33,10 +33,12 @@ def run(
                     made.append(number)
                     queue.send_result(number, number**2)
 
-    deal: Deal[int, None] = Deal(range(9), results.__setitem__, stop=lambda: len(made) >= stop_after, chunk=2)
+    scheduler: Scheduler[int, None] = Scheduler(
+        range(9), results.__setitem__, stop=lambda: len(made) >= stop_after, chunk=2
+    )
     file = JobFile(path, job)
     try:
-        Kept(ThisProcess(), file, shard).run(Work(square, None, int, None, "that squares"), deal)
+        Kept(ThisProcess(), file, shard).run(Work(square, None, int, None, "that squares"), scheduler)
     finally:
         file.close()
     return results, made

@@ -20,10 +20,10 @@ from workbench.jobs.scheduler import (
     FIRST_ALIKE,
     LATER_ALIKE,
     Chunk,
-    Deal,
     Executor,
     Failure,
     PoolError,
+    Scheduler,
     Shard,
     ThisProcess,
     parse_shard,
@@ -70,7 +70,7 @@ def test_what_is_not_wanted_any_more_is_left_out_and_all_before_it_is_done(
 ) -> None:
     def enough(run: Run, number: int) -> None:
         if number == 5:
-            run.deal.lower(8)
+            run.scheduler.lower(8)
 
     done = Run(Setup(folder=tmp_path), range(10**6), on_result=enough, chunk=3).by(executor)
     assert set(range(8)) <= set(done.results)
@@ -89,12 +89,12 @@ def test_what_was_stopped_is_resumed_with_what_is_left(executor: Executor, tmp_p
 
     kept: dict[int, Squared] = {}
     first = Run(Setup(folder=tmp_path), range(400), stop=lambda: asked, on_result=now, chunk=3)
-    first.deal.go_on({}, kept.__setitem__)
+    first.scheduler.go_on({}, kept.__setitem__)
     first.by(executor)
     assert 5 <= len(kept) < 400 and kept == first.results
     rest = Run(Setup(folder=tmp_path), range(400), chunk=3)
     more: dict[int, Squared] = {}
-    rest.deal.go_on(kept, more.__setitem__)
+    rest.scheduler.go_on(kept, more.__setitem__)
     rest.by(executor)
     assert not kept.keys() & more.keys() and rest.steps == len(more)
     assert rest.squares() == {number: number**2 for number in range(400)}
@@ -199,11 +199,11 @@ class Told:
     def __init__(self, numbers: Iterable[int], known: Mapping[int, int] | None = None, **how: Any) -> None:
         self.results: dict[int, int] = {}
         self.failures: list[Failure] = []
-        self.deal: Deal[int, None] = Deal(
+        self.scheduler: Scheduler[int, None] = Scheduler(
             numbers, self.results.__setitem__, on_failure=self.failures.append, **{"tries": 3, **how}
         )
         if known is not None:
-            self.deal.go_on(known, lambda number, result: None)
+            self.scheduler.go_on(known, lambda number, result: None)
 
 
 def problem(line: int) -> TaskError:
@@ -212,33 +212,33 @@ def problem(line: int) -> TaskError:
 
 def test_chunks_are_the_same_whatever_is_known_of_them() -> None:
     told = Told([*range(7), 9], known={0: 0, 1: 1, 2: 2, 4: 4}, chunk=3)
-    dealt = [told.deal.next("a"), told.deal.next("b"), told.deal.next("a")]
+    dealt = [told.scheduler.next("a"), told.scheduler.next("b"), told.scheduler.next("a")]
     assert dealt == [
         Chunk((3, 4, 5), frozenset({3, 5}), again=True),
         Chunk((6,), frozenset({6}), again=True),
         Chunk((9,), frozenset({9}), again=True),
     ]
-    assert told.deal.next("a") is None and told.results == {0: 0, 1: 1, 2: 2, 4: 4}
+    assert told.scheduler.next("a") is None and told.results == {0: 0, 1: 1, 2: 2, 4: 4}
 
 
 def test_a_chunk_of_a_dead_worker_comes_again_after_the_others_without_what_it_gave() -> None:
     told = Told(range(6), chunk=2)
-    assert told.deal.next("a") == Chunk((0, 1), frozenset({0, 1}))
-    told.deal.result("a", 1, 1)
-    told.deal.died("a", "was killed", -9)
-    later = [told.deal.next("b") for _ in range(3)]
+    assert told.scheduler.next("a") == Chunk((0, 1), frozenset({0, 1}))
+    told.scheduler.result("a", 1, 1)
+    told.scheduler.died("a", "was killed", -9)
+    later = [told.scheduler.next("b") for _ in range(3)]
     assert [chunk and chunk.numbers for chunk in later] == [(2, 3), (4, 5), (0, 1)]
     assert later[2] == Chunk((0, 1), frozenset({0}), again=True)
     with pytest.raises(PoolError, match="that it does not have"):
-        told.deal.result("b", 1, 1)
+        told.scheduler.result("b", 1, 1)
 
 
 def test_the_items_of_a_chunk_that_failed_are_tried_one_by_one_before_all_others() -> None:
     told = Told(range(9), chunk=3)
-    told.deal.next("a")
-    told.deal.result("a", 1, 1)
-    told.deal.failed("a", problem(7))
-    dealt = [told.deal.next("b") for _ in range(3)]
+    told.scheduler.next("a")
+    told.scheduler.result("a", 1, 1)
+    told.scheduler.failed("a", problem(7))
+    dealt = [told.scheduler.next("b") for _ in range(3)]
     assert dealt == [
         Chunk((0,), frozenset({0}), again=True),
         Chunk((2,), frozenset({2}), again=True),
@@ -251,30 +251,30 @@ def test_the_items_of_a_chunk_that_failed_are_tried_one_by_one_before_all_others
 def test_chunks_that_fail_alike_end_the_job_the_first_ones_soonest(before: int, most: int) -> None:
     told = Told(range(100))
     for number in range(before):
-        told.deal.next(number)
-        told.deal.result(number, number, 0)
+        told.scheduler.next(number)
+        told.scheduler.result(number, number, 0)
     for number in range(before, before + most - 1):
-        assert told.deal.next(number) is not None
-        told.deal.failed(number, problem(7))
-    assert told.deal.next("last") is not None
+        assert told.scheduler.next(number) is not None
+        told.scheduler.failed(number, problem(7))
+    assert told.scheduler.next("last") is not None
     with pytest.raises(TaskError, match="it broke at 7"):
-        told.deal.failed("last", problem(7))
+        told.scheduler.failed("last", problem(7))
     assert len(told.failures) == most
 
 
 def test_failures_at_different_places_or_between_results_do_not() -> None:
     told = Told(range(100))
     for number in range(2 * FIRST_ALIKE - 2):
-        told.deal.next(number)
-        told.deal.failed(number, problem(number % 2))
+        told.scheduler.next(number)
+        told.scheduler.failed(number, problem(number % 2))
     for number in range(20, 20 + 3 * LATER_ALIKE):
-        chunk = told.deal.next(number)
+        chunk = told.scheduler.next(number)
         if number % 2:
-            told.deal.failed(number, problem(1))
+            told.scheduler.failed(number, problem(1))
         else:
             assert chunk is not None
-            told.deal.result(number, chunk.numbers[0], 0)
-    assert told.deal.count_left(99) == 100 - (2 * FIRST_ALIKE - 2) - 3 * LATER_ALIKE
+            told.scheduler.result(number, chunk.numbers[0], 0)
+    assert told.scheduler.count_left(99) == 100 - (2 * FIRST_ALIKE - 2) - 3 * LATER_ALIKE
 
 
 @given(total=st.integers(1, 200), count=st.integers(1, 40), chunk=st.integers(1, 9))
@@ -283,9 +283,9 @@ def test_shards_are_all_chunks_once_and_of_one_size(total: int, count: int, chun
     sizes = set()
     for index in range(1, count + 1):
         told = Told(range(total), chunk=chunk)
-        told.deal.take_part(Shard(index, count))
+        told.scheduler.take_part(Shard(index, count))
         taken = 0
-        while (one := told.deal.next("a")) is not None:
+        while (one := told.scheduler.next("a")) is not None:
             found += one.numbers
             taken += 1
         sizes.add(taken)
@@ -304,16 +304,16 @@ def test_a_text_that_is_no_shard_is_refused(text: str) -> None:
 def test_a_group_that_fails_alike_is_given_up_and_the_others_go_on(stage: str, begun: int) -> None:
     results: list[int] = []
     failures: list[Failure] = []
-    deal: Deal[int, None] = Deal(
+    scheduler: Scheduler[int, None] = Scheduler(
         range(20), lambda number, _: results.append(number), on_failure=failures.append, group=10
     )
     failed = 0
-    while (chunk := deal.next("a worker")) is not None:
+    while (chunk := scheduler.next("a worker")) is not None:
         (number,) = chunk.numbers
         if number < 10:
             failed += 1
-            deal.failed("a worker", TaskError(replace(PROBLEM, stage=stage)))
+            scheduler.failed("a worker", TaskError(replace(PROBLEM, stage=stage)))
         else:
-            deal.result("a worker", number, number)
+            scheduler.result("a worker", number, number)
     assert failed == begun and results == list(range(10, 20))
     assert sorted(number for failure in failures for number in failure.numbers) == list(range(10))

@@ -16,7 +16,7 @@ from tests.drive.messages import of_schema, same
 from workbench.checks.job_items import CheckUpdate, ItemOutcome
 from workbench.checks.results import RuleResult, Seen
 from workbench.checks.run_rules import as_sent
-from workbench.jobs.scheduler import Deal, Work
+from workbench.jobs.scheduler import Scheduler, Work
 from workbench.jobs.worker_messages import MESSAGES, Listener, Message, WorkerQueue
 from workbench.machine.processes.wire import MessageSocket, Unreadable
 from workbench.planning.seeds_report import SolveReport
@@ -53,12 +53,12 @@ class SocketQueue(WorkerQueue):
 
 
 def sent(kind: Any, value: Any) -> list[Any]:
-    """What the deal gets of a result and an update."""
+    """What the scheduler gets of a result and an update."""
     ours, theirs = (MessageSocket(end, MESSAGES) for end in socket.socketpair())
     came: list[Any] = []
-    deal: Deal[Any, Any] = Deal([0], lambda number, result: came.append(result), came.append)
-    listener = Listener("a worker", Work(print, None, kind, kind, "x"), deal, print)
-    deal.next("worker")
+    scheduler: Scheduler[Any, Any] = Scheduler([0], lambda number, result: came.append(result), came.append)
+    listener = Listener("a worker", Work(print, None, kind, kind, "x"), scheduler, print)
+    scheduler.next("worker")
     queue = SocketQueue(theirs)
     with ours.end, theirs.end:
         for send in (queue.send_update, lambda value: queue.send_result(0, value)):

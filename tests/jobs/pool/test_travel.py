@@ -10,7 +10,7 @@ import pytest
 
 from workbench.actions.choose import needed_by
 from workbench.jobs import worker_files as travel
-from workbench.jobs.worker_files import TooMuch, files_below, pack_baggage, relocated
+from workbench.jobs.worker_files import TooMuch, files_below, pack_worker_files, relocated
 
 
 @pytest.fixture
@@ -37,11 +37,11 @@ def test_what_is_hidden_made_by_others_or_a_link_stays(place: Path) -> None:
 def test_what_is_named_from_the_current_folder_is_found_there_too(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    baggage = pack_baggage([place, place / "assets"], [Path("demo.npy"), place / "task.py"])
-    assert baggage.roots == (str(place), str(place.parent / "demo.npy"))
+    worker_files = pack_worker_files([place, place / "assets"], [Path("demo.npy"), place / "task.py"])
+    assert worker_files.roots == (str(place), str(place.parent / "demo.npy"))
     there = tmp_path / "there"
     there.mkdir()
-    places = baggage.unpack(there)
+    places = worker_files.unpack(there)
     assert Path.cwd() == Path(f"{there}{place.parent}")
     assert Path("mine/assets/cup/cup.urdf").read_text() == "assets/cup/cup.urdf"
     assert Path("demo.npy").read_bytes() == b"123"
@@ -80,4 +80,4 @@ def test_too_much_is_refused_with_what_is_large(place: Path, monkeypatch: pytest
     monkeypatch.setattr(travel, "MOST_BYTES", 2 << 20)
     (place / "huge.bin").write_bytes(bytes(5 << 20))
     with pytest.raises(TooMuch, match=r"are 5 MB, and up to 2 MB travel.*huge\.bin \(5 MB\)"):
-        pack_baggage([place])
+        pack_worker_files([place])

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from workbench.jobs.scheduler import Deal, Executor, Failure, ItemQueue, Work
+from workbench.jobs.scheduler import Executor, Failure, ItemQueue, Scheduler, Work
 from workbench.task.problem import Problem, TaskError
 
 PROBLEM = Problem("step", "it broke", "task.py", 3, "1 / 0", "Traceback")
@@ -113,7 +113,7 @@ class Run:
         self._on_result = on_result
         if how.pop("goes_on", False):
             how["on_failure"] = self.failures.append
-        self.deal: Deal[Squared, str | int] = Deal(numbers, self.over, self.hear, stop, **how)
+        self.scheduler: Scheduler[Squared, str | int] = Scheduler(numbers, self.over, self.hear, stop, **how)
         self.work = Work(run, setup, Squared, str | int, "that squares")
 
     def over(self, number: int, result: Squared) -> None:
@@ -128,7 +128,7 @@ class Run:
             self.updates.append(update)
 
     def by(self, executor: Executor) -> Run:
-        executor.run(self.work, self.deal)
+        executor.run(self.work, self.scheduler)
         return self
 
     def squares(self) -> dict[int, float]:

@@ -21,7 +21,7 @@ from tests.drive.episodes import appended, header_of, journal_of, made
 from tests.drive.waiting import until
 from tests.recording.read_rrd import read_rrd
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.episodes.seal import MadeHere, made_here
+from workbench.episodes.seal import InstallationSeal, made_here
 from workbench.episodes.writing.episode_writer import EpisodeWriter
 from workbench.episodes.writing.files_process import FilesProcess
 from workbench.episodes.writing.finish import make_files
@@ -96,7 +96,7 @@ def test_the_files_are_those_of_a_thread(tmp_path: Path, process: FilesProcess, 
     assert content(by_process.rrd) == content(by_thread.rrd)
     assert description(by_process.json) == description(by_thread.json)
     assert {made_here(read_episode(files.json).info) for files in (by_process, by_thread)} == {
-        MadeHere.CONTENT
+        InstallationSeal.CONTENT
     }
     assert files_in(tmp_path / "process") == [".h5", ".json", ".rrd"]
 

@@ -17,7 +17,7 @@ from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.writing.finish import EpisodeFiles
 from workbench.episodes.writing.publish import RecordingError
 from workbench.episodes.writing.upload import remove_uploaded_id, upload_episode
-from workbench.jobs.scheduler import Deal, ThisProcess, Work
+from workbench.jobs.scheduler import Scheduler, ThisProcess, Work
 from workbench.record.job import record
 from workbench.record.job_worker import RecordOptions, episode_id
 from workbench.task.description import TaskOptions
@@ -99,10 +99,10 @@ def test_what_another_worker_has_left_is_replaced(tmp_path: Path) -> None:
     class Again:
         elsewhere = False
 
-        def run(self, work: Work, deal: Deal) -> None:
+        def run(self, work: Work, scheduler: Scheduler) -> None:
             # As where the first worker died before it said that the first episode is there.
-            deal.go_on({1: first.written[1]}, lambda number, written: None)
-            ThisProcess().run(work, deal)
+            scheduler.go_on({1: first.written[1]}, lambda number, written: None)
+            ThisProcess().run(work, scheduler)
 
     again = record(what, executor=Again(), run=run)
     documents = [json.loads(path.read_text()) for path in (tmp_path / "there").glob("*.json")]

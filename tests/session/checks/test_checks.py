@@ -20,7 +20,7 @@ from workbench.envs.gpu_rules import Finding
 from workbench.live.commands import PlayRun
 from workbench.live.events import FileSaved
 from workbench.live.messages import Load
-from workbench.live.process.ask import GaveWay
+from workbench.live.process.ask import Preempted
 from workbench.live.process.background_jobs import Job, JobFailed, ProcessDied, StoppedBy
 from workbench.machine.kept_choices import kept_choices
 from workbench.page.command import Refused
@@ -73,7 +73,7 @@ class ScriptedBackground:
         while True:
             try:
                 return await work()
-            except GaveWay:
+            except Preempted:
                 continue
 
     async def ask(self, question: CheckGroup, on_progress: Callable[..., None]) -> CheckedGroup:
@@ -89,7 +89,7 @@ class ScriptedBackground:
                 on_progress(done, 2, RuleProgress(rule, result))
             if done >= self.give_way_after:
                 self.give_way_after = 99
-                raise GaveWay
+                raise Preempted
         following = question.group + 1
         return CheckedGroup(2, 2, "rewards" if following < 2 else "")
 

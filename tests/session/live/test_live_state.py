@@ -33,9 +33,9 @@ from workbench.live.messages import (
     Request,
     RulesBroken,
     Settings,
+    SliderAction,
     Status,
 )
-from workbench.live.messages import Told as ToldRobots
 from workbench.live.process.supervisor import End
 from workbench.live.reading import READ_EVERY
 from workbench.live.run import Run
@@ -114,7 +114,7 @@ def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_show
     session.happen(MomentShown(1))
     session.happen(MomentShown(None))
     told = np.ones((3, 2), np.float32)
-    played.tell(pictures(2), ToldRobots(told), Inspection(2, 3), RulesBroken((GONE_WRONG,)))
+    played.tell(pictures(2), SliderAction(told), Inspection(2, 3), RulesBroken((GONE_WRONG,)))
     played.tell(CameraFailed(EYE.key, "no shader"))
     before = played.view
     assert (

@@ -21,7 +21,7 @@ from tests.session.hazards import calm, provoke, provoked, write_task
 from workbench.cameras.questions import MeasureCamera
 from workbench.live.messages import Answer, Load, Progress, Request, Reset
 from workbench.live.process import ask as askers
-from workbench.live.process.ask import Asker, Background, OnProgress, Priority
+from workbench.live.process.ask import Background, OnProgress, Priority, QuestionClient
 from workbench.live.process.background_jobs import Job, JobFailed, ProcessDied
 from workbench.live.questions import MakeScene
 from workbench.machine import loop
@@ -44,7 +44,7 @@ class Line:
 
     def __init__(self) -> None:
         self.calls: Queue[Call] = Queue()
-        self.asker = Asker(self.send)
+        self.asker = QuestionClient(self.send)
 
     def send(self, request: Request) -> None:
         assert isinstance(request, Call)

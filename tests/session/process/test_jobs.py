@@ -204,7 +204,7 @@ def test_who_waits_for_work_of_the_loop_can_give_it_up() -> None:
 
 
 def test_what_blocks_keeps_its_order_and_does_not_keep_the_loop() -> None:
-    aside, goes_on, done = loop.Aside("test"), threading.Event(), list[int]()
+    aside, goes_on, done = loop.BlockingPool("test"), threading.Event(), list[int]()
 
     async def work(number: int) -> None:
         await aside.run(lambda: goes_on.wait(60))

@@ -31,7 +31,7 @@ from workbench.live.past import Strip, TimelineView
 from workbench.live.process.background_jobs import JobProgress
 from workbench.live.process.captured_output import Printed, PrintedLine
 from workbench.live.process.heartbeat import Busy
-from workbench.live.process.supervisor import Vitals
+from workbench.live.process.supervisor import ProcessMemory
 from workbench.live.run import PastLoad
 from workbench.live.view import SessionView
 from workbench.page.commands import ToggleTable
@@ -99,7 +99,7 @@ def base() -> SessionView:
         loads=(load, load),
         reload=ReloadReport("patched", "only evaluate changed"),
         printed=Printed(1, (PrintedLine("stdout", "one"),), 0),
-        vitals=Vitals(700 * 2**20, 8 * 2**30),
+        vitals=ProcessMemory(700 * 2**20, 8 * 2**30),
         checks=ChecksView("done", 1, (RuleResult("reward-changes", "broken", (FOUND,)),), total=1, seconds=1.0),
         rescored=RescoreView("done", 1, tuple(map(episode, range(4))), 50, 50, names=("reward", "success")),
         seeds=SeedsView("done", 1, SolveReport((SolvedSeed(0, 8, 13, 9.25, 3.2, "", Path("/r/0.rrd")),), (), 2.0, False, 1), total=1),
@@ -175,7 +175,7 @@ CHANGES: dict[str, Any] = {
     "an episode that was recorded": just(recording=RecordingStatus(episodes_written=1, last_file="/r/one.rrd", folder="r")),
     "an episode that is saved": just(recording=RecordingStatus(saving=SaveStatus(progress=JobProgress("drawing", 1, 2)))),
     "a printed line": just(printed=Printed(2, (PrintedLine("stdout", "one"), PrintedLine("stderr", "two")), 0)),
-    "memory": just(vitals=Vitals(900 * 2**20, 8 * 2**30)),
+    "memory": just(vitals=ProcessMemory(900 * 2**20, 8 * 2**30)),
     "what rescoring came to": lambda view: {"rescored": replace(view.rescored, serial=2, verdicts=(episode(0, 0.5),))},
     "rescoring goes on": lambda view: {"rescored": replace(view.rescored, serial=3, state="rescoring", done=20)},
     "a check goes on": lambda view: {"checks": replace(view.checks, serial=2, state="checking", total=58)},

@@ -10,7 +10,7 @@ import viser
 
 from tests.ui.scenes import table_scene
 from workbench.envs.scene.shapes import Material, Mesh
-from workbench.page.scene.bodies import LEAVES_AFTER, Looks, SceneView
+from workbench.page.scene.bodies import LEAVES_AFTER, DrawStyle, SceneView
 from workbench.page.scene.env_grid import lay_out
 
 
@@ -104,7 +104,7 @@ def test_a_dark_floor_is_lighter_in_the_light_theme_and_nothing_else_is_sent(
     view = SceneView(server)
     view.build(geometry, layout, poses)
     before = {handle.name: handle.glb_data for handle in view.handles}
-    view.build(geometry, layout, poses, looks=Looks(dark=False))
+    view.build(geometry, layout, poses, looks=DrawStyle(dark=False))
     new = [handle for handle in view.handles if handle.name not in before]
     assert len(new) == 1 and "ground" in new[0].name and len(view.handles) == len(before)
     scene: Any = trimesh.load(io.BytesIO(new[0].glb_data), file_type="glb", force="scene")
@@ -127,7 +127,7 @@ def test_simpler_shapes_take_the_place_of_the_finer_ones_a_moment_later(server: 
     view.build(geometry, layout, poses)
     fine = handle_named(view, "cube")
     rest = [handle.name for handle in view.handles if handle is not fine]
-    view.build(geometry, layout, poses, looks=Looks(error=0.01))
+    view.build(geometry, layout, poses, looks=DrawStyle(error=0.01))
     simple = handle_named(view, "cube")
     assert len(simple.glb_data) < 0.5 * len(fine.glb_data)
     assert [handle.name for handle in view.handles if handle is not simple] == rest

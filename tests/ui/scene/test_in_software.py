@@ -14,7 +14,7 @@ from tests.drive.waiting import until
 from tests.ui.scenes import table_scene
 from workbench.envs.scene.shapes import Mesh, SceneGeometry
 from workbench.machine.loop import do
-from workbench.page.scene.bodies import Looks
+from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import EnvLayout, lay_out
 from workbench.page.scene.software_rendering import InSoftware, pixel_of
 from workbench.page.scene.visible_motion import Eye
@@ -90,14 +90,14 @@ def test_shapes_are_simplified_in_the_background_for_pages_that_draw_in_software
     in_software = InSoftware(server)
     geometry, layout = heavy_scene()
     server.come(1)
-    assert in_software.looks(Looks(), geometry, layout, alone=False) == Looks()
+    assert in_software.looks(DrawStyle(), geometry, layout, alone=False) == DrawStyle()
     in_software.told_by(server.visitor(1))
-    until(lambda: in_software.looks(Looks(), geometry, layout, alone=False).error > 0, "simpler shapes")
-    near = in_software.looks(Looks(), geometry, layout, alone=False).error
-    assert in_software.looks(Looks(1_000_000), geometry, layout, alone=False).error == 0
+    until(lambda: in_software.looks(DrawStyle(), geometry, layout, alone=False).error > 0, "simpler shapes")
+    near = in_software.looks(DrawStyle(), geometry, layout, alone=False).error
+    assert in_software.looks(DrawStyle(1_000_000), geometry, layout, alone=False).error == 0
     server.pages[1].camera.position = np.array([50.0, 0.0, 30.0])
     until(
-        lambda: in_software.looks(Looks(), geometry, layout, alone=False).error > 4 * near,
+        lambda: in_software.looks(DrawStyle(), geometry, layout, alone=False).error > 4 * near,
         "still simpler ones for an eye that is far away",
     )
     server.leave(1)

@@ -3,12 +3,12 @@ from __future__ import annotations
 from tests.drive.panels import Panels
 from tests.ui.scenes import table_scene
 from workbench.page.scene.env_grid import lay_out
-from workbench.page.scene.viewpoint import Stage
+from workbench.page.scene.viewpoint import View3D
 
 
 def test_bodies_and_light_outlive_a_page_and_nothing_else_does(panels: Panels) -> None:
     server = panels.server
-    stage = Stage(server)
+    stage = View3D(server)
     geometry, poses = table_scene(2)
     layout = lay_out(geometry, poses)
     stage.scene.build(geometry, layout, poses)

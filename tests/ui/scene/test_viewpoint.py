@@ -12,7 +12,7 @@ from tests.ui.scenes import running, table_scene
 from tests.ui.tabs import camera_message, handshake
 from workbench.envs.camera_data import Picture
 from workbench.live.panels.view_panel import ViewPanel
-from workbench.page.scene.bodies import Looks
+from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import lay_out
 from workbench.page.scene.viewpoint import FOV, ONE, Framing, ViewChoice, Viewpoint, frame_box, frame_one
 
@@ -122,10 +122,10 @@ def test_what_is_chosen_in_the_view_panel_holds_for_the_pages_to_come(panels: Pa
     panels.set("Theme", "light")
     panel.draw(running(4))
     assert [panels.field(name).value for name in ("Show", "Detail", "Theme")] == [ONE, "coarse", "light"]
-    assert panel.only_selected and panel.looks == Looks(50_000, False)
+    assert panel.only_selected and panel.looks == DrawStyle(50_000, False)
     panel.toggle_only_selected()
     panel.toggle_dark()
     panel.draw(running(4))
     assert [panels.field(name).value for name in ("Show", "Theme")] == ["all envs", "dark"]
     with panels.server.gui.add_folder("The next page"):
-        assert ViewPanel(panels.server, chosen=choice).looks == Looks(50_000, True)
+        assert ViewPanel(panels.server, chosen=choice).looks == DrawStyle(50_000, True)

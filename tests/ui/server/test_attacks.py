@@ -44,7 +44,7 @@ from workbench.page.door.access import (
     decide,
 )
 from workbench.page.door.client_messages import KINDS, MAX_BYTES, MalformedMessage
-from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 from workbench.page.door.page_guard import PageGuard
 
@@ -448,7 +448,7 @@ def test_any_bytes_are_admitted_dropped_or_called_malformed(raw):
 
 def judged(raw: bytes) -> None:
     """Let the guard of a page that is on no connection check a frame; any other error fails the test."""
-    guard = PageGuard(lambda kind: False, RareLog(lambda line: None))
+    guard = PageGuard(lambda kind: False, RateLimitedLog(lambda line: None))
     with contextlib.suppress(MalformedMessage):
         assert guard.admits(raw) in (True, False)
 

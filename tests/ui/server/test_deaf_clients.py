@@ -25,7 +25,7 @@ def talk(client: Callable[[ClientConnection], Awaitable[None]]) -> int | None:
         ended: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
 
         async def handler(connection: ServerConnection) -> None:
-            watch = asyncio.create_task(strangers.close_when_stalled(connection, strangers.RareLog()))
+            watch = asyncio.create_task(strangers.close_when_stalled(connection, strangers.RateLimitedLog()))
             try:
                 await connection.send(MESSAGE)
                 await connection.recv()

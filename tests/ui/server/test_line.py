@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from tests.drive.far_line import FarLine, line_to
 from tests.drive.waiting import until
 from tests.ui.tabs import camera_message, handshake, messages_in
-from workbench.page.door.client_connection import CompressWhenFar, Line, WhenFar
+from workbench.page.door.client_connection import CompressWhenFar, PageConnection, WhenFar
 from workbench.page.door.gated_server import GatedServer
 
 pytestmark = pytest.mark.thorough
@@ -83,7 +83,7 @@ def test_a_page_far_away_gets_what_repeats_compressed() -> None:
     same = os.urandom(8000)
 
     async def repeat(connection: ServerConnection) -> None:
-        line = Line(connection)
+        line = PageConnection(connection)
         for _ in range(10):
             await line.send(same)
 
@@ -109,7 +109,7 @@ def test_a_message_for_a_page_that_leaves_meanwhile_is_not_waited_for() -> None:
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
         async def handler(connection: ServerConnection) -> None:
-            line = Line(connection)
+            line = PageConnection(connection)
             try:
                 with pytest.raises(ConnectionClosed):
                     await send_all(line.send, 50_000, 1000)

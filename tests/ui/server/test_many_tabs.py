@@ -26,7 +26,7 @@ from workbench.live.commands import PauseRun, PlayRun
 from workbench.live.events import PagesCounted, RunEvent
 from workbench.page.door import connection_limits as strangers
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
-from workbench.page.scene.viewpoint import Stage
+from workbench.page.scene.viewpoint import View3D
 from workbench.page.widgets.visitors import Visitors
 from workbench.task.description import TaskOptions
 
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.thorough
 class House:
     gated_server: GatedServer
     session: Session
-    stage: Stage
+    stage: View3D
     tabs: Tabs
     told: list[int]
     """How many pages are open, each time that the session was told."""
@@ -65,7 +65,7 @@ class Told(Session):
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     gated_server, told = open_server(ServerOptions(port=0)), [0]
-    session, stage = Told(told, tmp_path_factory.mktemp("author")), Stage(gated_server.server)
+    session, stage = Told(told, tmp_path_factory.mktemp("author")), View3D(gated_server.server)
     page = Page(gated_server.server, Visitors(gated_server.server, COMMANDS), session, stage=stage)
     pages = Pages(gated_server.server, stage, lambda which, dark: page)
     pages.start("live")

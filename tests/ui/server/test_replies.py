@@ -14,7 +14,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.door.file_response import Handler
 from workbench.page.door.responses import (
     EVERY_REPLY,
@@ -50,7 +50,7 @@ def answer(
     request = Request(path, Headers({"Accept-Encoding": accepts} if accepts else {}))
     connection = cast(ServerConnection, None)  # only a file that is sent while it is read needs one
     hook = viser_hook or of_viser()
-    return asyncio.run(admitted_reply(routes or {}, hook, connection, request, AUTHORITY, RareLog()))
+    return asyncio.run(admitted_reply(routes or {}, hook, connection, request, AUTHORITY, RateLimitedLog()))
 
 
 def says(body: bytes, kind: str = "text/plain") -> Callable[[str], tuple[int, str, bytes]]:

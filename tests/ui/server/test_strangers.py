@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from tests.ui.knocking import PROTOCOL, ask, both, client, cookie_of, knock, token_of
 from workbench.page.door import connection_limits as strangers
 from workbench.page.door.access import cookie_name
-from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.door.gated_server import GatedServer
 
 
@@ -283,7 +283,7 @@ def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
     now = [1000.0]
     monkeypatch.setattr(strangers.time, "monotonic", lambda: now[0])
     said: list[str] = []
-    told = RareLog(said.append, pause=60.0)
+    told = RateLimitedLog(said.append, pause=60.0)
     for _ in range(4 * 3600):
         told.happened("a", "It happened.")
         now[0] += 1.0

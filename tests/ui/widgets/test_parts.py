@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from tests.drive.panels import Clock
-from workbench.page.widgets.parts import DrawDue, PagePart, Parts
+from workbench.page.widgets.parts import DrawThrottle, PagePart, Parts
 
 
 class Plain(PagePart[int]):
@@ -15,11 +15,11 @@ class Plain(PagePart[int]):
 
 
 @pytest.fixture
-def due(clock: Clock) -> DrawDue:
-    return DrawDue(0.5, clock)
+def due(clock: Clock) -> DrawThrottle:
+    return DrawThrottle(0.5, clock)
 
 
-def test_something_new_waits_until_the_last_could_be_read(due: DrawDue, clock: Clock) -> None:
+def test_something_new_waits_until_the_last_could_be_read(due: DrawThrottle, clock: Clock) -> None:
     assert due.is_due(1)
     clock.passes(0.25)
     assert not due.is_due(2)
@@ -27,7 +27,9 @@ def test_something_new_waits_until_the_last_could_be_read(due: DrawDue, clock: C
     assert due.is_due(2) and not due.is_due(3)
 
 
-def test_what_somebody_waits_for_is_drawn_at_once_and_counts_as_drawn(due: DrawDue, clock: Clock) -> None:
+def test_what_somebody_waits_for_is_drawn_at_once_and_counts_as_drawn(
+    due: DrawThrottle, clock: Clock
+) -> None:
     assert due.is_due(1) and due.is_due(1, urgent="pressed") and not due.is_due(1, urgent="pressed")
     clock.passes(0.25)
     assert not due.is_due(3, urgent="pressed")

@@ -49,11 +49,11 @@ from workbench.live.messages import (
     Restore,
     RulesBroken,
     SetCapture,
+    SetSliderAction,
     Settings,
     SingleStep,
+    SliderAction,
     Status,
-    Tell,
-    Told,
     WarmUp,
 )
 from workbench.live.process.heartbeat import Doing, HeartbeatWriter, Interrupts
@@ -135,7 +135,7 @@ class Worker:
             SingleStep: self._single_step,
             Reset: self._reset,
             Settings: self._apply_settings,
-            Tell: self._tell,
+            SetSliderAction: self._tell,
             ReadPolicyAgain: self._read_policy_again,
             FollowPlan: self._follow_plan,
             PlaceCamera: self._cameras.place,
@@ -393,7 +393,7 @@ class Worker:
             self._task.run("importing the policy", self._use_action_source)
             self._task.guarded(self._send_told)
 
-    def _tell(self, request: Tell) -> None:
+    def _tell(self, request: SetSliderAction) -> None:
         def tell(opened: OpenedTask) -> None:
             task = opened.env
             # The page may have asked before it knew of a version with fewer envs, or of another robot.
@@ -407,7 +407,7 @@ class Worker:
 
     def _send_told(self, opened: OpenedTask) -> None:
         if self._chooser.by_sliders:
-            self._line.send(Told(self._chooser.slider_action(opened.env)))
+            self._line.send(SliderAction(self._chooser.slider_action(opened.env)))
 
     def _use_action_source(self) -> bool:
         """Set the source of actions as in the settings. Returns whether it can be used."""

@@ -12,7 +12,7 @@ from workbench.live.commands import FillEmptyFile, Interrupt, RebuildScene, Relo
 from workbench.live.panels.timeline_panel import GAP, step_in_words
 from workbench.live.process.heartbeat import Busy
 from workbench.live.view import SessionView
-from workbench.machine.loop import Aside
+from workbench.machine.loop import BlockingPool
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.editor_links import LinkTo, no_links
 from workbench.page.widgets.parts import PagePart
@@ -91,7 +91,7 @@ class Banner(PagePart[SessionView]):
         self._link, self._is_own = link, is_own
         self._blank: Path | None = None
         """File that is offered to be filled."""
-        self._disk = Aside("fill-file")
+        self._disk = BlockingPool("fill-file")
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")

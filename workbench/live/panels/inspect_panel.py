@@ -23,7 +23,7 @@ from workbench.page.command import Command
 from workbench.page.commands import TellUnfolded
 from workbench.page.scene.env_grid import InView
 from workbench.page.widgets.fields import choice, tick
-from workbench.page.widgets.parts import Clock, DrawDue, PagePart
+from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
 
@@ -181,7 +181,7 @@ class InspectPanel(PagePart[SessionView]):
         server.gui.add_html(render("tell", command=TellUnfolded(panel=TAB)))
         self._now: Inspection | None = None
         self._before: Inspection | None = None
-        self._due = DrawDue(READ_EVERY, clock)
+        self._due = DrawThrottle(READ_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
         chosen = self._chosen

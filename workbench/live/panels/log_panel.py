@@ -15,7 +15,7 @@ from rich.terminal_theme import TerminalTheme
 from workbench.live.commands import ClearLog, FilterLog, PauseLog
 from workbench.live.process.captured_output import PLAIN, SWITCHES, Printed, StyledText
 from workbench.live.process.memory_limit import format_size
-from workbench.live.process.supervisor import Vitals
+from workbench.live.process.supervisor import ProcessMemory
 from workbench.live.view import SessionView
 from workbench.page.command import Command
 from workbench.page.widgets.fields import Field, tick
@@ -206,7 +206,7 @@ def log_html(printed: Printed, wanted: str) -> str:
     )
 
 
-def vitals_html(vitals: Vitals) -> str:
+def vitals_html(vitals: ProcessMemory) -> str:
     """Memory of the processes, in words that change only when it matters."""
     if not vitals.memory:
         return ""

@@ -8,7 +8,7 @@ from workbench.live.env_commands import ShowEnvs
 from workbench.live.view import SessionView
 from workbench.page.command import Command
 from workbench.page.commands import ChooseDetail, ChooseTheme
-from workbench.page.scene.bodies import Looks
+from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.viewpoint import ALL, DETAILS, ONE, ViewChoice
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.parts import PagePart
@@ -51,8 +51,8 @@ class ViewPanel(PagePart[object]):
         return self._choice.show == ONE
 
     @property
-    def looks(self) -> Looks:
-        return Looks(DETAILS[self._choice.detail], self.dark)
+    def looks(self) -> DrawStyle:
+        return DrawStyle(DETAILS[self._choice.detail], self.dark)
 
     def show_only_selected(self, only: bool) -> None:
         self._choice.show = ONE if only else ALL

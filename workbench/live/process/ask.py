@@ -49,7 +49,7 @@ class _Asked:
     on_progress: OnProgress
 
 
-class Asker:
+class QuestionClient:
     """Asks the worker that plays; several questions may be under way. Used on the loop."""
 
     def __init__(self, send: Callable[[Request], None]) -> None:
@@ -94,7 +94,7 @@ class Asker:
                 asked.answer.set_exception(error)
 
 
-class GaveWay(Exception):
+class Preempted(Exception):
     """A job of higher priority needs the process: ask again in another turn."""
 
 
@@ -105,7 +105,7 @@ _Rank = tuple[int, int]
 """Rank of a job: its priority and its number; the highest rank comes first."""
 
 
-class Background(Asker):
+class Background(QuestionClient):
     """Asks a process in the background, one question at a time. Jobs share it in turns. Used on the loop.
 
     Rescoring the past, drawing it and searching cameras take seconds to minutes and move the envs, so they cannot run
@@ -158,7 +158,7 @@ class Background(Asker):
             await self._begin_turn(rank)
             try:
                 return await work()
-            except GaveWay:
+            except Preempted:
                 job.report(0, 0, WAITING)
             finally:
                 self._end_turn()
@@ -166,7 +166,7 @@ class Background(Asker):
     async def _begin_turn(self, rank: _Rank) -> None:
         granted = self._waiting[rank] = asyncio.get_running_loop().create_future()
         if self._is_waited_for() and not _is_load(self._question):
-            self._fail(GaveWay())
+            self._fail(Preempted())
         self._grant()
         try:
             await granted
@@ -256,7 +256,7 @@ class Background(Asker):
         return self.num_envs
 
     async def ask(self, question: Question[Value], on_progress: OnProgress = _ignore) -> Value:
-        """Ask a question as `Asker.ask` does; starts the process if there is none.
+        """Ask a question as `QuestionClient.ask` does; starts the process if there is none.
 
         Raises:
             JobFailed: there is no answer.
@@ -265,7 +265,7 @@ class Background(Asker):
         """
         # Before the question: the waiting job would wait for it too.
         if self._is_waited_for() and not _is_load(question):
-            raise GaveWay
+            raise Preempted
         if self._idle is not None:
             self._idle.cancel()  # also outside a turn, where a question may take hours
         if self._process is None:

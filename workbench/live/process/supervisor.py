@@ -99,7 +99,7 @@ class Death:
 
 
 @dataclass(frozen=True)
-class Vitals:
+class ProcessMemory:
     """Memory of the processes."""
 
     memory: int = 0
@@ -218,7 +218,7 @@ class Supervisor:
         self._condition = threading.Condition()
         self._worker: WorkerProcess | None = None
         self._spare: SpareWorker | None = SpareWorker(warm_up) if options.spare else None
-        self._vitals = Vitals(memory_limit=options.memory_limit)
+        self._vitals = ProcessMemory(memory_limit=options.memory_limit)
         self._load_sent: float | None = None
         self._replace_asked = False
         self._closing = False
@@ -246,7 +246,7 @@ class Supervisor:
         return None if worker is None else worker.pid
 
     @property
-    def vitals(self) -> Vitals:
+    def vitals(self) -> ProcessMemory:
         """Memory of the processes, as measured at the last check."""
         return self._vitals
 
@@ -483,7 +483,7 @@ class Supervisor:
         used = worker.memory(limit)
         spare = self._spare.memory if self._spare is not None else 0
         ready = self._spare is not None and self._spare.ready
-        self._vitals = Vitals(used, limit, spare or None, ready)
+        self._vitals = ProcessMemory(used, limit, spare or None, ready)
         if limit is not None and used > limit:
             state.why = (
                 f"was ended because it and what it started had {format_size(used)} in memory, more than the {format_size(limit)} that "

@@ -23,9 +23,9 @@ from workbench.live.messages import (
     Quit,
     Request,
     Reset,
+    SetSliderAction,
     Settings,
     SingleStep,
-    Tell,
     without_steps,
 )
 from workbench.live.process.heartbeat import (
@@ -287,8 +287,8 @@ class WorkerProcess:
 def _replaces(request: Request, before: Request) -> bool:
     if isinstance(request, PlaceCamera):
         return isinstance(before, PlaceCamera) and before.key == request.key
-    if isinstance(request, Tell):
-        return isinstance(before, Tell) and (before.env_idx, before.dimensions) == (
+    if isinstance(request, SetSliderAction):
+        return isinstance(before, SetSliderAction) and (before.env_idx, before.dimensions) == (
             request.env_idx,
             request.dimensions,
         )

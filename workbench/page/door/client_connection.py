@@ -33,7 +33,7 @@ class _Sent:
     answered_before: int
 
 
-class Line:
+class PageConnection:
     """Sends messages of viser to one page, as fast as it answers.
 
     A socket takes megabytes before it makes a sender wait, and so does ``ssh -L``: seconds on a slow line, and the answer

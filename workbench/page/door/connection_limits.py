@@ -42,7 +42,7 @@ _TOO_LONG = Response(
 ).serialize()
 
 
-class Strangers:
+class ConnectionLimits:
     """All connections that have not shown the token yet, on their event loop.
 
     A connection costs a task and its buffers before anything is known of it, so its time, the size of its head and the
@@ -51,7 +51,7 @@ class Strangers:
     idle sockets itself, and opens others when they are closed.)
     """
 
-    def __init__(self, told: RareLog) -> None:
+    def __init__(self, told: RateLimitedLog) -> None:
         self._told = told
         self._waiting: dict[Connection, str] = {}
 
@@ -83,7 +83,7 @@ class Connection(ServerConnection):
     """One connection. It is a stranger until `admit`."""
 
     def __init__(
-        self, strangers: Strangers, protocol: ServerProtocol, server: Server, **options: Any
+        self, strangers: ConnectionLimits, protocol: ServerProtocol, server: Server, **options: Any
     ) -> None:
         super().__init__(protocol, server, **options)
         self.peer = ""
@@ -155,7 +155,7 @@ def unsent(connection: ServerConnection) -> int:
 
 
 async def close_when_stalled(
-    connection: ServerConnection, told: RareLog, unanswered: Callable[[], int] = lambda: 0
+    connection: ServerConnection, told: RateLimitedLog, unanswered: Callable[[], int] = lambda: 0
 ) -> None:
     """Close the connection when its client has read nothing for `READ_WITHIN` seconds. A task of the connection.
 
@@ -167,7 +167,7 @@ async def close_when_stalled(
     matter. A slow line takes some now and then. A page that wakes up reconnects and gets the present state.
 
     Args:
-        unanswered: Bytes that the machine may have taken and the page has not read, as `Line.unanswered`.
+        unanswered: Bytes that the machine may have taken and the page has not read, as `PageConnection.unanswered`.
     """
     before = silent = 0
     while silent < _LOOKS:
@@ -194,7 +194,7 @@ LONGEST_LINE = 300
 """Maximum length of a line in characters."""
 
 
-class RareLog:
+class RateLimitedLog:
     """Logs each kind of event at once, again after `pause` seconds, after twice that, and so on. Thread-safe.
 
     Args:

@@ -18,7 +18,7 @@ from websockets.http11 import Request, Response
 from workbench.machine.folders import web_assets_folder
 from workbench.machine.versions import command_for_tested_versions
 from workbench.page.door import access, viser_private
-from workbench.page.door.connection_limits import Connection, RareLog, of_peer
+from workbench.page.door.connection_limits import Connection, RateLimitedLog, of_peer
 from workbench.page.door.file_response import Handler
 from workbench.page.door.listening_socket import (
     DEFAULT_PORT,
@@ -175,7 +175,7 @@ class GatedServer:
 class _AccessCheck:
     """Decides on each request, answers it, and reports refused ones in the terminal."""
 
-    def __init__(self, rules: access.AccessRules, example: str, told: RareLog) -> None:
+    def __init__(self, rules: access.AccessRules, example: str, told: RateLimitedLog) -> None:
         self.rules = rules
         self.turned_away = 0
         self.tells = False
@@ -237,7 +237,7 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
         listening = listen_on_file(options.socket, options.port)
     token = secrets.token_urlsafe(32) if options.token else None
     rules = access.AccessRules(token=token, names=_our_names(options), any_address=not listening.loopback)
-    told = RareLog()
+    told = RateLimitedLog()
     access_check = _AccessCheck(rules, f"http://{listening.authority}/" + ("?token=…" if token else ""), told)
     routes: dict[str, tuple[Handler, Mapping[str, str]]] = {}
 

@@ -13,7 +13,7 @@ from workbench.page.door.client_messages import (
     kind_of,
     read_message,
 )
-from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.connection_limits import RateLimitedLog
 
 RATE = 200.0
 """Maximum sustained rate of a page in messages a second; a drag sends about twenty."""
@@ -35,7 +35,7 @@ class PageGuard:
     sends faster than a page can is slowed down, so that the others keep their share of the event loop.
     """
 
-    def __init__(self, is_of_viser: Callable[[str], bool], told: RareLog) -> None:
+    def __init__(self, is_of_viser: Callable[[str], bool], told: RateLimitedLog) -> None:
         """
         Args:
             is_of_viser: whether viser has a message of this kind.

@@ -19,7 +19,7 @@ from websockets.http11 import Request, Response
 from workbench.machine.folders import web_assets_folder
 from workbench.machine.text import short_line
 from workbench.page.door import access, viser_private
-from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.door.file_response import FileReply, Handler, send_file
 
 SCRIPTS = (
@@ -90,7 +90,7 @@ async def admitted_reply(
     connection: ServerConnection,
     request: Request,
     authority: str,
-    told: RareLog,
+    told: RateLimitedLog,
 ) -> Response:
     page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
     # Decoded once, as viser does: what is still encoded is part of a file's name.

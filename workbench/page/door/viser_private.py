@@ -34,9 +34,14 @@ from websockets.http11 import Request, Response
 
 from workbench.machine.processes.child_python import unchanged_environment
 from workbench.machine.versions import command_for_tested_versions
-from workbench.page.door.client_connection import CompressWhenFar, Line
+from workbench.page.door.client_connection import CompressWhenFar, PageConnection
 from workbench.page.door.client_messages import KINDS, MAX_BYTES, MalformedMessage
-from workbench.page.door.connection_limits import Connection, RareLog, Strangers, close_when_stalled
+from workbench.page.door.connection_limits import (
+    Connection,
+    ConnectionLimits,
+    RateLimitedLog,
+    close_when_stalled,
+)
 from workbench.page.door.listening_socket import ServerError
 from workbench.page.door.page_guard import PageGuard
 
@@ -214,7 +219,7 @@ def _is_of_viser(kind: str) -> bool:
     return isinstance(known, type) and issubclass(known, viser._messages.Message)
 
 
-def _watched(handler: Serve, channels: dict[str, Serve], told: RareLog) -> Serve:
+def _watched(handler: Serve, channels: dict[str, Serve], told: RateLimitedLog) -> Serve:
     async def watched(connection: ServerConnection) -> None:
         request = connection.request
         if request is not None and (ours := channels.get(urlsplit(request.path).path)) is not None:
@@ -235,7 +240,7 @@ def _watched(handler: Serve, channels: dict[str, Serve], told: RareLog) -> Serve
                 if guard.admits(raw):
                     return raw
 
-        line = Line(connection)
+        line = PageConnection(connection)
         connection.recv = receive_checked  # type: ignore[method-assign,assignment]
         connection.send = line.send  # type: ignore[method-assign,assignment]
         listening = asyncio.create_task(close_when_stalled(connection, told, lambda: line.unanswered))
@@ -260,7 +265,7 @@ class _Terminal(logging.Filter):
 
     def __init__(self) -> None:
         super().__init__()
-        self.told = RareLog()
+        self.told = RateLimitedLog()
         self._installed = False
 
     def install(self) -> None:
@@ -358,7 +363,7 @@ def make_viser(
     wrap: Callable[[Hook], AsyncHook],
     label: str | None,
     response_seconds: float,
-    told: RareLog,
+    told: RateLimitedLog,
 ) -> GatedViser:
     """Make a `viser.ViserServer` that serves on ``listening`` only, behind the hook that ``wrap`` makes of viser's own.
 
@@ -387,7 +392,7 @@ def make_viser(
     real_serve = websockets.asyncio.server.serve
     serving: list[websockets.asyncio.server.serve] = []
     channels: dict[str, Serve] = {}
-    strangers = Strangers(told)
+    strangers = ConnectionLimits(told)
 
     def serve(handler: Serve, host: str, port: int, **options: Any) -> websockets.asyncio.server.serve:
         # Without viser's host and port: it would silently bind another port if this one were taken, or the one of the

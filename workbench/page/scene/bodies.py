@@ -27,7 +27,7 @@ nothing would be there."""
 
 
 @dataclass(frozen=True)
-class Looks:
+class DrawStyle:
     """How a scene is drawn."""
 
     triangles: int = 200_000
@@ -70,7 +70,7 @@ class SceneView:
         layout: EnvLayout,
         poses: NDArray[np.float32],
         only_env: int | None = None,
-        looks: Looks = Looks(),
+        looks: DrawStyle = DrawStyle(),
     ) -> None:
         """Show this scene instead of the last; groups that look the same stay and are not sent again.
 

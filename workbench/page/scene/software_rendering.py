@@ -11,10 +11,10 @@ import viser
 
 from workbench.envs.scene.mesh_levels import from_afar
 from workbench.envs.scene.shapes import SceneGeometry
-from workbench.machine.loop import Aside, begin, later, post
+from workbench.machine.loop import BlockingPool, begin, later, post
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.page.commands import TellDrawnInSoftware
-from workbench.page.scene.bodies import Looks
+from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import EnvLayout
 from workbench.page.scene.visible_motion import NEAREST, Eye, eyes_of
 from workbench.page.widgets.templates import render
@@ -53,7 +53,7 @@ class InSoftware:
         self._made: tuple[SceneGeometry, float] | None = None
         """Scene and tolerance for which the simplified shapes are ready."""
         self._simplifying: asyncio.Task[None] | None = None
-        self._aside = Aside("simplify")
+        self._aside = BlockingPool("simplify")
         server.on_client_connect(self._came)
         server.on_client_disconnect(self._left)
 
@@ -94,7 +94,7 @@ class InSoftware:
         if self._simplifying is None and self.all_pages and known:
             self._simplifying = begin(self._simplify())
 
-    def looks(self, looks: Looks, geometry: SceneGeometry, layout: EnvLayout, alone: bool) -> Looks:
+    def looks(self, looks: DrawStyle, geometry: SceneGeometry, layout: EnvLayout, alone: bool) -> DrawStyle:
         """These looks, or cheaper ones that differ by about a pixel in the pages that are open.
 
         Shapes are simplified in the background, and drawn so when they are ready. Who asks for finer ones than usual has
@@ -106,7 +106,7 @@ class InSoftware:
             layout: The grid of the envs.
             alone: One env is shown, at the origin.
         """
-        usual = not self.all_pages or looks.triangles > Looks().triangles
+        usual = not self.all_pages or looks.triangles > DrawStyle().triangles
         if usual or _triangles(geometry, alone) <= FEW:
             self._drawn = None
             return looks

@@ -237,7 +237,7 @@ def light(server: viser.ViserServer) -> None:
     )
 
 
-class Stage:
+class View3D:
     """Bodies, lights and viewpoint on this server, shared by the pages.
 
     The bodies stay in the browser while one page replaces the other, so that equal ones are not sent again, and the view

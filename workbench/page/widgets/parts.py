@@ -46,7 +46,7 @@ class PagePart(Generic[View]):
         raise NotImplementedError
 
 
-class DrawDue:
+class DrawThrottle:
     """When to draw one thing.
 
     Args:
@@ -78,14 +78,14 @@ class Parts(Generic[View]):
 
     def __init__(self, parts: Iterable[PagePart[View]], clock: Clock = time.monotonic) -> None:
         self._clock = clock
-        self._parts: list[tuple[PagePart[View], DrawDue]] = []
+        self._parts: list[tuple[PagePart[View], DrawThrottle]] = []
         self._owners: dict[type[Command], PagePart[View]] = {}
         for part in parts:
             self.add(part)
 
     def add(self, part: PagePart[View]) -> None:
         """Draw this one too, after the others."""
-        self._parts.append((part, DrawDue(part.every, self._clock)))
+        self._parts.append((part, DrawThrottle(part.every, self._clock)))
         for kind in part.does:
             assert kind not in self._owners, f"two parts do {kind.__name__}"
             self._owners[kind] = part

@@ -16,7 +16,7 @@ from websockets.asyncio.server import ServerConnection
 
 from workbench.machine.loop import submit
 from workbench.page.command import Command, CommandList, Refused
-from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.widgets.templates import render
 
 log = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ class Visitors:
         self.commands = commands
         self.do: Do = _nothing
         """Carries out a command; changes with the page that is shown."""
-        self._told = RareLog()
+        self._told = RateLimitedLog()
         self._by_name: dict[str, Visitor] = {}
         self._by_client: dict[int, Visitor] = {}
         server.on_client_connect(self._came)
