@@ -33,7 +33,13 @@ MANY_MODULES = 50
 # Until the tests begin: what they import is no garbage, and neither are they. It takes a third of the time to collect them.
 gc.disable()
 
-pytest_plugins = ["tests.drive.tiers"]
+pytest_plugins = [
+    "tests.drive.tiers",
+    "tests.drive.sessions",
+    "tests.drive.servers",
+    "tests.drive.recordings",
+    "tests.drive.task_files",
+]
 
 # By itself hypothesis fails an example that takes 0.2 s, which a busy machine makes of any.
 settings.register_profile("unhurried", deadline=None, suppress_health_check=[HealthCheck.too_slow])

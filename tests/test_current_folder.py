@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import websockets.sync.client
 
-from tests.ui.tabs import camera_message, handshake, messages_in
+from tests.drive.tabs import camera_message, handshake, messages_in
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -15,10 +15,10 @@ from tests.drive.episodes import made, write
 from tests.drive.hung_disk import HungDisk
 from tests.drive.page import TASK, open_workbench
 from tests.drive.processes import workers_of
+from tests.drive.tabs import open_deaf_tab, tabs_of
 from tests.drive.waiting import until
-from tests.recording.verify_rrd import verify_rrd
-from tests.session.hazards import provoke, provoked, write_task
-from tests.ui.tabs import open_deaf_tab, tabs_of
+from tests.episodes.verify_rrd import verify_rrd
+from tests.live.hazards import provoke, provoked, write_task
 from workbench.live.commands import PlayRun
 from workbench.record.commands import ChooseRecordedEnvs, ToggleRecording
 

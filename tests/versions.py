@@ -33,7 +33,14 @@ PAGE = ROOT / "web_assets" / "docs" / "reference" / "versions.md"
 SHOWN = ("viser", "rerun-sdk", "sapien", "torch", "numpy", "gymnasium")
 TESTS = {
     "fast": ["--fast"],
-    "core": ["-m", "not slow", "tests/core", "tests/test_make.py", "tests/test_recorder.py"],
+    "core": [
+        "-m",
+        "not slow",
+        "tests/envs",
+        "tests/pictures",
+        "tests/task/test_make.py",
+        "tests/record/test_recorder.py",
+    ],
     "all": ["-m", "not slow"],
 }
 """``fast`` is ``make test-fast``, ``all`` is ``make test``; both without the linters."""

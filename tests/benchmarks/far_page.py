@@ -38,7 +38,7 @@ sys.path.append(str(Path(__file__).parents[2]))
 from tests.benchmarks.page_bytes import Played, Player, play
 from tests.drive.far_line import FarLine, line_to
 from tests.drive.session import wait_until
-from tests.ui.tabs import camera_message, handshake, messages_in
+from tests.drive.tabs import camera_message, handshake, messages_in
 from workbench.app.live_page import Page
 from workbench.app.pages import Pages
 from workbench.app.session import Session

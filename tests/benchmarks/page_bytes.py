@@ -34,7 +34,7 @@ from tests.drive.far_line import FarLine, line_to
 from tests.drive.panels import Clock
 from tests.drive.scripted import ScriptedWorker, no_success
 from tests.drive.session import wait_until
-from tests.ui.tabs import camera_message, handshake, messages_in
+from tests.drive.tabs import camera_message, handshake, messages_in
 from workbench.app.live_page import Page
 from workbench.app.session import Session
 from workbench.commands import COMMANDS

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/unkillable.py [--num-envs 4] [--ways loop segfault ...] [--screenshot FILE]
 
-``workbench open`` on a task that misbehaves on demand (`tests/session/hazards.py`), a real Chromium before it, the
+``workbench open`` on a task that misbehaves on demand (`tests/live/hazards.py`), a real Chromium before it, the
 spare worker warm. For each way the task is put into it by a single step; until it is back, a control of the page
 is used again and again (*next env*) and the time until the page shows the next env is taken, inside
 the page. What cannot be left by *Interrupt* is ended by *Restart*. *Back* is the time from the death of the
@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import NO_DRAWING
 from tests.drive.page import launch, new_page, open_workbench
 from tests.drive.processes import workers_of
-from tests.session.hazards import calm, provocation, provoke, write_task
+from tests.live.hazards import calm, provocation, provoke, write_task
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 HANGS = {"loop": "Interrupt", "slow": "Interrupt", "catch": "Restart", "native": "Restart"}

@@ -14,8 +14,8 @@ from playwright.sync_api import Browser, Page, expect
 from tests.drive.charts import drawn
 from tests.drive.page import page_at
 from tests.drive.panels import Clock
+from tests.drive.scenes import running, step_of
 from tests.drive.waiting import until
-from tests.ui.scenes import running, step_of
 from workbench.live.history.curves import Curves, StepCurves
 from workbench.live.panels.reward_panel import CurvesPanel
 

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
-from tests.recording.library_files import describe
+from tests.episodes.library_files import describe
 from workbench.commands import COMMANDS
 from workbench.library.folder import Library
 from workbench.library.panel import LibraryPanel

@@ -14,7 +14,7 @@ from tests.drive.desk import Desk
 from tests.drive.page import TASK
 from tests.drive.studio import picture
 from tests.drive.waiting import until
-from tests.recording.verify_rrd import verify_rrd
+from tests.episodes.verify_rrd import verify_rrd
 from workbench.machine.files import replace_file
 
 pytestmark = pytest.mark.browser

@@ -173,7 +173,7 @@ def test_of_rerun_and_the_library_the_one_unfolded_last_folds_the_other_where_th
     # Its width is a share of the view's, of which the server hears a moment after the library was folded.
     until(lambda: page.locator("canvas[data-engine]").evaluate("c => c.clientWidth") > 800, "the wide view")
     page.get_by_role("tab", name="Share").click()
-    # It is loaded anew at each of its returns, a core for some seconds; what it shows is tests/ui/share/test_rerun_view.py's.
+    # It is loaded anew at each of its returns, a core for some seconds; what it shows is tests/share/test_rerun_view.py's.
     page.route("**/rerun/viewer-*/*.wasm", lambda route: route.abort())
     library, rerun = page.locator(".wb-library"), page.locator("iframe.wb-rerun")
     unfold = page.get_by_role("button", name="Expand column").first

@@ -11,8 +11,8 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Page, expect
 
+from tests.drive.scenes import table_scene
 from tests.drive.waiting import until
-from tests.ui.scenes import table_scene
 from workbench.commands import COMMANDS
 from workbench.envs.scene.shapes import Mesh
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
-from tests.recording.sweep_files import sweep_folder
+from tests.episodes.sweep_files import sweep_folder
 from workbench.commands import COMMANDS
 from workbench.library.folder import Library
 from workbench.page.door.gated_server import ServerOptions, open_server

@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, expect
 from tests.drive.desk import Desk
 from tests.drive.page import page_on
 from tests.drive.waiting import until
-from tests.session.hazards import calm, provoke, write_task
+from tests.live.hazards import calm, provoke, write_task
 from workbench.machine.processes.family import family
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

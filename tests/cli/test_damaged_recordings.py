@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.episodes import made, write
-from tests.recording.foreign_h5 import write as write_foreign
+from tests.episodes.foreign_h5 import write as write_foreign
 from workbench.cli.main import main
 from workbench.episodes.reader.reading import find_all_sources
 from workbench.library.folder import Library

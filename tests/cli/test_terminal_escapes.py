@@ -30,8 +30,8 @@ from rich.table import Table
 from rich.text import Text
 
 from tests.drive.episodes import made, write
+from tests.drive.tabs import handshake
 from tests.drive.waiting import until
-from tests.ui.tabs import handshake
 from workbench.cli.output import SafeConsole, print_line, print_problem, print_text, refuse, warn
 from workbench.library.folder import Library
 from workbench.library.rows import cells

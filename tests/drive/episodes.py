@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.drive.rows import EpisodeRow, append
-from tests.ui.scenes import camera, table_scene
+from tests.drive.scenes import camera, table_scene
 from workbench.envs.camera_data import CameraInfo, Picture
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.episodes.episode import Episode, EpisodeInfo

@@ -13,7 +13,7 @@ from typing import Any
 import viser
 
 from tests.drive.panels import Clock, Panels, forget_what_was_drawn
-from tests.ui.scenes import EMPTY
+from tests.drive.scenes import EMPTY
 from workbench.app.live_page import Page
 from workbench.live.history.env_table import EnvRows
 from workbench.live.view import SessionView

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.ui.scenes import camera, description, step_of, table_scene
+from tests.drive.scenes import camera, description, step_of, table_scene
 from workbench.envs.camera_data import CameraInfo, Picture
 from workbench.envs.step_result import StepResult
 from workbench.live.messages import (

@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.drive.scenes import camera as scene_camera
+from tests.drive.scenes import description, step_of, table_scene
 from tests.drive.waiting import until
-from tests.ui.scenes import camera as scene_camera
-from tests.ui.scenes import description, step_of, table_scene
 from workbench.app.session import Session
 from workbench.cameras.view import StudioCamera, StudioView
 from workbench.checks.profile import ProfileJobs

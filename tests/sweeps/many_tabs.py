@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import COUNT, TASK, play_to_pause, prepare, timed_click
 from tests.benchmarks.page_rate import Options as PageOptions
 from tests.drive.page import launch, new_page, open_workbench
-from tests.ui.tabs import Tab, open_deaf_tab, tabs_of
+from tests.drive.tabs import Tab, open_deaf_tab, tabs_of
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 

@@ -2,7 +2,7 @@
 
     python tests/sweeps/soak.py [--reloads 500] [--deaths 50] [--num-envs 4] [--no-spare]
 
-Versions of `tests/session/hazards.py`'s task are saved one after the other: one that can be put on the envs as they
+Versions of `tests/live/hazards.py`'s task are saved one after the other: one that can be put on the envs as they
 are, one with a wrong syntax, one for which all envs are built anew, one that raises in ``evaluate``. In between the worker dies, in one of several ways. After each tenth of
 it all a row says what the server and the worker hold: memory, threads, open files, child processes. The last
 lines say how much the server's figures grew from the first row to the last, and what was left at the end.
@@ -22,7 +22,7 @@ import psutil
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.session.hazards import calm, provoke, write_task
+from tests.live.hazards import calm, provoke, write_task
 from workbench.app.session import Session
 from workbench.live.commands import Step
 from workbench.live.process.supervisor import WorkerOptions

@@ -144,7 +144,7 @@ def unused_gpu_text(wanted: Backend) -> str | None:
 
 @lru_cache(maxsize=1)
 def _brdf_table() -> sapien.render.RenderTexture:
-    """SAPIEN's own, read out of it by ``tests/core/test_brdf_table.py``: (512, 512, 2), scale and bias.
+    """SAPIEN's own, read out of it by ``tests/envs/test_brdf_table.py``: (512, 512, 2), scale and bias.
 
     The file holds (2, 512, 512) float16 as the steps of their bits along a row, which takes a quarter of the bytes.
     """

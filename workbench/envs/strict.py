@@ -53,7 +53,7 @@ class StrictMixin:
       and `kept_rows`);
     * returns of ``evaluate``, the reward and the observation hooks without a row for each env (`evaluate_entries`).
 
-    Values are compared, so only what goes wrong is reported; ``tests/core/env/test_strict.py`` lists the ManiSkill tasks that
+    Values are compared, so only what goes wrong is reported; ``tests/envs/test_strict.py`` lists the ManiSkill tasks that
     break a rule.
     """
 

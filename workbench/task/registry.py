@@ -129,7 +129,7 @@ def registering(is_own: Callable[[str], bool], registrations: Registrations) -> 
     replaced by ones that clear the name first. The tables are not reset afterwards, whether the body raises or not: see
     `Registrations.undo`. Registrations of libraries that the file imports are left alone, since those stay imported.
 
-    Depends on undocumented names of mani_skill 3.0.1; tests/authoring/loading/test_registry.py fails if one moves.
+    Depends on undocumented names of mani_skill 3.0.1; tests/task/test_registry.py fails if one moves.
     """
     register_env, register_agent = env_registration.register_env, agent_registration.register_agent
 

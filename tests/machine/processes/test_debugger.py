@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from tests.drive.session import wait_until
-from tests.session.debug_client import DebugClient
+from tests.live.debug_client import DebugClient
 from workbench.app.session import Session
 from workbench.app.status_line import status_values
 from workbench.cli.main import main

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 from tests.drive.messages import ARRAYS, of_schema, same
-from tests.ui.scenes import camera, description, step_of, table_scene
+from tests.drive.scenes import camera, description, step_of, table_scene
 from workbench.app.worker.questions import QUESTIONS
 from workbench.envs.inspection import Inspection
 from workbench.episodes.row import Source

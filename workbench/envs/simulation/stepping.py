@@ -18,7 +18,7 @@ class Stepper:
     """Substeps of N systems, done when they are needed.
 
     PickCube-v1, 64 envs, two cores, physics part of a control step of five substeps (the bits are the same in every row,
-    ``tests/core/simulation/test_stepping.py``):
+    ``tests/envs/simulation/test_stepping.py``):
 
         one thread, env after env, substep after substep        24 ms
         two threads                                             14 ms
@@ -174,7 +174,7 @@ class NativeStep:
     the C++ method, and ctypes frees the lock while it runs: the same code on the same object. The object's address comes
     from ``_pybind11_conduit_v1_`` (pybind11 2.14, "Allowing extensions of one binding to use another's objects"), which
     checks ABI and C++ type. The exported names are those of sapien 3.0.3 on Linux
-    (``tests/core/simulation/test_native_step.py``). If one is missing, `why_not_native` says which, and SAPIEN's own
+    (``tests/envs/simulation/test_native_step.py``). If one is missing, `why_not_native` says which, and SAPIEN's own
     binding steps the systems one after the other.
     """
 

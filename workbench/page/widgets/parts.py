@@ -18,7 +18,7 @@ class PagePart(Generic[View]):
     """One part of a page, drawn from an immutable view.
 
     It is drawn again when its `key` changes, at most once per `every` seconds, and at once when `urgent` changes.
-    By default every view is drawn: viser sends no value that is equal (``tests/ui/test_assigning.py``), so a part
+    By default every view is drawn: viser sends no value that is equal (``tests/page/test_assigning.py``), so a part
     needs a key only where what it shows is expensive to make.
     """
 

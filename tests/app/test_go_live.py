@@ -1,0 +1,184 @@
+"""From the review into a live env and back, with scripted workers and without a browser."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import viser
+
+from tests.drive.episodes import made, write
+from tests.drive.panels import Panels
+from tests.drive.scenes import problem
+from tests.drive.waiting import until
+from workbench.app.go_live import GoLive, GoLivePart
+from workbench.app.pages import Which
+from workbench.app.server import App
+from workbench.app.session import Session
+from workbench.live.commands import PlayRun
+from workbench.live.messages import LoadFailed
+from workbench.machine.loop import do
+from workbench.page.door.gated_server import GatedServer
+from workbench.review.commands import ReturnToFirstTask
+from workbench.task.description import TaskOptions
+from workbench.task.reference import TaskName
+from workbench.trust.clearance import Clearances, CodeToRun, NotCleared
+
+
+class Person(Clearances):
+    """Says yes when it is told to, and is asked no more by who does not wait."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.says_yes = threading.Event()
+        self.asked = self.left = 0
+
+    def clear(self, wanted: CodeToRun, stopped: Callable[[], bool] = lambda: False) -> TaskName:
+        self.asked += 1
+        until(lambda: self.says_yes.is_set() or stopped(), "an answer")
+        if stopped():
+            self.left += 1
+            raise NotCleared("nobody waits any more")
+        return wanted.info.task
+
+
+class Desk:
+    """A review with an episode of the task that is open, 0, and one of another, 1."""
+
+    def __init__(self, app: App, live: Session, other: Session, panels: Panels) -> None:
+        self.app, self.live, self.other, self.panels = app, live, other, panels
+        self.person = Person()
+        self.opened: list[TaskName] = []
+        self.shown: list[str] = []
+        """Pages that were asked for; none is built."""
+        app.shared.pages.show = self._show
+        self.go_live = GoLive(app.shared, self._make, self.person, TaskOptions())
+        self.part = GoLivePart(app.shared.server, self.go_live)
+        panels.visitors.do = self.part.do
+        app.review_tools = replace(app.review_tools, go_live=self.go_live)
+
+    def _make(self, task: TaskName, options: TaskOptions) -> Session:
+        self.opened.append(task)
+        return self.other
+
+    def _show(self, which: Which, anew: bool = False) -> Future[None]:
+        self.shown.append(which)
+        return Future()
+
+    def go(self, which: int, state: int = 2) -> None:
+        opened = self.app.shared.recordings.review.view().opened[which]
+        do(lambda: self.go_live.go(opened.id, state))
+
+    def is_led_to_the_live_page(self) -> None:
+        """Though nobody looks: nothing draws the review here."""
+        until(lambda: self.shown == ["live"], "the live page", seen=self.go_live.going)
+        assert self.go_live.going() == ""
+
+
+@pytest.fixture
+def server(gated_server: GatedServer) -> viser.ViserServer:
+    """Of the review."""
+    return gated_server.server
+
+
+@pytest.fixture
+def desk(
+    child_process: None,
+    scripted_session: Callable[..., Session],
+    tmp_path: Path,
+    gated_server: GatedServer,
+    panels: Panels,
+) -> Iterator[Desk]:
+    folder = tmp_path / "recordings"
+    write(folder, made(4, seed=1), pictures=False)
+    write(folder, made(4, seed=2, task="Pull-v1"), pictures=False)
+    live, other = scripted_session(2), scripted_session(1)
+
+    def no_other(task: TaskName, options: TaskOptions) -> Session:
+        raise AssertionError("this test opens it itself")
+
+    app = App(gated_server, folder, no_other, TaskOptions(), session=live)
+    library, review = app.shared.recordings.library, app.shared.recordings.review
+    library.refresh()
+    review.open([row.id for row in sorted(library.view().rows, key=lambda row: row.seed or 0)])
+    until(lambda: len(review.view().opened) == 2, "the recordings", seen=lambda: review.view().problems)
+    desk = Desk(app, live, other, panels)
+    yield desk
+    desk.go_live.close()
+    app.close()
+
+
+def test_into_the_task_that_is_open_one_goes_at_once_and_the_page_follows_also_if_nobody_looks(
+    desk: Desk,
+) -> None:
+    desk.go(0, state=3)
+    assert desk.person.asked == 0 and desk.opened == [] and desk.app.shared.session is desk.live
+    until(lambda: desk.live.view().timeline.entered, "the recorded state")
+    desk.is_led_to_the_live_page()
+    assert not desk.go_live.can_go_home()
+
+
+def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason_to(desk: Desk) -> None:
+    desk.live._take(LoadFailed(problem(), kept=True))
+    desk.live._worker.goes_back = False  # type: ignore[attr-defined]
+    desk.go(0)
+    time.sleep(0.2)  # so long a page would be led there for a failure
+    assert desk.go_live.going() == "restoring Push-v1 at step 2 …" and desk.shown == []
+    desk.live._take(LoadFailed(problem(), kept=True))
+    desk.is_led_to_the_live_page()
+
+
+def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_yes(desk: Desk) -> None:
+    desk.live.do(PlayRun())
+    until(lambda: desk.live.view().playing, "the play")
+    desk.go(1)
+    until(lambda: desk.person.asked, "the question")
+    assert desk.go_live.going() == "waiting for permission to run the code of Pull-v1"
+    assert desk.app.shared.session is desk.live and desk.opened == []
+    desk.person.says_yes.set()
+    until(lambda: desk.app.shared.session is desk.other, "the other session")
+    assert desk.opened == ["Pull-v1"] and desk.go_live.can_go_home()
+    until(lambda: not desk.live.view().playing, "the pause of the task that nobody sees")
+    until(lambda: desk.other.view().timeline.entered, "the recorded state")
+    desk.is_led_to_the_live_page()
+    desk.part.draw(desk.app.shared.recordings.review.view())
+    desk.panels.press("Back to the first task")
+    assert desk.app.shared.session is desk.live and not desk.go_live.can_go_home()
+    desk.part.draw(desk.app.shared.recordings.review.view())
+    assert not desk.panels.shows("Back to the first task")
+
+
+def test_which_code_and_which_envs_are_kept_for_the_next_review(desk: Desk) -> None:
+    desk.part.draw(desk.app.shared.recordings.review.view())
+    assert desk.panels.field("Code").value == "today's"
+    desk.panels.set("Code", "as recorded")
+    desk.panels.set("Into", "all envs")
+    assert desk.go_live.recorded_source and desk.go_live.everywhere
+    desk.app.shared.server.gui.reset()
+    desk.part = GoLivePart(desk.app.shared.server, desk.go_live)
+    desk.part.draw(desk.app.shared.recordings.review.view())
+    assert desk.panels.field("Code").value == "as recorded" and desk.panels.field("Into").value == "all envs"
+    desk.panels.do(ReturnToFirstTask())
+    assert desk.panels.client.notices == ["No other task is open."]
+
+
+def test_who_presses_again_stays_and_nobody_is_asked_any_more(desk: Desk) -> None:
+    desk.go(1)
+    until(lambda: desk.person.asked, "the question")
+    desk.go(1)
+    assert desk.go_live.going() == ""
+    until(lambda: desk.person.left, "that nobody waits for the answer")
+    assert desk.opened == [] and desk.app.shared.session is desk.live
+
+
+def test_a_review_that_is_shown_anew_waits_for_nothing_that_is_under_way(desk: Desk) -> None:
+    desk.live._worker.goes_back = False  # type: ignore[attr-defined]
+    desk.go(0)
+    until(lambda: desk.go_live.going().startswith("restoring"), "the way")
+    GoLivePart(desk.app.shared.server, desk.go_live)
+    assert desk.go_live.going() == ""

@@ -1,0 +1,57 @@
+"""The row of marks above the tabs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+from tests.drive.env_rows import rows_of
+from tests.drive.panels import Panels
+from tests.drive.scenes import changed, running
+from workbench.app.marks import Marks
+from workbench.envs.outliers import Outlier, OutlierKind
+from workbench.live.env_commands import ShowFirstFlagged
+from workbench.live.history.env_table import EnvRows
+from workbench.live.process.background_jobs import JobProgress
+from workbench.page.widgets.open_tabs import OpenTabs
+from workbench.record.saving_state import SaveStatus
+from workbench.record.state import RecordingStatus
+
+
+@dataclass
+class OneTable:
+    rows: EnvRows
+
+    def env_rows(self) -> EnvRows:
+        return self.rows
+
+
+def marks(panels: Panels, rows: EnvRows) -> Marks:
+    return Marks(panels.server, cast(Any, OneTable(rows)), OpenTabs(panels.visitors))
+
+
+def test_flagged_envs_are_in_sight_and_a_press_leads_to_the_first(panels: Panels) -> None:
+    """A reward that was NaN in most envs left a green "running"."""
+    lost = Outlier(OutlierKind.REWARD_NOT_FINITE, 3, "the reward is <b>NaN</b>")
+    row = marks(panels, rows_of(outliers={4: (lost,), 2: (lost,)}))
+    row.draw(running(6))
+    (standing,) = (html for html in panels.htmls() if "wb-sight-flagged" in html.content)
+    content = standing.content
+    assert (
+        "2 of 6 envs flagged: the reward is &lt;b&gt;NaN" in content
+        and "In env 2, step 3: reward-finite: the reward" in content
+    )
+    row.draw(running(6, steps_per_second=21.0))
+    assert standing.content is content, "it stays under the finger that presses"
+    assert panels.presses(ShowFirstFlagged())
+
+
+def test_what_is_saved_of_the_past_is_in_sight_until_it_is_saved(panels: Panels) -> None:
+    row, view = marks(panels, rows_of(outliers={})), running(6)
+    saves = SaveStatus(progress=JobProgress("replaying", 3, 20))
+    saving = changed(view, recording=replace(view.of(RecordingStatus), saving=saves))
+    assert row.urgent(saving) != row.urgent(view)
+    row.draw(saving)
+    assert "wb-sight-saving" in panels.html()
+    row.draw(view)
+    assert "wb-sight" not in panels.html()

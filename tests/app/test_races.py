@@ -1,0 +1,157 @@
+"""What several people do at once on the pages of one server, and what fails once: each counts, and costs nothing else."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
+
+from tests.drive.panels import Panels
+from tests.drive.session import wait_until
+from tests.drive.tabs import handshake, tabs_of
+from tests.drive.waiting import PATIENCE, until
+from workbench.app.live_page import Page
+from workbench.app.server import App
+from workbench.app.session import Session
+from workbench.live.commands import PauseRun, PlayRun, Step
+from workbench.live.env_commands import SelectEnv
+from workbench.live.timeline_commands import Seek
+from workbench.page.command import Command
+from workbench.page.door.gated_server import GatedServer
+from workbench.page.widgets.visitors import PATH
+from workbench.task.description import TaskOptions
+
+
+@pytest.fixture
+def server(gated_server: GatedServer) -> Any:
+    return gated_server.server
+
+
+def no_session(task: object, options: object) -> Session:
+    raise AssertionError("nobody goes live from a recording")
+
+
+class Pressing:
+    """A page that sends commands without waiting, and has the replies."""
+
+    def __init__(self, channel: Connection) -> None:
+        self._channel, self._sent = channel, 0
+
+    def press(self, *commands: Command) -> None:
+        for command in commands:
+            self._sent += 1
+            name, fields = command.encode()
+            self._channel.send(json.dumps({"n": self._sent, "do": [name, fields]}))
+
+    def hears(self, count: int = 1) -> list[dict[str, Any]]:
+        return [json.loads(self._channel.recv(PATIENCE)) for _ in range(count)]
+
+
+class Two:
+    """The live page in two browsers."""
+
+    def __init__(self, session: Session, one: Pressing, other: Pressing) -> None:
+        self.session, self.one, self.other = session, one, other
+
+    @property
+    def steps(self) -> int:
+        return self.session.view().timeline.last
+
+
+@pytest.fixture
+def fails(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Set it before the drawing that is to fail."""
+    fails, redraw = threading.Event(), Page.redraw
+
+    def redraw_or_fail(self: Page) -> None:
+        if fails.is_set():
+            fails.clear()
+            raise LookupError("nothing to be seen")
+        redraw(self)
+
+    monkeypatch.setattr(Page, "redraw", redraw_or_fail)
+    return fails
+
+
+@pytest.fixture
+def two(
+    child_process: None, tmp_path: Path, gated_server: GatedServer, scripted_session: Callable[..., Session]
+) -> Iterator[Two]:
+    session = scripted_session(2)
+    app = App(gated_server, tmp_path, no_session, TaskOptions(), session)
+    app.shared.pages.start("live")
+    address, how = handshake(gated_server.url)
+    del how["subprotocols"]
+    with tabs_of(gated_server.url) as tabs:
+        opened = [tabs.open(), tabs.open()]
+        until(lambda: all(tab.open for tab in opened) and len(app.shared.visitors.all()) == 2, "both pages")
+        one, other = (
+            connect(f"{address.rstrip('/')}{PATH}?page={visitor.name}", proxy=None, **how)
+            for visitor in app.shared.visitors.all()
+        )
+        with one, other:
+            yield Two(session, Pressing(one), Pressing(other))
+    app.close()
+
+
+def test_two_pages_that_press_at_once_count_once_each_and_in_their_order(two: Two) -> None:
+    before, count = two.steps, 20
+    # A page that selects an env and then one that there is not: told so each time, so that its order is seen.
+    in_turns: list[Command] = [SelectEnv(env=0), SelectEnv(env=7)] * (count // 2)
+    pages = [(two.one, [Step()] * count), (two.other, [Step(), *in_turns])]
+    threads = [threading.Thread(target=page.press, args=presses) for page, presses in pages]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert two.one.hears(count) == [{"n": number} for number in range(1, count + 1)]
+    heard = two.other.hears(count + 1)
+    assert [reply["n"] for reply in heard] == list(range(1, count + 2))
+    assert ["refused" in reply for reply in heard] == [False, *[False, True] * (count // 2)]
+    wait_until(two.session, lambda view: view.timeline.last >= before + count + 1, "all steps")
+    two.one.press(SelectEnv(env=1))
+    two.one.hears()
+    view = wait_until(two.session, lambda view: view.selected_env == 1, "the last press")
+    assert view.timeline.last == before + count + 1, "none counted twice"
+
+
+def test_a_slider_that_one_person_drags_swallows_no_key_of_another(two: Two) -> None:
+    two.one.press(*[Step()] * 5)
+    two.one.hears(5)
+    wait_until(two.session, lambda view: view.timeline.last == 5, "some past")
+    for count in range(1, 11):
+        two.one.press(*(Seek(step=step % 5) for step in range(8)))
+        two.other.press(Step())
+        assert two.other.hears() == [{"n": count}]
+        assert two.one.hears(8) == [{"n": 5 + 8 * (count - 1) + number} for number in range(1, 9)]
+        wait_until(two.session, lambda view, last=5 + count: view.timeline.last == last, "the step")
+
+
+def test_a_drawing_that_fails_once_is_told_and_the_page_is_drawn_again(
+    fails: threading.Event, two: Two, panels: Panels, caplog: pytest.LogCaptureFixture
+) -> None:
+    fails.set()
+    two.one.press(PlayRun())
+    two.one.hears()
+    until(lambda: not fails.is_set(), "the drawing that fails")
+    before = two.steps
+    until(lambda: two.steps > before + 5, "steps")
+    until(
+        lambda: "running" in panels.html("wb-status"),
+        "the page that is drawn",
+        seen=lambda: panels.html("wb-status"),
+    )
+    two.other.press(PauseRun())
+    assert two.other.hears() == [{"n": 1}], "what the other page asks for is done"
+    until(
+        lambda: "paused" in panels.html("wb-status"),
+        "the page that is drawn",
+        seen=lambda: panels.html("wb-status"),
+    )
+    assert "could not be drawn" in caplog.text and "nothing to be seen" in caplog.text

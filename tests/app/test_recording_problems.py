@@ -1,0 +1,70 @@
+"""What could not be recorded is told on whichever page is open, and in the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import websockets.sync.client
+
+from tests.drive.scripted import scripted
+from tests.drive.session import wait_until
+from tests.drive.tabs import camera_message, handshake, messages_in
+from tests.drive.waiting import until
+from workbench.app.pages import Which
+from workbench.app.server import App
+from workbench.app.session import Session
+from workbench.live.commands import Step
+from workbench.live.events import EnvsReset
+from workbench.page.door.gated_server import GatedServer
+from workbench.record.saving_state import SaveWanted
+from workbench.record.state import RecordingStatus, RecordingWanted
+from workbench.task.description import TaskOptions
+
+
+@pytest.mark.usefixtures("child_process")
+@pytest.mark.parametrize("page", ["live", "review"])
+def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServer) -> None:
+    folder = tmp_path / "no folder"
+    folder.write_text("a file")
+    told: list[str] = []
+    session = Session(
+        str(tmp_path / "push.py"), TaskOptions(num_envs=2), recordings=folder, make_worker=scripted(2)
+    )
+    wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
+
+    def no_other(*_: object) -> Session:
+        raise AssertionError("no other task is opened")
+
+    app = App(gated_server, folder, no_other, TaskOptions(), session, on_notice=told.append)
+    app.open_task.catalogue.registered.close()
+    app.shared.pages.start(page)
+    address, how = handshake(gated_server.url)
+    with websockets.sync.client.connect(address, **how) as connection:
+        connection.send(camera_message())
+        until(lambda: gated_server.server.get_clients(), "the client")
+
+        def tells(number: int) -> bool:
+            frame = connection.recv(timeout=30)
+            assert isinstance(frame, bytes)
+            texts = [
+                message["props"]["body"]
+                for message in messages_in(frame)
+                if message["type"] == "NotificationShowMessage"
+            ]
+            return any(str(folder) in text for text in texts) and len(told) == number
+
+        for number in (1, 2):
+            session.happen(RecordingWanted())
+            until(lambda number=number: tells(number), "the notice")
+        # What is refused at a moment is told too, and not kept for the moments after it.
+        begun = session.view().timeline.moments
+        session.happen(EnvsReset())
+        wait_until(session, lambda view: view.timeline.moments > begun, "the reset")
+        session.happen(SaveWanted(before=True))
+        assert session.view().of(RecordingStatus).saving.failed
+        session.do(Step())
+        wait_until(session, lambda view: not view.of(RecordingStatus).saving.message, "the message's end")
+    assert len(told) == 2
+    app.close()
+    session.close()

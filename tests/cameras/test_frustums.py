@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import viser.transforms
+
+from tests.drive.panels import Panels
+from tests.drive.scenes import camera
+from workbench.cameras.frustums import CameraFrustums, frustum_pose
+from workbench.envs.camera_data import CameraKind, Picture
+
+POSE = np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0], np.float32)
+GREY = np.full((6, 8, 3), 128, np.uint8)
+
+
+def test_camera_that_looks_along_x_looks_along_opencv_s_z() -> None:
+    wxyz, position = frustum_pose(POSE, np.array([10, 0, 0], np.float32))
+    turn = viser.transforms.SO3(wxyz)
+    np.testing.assert_allclose(turn.apply(np.array([0.0, 0.0, 1.0])), [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(turn.apply(np.array([0.0, 1.0, 0.0])), [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(position, [11, 2, 3])
+
+
+def test_frustums_follow_their_pictures_and_leave_with_them(panels: Panels) -> None:
+    frustums = CameraFrustums(panels.server)
+    cameras = (camera("base"), camera("hand"))
+    offset = np.zeros(3, np.float32)
+    pictures: dict[tuple[CameraKind, str], Picture] = {
+        ("sensor", name): Picture(name, "sensor", 0, POSE, GREY) for name in ("base", "hand")
+    }
+    frustums.draw(cameras, pictures, offset)
+    assert len(panels.nodes("/cameras/")) == 2
+    moved = Picture("base", "sensor", 0, POSE + [1, 0, 0, 0, 0, 0, 0], GREY)
+    frustums.draw(cameras, {("sensor", "base"): moved}, offset)
+    (base,) = panels.nodes("/cameras/")
+    assert base.name == "/cameras/sensor base"
+    np.testing.assert_allclose(base.position, [2, 2, 3])
+    wider = replace(camera("base"), fovy=1.5, width=12)
+    frustums.draw((wider,), {("sensor", "base"): moved}, offset)
+    (base,) = panels.nodes("/cameras/")
+    assert (base.fov, base.aspect) == (1.5, 2.0)
+    frustums.draw((), {("sensor", "base"): moved}, offset)
+    assert panels.nodes("/cameras/") == []
+
+
+def test_the_nearest_frustum_that_a_ray_meets_is_the_one_pressed(panels: Panels) -> None:
+    frustums = CameraFrustums(panels.server)
+    behind = POSE + [0.3, 0, 0, 0, 0, 0, 0]
+    pictures: dict[tuple[CameraKind, str], Picture] = {
+        ("sensor", "base"): Picture("base", "sensor", 0, POSE, GREY),
+        ("sensor", "hand"): Picture("hand", "sensor", 0, behind.astype(np.float32), GREY),
+    }
+    frustums.draw((camera("base"), camera("hand")), pictures, np.zeros(3, np.float32), size=0.1)
+    along = np.array([1.0, 0.0, 0.0])
+    # They look along x, one behind the other.
+    assert frustums.under_ray(np.array([0.0, 2, 3]), along) == ("sensor", "base")
+    assert frustums.under_ray(np.array([9.0, 2, 3]), -along) == ("sensor", "hand")
+    assert frustums.under_ray(np.array([2.0, 2, 3]), along) is None, "both lie behind"
+    assert frustums.under_ray(np.array([0.0, 2.2, 3]), along) is None
+    # Just inside and just outside of the edges that viser draws.
+    frustums.draw(
+        (camera("base"),), {("sensor", "base"): pictures["sensor", "base"]}, np.zeros(3, np.float32), size=0.1
+    )
+    (handle,) = panels.nodes("/cameras/")
+    y = np.tan(handle.fov / 2)
+    corner = np.array([y * handle.aspect, y, 1.0]) * 0.1 / np.cbrt(y * y * handle.aspect / 3)
+    turn = viser.transforms.SO3(handle.wxyz)
+    for sign in ([1, 1], [-1, 1], [1, -1], [-1, -1]):
+        for share, met in ((0.99, ("sensor", "base")), (1.01, None)):
+            aside = turn.apply(np.array([*(corner[:2] * sign * share), 0.0]))
+            in_front = handle.position + aside + along * corner[2]
+            assert frustums.under_ray(in_front + along, -along) == met

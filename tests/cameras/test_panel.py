@@ -1,0 +1,119 @@
+"""The Cameras tab, drawn from views that are made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tests.drive.panels import Clock, Panels
+from tests.drive.scenes import camera, description, running, table_scene
+from workbench.cameras.commands import ShowPictures
+from workbench.cameras.panel import CamerasPanel
+from workbench.cameras.view import ShownCameras, shown_cameras
+from workbench.envs.camera_data import CameraInfo, Picture
+from workbench.live.messages import CameraRequest
+
+POSE = np.array([0, 0, 1, 1, 0, 0, 0], np.float32)
+
+
+BASE, TOP = "base · sensor", "top · sensor"
+
+
+def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> ShownCameras | None:
+    pictures = {
+        (c.kind, c.name): Picture(c.name, c.kind, 0, POSE, np.zeros((6, 8, 3), np.uint8)) for c in cameras
+    }
+    view = running(
+        1,
+        task=description(table_scene(1)[0], cameras),
+        cameras_serial=serial,
+        pictures=pictures if pictured else {},
+        pictures_serial=serial,
+    )
+    return shown_cameras(view)
+
+
+def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:
+    panel = CamerasPanel(panels.server, clock=clock)
+    panels.visitors.do = panel.do
+    panel.draw(seen(1, (camera("base"), camera("hand"))))
+    base = panels.part(BASE)
+    base.set("depth", True)
+    (image,) = base.images()
+    clock.passes()
+    both = seen(2, (camera("top"), replace(camera("base"), width=640)))
+    panel.draw(both)
+    assert panels.folders() == [TOP, BASE]
+    assert base.field("depth").value and base.images() == [image]
+    assert "640 × 6" in base.html()
+    assert panel.wanted(both) == (
+        CameraRequest("top", "sensor", ("rgb",)),
+        CameraRequest("base", "sensor", ("rgb", "depth")),
+    )
+    # What it can show is another choice of ticks.
+    panel.draw(seen(3, (replace(camera("base"), modalities=("rgb",)),)))
+    assert panels.folders() == [BASE] and not base.shows("depth") and base.images() != [image]
+
+
+def test_what_is_ticked_is_asked_for_and_stays_ticked_while_its_camera_is_gone(panels: Panels) -> None:
+    panel = CamerasPanel(panels.server)
+    panels.visitors.do = panel.do
+    panel.draw(None)
+    assert not panels.shows("Show in 3D view")
+    panel.draw(seen(1, (camera("base"),)))
+    assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("rgb",)),)
+    base = panels.part(BASE)
+    base.set("rgb", False)
+    base.set("segmentation", True)
+    panels.set("Show in 3D view", False)
+    panel.draw(seen(1, (camera("base"),)))
+    assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("segmentation",)),)
+    assert not base.field("rgb").value and not panels.field("Show in 3D view").value
+    assert not panel.show_frustums
+    panel.draw(seen(2, (camera("top"),)))
+    panel.draw(seen(3, (camera("base"),)))
+    assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("segmentation",)),)
+    panels.do(ShowPictures(kind="sensor", name="base", modality="albedo", on=True))
+    assert panels.client.notices == ["No camera base gives albedo."]
+
+
+def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:
+    panel = CamerasPanel(panels.server)
+    cameras = (camera("base"),)
+    panel.draw(seen(1, cameras))
+    assert "another moment" not in panels.html()
+    panel.draw(seen(1, cameras, pictured=False))
+    assert "another moment" in panels.html() and "wb-other-moment" in panels.html()
+    panel.draw(seen(1, cameras))
+    assert "another moment" not in panels.html()
+
+
+def test_pictures_that_follow_each_other_are_as_wide_as_the_panel_and_the_last_is_whole(
+    panels: Panels, clock: Clock
+) -> None:
+    panel = CamerasPanel(panels.server, clock=clock)
+
+    moving = seen(1, (camera("base"),))
+    assert moving is not None
+
+    def drawn(serial: int, moving: ShownCameras = moving) -> int:
+        panel.draw(replace(moving, pictures_serial=serial, pictures=dict.fromkeys(moving.pictures, anew())))
+        (image,) = panels.part(BASE).images()
+        return image.image.shape[1]
+
+    def anew() -> Picture:
+        return Picture("base", "sensor", 0, POSE, np.zeros((600, 1000, 3), np.uint8))
+
+    assert drawn(1) == 1000, "the first"
+    clock.passes(0.1)
+    assert drawn(2) == 400
+    clock.passes(0.1)
+    assert drawn(3) == 400
+    (image,) = panels.part(BASE).images()
+    clock.passes(0.2)
+    panel.draw(replace(moving, pictures_serial=3))
+    assert image.image.shape == (240, 400, 3)
+    clock.passes(0.3)
+    panel.draw(replace(moving, pictures_serial=3))
+    assert image.image.shape == (600, 1000, 3)

@@ -1,0 +1,253 @@
+"""The studio by its events alone: whatever happens in whatever order, the value is the same and can be shown."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.scenes import camera as scene_camera
+from tests.drive.scenes import problem
+from tests.drive.session import BASE, DEATH, PEOPLE, Told, told_session
+from workbench.cameras import events as of
+from workbench.cameras.apply import apply
+from workbench.cameras.commands import (
+    CopyTask,
+    DropCameraChange,
+    PickPixel,
+    PutMovedCamerasBack,
+    RedoCamera,
+    ResetCamera,
+    RevertCameraChange,
+    SaveCameraChange,
+    ScalePreview,
+    SelectCamera,
+    StopMeasuring,
+    UndoCamera,
+    UsePlacement,
+)
+from workbench.cameras.state import Change, Studio, placed_cameras, view_of
+from workbench.cameras.view import EditRequest, EditState, PickedPixel
+from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
+from workbench.live.commands import Step
+from workbench.live.effects import Asked
+from workbench.live.events import FileSaved, MomentShown, Now, Send, VersionLoaded, WorkerDied
+from workbench.live.messages import Loaded, LoadFailed, PlaceCamera, Placed
+from workbench.live.run import Run
+from workbench.page.command import Command, Refused
+from workbench.task.apply_edits import SourceEdit
+
+FILE = "/home/me/push.py"
+SETTINGS = CameraSettings((0.4, 0.0, 0.6), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
+EDIT = SourceEdit(FILE, "old", "new", (), SETTINGS)
+NOTHING: CameraKey = ("sensor", "nothing")
+ODD: CameraKey = ("sensor", "odd")
+Happens = tuple[object, int, float]
+"""An event, the run that it meets, and seconds since the event before."""
+
+
+@cache
+def runs() -> tuple[Run, ...]:
+    """Before a task is loaded; with the edit and without it, live and in the past; on a GPU; without cameras."""
+    found: list[Run] = []
+
+    def note(told: Told) -> None:
+        found.append(told.session.look(lambda run: run))
+
+    cameras = (
+        replace(scene_camera(), settings=SETTINGS, mount="arm/hand"),
+        replace(scene_camera("render_camera", "human"), settings=replace(SETTINGS, distance=0.5)),
+        scene_camera("odd"),
+    )
+    with tempfile.TemporaryDirectory() as folder, told_session(Path(folder)) as told:
+        note(told)
+        for text in ("old", "new"):
+            told.load(cameras=cameras, file=FILE, source_files=(FILE,), source={FILE: text})
+            told.reset()
+            told.step(2)
+            note(told)
+        told.session.happen(MomentShown(1, env=2))
+        note(told)
+        told.load("rebuilt", cameras=cameras, backend="gpu")
+        note(told)
+        told.load("rebuilt", cameras=())
+        note(told)
+    return tuple(found)
+
+
+def loaded(level: str | None) -> VersionLoaded:
+    """Of the studio only the level counts: what was loaded is in the run."""
+    report: Any = None if level is None else SimpleNamespace(level=level)
+    nothing: Any = None
+    return VersionLoaded(Loaded(nothing, nothing, {}, report), on_disk=True)
+
+
+def requests(keys: st.SearchStrategy[CameraKey]) -> st.SearchStrategy[EditRequest]:
+    what: Any = st.sampled_from(["edit", "add", "duplicate", "rename", "remove"])
+    return st.builds(
+        EditRequest, what, keys, st.sampled_from([None, SETTINGS]), st.sampled_from(["", "render_camera"])
+    )
+
+
+keys: st.SearchStrategy[CameraKey] = st.sampled_from([BASE, PEOPLE, ODD, NOTHING])
+heights = st.integers(0, 4).map(lambda height: replace(SETTINGS, position=(0.4, 0.0, height / 4)))
+settings = st.one_of(heights, st.sampled_from([replace(SETTINGS, near=math.nan), SETTINGS]))
+pictures = keys.map(lambda key: Picture(key[1], key[0], 0, np.zeros(7, np.float32)))
+corners = st.sampled_from([(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
+report: Any = SimpleNamespace(envs=(0, 1, 2), worst_first=lambda: [2, 0, 1])
+words = st.sampled_from(["", "why", "Why."])
+commands: st.SearchStrategy[Command] = st.one_of(
+    st.sampled_from(
+        [UndoCamera(), RedoCamera(), ResetCamera(), PutMovedCamerasBack(), StopMeasuring(), Step()]
+    ),
+    st.sampled_from([SaveCameraChange(), RevertCameraChange(), CopyTask(), DropCameraChange()]),
+    keys.map(lambda key: SelectCamera(kind=key[0], name=key[1])),
+    st.integers(-1, 2).map(lambda number: UsePlacement(number=number)),
+    st.sampled_from([0.5, 1.0]).map(lambda scale: ScalePreview(scale=scale)),
+    st.just(PickPixel(x=0.2, y=0.3)),
+)
+
+
+def offered(there: CameraSettings) -> Any:
+    return SimpleNamespace(settings=there)
+
+
+def found(request: EditRequest) -> st.SearchStrategy[of.PlanFound]:
+    states = EditState("planned", request, EDIT), EditState("refused", request, can_copy=True)
+    return st.sampled_from([of.PlanFound(request, state) for state in states])
+
+
+plans = requests(keys).flatmap(found)
+events: st.SearchStrategy[object] = st.one_of(
+    commands.map(lambda command: Asked(command, "a page")),
+    st.builds(of.CameraChosen, st.one_of(st.none(), keys)),
+    st.builds(of.CameraPlaced, keys, settings, st.sampled_from([None, "key"]), st.just(1.0)),
+    st.builds(
+        of.MeasureWanted,
+        st.sampled_from(["envs", "steps", "resets"]),  # type: ignore[arg-type]
+        st.integers(-1, 2000),
+    ),
+    st.builds(of.SuggestionsWanted, st.just(("cube",)), corners, corners, st.integers(0, 3)),
+    st.builds(of.ComparisonWanted, settings),
+    st.sampled_from([of.SheetWanted(), of.StudioOpened(), of.Measuring(True), of.Measuring(False)]),
+    st.builds(of.PreviewDrawn, pictures),
+    st.sampled_from([of.EditFailed, of.FileNotChanged]).flatmap(lambda kind: words.map(kind)),
+    st.builds(of.WorkFailed, st.sampled_from(["live", "preview", "new camera"]), words),  # type: ignore[arg-type]
+    st.builds(of.ReportMade, st.just(report), keys, settings, st.integers(0, 2), st.just(())),
+    st.lists(settings, max_size=2).map(lambda all: of.SuggestionsFound(tuple(map(offered, all)), ("cube",))),
+    st.builds(of.PicturesCompared, pictures, pictures),
+    st.builds(of.SheetPictureDrawn, pictures),
+    keys.map(lambda key: of.PixelPicked(PickedPixel(key, 0, 0.0, 0.0, (0, 0), None, None, None))),
+    st.builds(of.EditWanted, requests(keys)),
+    plans,
+    st.builds(of.NewCameraDrawn, requests(keys), st.one_of(st.none(), pictures)),
+    st.sampled_from([of.FileChanged(), of.StudioClosed()]),
+    st.sampled_from([None, Path(FILE)]).map(lambda file: of.TaskCopied(file, EditState())),
+    st.sampled_from([None, "same", "cameras", "patched", "rebuilt"]).map(loaded),
+    st.booleans().map(lambda at_run: LoadFailed(problem(), kept=True, at_run=at_run)),
+    st.builds(Placed, keys, st.one_of(st.none(), settings), st.none(), why_not=words),
+    st.sampled_from([FileSaved(), WorkerDied(DEATH, "")]),
+)
+sequences = st.lists(st.tuples(events, st.integers(0, 5), st.sampled_from([0.0, 2.0])), max_size=30)
+
+
+def after(happened: list[Happens], see: Callable[[object, Studio, Change, Run], None]) -> Studio:
+    """The value after all events; `see` gets each event, the value before it, and what it came to."""
+    studio, seconds = Studio(), 0.0
+    for event, at, later in happened:
+        run, seconds = runs()[at], seconds + later
+        try:
+            change = apply(studio, event, run, Now(seconds, 0.0))
+        except Refused as reason:
+            assert str(reason) and isinstance(event, Asked)
+            continue
+        see(event, studio, change, run)
+        studio = change[0]
+    return studio
+
+
+def no_look(event: object, before: Studio, change: Change, run: Run) -> None:
+    pass
+
+
+@given(sequences)
+def test_the_same_events_give_the_same_value_and_each_can_be_shown(happened: list[Happens]) -> None:
+    def shows(event: object, before: Studio, change: Change, run: Run) -> None:
+        view = view_of(change[0], run, None)
+        assert {one.key for one in view.cameras if one.moved} <= {
+            one.key for one in placed_cameras(change[0])
+        }
+        assert view_of(change[0], run, None).selected == view.selected == change[0].selected
+
+    assert after(happened, shows) == after(happened, no_look)
+
+
+@given(sequences)
+def test_a_camera_is_sent_as_it_is_placed_then(happened: list[Happens]) -> None:
+    def sent(event: object, before: Studio, change: Change, run: Run) -> None:
+        studio, effects = change
+        requests = [effect.request for effect in effects if isinstance(effect, Send)]
+        assert len(requests) == len({one.key for one in requests if isinstance(one, PlaceCamera)})
+        for request in requests:
+            assert isinstance(request, PlaceCamera)
+            assert request.settings == studio.placements.placed.get(request.key)
+        if isinstance(event, VersionLoaded) and run.task is not None:
+            assert set(placed_cameras(studio)) <= set(requests)
+
+    after(happened, sent)
+
+
+@given(sequences)
+def test_edits_are_made_one_after_the_other_and_none_after_the_end(happened: list[Happens]) -> None:
+    ends = of.PlanFound, of.FileChanged, of.FileNotChanged, of.TaskCopied, of.EditFailed
+
+    def one_by_one(event: object, before: Studio, change: Change, run: Run) -> None:
+        studio, effects = change
+        begun = [one for one in effects if isinstance(one, of.FindPlan | of.ChangeFile | of.CopyToFolder)]
+        assert len(begun) <= (not before.edits.busy or isinstance(event, ends))
+        assert not begun or (studio.edits.busy and not before.edits.closed)
+        assert studio.edits.busy or not studio.edits.waiting
+
+    after(happened, one_by_one)
+
+
+@given(sequences)
+def test_every_step_can_be_undone_and_then_there_is_none(happened: list[Happens]) -> None:
+    studio, run, now = after(happened, no_look), runs()[1], Now(0.0, 0.0)
+    while (placements := studio.placements).done:
+        studio, effects = apply(studio, Asked(UndoCamera()), run, now)
+        (step,) = placements.done[len(studio.placements.done) :]
+        assert studio.placements.now(step.key) == step.before
+        assert effects == [Send(PlaceCamera(step.key, studio.placements.placed.get(step.key)))]
+    with pytest.raises(Refused):
+        apply(studio, Asked(UndoCamera()), run, now)
+
+
+@given(settings.filter(lambda one: one != SETTINGS), st.booleans())
+def test_only_a_change_that_was_read_is_saved(moved: CameraSettings, back: bool) -> None:
+    run, now = runs()[1], Now(0.0, 0.0)
+    request = EditRequest("edit", BASE, SETTINGS)
+    steps = [
+        Asked(SaveCameraChange()),
+        loaded(None),
+        of.EditWanted(request),
+        of.PlanFound(request, EditState("planned", request, EDIT)),
+        of.CameraPlaced(BASE, moved),
+        *([Asked(PutMovedCamerasBack())] if back else []),
+    ]
+    studio = after([(event, 1, 0.0) for event in steps], no_look)
+    if studio.placements.now(BASE) == SETTINGS:
+        assert apply(studio, Asked(SaveCameraChange()), run, now)[1][-1] == of.ChangeFile(EDIT, revert=False)
+    else:
+        with pytest.raises(Refused):
+            apply(studio, Asked(SaveCameraChange()), run, now)

@@ -1,0 +1,46 @@
+"""Boxes and triangles outside a camera's view, against where their points fall in its picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import sapien
+import sapien.render
+
+from tests.drive.scenes import box_mesh
+from workbench.envs.rendering.in_view import cut_to_view, is_outside, outside_and_inside, planes_of
+
+
+@pytest.fixture
+def camera(renderer: None) -> Any:
+    made = sapien.render.RenderCameraComponent(40, 30)
+    made.set_perspective_parameters(0.1, 10.0, 30.0, 35.0, 15.0, 20.0, 0.0)  # type: ignore[call-arg]
+    return made
+
+
+def test_a_point_is_in_view_where_its_pixel_is_in_the_picture(camera: Any) -> None:
+    points = np.random.default_rng(0).uniform([-1, -3, -3], [4, 3, 3], (2000, 3))
+    x, y, z = points.T
+    k = camera.get_intrinsic_matrix()
+    column, row = k[0, 2] - k[0, 0] * y / x, k[1, 2] - k[1, 1] * z / x
+    seen = (x > 0.1) & (column > 0) & (column < 40) & (row > 0) & (row < 30)
+    planes = planes_of(camera)
+    boxes = np.stack([points, points], axis=1).astype(np.float32)
+    outside, inside = outside_and_inside(boxes, np.tile(planes, (2000, 1, 1)))
+    np.testing.assert_array_equal(outside, ~inside, "a box without a size")
+    assert seen.any() and not (outside & seen).any()
+    np.testing.assert_array_equal([is_outside(point[None], planes) for point in points], outside)
+    nearly = (x > 0.09) & (column > -2) & (column < 42) & (row > -2) & (row < 32)
+    assert outside[~nearly].all()
+
+
+def test_triangles_behind_the_camera_are_cut_and_the_rest_keeps_its_normals(camera: Any) -> None:
+    mesh = box_mesh((4.0, 0.2, 0.2))
+    cut = cut_to_view(mesh, planes_of(camera))
+    assert 0 < len(cut.faces) < len(mesh.faces)
+    kept = {tuple(corner) for corner in mesh.vertices[mesh.faces].reshape(-1, 9).round(4)}
+    assert {tuple(corner) for corner in cut.vertices[cut.faces].reshape(-1, 9).round(4)} <= kept
+    assert cut.normals is None or len(cut.normals) == len(cut.vertices)
+    assert len(cut_to_view(box_mesh((1, 1, 1), (-3, 0, 0)), planes_of(camera)).faces) == 0

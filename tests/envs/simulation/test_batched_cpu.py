@@ -1,0 +1,147 @@
+"""The batched CPU core against ManiSkill's own single CPU env, as the reference."""
+
+# ManiSkill annotates an env's members as the widest thing they may be in any task.
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportOptionalMemberAccess=false, reportIndexIssue=false, reportOptionalSubscript=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.structs.pose import Pose
+
+from tests.envs.stock_env import batch_of
+from tests.envs.written import ThrowsAFreeChain
+from workbench.envs.cpu_scene import batched_class
+from workbench.envs.gpu_rules import Degree
+
+STATE_ONLY = {"obs_mode": "state", "render_backend": "none"}
+
+
+def batched(env_id: str, num_envs: int, rules: Degree | None = None) -> BaseEnv:
+    return batched_class(REGISTERED_ENVS[env_id].cls, rules=rules)(num_envs=num_envs, **STATE_ONLY)
+
+
+@pytest.fixture(scope="module")
+def pick_cubes() -> Iterator[BaseEnv]:
+    env = batched("PickCube-v1", 4)
+    yield env
+    env.close()
+
+
+def test_link_velocities_are_those_of_the_links(pick_cubes: BaseEnv) -> None:
+    pick_cubes.reset(seed=[0, 1, 2, 3])
+    for _ in range(5):
+        pick_cubes.step(pick_cubes.action_space.sample())
+    for link in pick_cubes.agent.robot.links:
+        expected = torch.tensor(np.array([body.linear_velocity for body in link._bodies]))
+        assert torch.equal(link.linear_velocity, expected)
+
+
+@pytest.mark.filterwarnings("ignore:The pose of link")
+@pytest.mark.parametrize("rules", ["off", None])
+def test_a_root_that_was_set_stays_set_when_the_velocity_of_a_link_is_read_before_it_is_applied(
+    rules: Degree | None,
+) -> None:
+    env = batched("PickCube-v1", 2, rules)
+    env.reset(seed=[0, 1])
+    env.step(env.action_space.sample())
+    robot, wanted = env.agent.robot, env.agent.robot.pose.raw_pose.clone()
+    wanted[:, 0] -= 0.1
+    fast = torch.full((2, 3), 0.5)
+    robot.set_pose(Pose.create(wanted))
+    robot.set_root_linear_velocity(fast)
+    assert robot.links[3].linear_velocity.shape == (2, 3)
+    assert torch.equal(robot.root_linear_velocity, fast)
+    env.scene._gpu_apply_all()
+    assert np.allclose([a.root_pose.p for a in robot._objs], wanted[:, :3], atol=1e-6)
+    env.scene.px.gpu_update_articulation_kinematics()
+    env.scene._gpu_fetch_all()
+    assert torch.allclose(robot.pose.raw_pose, wanted, atol=1e-6)
+    env.close()
+
+
+def test_a_pose_with_nan_is_refused_with_the_name_of_the_body(pick_cubes: BaseEnv) -> None:
+    pick_cubes.reset(seed=[0, 1, 2, 3])
+    state = pick_cubes.get_state_dict()
+    state["actors"]["cube"][1, 0] = float("nan")
+    with pytest.raises(ValueError, match="cube"):
+        pick_cubes.set_state_dict(state)
+    pick_cubes.scene._needs_fetch = False
+    pick_cubes.scene._gpu_fetch_all()
+
+
+def test_a_velocity_of_what_the_task_moves_itself_is_not_given_to_physx(pick_cubes: BaseEnv) -> None:
+    pick_cubes.reset(seed=[0, 1, 2, 3])
+    for actor in (pick_cubes.goal_site, pick_cubes.cube):
+        actor.set_linear_velocity(torch.full((4, 3), 0.5))
+    pick_cubes.scene._gpu_apply_all()
+    assert not any(body.linear_velocity.any() for body in pick_cubes.goal_site._bodies)
+    assert all((body.linear_velocity == 0.5).all() for body in pick_cubes.cube._bodies)
+
+
+def test_every_env_has_its_own_ground() -> None:
+    class DropsACube(REGISTERED_ENVS["PickCube-v1"].cls):
+        """The cube falls beside the table, onto the floor that the table scene builds 0.92 m below."""
+
+        def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+            super()._initialize_episode(env_idx, options)
+            pose = self.cube.pose.raw_pose.clone()
+            pose[:, :3] = torch.tensor([-2.0, 0.0, -0.7])
+            self.cube.set_pose(Pose.create(pose[env_idx]))
+
+    env = batched_class(DropsACube)(num_envs=3, **STATE_ONLY)
+    env.reset(seed=[0, 1, 2])
+    for _ in range(20):
+        env.step(np.zeros((3, 8), np.float32))
+    heights = env.cube.pose.p[:, 2]
+    assert torch.allclose(heights, heights[:1]), heights
+    assert float(heights.min()) > -0.95, "fell through the floor"
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
+def test_what_is_written_into_the_tensors_and_applied_is_what_physx_has() -> None:
+    env = batch_of(ThrowsAFreeChain, 3)
+    env.reset(seed=[0, 1, 2])
+    px, rng = env.scene.px, np.random.default_rng(0)
+
+    def drawn(width: int) -> torch.Tensor:
+        return torch.from_numpy(rng.uniform(-0.5, 0.5, (3, width)).astype(np.float32))
+
+    turned = torch.nn.functional.normalize(drawn(4))
+    written = {name: torch.cat([drawn(3), turned, drawn(6)], dim=1) for name in ("falls", "free")}
+    data = px.cuda_rigid_body_data.torch()
+    data[env.falls._body_data_index] = written["falls"]
+    data[env.free.root._body_data_index] = written["free"]
+    joints = {name: drawn(2) for name in ("qpos", "qvel", "qf", "target_qpos", "target_qvel")}
+    for name, values in joints.items():
+        getattr(px, f"cuda_articulation_{name}").torch()[env.chain._data_index.long(), :2] = values
+    env.scene._gpu_apply_all()
+    px.gpu_apply_articulation_qf()
+    px.gpu_apply_articulation_target_velocity()
+    px.packs()  # targets are written before the next step, or before it is packed
+    for i in range(3):
+        body, root, chain = env.falls._bodies[i], env.free._objs[i], env.chain._objs[i]
+        for moved, row in ((body, written["falls"][i]), (root, written["free"][i])):
+            pose = moved.entity.pose if moved is body else moved.root_pose
+            linear, angular = (
+                (moved.linear_velocity, moved.angular_velocity)
+                if moved is body
+                else (moved.root_linear_velocity, moved.root_angular_velocity)
+            )
+            np.testing.assert_allclose([*pose.p, *linear, *angular], [*row[:3], *row[7:]], atol=1e-5)
+            assert abs(float(pose.q @ row[3:7].numpy())) == pytest.approx(1, abs=1e-5)
+        for name, got in {"qpos": chain.qpos, "qvel": chain.qvel, "qf": chain.qf}.items():
+            np.testing.assert_allclose(got, joints[name][i], atol=1e-6, err_msg=name)
+        for joint, target, velocity in zip(
+            chain.active_joints, joints["target_qpos"][i], joints["target_qvel"][i], strict=True
+        ):
+            assert (joint.drive_target[0], joint.drive_velocity_target[0]) == (target, velocity)
+    env.close()

@@ -1,0 +1,186 @@
+"""What ``evaluate`` returns, split into columns and the rest; and that ManiSkill passes on the same."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mani_skill.utils.structs.pose import Pose
+
+import workbench
+from tests.drive.entries import ENTRIES, Mute
+from tests.drive.envs import CPU, batched
+from tests.live.odd_entries import write_task
+from workbench.envs.evaluate_entries import MOST_ENTRIES, MOST_LETTERS, split_entries
+from workbench.envs.maniskill_private import open_env
+from workbench.envs.task_env import TaskEnv
+from workbench.task.load import load_task
+
+N = 4
+EACH = torch.arange(float(N))
+
+
+class Chatty:
+    def __repr__(self) -> str:
+        return "x" * 10**6
+
+
+@pytest.mark.parametrize(
+    ("value", "dtype", "shape"),
+    [
+        (EACH, "float32", (N,)),
+        (EACH.half(), "float16", (N,)),
+        (EACH.bfloat16(), "float32", (N,)),
+        (EACH.clone().requires_grad_(), "float32", (N,)),
+        (torch.zeros(N, 0), "float32", (N, 0)),
+        (torch.eye(N).to_sparse(), "float32", (N, N)),
+        ((True, False, True, True), "bool", (N,)),
+        ([torch.tensor(1.0)] * N, "float32", (N,)),
+        ([[1.0, 2.0]] * N, "float64", (N, 2)),
+        (Pose.create_from_pq(p=torch.zeros(N, 3)), "float32", (N, 7)),
+    ],
+)
+def test_what_has_a_row_for_each_env_is_a_column(value: Any, dtype: str, shape: tuple[int, ...]) -> None:
+    columns, others = split_entries({"entry": value, "elapsed_steps": EACH}, N)
+    assert (columns["entry"].dtype, columns["entry"].shape) == (np.dtype(dtype), shape)
+    assert others == {} and list(columns) == ["entry"]
+
+
+@pytest.mark.parametrize(
+    ("value", "what", "text"),
+    [
+        (None, "None", "None"),
+        ({}, "dict", "{}"),
+        (1 + 2j, "complex", "(1+2j)"),
+        (2**70, "int", str(2**70)),
+        (10**5000, "int", "<int, whose repr raises ValueError>"),
+        (Mute(), "Mute", "<Mute, whose repr raises KeyError>"),
+        ([[1], [1, 2]], "list", "[[1], [1, 2]]"),
+        (torch.zeros(0), "float32 tensor of shape (0,)", "[]"),
+        (torch.zeros(300, 300), "float32 tensor of shape (300, 300)", "90,000 numbers"),
+        ("\ud800 \x00 \x1b[31m\nred", "str", "\ufffd \ufffd \ufffd[31m\nred"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_is_no_number_is_a_text_of_the_whole_batch(value: Any, what: str, text: str) -> None:
+    columns, others = split_entries({"entry": value}, N)
+    entry = others["entry"]
+    assert columns == {} and (entry.what, entry.texts, entry.numbers) == (what, (text,), None)
+    assert not entry.per_env
+
+
+def test_nested_dicts_are_their_leaves_and_names_stay_apart() -> None:
+    twice: dict[Any, Any] = {"a": {"b": EACH, 1: None}, "a/b": "also", "": 1, 2: 2, "2": 3}
+    twice["self"] = OrderedDict(again=twice)
+    columns, others = split_entries(twice, N)
+    assert {"a/b", "self/again/a/b"} == set(columns)
+    assert {"a/1", "a/b (2)", "''", "2", "2 (2)"} <= set(others)
+    assert not set(columns) & set(others)
+
+
+def test_what_is_huge_is_bounded() -> None:
+    entries: dict[Any, Any] = {"x" * 10_000: Chatty(), "list": list(range(10**5)), "text": "y" * 10**6}
+    _, others = split_entries(entries, N)
+    assert max(map(len, others)) <= 200
+    for entry in others.values():
+        assert len(entry.texts[0]) <= MOST_LETTERS and not entry.whole
+    _, named = split_entries({"n" * 200: None, "m" * 201: None}, N)
+    assert list(named) == ["n" * 200, "m" * 199 + "…"]
+    many, rest = split_entries({str(i): EACH for i in range(MOST_ENTRIES + 7)}, N)
+    assert len(many) == MOST_ENTRIES and rest["…"].texts == ("7 more",)
+
+
+def test_columns_are_copies_that_the_next_step_does_not_change() -> None:
+    value, number = EACH.clone(), torch.tensor(1.0)
+    columns, others = split_entries({"each": value, "mean": number}, N)
+    value += 1
+    number += 1
+    assert columns["each"].tolist() == [0, 1, 2, 3] and others["mean"].numbers == 1
+
+
+@settings(max_examples=30)
+@given(ENTRIES, st.integers(1, 5))
+def test_any_dict_is_split(entries: dict[Any, Any], num_envs: int) -> None:
+    columns, others = split_entries(entries, num_envs)
+    assert not set(columns) & set(others)
+    for values in columns.values():
+        assert len(values) == num_envs and values.dtype.kind in "biuf"
+    for name, entry in others.items():
+        name.encode()
+        assert len(entry.texts) == (0 if entry.numbers is not None else num_envs if entry.per_env else 1)
+        "".join(entry.texts).encode()
+
+
+# --- the same in stock ManiSkill ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def odd_task(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_task(tmp_path_factory.mktemp("odd"))
+
+
+def same(ours: Any, stock: Any) -> bool:
+    if isinstance(stock, dict):
+        return ours.keys() == stock.keys() and all(same(ours[key], stock[key]) for key in stock)
+    if isinstance(stock, torch.Tensor):
+        return ours.dtype == stock.dtype and torch.equal(ours, stock)
+    if isinstance(stock, np.ndarray):
+        return np.array_equal(ours, stock)
+    return ours == stock or type(ours) is type(stock)
+
+
+def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
+    ours: Any = workbench.make(odd_task, 1, **CPU, rules="stop")
+    stock: Any = gym.make("OddEntries-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
+    for env in (ours, stock):
+        env.reset(seed=3)
+    rng = np.random.default_rng(0)
+    for _ in range(7):
+        action = rng.uniform(-1, 1, (1, 8)).astype(np.float32)
+        given, expected = ours.step(action), stock.step(action)
+        assert same(given[4], expected[4])
+        assert torch.equal(given[1], expected[1]) and torch.equal(given[2], expected[2])
+    ours.close()
+    stock.close()
+
+
+class OneTruth:
+    """In front of a task: the single truth that a task written for one env returns."""
+
+    def evaluate(self) -> dict[str, Any]:
+        return {"success": torch.tensor(False), "fail": torch.tensor(True)}
+
+
+@pytest.mark.parametrize("rules", ["off", "stop"])
+def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, rules: Any) -> None:
+    task = type("One", (OneTruth, load_task(str(odd_task)).cls), {})
+    env = TaskEnv(batched(task, 1, rules=rules, reward_mode="sparse"))
+    assert env.reset(seed=0).terminated.tolist() == [True]
+    step = env.step(None)
+    assert step.terminated.tolist() == [True] and step.reward.tolist() == [-1.0]
+    assert step.evaluate["success"].tolist() == [False] and step.evaluate["fail"].tolist() == [True]
+    env.close()
+
+
+def test_steps_and_rescoring_give_both_halves(odd_task: Path) -> None:
+    env = workbench.make(odd_task, 3, **CPU, reward_mode="dense")
+    task = TaskEnv(open_env(env))
+    task.reset(seed=0)
+    step = task.step(np.zeros((3, 8), np.float32))
+    for told in (step, task.rescore(np.zeros((3, 8), np.float32))):
+        assert told.others["phase"].texts == ("reach",) and told.others["stage"].numbers == 2
+        assert told.others["best"].what == "None" and told.others["words"].texts[2] == "cube 2"
+        progress: Any = told.others["progress"].numbers
+        np.testing.assert_allclose(progress, told.evaluate["away"].mean(), rtol=1e-6)
+        assert told.evaluate["turns"].shape == (3,) and "sometimes" in told.others
+        assert told.others["reward_terms/mean"].numbers is not None
+        assert "reward_terms/all" in told.evaluate and "elapsed_steps" not in told.evaluate
+    assert "turns" in task.step(np.zeros((3, 8), np.float32)).others
+    env.close()

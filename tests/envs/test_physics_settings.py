@@ -1,0 +1,190 @@
+"""What a task may change about physics: each change does what it does in a stock env, and does something."""
+
+# ManiSkill annotates an env's members as the widest thing they may be, and vectors as tuples.
+# pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
+# pyright: reportOptionalIterable=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import sapien
+import sapien.physx as physx
+import torch
+from mani_skill.utils.structs.types import SceneConfig, SimConfig
+
+from tests.envs.collision import Collision
+from tests.envs.stock_env import batch_of, follow
+from workbench.envs.broken_rule import RuleWarning
+
+pytestmark = pytest.mark.thorough
+
+STEPS = 15
+
+
+def drive_between_actors(env: Any) -> None:
+    drive = env.scene.create_drive(env.a, sapien.Pose([0.1, 0, 0]), env.b, sapien.Pose([-0.1, 0, 0]))
+    drive.set_drive_property_x(stiffness=50, damping=5)
+    drive.set_drive_property_y(stiffness=50, damping=5)
+    drive.set_limit_z(0, 0)
+
+
+def drive_between_a_link_and_an_actor(env: Any) -> None:
+    drive = env.scene.create_drive(env.chain.links[-1], sapien.Pose(), env.b, sapien.Pose())
+    drive.set_drive_property_x(stiffness=20, damping=2)
+    drive.set_drive_property_z(stiffness=20, damping=2)
+
+
+def no_collision_between_the_boxes(env: Any) -> None:
+    for actor in (env.a, env.b):
+        actor.set_collision_group_bit(group=2, bit_idx=28, bit=1)
+
+
+def joint_drives(env: Any) -> None:
+    for joint in env.chain.active_joints:
+        joint.set_drive_properties(stiffness=30, damping=3, force_limit=4)
+
+
+def joint_properties(env: Any) -> None:
+    for joint in env.chain.active_joints:
+        joint.set_friction(0.5)
+        joint.set_limits(np.array([[-0.1, 0.4]]))
+
+
+def mass_of_every_body(env: Any) -> None:
+    # One body after the other: how a task gives each env its own mass.
+    for number, body in zip(env.env_numbers(), env.a._bodies):
+        body.mass = 2.0 + number
+
+
+def friction_of_every_shape(env: Any) -> None:
+    for body in [*env.a._bodies, *env.b._bodies]:
+        for shape in body.collision_shapes:
+            shape.physical_material = physx.PhysxMaterial(1.5, 1.5, 0.5)
+
+
+def push(env: Any) -> None:
+    env.a.apply_force(
+        np.array([0.0, 3.0, 0.0], np.float32) if env.num_envs == 1 else torch.tensor([0.0, 3.0, 0.0])
+    )
+
+
+def joint_forces(env: Any) -> None:
+    env.chain.set_qf(torch.tensor([0.5, -0.2]))
+    env.apply()
+
+
+def drive_targets(env: Any) -> None:
+    joints = env.chain.active_joints
+    env.chain.set_joint_drive_targets(torch.full((env.num_envs, 2), -0.5), joints)
+    env.chain.set_joint_drive_velocity_targets(torch.full((env.num_envs, 2), 0.1), joints)
+    env.apply()
+
+
+def new_velocity(env: Any) -> None:
+    env.b.set_linear_velocity(torch.tensor([0.0, -0.5, 0.0]))
+    env.b.set_angular_velocity(torch.tensor([0.0, 0.0, 2.0]))
+    env.chain.set_qvel(torch.tensor([0.1, 0.2]))
+    env.apply()
+
+
+LOADS = {
+    "mass": lambda env: env.a.set_mass(20.0),
+    "mass of every body": mass_of_every_body,
+    "no gravity": lambda env: env.a.set_disable_gravity(True),
+    "no gravity for links": lambda env: [link.set_disable_gravity(True) for link in env.chain.links],
+    "linear damping": lambda env: env.a.set_linear_damping(5.0),
+    "angular damping": lambda env: env.a.set_angular_damping(50.0),
+    "locked axes": lambda env: env.a.set_locked_motion_axes([False, True, False, True, True, True]),
+    "friction": friction_of_every_shape,
+    "no collision": no_collision_between_the_boxes,
+    "drive between actors": drive_between_actors,
+    "drive between a link and an actor": drive_between_a_link_and_an_actor,
+    "joint drives": joint_drives,
+    "joint friction and limits": joint_properties,
+}
+STEP_CHANGES = {
+    "force": push,
+    "joint forces": joint_forces,
+    "velocities": new_velocity,
+}
+
+
+def outcome(env: Any) -> torch.Tensor:
+    return env.get_state()
+
+
+@pytest.fixture(scope="module")
+def unchanged() -> torch.Tensor:
+    env = follow(Collision, steps=STEPS)
+    state = outcome(env)
+    env.close()
+    return state
+
+
+@pytest.mark.parametrize("change", LOADS)
+def test_a_change_while_loading(change: str, unchanged: torch.Tensor) -> None:
+    task = type("Changed", (Collision,), {"on_load": staticmethod(LOADS[change])})
+    env = follow(task, steps=STEPS)
+    assert bool(((outcome(env) - unchanged).abs() > 1e-4).any(dim=1).all()), "the change changed nothing"
+    env.close()
+
+
+@pytest.mark.parametrize("change", STEP_CHANGES)
+def test_a_change_on_every_control_step(change: str, unchanged: torch.Tensor) -> None:
+    task = type("Changed", (Collision,), {"on_step": staticmethod(STEP_CHANGES[change])})
+    env = follow(task, steps=STEPS)
+    assert bool(((outcome(env) - unchanged).abs() > 1e-4).any(dim=1).all()), "the change changed nothing"
+    env.close()
+
+
+def test_drive_targets_and_velocity_targets() -> None:
+    task = type(
+        "Changed",
+        (Collision,),
+        {"on_load": staticmethod(joint_drives), "on_step": staticmethod(drive_targets)},
+    )
+    env = follow(task, steps=STEPS)
+    assert torch.equal(env.chain.drive_targets, torch.full((3, 2), -0.5))
+    assert torch.equal(env.chain.drive_velocities, torch.full((3, 2), 0.1))
+    env.close()
+
+
+SIM_CONFIGS = {
+    "frequencies": SimConfig(sim_freq=240, control_freq=40),
+    "gravity": SimConfig(scene_config=SceneConfig(gravity=np.array([0.0, 1.0, -3.0]))),
+    "solver": SimConfig(scene_config=SceneConfig(solver_position_iterations=1, solver_velocity_iterations=4)),
+    "contact offset": SimConfig(scene_config=SceneConfig(contact_offset=0.001, bounce_threshold=0.1)),
+    "solver kind": SimConfig(scene_config=SceneConfig(enable_tgs=False, enable_pcm=False)),
+}
+
+
+@pytest.mark.parametrize("change", SIM_CONFIGS)
+def test_the_simulation_config_reaches_every_env(change: str, unchanged: torch.Tensor) -> None:
+    config = SIM_CONFIGS[change]
+    task = type("Configured", (Collision,), {"_default_sim_config": property(lambda self: config)})
+    env = follow(task, steps=STEPS)
+    assert bool(((outcome(env) - unchanged).abs() > 1e-6).any(dim=1).all()), "the config changed nothing"
+    env.close()
+
+
+def test_what_the_gpu_refuses_once_it_runs_is_told_at_its_line() -> None:
+    env = batch_of(Collision, 3)
+    for change in (
+        lambda: env.a.set_mass(2.0),
+        lambda: env.a.set_disable_gravity(True),
+        lambda: env.a.set_linear_damping(1.0),
+        lambda: env.a.set_locked_motion_axes([True] * 6),
+        lambda: env.chain.active_joints[0].set_limits([[0, 1]]),
+        lambda: env.chain.compute_passive_force(),
+        lambda: env.chain.create_pinocchio_model(),
+        lambda: env.b.remove_from_scene(),
+        lambda: env.scene.remove_articulation(env.chain),
+    ):
+        with pytest.warns(RuleWarning, match="on the GPU this fails") as told:
+            change()
+        assert __file__ in {warning.filename for warning in told}
+    assert env.a.mass.tolist() == [2.0] * 3
+    env.close()

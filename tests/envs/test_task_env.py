@@ -1,0 +1,294 @@
+"""The plain-array interface over a running task, and how tasks are made."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from typing import Any, get_args
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from tests.drive.envs import PUSH_CUBE, batched, stock
+from tests.envs.stock_env import Bare
+from workbench.envs import action_vector as actions
+from workbench.envs import backends
+from workbench.envs.backends import choose_backend
+from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
+
+pytestmark = pytest.mark.thorough
+
+N = 4
+
+
+def opened(env_id: str, num_envs: int = N, **kwargs: object) -> TaskEnv:
+    return TaskEnv(batched(env_id, num_envs, **kwargs), REGISTERED_ENVS[env_id].max_episode_steps)
+
+
+@pytest.fixture(scope="module")
+def push() -> Iterator[TaskEnv]:
+    env = opened("PushCube-v1")
+    yield env
+    env.close()
+
+
+def test_a_reward_that_could_be_learned_from_is_a_number_like_others(push: TaskEnv) -> None:
+    """As of a task that asks a network of torch's."""
+    reward = torch.ones(N, requires_grad=True) * 2
+    assert (
+        push.result({"success": torch.zeros(N, dtype=torch.bool)}, reward, None).reward.tolist() == [2.0] * N
+    )
+
+
+def test_what_a_step_returned_does_not_change_with_the_next(push: TaskEnv) -> None:
+    push.reset(seed=0)
+    step = push.step(np.ones((N, 8), np.float32))
+    copies = step.poses.copy(), step.reward.copy(), step.elapsed_steps.copy()
+    push.step(-np.ones((N, 8), np.float32))
+    assert np.array_equal(step.poses, copies[0], equal_nan=True)
+    assert np.array_equal(step.reward, copies[1]) and np.array_equal(step.elapsed_steps, copies[2])
+
+
+def test_the_time_limit_truncates(push: TaskEnv) -> None:
+    push.reset(seed=0)
+    results = [push.step(np.zeros((N, 8), np.float32)) for _ in range(push.max_episode_steps)]
+    assert not results[-2].truncated.any() and results[-1].truncated.all()
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    subset=st.sets(st.integers(0, N - 1), min_size=1, max_size=N),
+    seed=st.integers(0, 2**31 - N - 1),
+    steps=st.integers(0, 3),
+)
+def test_a_partial_reset_touches_its_subset_only(
+    push: TaskEnv, subset: set[int], seed: int, steps: int
+) -> None:
+    push.reset(seed=7)
+    before = push.reset(seed=7)
+    for _ in range(steps):
+        before = push.step(np.full((N, 8), 0.3, np.float32))
+    after = push.reset(seed=seed, env_idx=sorted(subset))
+    others = [i for i in range(N) if i not in subset]
+    assert np.array_equal(after.poses[others], before.poses[others], equal_nan=True)
+    assert [int(after.elapsed_steps[i]) for i in subset] == [0] * len(subset)
+    assert [int(after.elapsed_steps[i]) for i in others] == [steps] * len(others)
+
+
+def test_in_whichever_order_envs_are_named_each_starts_from_its_own_seed(push: TaskEnv) -> None:
+    push.reset(seed=0)
+    ascending = push.reset(seed=[41, 40], env_idx=[0, 2])
+    push.reset(seed=0)
+    named = push.reset(seed=[40, 41], env_idx=[2, 0])
+    assert push.episode_seeds.tolist() == [41, 1, 40, 3]
+    assert np.array_equal(named.poses, ascending.poses, equal_nan=True)
+    single = stock("PushCube-v1")
+    single.reset(seed=41)
+    assert torch.equal(push.env.obj.pose.p[0], single.obj.pose.p[0])
+    # Its first joints come from numpy's generator, of which ManiSkill keeps one for the whole batch.
+    assert torch.equal(push.env.agent.robot.qpos[0], single.agent.robot.qpos[0])
+    single.close()
+
+
+class DrawsWhenAsked(PUSH_CUBE):
+    """Every look at it draws from all generators and counts."""
+
+    looks = 0
+
+    def evaluate(self) -> dict:
+        self.looks += 1
+        drawn = torch.rand(self.num_envs) + float(np.random.rand() + random.random())
+        drawn = drawn + torch.tensor(self._batched_episode_rng.normal(), dtype=torch.float32)
+        return {**super().evaluate(), "drawn": drawn, "looks": torch.full((self.num_envs,), self.looks)}
+
+
+def test_judging_the_present_moment_leaves_nothing_behind() -> None:
+    env = TaskEnv(batched(DrawsWhenAsked, 3), 50)
+    env.reset(seed=0)
+    env.step(np.zeros((3, 8), np.float32))
+    first, again = env.rescore(), env.rescore(np.zeros((3, 8), np.float32))
+    assert not first.reward.any() and first.action is None and again.reward.all()
+    for name in ("drawn", "looks"):
+        assert np.array_equal(first.evaluate[name], again.evaluate[name]), name
+    assert len({*first.evaluate["drawn"].tolist()}) == 3
+    assert np.array_equal(env.step(np.zeros((3, 8), np.float32)).evaluate["drawn"], first.evaluate["drawn"])
+    env.close()
+
+
+class TellsOfEach(PUSH_CUBE):
+    """Env 1 succeeds and env 2 fails from the start; of env 0 one part of the observation is lost."""
+
+    def evaluate(self) -> dict:
+        numbers = torch.arange(self.num_envs)
+        return {"success": numbers == 1, "fail": numbers == 2}
+
+    def _get_obs_extra(self, info: dict) -> dict:
+        lost = torch.zeros(self.num_envs, 2)
+        lost[0, 1] = torch.nan
+        return {"lost": lost, "sound": torch.zeros(self.num_envs), "number": torch.zeros(self.num_envs, 1)}
+
+
+@pytest.mark.parametrize("obs_mode", ["state", "state_dict"])
+def test_what_a_task_says_of_each_env_is_told_of_that_env(obs_mode: str) -> None:
+    env = TaskEnv(batched(TellsOfEach, 4, obs_mode=obs_mode), 50)
+    for step in (env.reset(seed=0), env.step(np.zeros((4, 8), np.float32)), env.rescore()):
+        assert step.terminated.tolist() == [False, True, True, False]
+        assert step.sound_obs is not None and step.sound_obs.tolist() == [False, True, True, True]
+        assert not step.truncated.any()
+    env.close()
+
+
+def test_a_scene_that_a_reset_builds_anew_is_the_one_that_is_read_and_acted_on() -> None:
+    env = opened("PushCube-v1", 2, control_mode="pd_joint_pos")
+    env.reset(seed=0)
+    old, scene = env.parts, env.env.scene
+    step = env.reset(seed=1, options={"reconfigure": True})
+    assert env.env.scene is not scene
+    assert env.parts is not old and env.parts[0].controller is env.env.agent.controller.controllers["arm"]
+    cube = scene_index(env.env).names.index("cube")
+    assert np.array_equal(step.poses[:, cube, :3], env.env.obj.pose.p.numpy())
+    start = env.env.agent.robot.qpos.clone()
+    env.step(actions.hold_action(env.parts, 2))
+    assert (env.env.agent.robot.qpos - start).abs().max() < 0.02
+    env.close()
+
+
+def test_a_seed_is_kept_to_where_resets_without_one_draw_their_own() -> None:
+    env = opened("PushCube-v1", 3, enhanced_determinism=True)
+    env.reset(seed=0)
+    env.reset(seed=[40, 41], env_idx=[2, 1])
+    assert env.episode_seeds.tolist() == [0, 41, 40]
+    single = stock("PushCube-v1", enhanced_determinism=True)
+    single.reset(seed=41)
+    assert torch.equal(env.env.obj.pose.p[1], single.obj.pose.p[0])
+    before = env.episode_seeds.tolist()
+    env.reset(env_idx=[2])
+    assert env.episode_seeds[:2].tolist() == before[:2] and env.episode_seeds[2] != before[2]
+    single.close()
+    env.close()
+
+
+# --- actions ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "control_mode",
+    ["pd_joint_delta_pos", "pd_joint_pos", "pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_vel"],
+)
+def test_holding_still_holds_still(control_mode: str) -> None:
+    env = opened("PickCube-v1", 2, control_mode=control_mode)
+    env.reset(seed=0)
+    robot = env.env.agent.robot
+    start = robot.get_qpos().clone()
+    start[:, 7:] = torch.tensor([[0.02], [0.035]])  # a hand that is half open, in each env otherwise
+    robot.set_qpos(start)
+    env.env.scene._gpu_apply_all()
+    env.env.scene.px.gpu_update_articulation_kinematics()
+    env.env.scene._gpu_fetch_all()
+    for _ in range(10):
+        env.step(actions.hold_action(env.parts, 2))
+    moved = (robot.get_qpos() - start).abs()
+    assert moved[:, :7].max() < 0.02 and ("delta" in control_mode or moved[:, 7:].max() < 0.005), moved
+    env.close()
+
+
+def test_the_action_of_two_robots_is_one_flat_vector_and_back() -> None:
+    env = opened("TwoRobotPickCube-v1", 2)
+    low, _ = actions.bounds(env.parts)
+    assert len(low) == 16
+    flat = actions.random_action(env.parts, 2, np.random.default_rng(0))
+    robots = actions.to_env_action(env.env, env.parts, flat)
+    assert set(robots) == set(env.env.single_action_space.spaces)
+    assert np.array_equal(actions.to_flat_action(env.env, env.parts, robots), flat)
+    env.reset(seed=0)
+    assert np.array_equal(env.step(flat).action, flat)
+    env.close()
+
+
+@pytest.mark.parametrize("given", [np.zeros(8), np.zeros((N, 8)), torch.zeros(N, 8)])
+def test_a_policys_action_may_be_one_for_all_or_one_each(push: TaskEnv, given: object) -> None:
+    assert actions.to_flat_action(push.env, push.parts, given).shape == (N, 8)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((N, 7)), np.zeros((2, 8)), np.full((N, 8), np.nan), 3.0])
+def test_a_policys_action_that_does_not_fit_is_refused(push: TaskEnv, wrong: object) -> None:
+    with pytest.raises(ValueError):
+        actions.to_flat_action(push.env, push.parts, wrong)
+
+
+# --- making ----------------------------------------------------------------------------------------
+
+
+def test_the_reward_is_the_richest_that_the_class_implements() -> None:
+    class NoReward(BaseEnv):
+        pass
+
+    class DenseOnly(BaseEnv):
+        def compute_dense_reward(self, obs: object, action: object, info: dict) -> torch.Tensor:
+            return torch.zeros(self.num_envs)
+
+    assert default_reward_mode(NoReward) == "sparse"
+    assert default_reward_mode(DenseOnly) == "dense"
+    assert default_reward_mode(PUSH_CUBE) == "normalized_dense"
+
+
+def test_a_gpu_is_simulated_on_only_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test of GPU simulation has passed anywhere: whoever takes it is to know."""
+    monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: None)
+    taken = {wanted: choose_backend(wanted, render=False).simulation for wanted in get_args(backends.Backend)}
+    assert taken == {"auto": "cpu", "cpu": "cpu", "gpu": "gpu"}
+    told = backends.unused_gpu_text("auto")
+    assert told is not None and "--backend gpu" in told and "passed its tests on no machine" in told
+    assert backends.unused_gpu_text("cpu") is backends.unused_gpu_text("gpu") is None
+    monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: "there is none")
+    assert backends.unused_gpu_text("auto") is None
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        EnvOptions(2, "cpu", render=False),
+        EnvOptions(2, "cpu", render=False, kwargs={"render_backend": "cpu"}),
+        EnvOptions(2, "cpu", kwargs={"render_backend": "none"}),
+        EnvOptions(2, "cpu", kwargs={"render_backend": None}),
+    ],
+)
+def test_without_pictures_there_is_no_render_system(options: EnvOptions) -> None:
+    env = make_env(Bare, options)
+    assert env.backend.render_backend == "none"
+    for scene in env.scene.sub_scenes:
+        with pytest.raises(RuntimeError, match="no system with name .render."):
+            _ = scene.render_system
+    env.close()
+
+
+class OnlyDense(Bare):
+    SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "none")
+
+    def __init__(self, *args: Any, calm: int = 0, **kwargs: Any) -> None:
+        self.calm = calm
+        super().__init__(*args, **kwargs)
+
+    def compute_dense_reward(self, obs: Any, action: Any, info: dict) -> torch.Tensor:
+        return torch.ones(self.num_envs)
+
+
+def test_what_is_named_goes_before_what_a_task_is_registered_with_and_that_before_its_reward() -> None:
+    def made(registered: dict | None, **named: object) -> Any:
+        env = make_env(OnlyDense, EnvOptions(2, "cpu", render=False, kwargs=named), default_kwargs=registered)
+        env.close()
+        return env
+
+    assert (made(None).reward_mode, made(None).calm) == ("dense", 0)
+    assert (made({"calm": 1}).reward_mode, made({"calm": 1}).calm) == ("dense", 1)
+    both = made({"calm": 1, "reward_mode": "none", "num_envs": 5}, calm=2)
+    assert (both.reward_mode, both.calm, both.num_envs) == ("none", 2, 2)

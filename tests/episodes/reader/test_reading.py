@@ -1,0 +1,225 @@
+"""Recordings of others are read in a process that may do little else, and whatever ends it is a sentence."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from tests.drive.waiting import until
+from tests.episodes.library_files import describe
+from workbench.episodes.reader import reading
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.reader.scan import scan_folder
+from workbench.episodes.row import Facts, Source, UnreadableRecording
+from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.confinement import landlock_version
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+
+def rows(folder: Path) -> dict[str, Facts]:
+    read = reading.read_rows(folder, scan_folder(folder).found.values())
+    return {found.key: entries[0][0] for found, entries in read if entries}
+
+
+def slow_json(path: Path) -> None:
+    """That takes its reader about a second."""
+    path.write_text("[" + "[0,1,2,3,4,5,6,7,8,9]," * 1_500_000 + "0]")
+
+
+def reader_of(folder: Path, episodes: bool) -> int:
+    return reading._readers[folder, episodes]._pid
+
+
+def test_what_takes_too_long_is_given_up_and_the_others_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in "acd":
+        describe(tmp_path, name)
+    rows(tmp_path)
+    slow_json(tmp_path / "b.json")
+    monkeypatch.setattr(reading, "ROW_SECONDS", 0.2)
+    first = reader_of(tmp_path, episodes=False)
+    found = rows(tmp_path)
+    assert sorted(key for key, facts in found.items() if facts.problem is None) == ["a", "c", "d"]
+    assert (
+        found["b"].problem
+        == "b (.json) takes longer to read than 0 s, and is read again when it is opened or changes."
+    )
+    assert not psutil.pid_exists(first)
+    (tmp_path / "b.json").unlink()
+    assert sorted(rows(tmp_path)) == ["a", "c", "d"]
+
+
+@pytest.mark.slow
+def test_reading_that_is_not_needed_any_more_is_given_up(tmp_path: Path) -> None:
+    whole = describe(tmp_path, "a")
+    slow_json(tmp_path / "b.json")
+    began = time.monotonic()
+    with pytest.raises(UnreadableRecording, match="b"):
+        reading.read_recording(Source(tmp_path / "b.json"), stopped=lambda: time.monotonic() - began > 0.3)
+    assert time.monotonic() - began < reading.OPEN_SECONDS / 2
+    assert rows(tmp_path)["a"].problem is None and whole.exists()
+
+
+def test_a_reader_that_crashes_is_a_row_and_another_one_reads_on(tmp_path: Path) -> None:
+    for name in "acd":
+        describe(tmp_path, name)
+    rows(tmp_path)
+    slow_json(tmp_path / "b.json")
+    ended = threading.Event()
+
+    def crash() -> None:
+        seen: list[int] = []
+        # The first is forgiven: it could have been anybody.
+        while len(seen) < 2 and not ended.wait(0.05):
+            victim = reader_of(tmp_path, episodes=False)
+            if victim not in seen and psutil.Process(victim).cpu_times().user > 0.1:
+                os.kill(victim, signal.SIGSEGV)
+                seen.append(victim)
+
+    thread = threading.Thread(target=crash)
+    thread.start()
+    found = rows(tmp_path)
+    ended.set()
+    thread.join()
+    assert sorted(key for key, facts in found.items() if facts.problem is None) == ["a", "c", "d"]
+    assert found["b"].problem == (
+        "b (.json) ended the process that reads recordings (it was killed by SIGSEGV), and is read again when it is opened or changes."
+    )
+
+
+def test_an_episode_is_what_reading_it_here_gives(recorded: Any, tmp_path: Path) -> None:
+    path = recorded.episode.write(tmp_path).json
+    here, there = read_episode(path), reading.read_recording(Source(path))
+    assert there.info == here.info and there.segmentation == here.segmentation
+    assert there.action_names == here.action_names and there.broken_files == here.broken_files == ()
+    for name in ("poses", "action", "reward", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(there, name), getattr(here, name), strict=True)
+    for name in ("evaluate", "env_states", "obs"):
+        ours, theirs = getattr(here, name), getattr(there, name)
+        assert list(ours) == list(theirs)
+        for key in ours:
+            np.testing.assert_array_equal(theirs[key], ours[key], strict=True)
+    assert here.geometry is not None and there.geometry is not None
+    assert there.geometry.body_names == here.geometry.body_names
+    for theirs, ours in zip(there.geometry.visuals, here.geometry.visuals, strict=True):
+        assert theirs.name == ours.name
+        np.testing.assert_array_equal(theirs.mesh.faces, ours.mesh.faces)
+        np.testing.assert_array_equal(theirs.bodies, ours.bodies)
+    for theirs, ours in zip(there.cameras, here.cameras, strict=True):
+        assert theirs.info.key == ours.info.key
+        np.testing.assert_array_equal(theirs.pose, ours.pose)
+        for modality in ("rgb", "depth", "segmentation"):
+            seen, again = getattr(ours, modality), getattr(theirs, modality)
+            assert (seen is None) == (again is None)
+            if seen is not None:
+                assert len(again) == len(seen) and again.blob(1) == seen.blob(1)
+                np.testing.assert_array_equal(again[1], seen[1], strict=True)
+
+
+@pytest.mark.slow
+def test_pictures_go_on_where_the_reader_was_ended_and_where_the_file_is_gone(
+    recorded: Any, tmp_path: Path
+) -> None:
+    path = recorded.episode.write(tmp_path).json
+    (camera, *_) = [c for c in reading.read_recording(Source(path)).cameras if c.rgb is not None]
+    assert camera.rgb is not None
+    before = camera.rgb[0]
+    reader = psutil.Process(reader_of(tmp_path, episodes=True))
+    reader.kill()
+    until(lambda: not reader.is_running() or reader.status() == psutil.STATUS_ZOMBIE, "its end")
+    np.testing.assert_array_equal(camera.rgb[0], before)
+    for file in tmp_path.iterdir():
+        if file.is_file():
+            file.unlink()
+    np.testing.assert_array_equal(camera.rgb[0], before)
+
+
+@pytest.mark.slow
+def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
+    describe(tmp_path, "a")
+    program = (
+        "import sys, os, pathlib, time\n"
+        "from workbench.recording.reader import reading\n"
+        "from workbench.episodes.reader.scan import scan_folder\n"
+        "folder = pathlib.Path(sys.argv[1])\n"
+        "list(reading.read_rows(folder, scan_folder(folder).found.values()))\n"
+        "print('read', flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    process = subprocess.Popen(
+        python_command("-c", program, str(tmp_path)), env=child_environment(), stdout=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"read\n"
+    family = psutil.Process(process.pid).children(recursive=True)
+    assert family
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    _, alive = psutil.wait_procs(family, timeout=10)
+    assert not alive
+
+
+def test_an_episode_that_claims_more_memory_than_there_may_be_is_refused(
+    recorded: Any, tmp_path: Path
+) -> None:
+    path = recorded.episode.write(tmp_path).json
+    whole = json.loads(path.read_text()) | {"workbench_checksum": None}
+    for length, says in ((10**15, "steps"), (9_000_000, "numbers"), (-5, "steps"), ("many", "broken")):
+        whole["workbench"]["length"] = length
+        path.write_text(json.dumps(whole))
+        with pytest.raises(UnreadableRecording, match=says):
+            reading.read_recording(Source(path))
+    assert psutil.Process().memory_info().rss < 3 << 30
+
+
+@pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
+def test_a_reader_can_reach_its_folder_and_nothing_else(tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    (folder / "inside").write_text("inside")
+    (tmp_path / "outside").write_text("outside")
+    program = """
+import os, pathlib, socket, subprocess, sys
+from workbench.machine.processes.confinement import confine
+folder = pathlib.Path(sys.argv[1])
+server = socket.socket(); server.bind(("127.0.0.1", 0)); server.listen()
+confine([folder], 1 << 30)
+def tried(do):
+    try:
+        do()
+        return "did"
+    except OSError as error:
+        return os.strerror(error.errno)
+    except MemoryError:
+        return "no memory"
+print(tried((folder / "inside").read_text), tried((folder.parent / "outside").read_text), sep="|", end="|")
+print(tried(lambda: (folder / "new").write_text("x")), tried(lambda: (folder / "inside").unlink()), sep="|", end="|")
+print(tried(lambda: list(pathlib.Path.home().iterdir())), sep="|", end="|")
+print(tried(lambda: socket.create_connection(server.getsockname())), sep="|", end="|")
+print(tried(lambda: os.kill(os.getppid(), 0)), tried(lambda: bytearray(2 << 30)), sep="|", end="|")
+print(tried(lambda: subprocess.run(["/bin/true"], check=True)), tried(lambda: open(f"/proc/{os.getppid()}/environ").read()), sep="|")
+"""
+    said = subprocess.run(
+        python_command("-c", program, str(folder)),
+        env=child_environment(OPENBLAS_NUM_THREADS="1"),
+        capture_output=True,
+        text=True,
+    )
+    no = "Permission denied"
+    assert said.stdout.strip().split("|") == [
+        "did", no, no, no, no, no, "Operation not permitted", "no memory", "did", no
+    ], said.stderr  # fmt: skip
+    assert (folder / "inside").read_text() == "inside"

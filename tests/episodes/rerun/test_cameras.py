@@ -1,0 +1,60 @@
+"""The cameras of a recording see what ManiSkill's own matrices say that they see."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tests.episodes.read_rrd import Column, read_rrd
+
+
+@pytest.fixture(scope="module")
+def entities(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Column]]:
+    return read_rrd(recorded.episode.write(tmp_path_factory.mktemp("recordings")).rrd)
+
+
+def at(column: Column, state: int) -> NDArray:
+    """The value that the viewer shows at `state`: the latest row up to it."""
+    if column.steps is None:
+        return column.values[0][0]
+    return column.values[np.searchsorted(column.steps, state, side="right") - 1][0]
+
+
+@pytest.mark.parametrize("camera", ["base_camera", "hand_camera"])
+def test_a_point_falls_on_the_pixel_where_opencv_puts_it(
+    recorded: Any, entities: dict[str, dict[str, Column]], camera: str
+) -> None:
+    read = entities[f"/world/cameras/{camera}"]
+    names = recorded.episode.geometry.body_names
+    points = recorded.episode.poses[:, [names.index("cube"), names.index("goal_site")], :3]
+    seen = 0
+    for state in range(len(points)):
+        rotation = Rotation.from_quat(at(read["Transform3D:quaternion"], state))
+        in_camera = rotation.inv().apply(points[state] - at(read["Transform3D:translation"], state))
+        # Rerun keeps matrices by columns.
+        pixel = in_camera @ at(read["Pinhole:image_from_camera"], state).reshape(3, 3)
+        extrinsic, intrinsic = recorded.extrinsic_cv[camera][state], recorded.intrinsic_cv[camera][state]
+        expected = (points[state] @ extrinsic[:, :3].T + extrinsic[:, 3]) @ intrinsic.T
+        np.testing.assert_allclose(pixel, expected, atol=2e-4)
+        seen += int((expected[:, 2] > 0).sum())
+    assert seen > 0, "both points were behind the camera all the time"
+
+
+def test_the_pixel_of_the_cube_shows_the_cube(recorded: Any, entities: dict[str, dict[str, Column]]) -> None:
+    episode = recorded.episode
+    read = entities["/world/cameras/base_camera"]
+    cube = episode.poses[0, episode.geometry.body_names.index("cube"), :3]
+    rotation = Rotation.from_quat(at(read["Transform3D:quaternion"], 0))
+    pixel = rotation.inv().apply(cube - at(read["Transform3D:translation"], 0)) @ at(
+        read["Pinhole:image_from_camera"], 0
+    ).reshape(3, 3)
+    column, row = (pixel[:2] / pixel[2]).astype(int)
+    shown = episode.cameras[0].segmentation[0, row, column]
+    assert episode.segmentation[shown] == "cube"
+    assert at(read["Pinhole:resolution"], 0).tolist() == [96, 96]
+    # RDF, right down forward, in rerun's numbering of directions.
+    assert at(read["Pinhole:camera_xyz"], 0).tolist() == [3, 2, 5]

@@ -1,0 +1,113 @@
+"""Pictures of a recording are read when they are looked at."""
+
+from __future__ import annotations
+
+import gc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.episodes import made, write
+from tests.episodes.refused_calls import descriptors
+from workbench.episodes.episode import CameraTrack, Episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.rerun import layout, read
+from workbench.episodes.row import UnreadableRecording
+
+
+def camera_of(episode: Episode, rgb: bool = True) -> CameraTrack:
+    (track,) = episode.cameras
+    assert (track.rgb is not None) == rgb and track.segmentation is not None
+    return track
+
+
+def brightness(episode: Episode, index: int) -> int:
+    track = camera_of(episode)
+    assert track.rgb is not None
+    return int(np.rint(track.rgb[index].mean()))
+
+
+def test_pictures_of_a_file_that_is_damaged_while_it_is_open_are_an_error(tmp_path: Path) -> None:
+    rrd = write(tmp_path, made(9)).with_suffix(".rrd")
+    intact, damaged = read_episode(rrd), read_episode(rrd)
+    assert brightness(intact, 4) == pytest.approx(80, abs=3)
+    with rrd.open("r+b") as file:
+        file.write(bytes(rrd.stat().st_size))
+    assert brightness(intact, 5) == pytest.approx(100, abs=3), "its neighbours came with it"
+    with pytest.raises(OSError, match="damaged"):
+        brightness(damaged, 4)
+
+
+@pytest.mark.parametrize("part", np.linspace(0.3, 0.9, 7))
+def test_of_an_rrd_that_is_damaged_somewhere_the_rest_is_read_or_it_is_refused(
+    tmp_path: Path, part: float
+) -> None:
+    rrd = tmp_path / "alone.rrd"
+    write(tmp_path, made(9)).with_suffix(".rrd").rename(rrd)
+    with rrd.open("r+b") as file:
+        file.seek(int(part * rrd.stat().st_size))
+        file.write(bytes(500))
+    try:
+        episode = read_episode(rrd)
+    except UnreadableRecording as error:
+        assert rrd.name in str(error)
+        return
+    assert episode.reward.tolist() == list(range(1, 10))
+    (camera,) = episode.cameras
+    lost = {name for name in ("rgb", "depth", "segmentation") if getattr(camera, name) is None}
+    told = " ".join(broken.sentence for broken in episode.broken_files)
+    assert lost == {name for name in ("rgb", "depth", "segmentation") if f"base_camera/{name}" in told}
+
+
+def test_damaged_pictures_do_not_cost_the_other_cameras(tmp_path: Path) -> None:
+    rrd = tmp_path / "alone.rrd"
+    write(tmp_path, made(9)).with_suffix(".rrd").rename(rrd)
+    content = rrd.read_bytes()
+    place = content.index(b"\xff\xd8\xff\xe0")  # of the first JPEG
+    rrd.write_bytes(content[:place] + bytes(64) + content[place + 64 :])
+    episode = read_episode(rrd)
+    track = camera_of(episode, rgb=False)
+    assert track.rgb is None and track.depth is not None
+    assert track.depth[3] == pytest.approx(0.3)
+    (broken,) = episode.broken_files
+    assert broken.sentence == "alone.rrd was changed: pictures are missing (base_camera/rgb)."
+
+
+def test_pictures_of_a_deleted_recording_are_read_while_it_is_open(tmp_path: Path) -> None:
+    rrd = write(tmp_path, made(9)).with_suffix(".rrd")
+    episode = read_episode(rrd)
+    rrd.unlink()
+    assert brightness(episode, 4) == pytest.approx(80, abs=3)
+
+
+def test_pictures_of_several_chunks_are_read_in_any_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(layout, "_MOST_PICTURES", 3)
+    monkeypatch.setattr(read, "KEPT_BYTES", 0)
+    episode = read_episode(write(tmp_path, made(10)).with_suffix(".rrd"))
+    assert camera_of(episode).frame.tolist() == list(range(11))
+    order = [10, 0, 5, 3, 9, 2, 2, 7]
+    assert [brightness(episode, i) for i in order] == pytest.approx([20 * i for i in order], abs=3)
+    segmentation = camera_of(episode).segmentation
+    assert segmentation is not None
+    assert all((segmentation[i] == 1).all() for i in order)
+
+
+def test_a_picture_here_and_there_is_of_the_state_that_it_was_taken_at(tmp_path: Path) -> None:
+    episode = read_episode(write(tmp_path, made(10), every=3).with_suffix(".rrd"))
+    assert camera_of(episode).frame.tolist() == [0, 3, 6, 9]
+    assert [brightness(episode, i) for i in range(4)] == pytest.approx([0, 60, 120, 180], abs=3)
+
+
+def test_its_file_is_closed_when_a_recording_is_let_go_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rrd = write(tmp_path, made(9)).with_suffix(".rrd")
+    monkeypatch.setattr(read, "_chunk_cache", read._ChunkCache())
+    episode = read_episode(rrd)
+    assert str(rrd) in descriptors()
+    del episode
+    gc.collect()
+    assert str(rrd) not in descriptors()

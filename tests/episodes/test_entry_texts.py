@@ -1,0 +1,135 @@
+"""Entries of ``evaluate`` that are no numbers: written where they change, bounded, recovered, and read back."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.drive.entries import ENTRIES
+from tests.drive.episodes import Made, journal_of
+from tests.drive.rows import append
+from tests.episodes.read_rrd import read_rrd
+from tests.episodes.verify_rrd import verify_rrd
+from workbench.envs.evaluate_entries import split_entries
+from workbench.envs.step_result import OtherEntry
+from workbench.episodes.columns import CUT_MESSAGE, MOST_BYTES, TextEntry, TextWriter, text_tracks
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.writing.episode_writer import EpisodeFiles
+from workbench.episodes.writing.finish import recover
+
+Maker = Callable[..., Made]
+Others = Mapping[str, OtherEntry]
+
+
+def said(text: str) -> OtherEntry:
+    return OtherEntry("str", (text,))
+
+
+def write(made: Made, folder: Path, others: list[Others], finish: bool = True) -> EpisodeFiles | None:
+    """An episode whose states have these `others`."""
+    writer = made.writer(folder)
+    for row, entries in zip(made.rows(), others, strict=True):
+        append(writer, dataclasses.replace(row, others=entries))
+    if finish:
+        return writer.finish()
+    journal_of(writer).sync()
+    writer.close()
+    return None
+
+
+def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
+    writer = TextWriter()
+    lines = [
+        line
+        for state in range(5000)
+        for line in writer.changes(state, {"clock": said(f"{state:050}"), "a": said("x")})
+    ]
+    assert sum(len(line[1]) for line in lines) < MOST_BYTES + 400
+    tracks = text_tracks(lines)
+    last_state, last = tracks["clock"][-1]
+    assert last is not None and last.text == CUT_MESSAGE and not last.whole and 100 < last_state < 5000
+    assert tracks["a"] == ((0, TextEntry("str", "x", False, True)),)
+
+
+def test_numbers_texts_and_both_come_back(child_process: None, make_episode: Maker, tmp_path: Path) -> None:
+    number = OtherEntry("float", numbers=np.array(0.5))
+    states: list[Others] = [
+        {"best": OtherEntry("None", ("None",)), "goal": OtherEntry("list", numbers=np.arange(2))},
+        {"best": number, "goal": OtherEntry("list", numbers=np.arange(2))},
+        {"best": number, "goal": OtherEntry("list", numbers=np.arange(2)), "map": OtherEntry("T", ("9",), whole=False)},
+        {"goal": OtherEntry("list", numbers=np.arange(2)), "word": OtherEntry("list", ("b",), per_env=True)},
+    ]  # fmt: skip
+    files = write(make_episode(3), tmp_path, states)
+    assert files is not None
+    verify_rrd(files.rrd)
+    episode = read_episode(files.json)
+    np.testing.assert_array_equal(episode.batch["best"], [np.nan, 0.5, 0.5, np.nan])
+    np.testing.assert_array_equal(episode.batch["goal"], [[0, 1]] * 4)
+    assert episode.batch["goal"].dtype.kind == "i"
+    assert episode.other_entries_at(0)["best"] == OtherEntry("None", ("None",))
+    assert episode.other_entries_at(1)["best"].numbers == 0.5
+    assert episode.other_entries_at(2)["map"] == OtherEntry("T", ("9",), whole=False)
+    assert episode.other_entries_at(3)["word"] == OtherEntry("list", ("b",), per_env=True)
+    assert "map" not in episode.other_entries_at(3) and "word" not in episode.other_entries_at(2)
+    entities = read_rrd(files.rrd)
+    assert {"/batch/best", "/batch/goal"} <= set(entities)
+    log = entities["/logs/evaluate"]["TextLog:text"]
+    assert [value[0] for value in log.values] == [
+        "best: None",
+        "best is not returned any more",
+        "map: 9",
+        "map is not returned any more",
+        "word: b",
+    ]
+
+
+def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Path) -> None:
+    write(make_episode(3), tmp_path, [{"phase": said(f"{state // 2}")} for state in range(4)], finish=False)
+    (files,) = recover(tmp_path)
+    episode = read_episode(files.json)
+    assert episode.info.recovered
+    assert [episode.other_entries_at(state)["phase"].texts for state in range(4)] == [
+        ("0",),
+        ("0",),
+        ("1",),
+        ("1",),
+    ]
+
+
+@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(states=st.lists(ENTRIES, min_size=3, max_size=3), num_envs=st.integers(1, 3))
+def test_whatever_evaluate_returns_is_recorded(
+    make_episode: Maker, states: list[dict[Any, Any]], num_envs: int
+) -> None:
+    env = num_envs - 1
+    halves = [split_entries(entries, num_envs) for entries in states]
+    made = make_episode(2)
+    with tempfile.TemporaryDirectory() as folder:
+        writer = made.writer(Path(folder))
+        for row, (columns, others) in zip(made.rows(), halves, strict=True):
+            append(
+                writer,
+                dataclasses.replace(
+                    row,
+                    evaluate={name: values[env] for name, values in columns.items()},
+                    others={name: entry.of_env(env) for name, entry in others.items()},
+                ),
+            )
+        files = writer.finish()
+        episode = read_episode(files.json)
+    for state, (columns, others) in enumerate(halves):
+        there = episode.other_entries_at(state)
+        assert columns.keys() <= episode.evaluate.keys() and others.keys() <= there.keys()
+        for name, entry in others.items():
+            if entry.numbers is None:
+                assert there[name].texts == entry.of_env(env).texts and there[name].what == entry.what
+            else:
+                kept = np.asarray(episode.batch[name][state]).reshape(-1)[: entry.numbers.size]
+                np.testing.assert_array_equal(kept, entry.numbers.reshape(-1).astype(kept.dtype))

@@ -1,0 +1,69 @@
+"""A film, a sheet or a page that is written is there whole or not at all, and takes no other file's place."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.episodes.refused_calls import descriptors, left_open, refused
+from workbench.machine.files import new_file
+
+
+def write(path: Path, content: bytes = b"whole") -> None:
+    with new_file(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def there(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("then", [0, errno.EROFS])
+@pytest.mark.parametrize("links", [True, False])
+def test_whatever_call_fails_it_is_whole_or_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool, then: int
+) -> None:
+    if not links:
+
+        def refuse(*_: object) -> None:
+            raise OSError(errno.EPERM, "Operation not permitted")
+
+        monkeypatch.setattr(os, "link", refuse)
+    with refused() as calls:
+        write(tmp_path / "0" / "a.mp4")
+    assert {call.split()[0] for call in calls} >= {"mkdir", "fsync", "link" if links else "replace"}
+    for at, call in enumerate(calls, 1):
+        path, before = tmp_path / str(at) / "a.mp4", descriptors()
+        told = ""
+        with refused(at, then=then):
+            try:
+                write(path)
+            except OSError as error:
+                told = str(error.strerror)
+        assert left_open(before) == [], call
+        if path.exists() and (links or not then or path.stat().st_size):
+            assert path.read_bytes() == b"whole" and not told, call
+        else:
+            assert told.startswith(f"Cannot write {path}: "), (call, told)
+        left = list(path.parent.glob("*")) if path.parent.exists() else []
+        assert then or call.startswith("unlink") or set(left) <= {path}, call
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_file_that_came_meanwhile_is_not_written_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
+) -> None:
+    if not links:
+        monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError(errno.EPERM, "no links")))
+    path = tmp_path / "a.mp4"
+    with pytest.raises(FileExistsError, match="is not written over"):
+        with new_file(path) as temporary:
+            temporary.write_bytes(b"ours")
+            path.write_bytes(b"of another")
+    assert there(tmp_path) == {"a.mp4": b"of another"}
+    with pytest.raises(FileExistsError, match="is not written over"):
+        write(path)
+    assert there(tmp_path) == {"a.mp4": b"of another"}

@@ -1,0 +1,157 @@
+"""Recorded episodes lived through again in running envs, measured against what was recorded."""
+
+# pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.live.recorded_runs import Recorded, opened, reaching, record
+from workbench.episodes.recorded_state import read_states, state_distance
+from workbench.episodes.replay import replay_to
+from workbench.task.open import OpenedTask
+from workbench.task.problem import TaskError
+
+pytestmark = pytest.mark.thorough
+
+N, STEPS = 3, 44
+TASKS = Path(__file__).parents[2] / "tasks"
+
+
+@pytest.fixture(scope="module", params=["PickCube-v1", str(TASKS / "push_cube.py")], ids=["pick", "push"])
+def task(request: pytest.FixtureRequest) -> Iterator[OpenedTask]:
+    task = opened(request.param, N)
+    yield task
+    task.env.close()
+
+
+@pytest.fixture(scope="module")
+def recorded(task: OpenedTask) -> Recorded:
+    return record(task, STEPS, [31, 7, 5], reaching(STEPS, N))
+
+
+def goes_on_as_recorded(task: OpenedTask, recorded: Recorded, env: int, state: int) -> None:
+    """The same states and rewards under the same actions, to the last bit."""
+    for t in range(state, STEPS):
+        step = task.env.step(recorded.steps[t + 1].action)
+        now = read_states(task.env.env)
+        for name, rows in now.items():
+            assert np.array_equal(rows[env], recorded.states[t + 1][name][env]), (name, t)
+        assert step.reward[env] == recorded.steps[t + 1].reward[env]
+
+
+@pytest.mark.parametrize("state", [0, 1, 17, STEPS - 3])
+def test_what_follows_a_state_that_was_gone_into_is_what_was_recorded_to_the_last_bit(
+    task: OpenedTask, recorded: Recorded, state: int
+) -> None:
+    run, env = recorded.run(1), 1
+    step, replay_result = replay_to(task, run, state, [env])
+    assert (replay_result.way, replay_result.metres, replay_result.radians) == ("re-simulated", 0, 0)
+    assert replay_result.missed == {} and not replay_result.start_differs
+    assert step.elapsed_steps[env] == state and task.env.episode_seeds[env] == 7
+    for name, values in recorded.steps[state].evaluate.items():
+        # The terms of a reward are those of an action, and none was made now.
+        assert name.startswith("reward_terms/") or np.array_equal(step.evaluate[name][env], values[env]), name
+    goes_on_as_recorded(task, recorded, env, state)
+
+
+def test_the_envs_beside_it_go_on_as_if_nothing_had_happened(task: OpenedTask, recorded: Recorded) -> None:
+    def run(steps: int, disturb: bool) -> list[dict[str, np.ndarray]]:
+        rng, states = np.random.default_rng(3), []
+        record(task, 25, [1, 2, 3], reaching(25, N))
+        if disturb:
+            replay_to(task, recorded.run(1), 20, [1])
+        for _ in range(steps):
+            task.env.step(rng.uniform(-0.4, 0.4, (N, 8)).astype(np.float32))
+            states.append(read_states(task.env.env))
+        return states
+
+    plain, disturbed = run(12, False), run(12, True)
+    for a, b in zip(plain, disturbed, strict=True):
+        for name in a:
+            assert np.array_equal(a[name][[0, 2]], b[name][[0, 2]]), name
+    assert not np.array_equal(plain[0]["articulations/panda"][1], disturbed[0]["articulations/panda"][1])
+
+
+def test_all_envs_can_stand_in_one_state_and_go_on_alike(task: OpenedTask, recorded: Recorded) -> None:
+    _, replay_result = replay_to(task, recorded.run(2), 30, range(N))
+    assert replay_result.metres == 0
+    for t in range(30, STEPS):
+        action = np.broadcast_to(recorded.steps[t + 1].action[2], (N, 8)).astype(np.float32)
+        task.env.step(action)
+    last = read_states(task.env.env)
+    for name, rows in last.items():
+        for env in range(N):
+            assert np.array_equal(rows[env], recorded.states[STEPS][name][2])
+
+
+def test_an_episode_of_a_reset_of_all_envs_begins_where_it_began(task: OpenedTask) -> None:
+    # Its seed alone does not say: numbers were drawn for all three at once.
+    recorded = record(task, STEPS, None, reaching(STEPS, N))
+    _, replay_result = replay_to(task, recorded.run(2), 20, [0])
+    assert replay_result.start_differs and replay_result.metres == 0 and replay_result.way == "re-simulated"
+
+
+def test_states_that_part_from_the_record_are_put_back_on_it(task: OpenedTask, recorded: Recorded) -> None:
+    run = recorded.run(1)
+    states = {name: rows.copy() for name, rows in run.env_states.items()}
+    states["actors/cube"][12:, 0] += 0.05  # as if somebody had pushed it
+    step, replay_result = replay_to(task, replace(run, env_states=states), 20, [1])
+    assert replay_result.way == "corrected" and 1 <= replay_result.corrected <= 8
+    assert replay_result.metres is not None and replay_result.metres < 1e-4
+    now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
+    assert state_distance(now, {n: rows[20] for n, rows in states.items()})[0] < 1e-4
+
+
+def test_actions_that_do_not_fit_are_said_and_the_state_is_put_there(
+    task: OpenedTask, recorded: Recorded
+) -> None:
+    run = recorded.run(1)
+    step, replay_result = replay_to(task, replace(run, action=run.action[:, :5]), 25, [1])
+    assert replay_result.way == "put there" and "5 dimensions" in replay_result.missed["the way there"]
+    assert replay_result.metres is not None and replay_result.metres < 1e-6
+    assert step.elapsed_steps[1] == 25
+    robot = task.env.env.agent.robot
+    targets = task.env.env.scene.px.cuda_articulation_target_qpos.torch()[1]
+    assert np.allclose(targets[: robot.max_dof], robot.get_qpos()[1], atol=1e-6)
+    # It stays where it is, and does not run to where it stood before.
+    task.env.step(None)
+    now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
+    assert state_distance(now, run.state(25))[1] < 0.05
+
+
+def test_a_seed_begins_the_same_episode_in_every_env_of_a_batch(task: OpenedTask) -> None:
+    # The robot's first joints too, which ManiSkill draws from env 0's generator.
+    task.env.reset(seed=[4], env_idx=[0])
+    first = {name: rows[0].copy() for name, rows in read_states(task.env.env).items()}
+    task.env.step(np.zeros((N, 8), np.float32))
+    task.env.reset(seed=[4], env_idx=[2])
+    again = {name: rows[2] for name, rows in read_states(task.env.env).items()}
+    for name in first:
+        assert np.array_equal(first[name], again[name]), name
+
+
+def test_what_the_task_raises_on_the_way_is_its_own_line(tmp_path: Path) -> None:
+    text = (TASKS / "push_cube.py").read_text()
+    file = tmp_path / "push_cube.py"
+    line = "    def evaluate(self)"
+    assert line in text
+    file.write_text(text)
+    task = opened(str(file), 2)
+    run = record(task, 8, [3, 4]).run(0)
+    task.env.close()
+    head, rest = text.split(line, 1)
+    body = rest.split("\n", 1)
+    file.write_text(
+        f"{head}{line}{body[0]}\n        if (self.elapsed_steps > 3).any():\n            1 / 0\n{body[1]}"
+    )
+    task = opened(str(file), 2)
+    with pytest.raises(TaskError) as raised:
+        replay_to(task, run, 6, [0])
+    assert raised.value.problem.file == str(file) and "ZeroDivisionError" in raised.value.problem.message
+    task.env.close()

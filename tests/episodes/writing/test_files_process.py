@@ -1,0 +1,200 @@
+"""A process makes the same files as a thread; when it is killed nothing is lost and nothing is made twice."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import termios
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.episodes import appended, header_of, journal_of, made
+from tests.drive.waiting import until
+from tests.episodes.read_rrd import read_rrd
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.seal import InstallationSeal, made_here
+from workbench.episodes.writing.episode_writer import EpisodeWriter
+from workbench.episodes.writing.files_process import FilesProcess
+from workbench.episodes.writing.finish import make_files
+from workbench.episodes.writing.journal import claim
+from workbench.episodes.writing.publish import RecordingError
+from workbench.record.gather import EpisodeFinisher, GatheredEpisode
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+
+@pytest.fixture(scope="module")
+def process() -> Iterator[FilesProcess]:
+    """Not to be killed."""
+    process = started()
+    yield process
+    process.close()
+
+
+def started() -> FilesProcess:
+    process = FilesProcess()
+    until(lambda: process.is_ready, "the process has done its imports")
+    return process
+
+
+def pid_of(process: FilesProcess) -> int:
+    return process._process.pid
+
+
+def unread(process: FilesProcess) -> int:
+    """Bytes that it was sent and has not received."""
+    count = array("i", [0])
+    fcntl.ioctl(process._end, termios.TIOCOUTQ, count)
+    return count[0]
+
+
+def content(rrd: Path) -> dict[str, dict[str, object]]:
+    """All of it but rerun's random numbers."""
+    return {
+        entity: {
+            name: (plain(column.steps), list(map(plain, column.values))) for name, column in columns.items()
+        }
+        for entity, columns in read_rrd(rrd).items()
+    }
+
+
+def plain(value: object) -> object:
+    return (value.dtype.str, value.tobytes()) if isinstance(value, np.ndarray) else value
+
+
+def description(path: Path) -> object:
+    """All of it but what follows from those numbers."""
+    data = json.loads(path.read_text())
+    for name in ("files", "made_here"):
+        del data["workbench"][name]
+    del data["workbench_checksum"]
+    return data
+
+
+def files_in(folder: Path) -> list[str]:
+    return sorted(path.suffix for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("pictures", [False, True])
+def test_the_files_are_those_of_a_thread(tmp_path: Path, process: FilesProcess, pictures: bool) -> None:
+    episode = made(6, 4, env_kwargs={"sizes": (1, 2.5), "name": None}, reset_options={"k": [1]})
+    by_process = appended(tmp_path / "process", episode, pictures).finish(process)
+    by_thread = appended(tmp_path / "thread", episode, pictures).finish()
+    assert by_process.h5.name == by_thread.h5.name and by_process.rrd.parent == tmp_path / "process"
+    assert (by_process.solved_at, by_process.means) == (by_thread.solved_at, by_thread.means)
+    assert by_process.solved_at == 4
+    assert by_process.h5.read_bytes() == by_thread.h5.read_bytes()
+    assert content(by_process.rrd) == content(by_thread.rrd)
+    assert description(by_process.json) == description(by_thread.json)
+    assert {made_here(read_episode(files.json).info) for files in (by_process, by_thread)} == {
+        InstallationSeal.CONTENT
+    }
+    assert files_in(tmp_path / "process") == [".h5", ".json", ".rrd"]
+
+
+def test_what_cannot_be_written_is_said_as_on_a_thread(tmp_path: Path, process: FilesProcess) -> None:
+    said = []
+    for asked in (process, None):
+        folder = tmp_path / "here"
+        writer = appended(folder, made(3), pictures=False)
+        shutil.rmtree(folder)
+        with pytest.raises(RecordingError) as error:
+            writer.finish(asked)
+        writer.discard()
+        said.append(str(error.value))
+    assert said[0] == said[1] and "here" in said[0]
+    assert appended(tmp_path, made(3), pictures=False).finish(process).json.is_file()  # it goes on
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment_the_episode_is_made_once(tmp_path: Path) -> None:
+    for wait in (0, 0.02):
+        folder, process = tmp_path / str(wait), started()
+        writer = appended(folder, made(20), pictures=True)
+        pid = pid_of(process)
+        killer = subprocess.Popen(
+            [sys.executable, "-c", f"import os, time; input(); time.sleep({wait}); os.kill({pid}, 9)"],
+            stdin=subprocess.PIPE,
+        )
+        assert killer.stdin is not None
+        killer.stdin.write(b"\n")
+        killer.stdin.flush()
+        files = writer.finish(process)
+        killer.communicate()
+        assert read_episode(files.rrd).length == 20
+        assert files_in(folder) == [".h5", ".json", ".rrd"]
+        process.close()
+
+
+def test_killed_before_it_could_say_that_it_is_done_the_files_are_its(tmp_path: Path) -> None:
+    process = started()
+    writer = appended(tmp_path, made(3, 2), pictures=False)
+    journal_of(writer).finish()
+    before = make_files(journal_of(writer).path, header_of(journal_of(writer).path), tmp_path)
+    os.kill(pid_of(process), signal.SIGKILL)
+    assert writer.finish(process) == before
+    assert files_in(tmp_path) == [".h5", ".json", ".rrd"]
+    assert not process.is_ready
+
+
+def test_nobody_recovers_what_it_works_on(tmp_path: Path, process: FilesProcess) -> None:
+    """The writer's process may be killed meanwhile, which releases its own lock."""
+    writer = appended(tmp_path, made(3), pictures=False)
+    path = journal_of(writer).path
+    os.kill(pid_of(process), signal.SIGSTOP)
+    waiting = EpisodeFinisher()
+    future = waiting._pool.submit(writer.finish, process)
+    until(lambda: unread(process) > 0, "it is asked")
+    writer.close()
+    assert claim(path) is None
+    os.kill(pid_of(process), signal.SIGCONT)
+    assert future.result(30).json.is_file()
+    waiting.close()
+
+
+def test_where_no_process_can_be_started_the_thread_makes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", refused)
+    finisher = EpisodeFinisher(in_process=True)
+    future = finisher.finish(GatheredEpisode(written(tmp_path), env=0, seed=0))
+    finisher.close()
+    assert not isinstance(future.result(), str)
+
+
+def written(folder: Path) -> EpisodeWriter:
+    return appended(folder, made(3), pictures=False)
+
+
+@pytest.mark.slow
+def test_it_ends_with_the_program_that_started_it(tmp_path: Path) -> None:
+    program = (
+        "import os, time\n"
+        "from workbench.episodes.writing.files_process import FilesProcess\n"
+        "process = FilesProcess()\n"
+        "while not process.is_ready: time.sleep(0.01)\n"
+        "print(process._process.pid, flush=True)\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    pid = int(ended.stdout)
+    until(lambda: not Path(f"/proc/{pid}").exists() or "\nState:\tZ" in status_of(pid), "it has ended too")
+
+
+def status_of(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return "\nState:\tZ"

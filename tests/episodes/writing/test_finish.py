@@ -1,0 +1,93 @@
+"""The end of an episode: whatever call of the system fails, its files are there or what was recorded of it is."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.drive.episodes import Made
+from tests.drive.rows import append
+from tests.episodes.refused_calls import descriptors, refused
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.writing.episode_writer import EpisodeWriter
+from workbench.episodes.writing.finish import SUFFIXES, recover
+from workbench.episodes.writing.journal import FOLDER
+from workbench.episodes.writing.publish import RecordingError
+
+pytestmark = pytest.mark.thorough
+
+Maker = Callable[..., Made]
+
+
+def recorded(make_episode: Maker, folder: Path) -> EpisodeWriter:
+    episode = make_episode(2)
+    writer = episode.writer(folder)
+    for row in episode.rows():
+        append(writer, row)
+    return writer
+
+
+@pytest.mark.parametrize(
+    "again, then",
+    [
+        ("finish", 0),
+        pytest.param("recover", 0, marks=pytest.mark.slow),
+        pytest.param("recover", errno.EROFS, marks=pytest.mark.slow),
+    ],
+)
+def test_whatever_call_fails_the_next_try_makes_the_files_once(
+    make_episode: Maker, tmp_path: Path, again: str, then: int
+) -> None:
+    writer = recorded(make_episode, tmp_path / "0")
+    with refused() as calls:
+        writer.finish()
+    assert {call.split()[0] for call in calls} >= {"pwrite", "open", "fsync", "link", "unlink", "rmdir"}
+    of_files = [n for n, call in enumerate(calls) if call.startswith("fsync") and call.endswith(SUFFIXES)]
+    assert len(of_files) == 3 and max(of_files) < min(n for n, c in enumerate(calls) if c.startswith("link"))
+    for at, call in enumerate(calls, 1):
+        folder, before = tmp_path / str(at), descriptors()
+        writer = recorded(make_episode, folder)
+        made = True
+        with refused(at, then=then):
+            try:
+                writer.finish()
+            except RecordingError:
+                made = False
+        whole = list(folder.glob("*.json"))
+        assert len(whole) == made or then, call
+        if again == "finish":
+            writer.finish()
+        writer.close()
+        assert descriptors() == before, call
+        recover(folder)
+        if again == "recover" and call.startswith("pwrite"):
+            assert os.listdir(folder) == [], "its rows were nowhere but in memory"
+            continue
+        (path,) = folder.glob("*.json")
+        assert read_episode(path).length == 2 and read_episode(path).broken_files == (), call
+        assert len(os.listdir(folder)) == 3, call
+        assert not (folder / FOLDER).exists()
+
+
+@pytest.mark.parametrize("then", [0, errno.EROFS])
+def test_whatever_call_fails_an_episode_that_is_begun_is_told_in_a_sentence(
+    make_episode: Maker, tmp_path: Path, then: int
+) -> None:
+    episode = make_episode(2)
+    with refused() as calls:
+        episode.writer(tmp_path / "0").discard()
+    for at, call in enumerate(calls, 1):
+        folder, before = tmp_path / str(at), descriptors()
+        episode.geometry = make_episode().geometry  # whose meshes no other episode of the process has
+        with refused(at, then=then):
+            try:
+                episode.writer(folder).discard()
+            except RecordingError as error:
+                assert "Cannot record Made-v1" in str(error), call
+        assert descriptors() == before, call
+        recover(folder)
+        assert not folder.exists() or os.listdir(folder) == [], call

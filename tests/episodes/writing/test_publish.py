@@ -1,0 +1,88 @@
+"""The files of an episode get their names together and for good, or none gets one: whatever call of the system fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from tests.episodes.refused_calls import descriptors, left_open, refused
+from workbench.episodes.writing.publish import publish, sync_files
+
+SUFFIXES = (".rrd", ".h5", ".json")
+
+
+def made(folder: Path) -> list[Path]:
+    """Three finished files under their temporary names."""
+    (folder / "made").mkdir(parents=True)
+    paths = [folder / "made" / f"id{suffix}" for suffix in SUFFIXES]
+    for path in paths:
+        path.write_text(path.suffix)
+    return paths
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.is_file())
+
+
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_an_error_of_the_disk_is_told_of_whichever_file_it_is(tmp_path: Path, at: int) -> None:
+    paths = made(tmp_path)
+    before, threads = descriptors(), threading.active_count()
+    with refused(at, ("fsync",)) as calls, pytest.raises(OSError) as told:
+        sync_files(paths)
+    assert told.value.errno == errno.EIO
+    assert sorted(calls) == ["fsync id.h5", "fsync id.json", "fsync id.rrd"]
+    assert left_open(before) == [] and threading.active_count() <= threads
+    sync_files(paths)
+
+
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_a_name_that_another_took_meanwhile_takes_the_others_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int
+) -> None:
+    paths, link, done = made(tmp_path), os.link, []
+
+    def raced(source: Path, target: Path) -> None:
+        done.append(target)
+        if len(done) == at:
+            target.write_text("of another")
+        link(source, target)
+
+    monkeypatch.setattr(os, "link", raced)
+    found = publish(paths, tmp_path, "episode")
+    assert [path.name for path in found] == [f"episode_2{suffix}" for suffix in SUFFIXES]
+    (others,) = set(names(tmp_path)) - {path.name for path in found}
+    assert others == f"episode{SUFFIXES[at - 1]}" and (tmp_path / others).read_text() == "of another"
+
+
+@pytest.mark.parametrize("links", [True, False])
+@pytest.mark.parametrize("then", [0, errno.EROFS])
+def test_whatever_call_fails_all_three_have_names_or_none_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool, then: int
+) -> None:
+    """Also where the folder itself cannot be made to last, and on a disk that has no links."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    if not links:
+        monkeypatch.setattr(os, "link", refuse)
+    paths = made(tmp_path / "0")
+    with refused() as calls:
+        publish(paths, tmp_path / "0", "episode")
+    assert len(calls) > 3 and calls[-1].startswith("fsync")
+    for at, call in enumerate(calls, 1):
+        folder = tmp_path / str(at)
+        paths, before = made(folder), descriptors()
+        with refused(at, then=then), pytest.raises(OSError) as told:
+            publish(paths, folder, "episode")
+        assert told.value.errno == errno.EIO, call
+        assert left_open(before) == [], call
+        if not then:
+            assert names(folder) == [], call
+        if links:
+            assert all(path.exists() for path in paths), call

@@ -1,0 +1,126 @@
+"""How far a job is that records into a folder, in the library of that folder."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.waiting import until
+from tests.episodes.library_files import describe
+from workbench.cli.arguments import JobArguments
+from workbench.cli.run_by import told_in_folder
+from workbench.library.folder import Library
+from workbench.library.job_status import SILENT_SECONDS, JobFailure, JobStatus, StatusFile, read_jobs
+from workbench.library.rows import job_text
+from workbench.page.widgets.templates import render
+from workbench.record.job import RecordProgress
+
+RUNS = JobStatus("record", "my_task.py", 40, 100, rate=2.0)
+
+
+def test_a_job_is_seen_while_it_runs_and_a_while_after(tmp_path: Path) -> None:
+    now = 1e9
+    file = StatusFile(tmp_path, lambda: now)
+    file.write(RUNS)
+    (status,) = read_jobs(tmp_path, now + 1)
+    assert (status.done, status.total, status.seconds_left) == (40, 100, 30.0)
+    assert job_text(status, now + 1) == ", 2.0 a second, 30 s left"
+    assert status.is_silent(now + SILENT_SECONDS + 1)
+    file.write(JobStatus("record", "my_task.py", 100, 100, state="done"))
+    assert [one.state for one in read_jobs(tmp_path, now + 60)] == ["done"]
+    assert read_jobs(tmp_path, now + 3601) == ()
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_rate_of_a_job_that_goes_on_is_that_of_this_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimpleNamespace(monotonic=lambda: now)
+    monkeypatch.setattr("workbench.cli.run_by.time", clock)
+    with told_in_folder(JobArguments(), "record", "my_task.py", tmp_path, 100, str) as told:
+        tell = told.beside(lambda progress: None)
+        now = 50.0
+        tell(RecordProgress(80, 0, done=80.0, was_there=True))
+        now = 55.0
+        tell(RecordProgress(90, 0, done=90.0))
+        told.end("stopped")
+    (status,) = read_jobs(tmp_path, time.time())
+    assert (status.done, status.rate) == (90, 2.0)
+
+
+def test_jobs_of_folders_below_are_seen_with_their_place(tmp_path: Path, child_process: None) -> None:
+    below = tmp_path / "parts" / "1"
+    below.mkdir(parents=True)
+    describe(below, "one", id="one")
+    StatusFile(below).write(RUNS)
+    library = Library(tmp_path)
+    library.watch()
+    try:
+        until(lambda: library.view().jobs, "the job")
+        (job,) = library.view().jobs
+        assert job.place == "parts/1"
+        shown = render("library_jobs", jobs=[{"of": job, "how": "", "runs": True}])
+        assert "my_task.py into parts/1/" in shown
+    finally:
+        library.close()
+
+
+def test_it_is_written_once_a_second_and_its_end_at_once(tmp_path: Path) -> None:
+    now = 1e9
+    file = StatusFile(tmp_path, lambda: now)
+    for done in range(5):
+        file.write(JobStatus("record", "my_task.py", done, 100))
+    assert read_jobs(tmp_path, now)[0].done == 0
+    file.write(JobStatus("record", "my_task.py", 4, 100, state="stopped"))
+    assert read_jobs(tmp_path, now)[0].state == "stopped"
+
+
+def test_a_job_that_goes_on_replaces_its_last_word_and_no_other(tmp_path: Path) -> None:
+    now = time.time()
+    for status in (
+        replace(RUNS, state="stopped"),
+        replace(RUNS, part="1/2", state="done"),
+        replace(RUNS, task="other.py", state="done"),
+        RUNS,
+    ):
+        StatusFile(tmp_path, lambda: now).write(status)
+    StatusFile(tmp_path, lambda: now).remove_old(RUNS)
+    left = {(one.task, one.part, one.state) for one in read_jobs(tmp_path, now)}
+    assert left == {
+        ("my_task.py", "1/2", "done"),
+        ("other.py", "", "done"),
+        ("my_task.py", "", "running"),
+    }, "another may be under way"
+
+
+@given(content=st.binary(max_size=200) | st.builds(lambda value: msgspec.json.encode(value), st.dictionaries(
+    st.sampled_from(["command", "task", "done", "total", "state", "failures", "written_at", "rate"]),
+    st.none() | st.integers() | st.text() | st.floats(allow_nan=False, allow_infinity=False) | st.lists(st.integers()),
+)))  # fmt: skip
+def test_a_file_that_is_anything_else_is_passed_over_or_read_as_data(content: bytes) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / ".job-0.status").write_bytes(content)
+        for status in read_jobs(Path(folder), time.time()):
+            assert isinstance(status, JobStatus)
+
+
+def test_what_is_written_in_it_is_text_on_the_page(tmp_path: Path) -> None:
+    bad = "<script>alert(1)</script>"
+    failure = JobFailure(bad, 2, bad, f"  {bad}\n\x1b[31m")
+    StatusFile(tmp_path).write(JobStatus(bad, bad, 1, 2, failures=(failure,)))
+    jobs = [
+        {"of": job, "how": job_text(job, job.written_at), "runs": True}
+        for job in read_jobs(tmp_path, time.time())
+    ]
+    shown = render("library_jobs", jobs=jobs)
+    assert "<script" not in shown and "&lt;script&gt;" in shown and "\x1b" not in shown
+    assert "2 failed" in shown

@@ -1,0 +1,433 @@
+"""The table's HTML and what its rows and pills do, on real files without a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from tests.drive.panels import Clock, Panels, told_so_far
+from tests.drive.waiting import until
+from tests.episodes.library_files import describe
+from workbench.library.commands import (
+    AlsoPreviousRow,
+    ClearRowFilter,
+    DeleteSelected,
+    FilterRows,
+    NextRow,
+    NextRows,
+    NoteSelected,
+    OpenRow,
+    OpenSelected,
+    PressRow,
+    RescoreSelected,
+    SelectAllRows,
+    SelectNoRows,
+    SortRows,
+    TagSelected,
+    UndoDelete,
+)
+from workbench.library.folder import Library
+from workbench.library.listing import MOST_ROWS, Action
+from workbench.library.panel import LibraryPanel
+from workbench.library.rows import OpenVersion
+from workbench.page.command import Command
+from workbench.page.commands import AnswerDialog, CloseDialog
+from workbench.page.widgets.visitors import Visitor
+
+COUNT = MOST_ROWS + 5
+
+
+@pytest.fixture
+def library(child_process: None, tmp_path: Path) -> Iterator[Library]:
+    for k in range(COUNT):
+        describe(
+            tmp_path,
+            f"r{k:02}",
+            id=f"id{k:02}",
+            seed=k,
+            written_at=f"2026-11-21T10:00:{k:02}",
+            success=k % 2 == 0,
+        )
+    library = Library(tmp_path)
+    library.refresh()
+    yield library
+    library.close()
+
+
+class Told:
+    """What the host of the panel was told."""
+
+    def __init__(self) -> None:
+        self.opened: list[tuple[str, ...]] = []
+
+
+@pytest.fixture
+def told() -> Told:
+    return Told()
+
+
+class Table:
+    """The library on a page, with a hand on it."""
+
+    def __init__(self, panel: LibraryPanel, panels: Panels, clock: Clock) -> None:
+        self.panel, self.panels, self.clock = panel, panels, clock
+
+    def draw(self) -> None:
+        self.clock.passes()
+        self.panel.draw()
+
+    def ask(self, command: Command) -> None:
+        """Press the part of the table that does this."""
+        self.panels.ask(command)
+        self.draw()
+
+    def key(self, command: Command) -> None:
+        self.panels.do(command)
+        self.draw()
+
+    def look_for(self, words: str) -> None:
+        self.panels.type("Find", words)
+        self.draw()
+
+    def numbers(self) -> dict[str, int]:
+        """Of the rows that are shown, by id, in their order."""
+        rows = re.findall(
+            r'<tbody data-row="(\d+)".*?wb-library-name">(\w+)<', self.panels.html("wb-library"), re.DOTALL
+        )
+        return {re.sub(r"^r(?=\d)", "id", name): int(number) for number, name in rows}
+
+    def press_row(self, id: str, held: Literal["", "ctrl", "shift", "ctrl+shift"] = "") -> None:
+        assert self.panels.presses(PressRow(id=id))
+        self.key(PressRow(id=id, held=held))
+
+    def shown(self) -> list[str]:
+        return list(self.numbers())
+
+    def marked(self) -> list[str]:
+        ids = {number: id for id, number in self.numbers().items()}
+        marks = re.findall(r'data-row="(\d+)"\] \.wb-tick i \{', self.panels.html("<style"))
+        return [ids[int(number)] for number in marks]
+
+    def pictures(self) -> int:
+        """How many rows show one."""
+        return self.panels.html("wb-library").count("<img")
+
+    def selected(self) -> tuple[str, ...]:
+        return self.panel.selected()
+
+
+@pytest.fixture
+def table(panels: Panels, library: Library, told: Told, clock: Clock) -> Iterator[Table]:
+    panel = LibraryPanel(panels.server, library, told.opened.append)
+
+    def do(command: Command, visitor: Visitor) -> None:
+        if isinstance(command, CloseDialog):
+            panel.close()
+        else:
+            panel.do(command, visitor)
+
+    panels.visitors.do = do
+    table = Table(panel, panels, clock)
+    until(lambda: table.draw() or table.pictures() == MOST_ROWS, "the pictures")
+    yield table
+    panel.end()
+
+
+def newest(first: int, last: int) -> list[str]:
+    return [f"id{k:02}" for k in range(COUNT - 1, -1, -1)][first:last]
+
+
+def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
+    assert table.shown() == newest(0, MOST_ROWS)
+    table.ask(NextRows())
+    assert table.shown() == newest(MOST_ROWS, COUNT)
+    table.ask(SortRows(column="seed"))
+    assert table.shown()[:3] == ["id00", "id01", "id02"]
+    table.ask(SortRows(column="seed"))
+    assert table.shown()[0] == newest(0, 1)[0]
+    table.ask(FilterRows(outcome="no success"))
+    assert len(table.shown()) == COUNT // 2 and table.shown()[0] == "id53"
+    table.look_for("seed:7")
+    assert table.shown() == ["id07"]
+    table.look_for("nothing has this")
+    assert table.shown() == [] and "nothing has this" in table.panels.html("wb-library")
+
+
+def test_rows_of_another_version_than_the_open_one_are_marked_as_soon_as_it_is_another(
+    panels: Panels, library: Library, clock: Clock
+) -> None:
+    (recorded,) = {(row.task, row.source_hash) for row in library.view().rows}
+    open_version = OpenVersion(*recorded)
+    panel = LibraryPanel(panels.server, library, lambda ids: None, lambda: open_version)
+    panel.draw()
+    assert "another version" not in panels.html("wb-library")
+    open_version = OpenVersion(recorded[0], "edited")
+    clock.passes()
+    panel.draw()
+    assert panels.html("wb-library").count("another version") == MOST_ROWS
+
+
+def test_another_search_filter_or_order_begins_on_the_first_page(table: Table) -> None:
+    for arrange in (
+        lambda: table.look_for("r"),  # all of them have it
+        lambda: table.look_for(""),
+        lambda: table.ask(FilterRows(outcome="all")),
+        lambda: table.ask(SortRows(column="seed")),
+        lambda: table.ask(SortRows(column="seed")),
+    ):
+        table.ask(NextRows())
+        assert len(table.shown()) == COUNT - MOST_ROWS
+        arrange()
+        assert len(table.shown()) == MOST_ROWS
+
+
+def test_the_recordings_of_one_task_are_listed_until_it_has_none_or_all_are_wanted_again(
+    table: Table, library: Library, tmp_path: Path
+) -> None:
+    assert not table.panels.shows("Task")
+    for name in ("z0", "z1"):
+        describe(tmp_path, name, id=name, task=f"Other-{name}", written_at="2026-11-21T11:00:00")
+    library.refresh()
+    table.draw()
+    (first,) = {row.task for row in library.view().rows} - {"Other-z0", "Other-z1"}
+    assert table.panels.field("Task").options == {
+        "all tasks": None,
+        first: first,
+        "Other-z0": "Other-z0",
+        "Other-z1": "Other-z1",
+    }
+    table.panels.set("Task", "Other-z0")
+    table.draw()
+    assert table.shown() == ["z0"] and table.panels.field("Task").value == "Other-z0"
+    library.delete(["z0"])
+    table.draw()
+    table.draw()
+    assert table.shown()[0] == "z1" and table.panels.field("Task").value == "all tasks"
+    table.panels.set("Task", "Other-z1")
+    table.draw()
+    assert table.shown() == ["z1"]
+    table.key(ClearRowFilter())
+    assert len(table.shown()) == MOST_ROWS and table.panels.field("Task").value == "all tasks"
+
+
+def test_all_selects_what_is_listed_and_leaves_the_filter(table: Table) -> None:
+    table.ask(FilterRows(outcome="no success"))
+    failed = table.shown()
+    table.press_row(failed[0])
+    table.ask(SelectAllRows())
+    assert table.shown() == failed and len(table.selected()) == COUNT // 2
+    table.ask(SelectNoRows())
+    assert table.selected() == () and table.shown() == failed
+
+
+def test_what_cannot_be_read_is_not_opened_and_says_why(
+    table: Table, library: Library, told: Told, tmp_path: Path
+) -> None:
+    (tmp_path / "cut.rrd").write_bytes(b"RRF2 and nothing more")
+    library.refresh()
+    until(lambda: any(row.problem for row in library.view().rows), "the damaged file")
+    table.draw()
+    (damaged,) = (row for row in library.view().rows if row.problem)
+    table.panel.select([damaged.id])
+    table.key(OpenSelected())
+    assert told.opened == []
+
+
+def test_of_a_damaged_recording_what_is_left_is_opened(
+    table: Table, library: Library, told: Told, tmp_path: Path
+) -> None:
+    for file in (Path(__file__).parents[1] / "golden/v1/damaged").glob("*seed0008*"):
+        shutil.copy(file, tmp_path)
+    library.refresh()
+    until(lambda: any(row.problem for row in library.view().rows), "the damaged recording")
+    table.draw()
+    (damaged,) = (row for row in library.view().rows if row.problem)
+    table.panel.select([damaged.id])
+    table.key(OpenSelected())
+    assert told.opened == [(damaged.id,)]
+
+
+def test_rows_are_selected_as_in_a_list_of_files(table: Table, told: Told) -> None:
+    ids = newest(0, 9)
+    table.press_row(ids[2])
+    assert table.selected() == (ids[2],) and table.marked() == [ids[2]]
+    table.press_row(ids[5], "shift")
+    assert table.selected() == tuple(ids[2:6]) == tuple(table.marked())
+    table.press_row(ids[3], "ctrl")
+    table.press_row(ids[8], "ctrl")
+    assert table.selected() == (ids[2], ids[4], ids[5], ids[8])
+    table.press_row(ids[6], "ctrl+shift")
+    assert table.selected() == (ids[2], *ids[4:9])
+    table.press_row(ids[0])
+    assert table.selected() == (ids[0],)
+    table.ask(OpenRow(id=ids[1]))
+    assert told.opened == [(ids[1],)] and table.selected() == (ids[1],)
+
+
+def test_keys_walk_over_the_pages(table: Table) -> None:
+    table.key(NextRow())
+    assert table.selected() == (newest(0, 1)[0],)
+    for _ in range(MOST_ROWS):
+        table.key(NextRow())
+    table.draw()
+    assert table.selected() == tuple(newest(MOST_ROWS, MOST_ROWS + 1))
+    assert table.shown() == newest(MOST_ROWS, COUNT) and "data-follow" in table.panels.html("<style")
+    table.key(AlsoPreviousRow())
+    table.key(AlsoPreviousRow())
+    assert table.selected() == tuple(newest(MOST_ROWS - 2, MOST_ROWS + 1))
+
+
+def test_what_is_no_longer_listed_is_no_longer_selected(table: Table, library: Library, told: Told) -> None:
+    table.key(SelectAllRows())
+    assert len(table.selected()) == COUNT
+    table.ask(FilterRows(outcome="success"))
+    assert len(table.selected()) == (COUNT + 1) // 2
+    library.delete(table.selected()[:3])
+    table.draw()
+    assert len(table.selected()) == (COUNT + 1) // 2 - 3
+
+
+def test_a_press_on_a_row_that_has_moved_selects_that_row_and_one_that_is_gone_selects_nothing(
+    table: Table, library: Library, tmp_path: Path
+) -> None:
+    wanted = newest(3, 4)[0]
+    describe(tmp_path, "new", id="new", written_at="2026-11-21T11:00:00")
+    library.refresh()
+    table.draw()
+    assert table.shown()[0] == "new"
+    table.key(PressRow(id=wanted))
+    assert table.selected() == (wanted,)
+    table.key(PressRow(id="nothing has this"))
+    assert table.selected() == (wanted,)
+
+
+def test_buttons_are_there_for_as_many_as_they_take(table: Table, told: Told) -> None:
+    rescored: list[tuple[str, ...]] = []
+    table.panel.add_action(Action("Rescore", RescoreSelected(), "With today's code", rescored.append))
+    table.draw()
+    assert table.panels.html("wb-pill").count("wb-off") >= 5
+    ids = newest(0, 5)
+    table.press_row(ids[0])
+    table.press_row(ids[4], "shift")
+    assert '<span class="wb-pill wb-off" title="At most 4 at once">Open' in table.panels.html("wb-pill")
+    table.ask(RescoreSelected())
+    assert rescored == [tuple(ids)]
+    table.press_row(ids[4], "ctrl")
+    table.ask(OpenSelected())
+    assert told.opened == [tuple(ids[:4])]
+
+
+def test_tags_note_and_deletion_are_asked_for_and_done(
+    table: Table, library: Library, tmp_path: Path
+) -> None:
+    first, second = newest(0, 2)
+    library.set_tags([first], add=["mine", "both"])
+    library.set_tags([second], add=["both"])
+    table.draw()
+    table.press_row(first)
+    table.press_row(second, "shift")
+    table.ask(TagSelected())
+    table.panels.type("", "good, new <b>")
+    table.panels.ask(AnswerDialog())
+    tags = [("mine", "good", "new <b>"), ("good", "new <b>")]
+    until(lambda: [library.row(id).tags for id in (first, second)] == tags, "the tags")  # type: ignore[union-attr]
+    table.draw()
+    assert "new &lt;b&gt;" in table.panels.html("wb-library") and "<b>" not in table.panels.html("wb-library")
+    table.ask(NoteSelected())
+    table.panels.type("", "look again")
+    table.panels.ask(AnswerDialog())
+    until(lambda: library.row(second).note == "look again", "the note")  # type: ignore[union-attr]
+    assert json.loads((tmp_path / f"r{second[2:]}.json").read_text())["workbench"]["note"] == "look again"
+    table.draw()
+    table.ask(DeleteSelected())
+    table.panels.press("Cancel")
+    assert len(library.view().rows) == COUNT
+    table.ask(DeleteSelected())
+    table.panels.ask(AnswerDialog())
+    until(lambda: len(library.view().rows) == COUNT - 2, "two rows fewer")
+    table.draw()
+    assert table.selected() == ()
+    assert "In the trash: 6 files" in table.panels.html()
+    table.ask(UndoDelete())
+    until(lambda: len(library.view().rows) == COUNT, "the rows again")
+    table.draw()
+    assert "In the trash" not in table.panels.html()
+
+
+def test_a_disk_that_hangs_holds_neither_the_table_nor_what_is_pressed_in_it(
+    table: Table, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on, read, set_note = threading.Event(), library.thumbnails, library.set_note
+    begun: list[str] = []
+
+    def thumbnails(ids: Sequence[str]) -> dict[str, bytes]:
+        goes_on.wait(60)
+        return read(ids)
+
+    def note(ids: Sequence[str], text: str) -> None:
+        begun.append(text)
+        goes_on.wait(60)
+        set_note(ids, text)
+
+    monkeypatch.setattr(library, "thumbnails", thumbnails)
+    monkeypatch.setattr(library, "set_note", note)
+    table.ask(SortRows(column="seed"))
+    assert table.shown()[:3] == ["id00", "id01", "id02"]
+    assert table.pictures() == COUNT - 10, "those that were shown before"
+    assert "no picture" not in table.panels.html("wb-library")
+    for id, text in (("id00", "first"), ("id01", "second")):
+        table.press_row(id)
+        table.ask(NoteSelected())
+        table.panels.type("", text)
+        table.panels.ask(AnswerDialog())
+    assert table.selected() == ("id01",) and not table.panels.shows("", "field")
+    until(lambda: begun == ["first"], "the first note")
+    goes_on.set()
+    until(lambda: [library.row(f"id0{k}").note for k in (0, 1)] == ["first", "second"], "the notes")  # type: ignore[union-attr]
+    until(lambda: table.draw() or table.pictures() == MOST_ROWS, "the pictures")
+
+
+def test_only_the_first_answer_counts(table: Table, library: Library) -> None:
+    table.press_row(newest(0, 1)[0])
+    table.ask(DeleteSelected())
+    for _ in range(3):
+        table.panels.do(AnswerDialog())
+    until(lambda: len(library.view().rows) == COUNT - 1, "one row fewer")
+    table.draw()
+    table.ask(UndoDelete())
+    until(lambda: len(library.view().rows) == COUNT, "the row again")
+    table.draw()
+    assert not table.panels.presses(UndoDelete())
+
+
+def test_an_edit_that_is_not_possible_any_more_says_why(
+    table: Table, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = table.panels.client
+    monkeypatch.setattr(table.panels.server, "get_clients", lambda: {client.client_id: client})
+    gone = newest(0, 1)[0]
+    table.press_row(gone)
+    table.ask(NoteSelected())
+    library.delete([gone])
+    table.panels.ask(AnswerDialog())
+    until(lambda: "not in the library any more" in " ".join(client.notices), "the reason")
+
+
+def test_a_table_that_has_not_changed_is_not_sent_again(table: Table, library: Library) -> None:
+    table.press_row(newest(0, 1)[0])
+    library.refresh()
+    before = told_so_far(table.panels.server)
+    table.draw()
+    assert told_so_far(table.panels.server) == before
+    shown = [html.content for html in table.panels.htmls()]
+    table.press_row(newest(1, 2)[0])
+    now = [html.content for html in table.panels.htmls()]
+    (marks,) = (new for old, new in zip(shown, now, strict=True) if new != old)
+    assert marks.startswith("<style"), "which are selected, and not the table"

@@ -1,0 +1,206 @@
+"""The form of how the envs are made: what is shown, refused and applied, and the command line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.panels import Panels
+from tests.drive.scenes import running
+from workbench.app.session import Session
+from workbench.commands import COMMANDS, Refused
+from workbench.envs.keywords import HowMade, Keyword
+from workbench.live.commands import ResetEnvOptions
+from workbench.live.events import OptionsApplied
+from workbench.live.panels.env_options import EnvOptionsPanel, merged
+from workbench.live.view import SessionView
+from workbench.page.widgets.parts import Parts
+from workbench.task.description import TaskOptions
+
+ROBOT = Keyword("robot_uids", "choice", '"panda"', choices=('"panda"', '"fetch"'))
+CONTROL = Keyword("control_mode", "choice", '"pd_joint_pos"', choices=('"pd_joint_pos"', '"pd_ee_pose"'))
+SIZE = Keyword("size", "float", "0.02", "0.02")
+OWN = (
+    SIZE,
+    Keyword("count", "int", "3", "3"),
+    Keyword("flag", "bool", "true", "true"),
+    Keyword("name", "str", '"a"', '"a"'),
+    Keyword("way", "choice", '"left"', '"left"', ('"left"', '"right"'), optional=True),
+    Keyword("where", "json", "[0, 1]", "[0, 1]"),
+    Keyword("made", "json", "<object>", fixed="its value is an object of Python"),
+)
+MADE = HowMade("panda", (ROBOT, CONTROL), OWN)
+
+
+class Form:
+    """The form of a session that says what is told here."""
+
+    def __init__(self, panels: Panels, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.panels, self.applied = panels, list[TaskOptions]()
+        view = running(4)
+        assert view.task is not None
+        task = replace(view.task, made=MADE, device="cpu, pictures on llvmpipe")
+        self.view: SessionView = replace(view, task=task, options=TaskOptions(4))
+        monkeypatch.setattr(session, "view", lambda: self.view)
+        monkeypatch.setattr(session, "happen", self._happens)
+        self.panel = EnvOptionsPanel(panels.server, session)
+        self.parts = Parts([self.panel])
+        panels.visitors.do = self.parts.do
+        self.draw()
+
+    def _happens(self, event: object) -> None:
+        assert isinstance(event, OptionsApplied)
+        self.applied.append(event.options)
+
+    def draw(self) -> None:
+        self.parts.draw(self.view)
+
+    def set(self, name: str, value: object) -> None:
+        self.panels.set(name, value)
+        self.draw()
+
+    def press(self, name: str) -> None:
+        self.panels.press(name)
+        self.draw()
+
+
+@pytest.fixture
+def form(panels: Panels, scripted_session: Callable[..., Session], monkeypatch: pytest.MonkeyPatch) -> Form:
+    return Form(panels, scripted_session(4), monkeypatch)
+
+
+def test_each_keyword_has_the_input_of_its_type_and_shows_what_is_in_effect(form: Form) -> None:
+    shown = {
+        name: form.panels.field(name).value
+        for name in ("Envs", "Robot", "Control", "size", "count", "flag", "name", "way", "where", "made")
+    }
+    assert shown == {
+        "Envs": 4,
+        "Robot": "panda",
+        "Control": "pd_joint_pos",
+        "size": 0.02,
+        "count": 3,
+        "flag": True,
+        "name": "a",
+        "way": "left",
+        "where": "[0, 1]",
+        "made": "<object>",
+    }
+    assert tuple(form.panels.field("Robot").options) == ("panda", "fetch")
+    assert form.panels.field("made").off
+    assert form.panels.button("Apply").command is None and not form.panels.shows("Discard", "button")
+
+
+def test_only_what_was_changed_is_given_and_all_at_once(form: Form) -> None:
+    form.set("Envs", 8)
+    form.set("size", 0.001)
+    form.set("flag", False)
+    form.set("where", "[2]")
+    form.set("way", "none (null)")
+    assert form.applied == [] and form.panels.shows("Discard", "button")
+    form.press("Apply")
+    assert form.applied == [
+        TaskOptions(8, env_kwargs={"size": 0.001, "flag": False, "way": None, "where": [2]})
+    ]
+
+
+@pytest.mark.parametrize(("text", "why"), [("{", "where takes a value in JSON"), ("NaN", "where takes")])
+def test_a_value_that_is_none_is_refused_in_words(form: Form, text: str, why: str) -> None:
+    form.set("where", text)
+    form.press("Apply")
+    assert form.applied == [] and why in form.panels.client.notices[-1]
+    assert form.panels.field("where").value == text, "to be mended"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("made", "1"), ("nothing_like_it", 1), ("name", "a\0b"), ("where", "x" * 2001)]
+)
+def test_what_no_input_takes_is_refused_and_the_form_stays(form: Form, name: str, value: Any) -> None:
+    before = form.panels.everything()
+    fields = {"name": name, "value": value}
+    with pytest.raises(Refused):
+        form.parts.do(COMMANDS.decode("set_keyword", fields), form.panels.visitor)
+    form.draw()
+    assert form.panels.everything() == before
+
+
+def test_whole_numbers_stay_whole_and_a_value_of_another_type_is_refused_in_words(form: Form) -> None:
+    form.set("count", 5)
+    form.set("size", 2)
+    form.press("Apply")
+    (options,) = form.applied
+    assert [(one, type(one)) for one in options.env_kwargs.values()] == [(2.0, float), (5, int)]
+    form.set("count", 2.5)
+    form.press("Apply")
+    assert form.panels.client.notices == ["count takes a whole number; got '2.5'."]
+
+
+def test_what_is_typed_survives_a_save_and_goes_with_discard(form: Form) -> None:
+    form.set("size", 0.5)
+    form.view = replace(form.view, task_serial=9)
+    form.draw()
+    assert form.panels.field("size").value == 0.5
+    form.press("Discard")
+    assert form.panels.field("size").value == 0.02 and form.applied == []
+    assert not form.panels.shows("Discard", "button")
+
+
+def test_a_number_that_is_typed_while_the_task_loads_stays(form: Form) -> None:
+    loaded = form.view
+    form.view = replace(loaded, task=None, options=TaskOptions(5))
+    form.draw()
+    form.set("Envs", 7)
+    form.view = replace(loaded, options=TaskOptions(5))
+    form.draw()
+    assert form.panels.field("Envs").value == 7 and form.panels.field("size").value == 0.02
+
+
+def test_refused_options_stay_in_the_form_and_discard_takes_the_problem_away(form: Form) -> None:
+    form.set("Envs", 4000)
+    form.press("Apply")
+    form.view = replace(form.view, options_refused=form.applied[0], state="error")
+    form.draw()
+    assert "Not taken: num_envs = 4000" in form.panels.html("wb-env-options")
+    assert form.panels.field("Envs").value == 4000
+    form.press("Discard")
+    assert form.panels.field("Envs").value == 4 and form.applied[-1] == TaskOptions(4)
+
+
+def test_options_that_were_taken_are_what_is_in_effect(form: Form) -> None:
+    form.set("size", 0.5)
+    form.press("Apply")
+    assert form.view.task is not None
+    made = replace(MADE, own=(replace(SIZE, value="0.5"), *OWN[1:]))
+    form.view = replace(
+        form.view, options=form.applied[0], task=replace(form.view.task, made=made), task_serial=2
+    )
+    form.draw()
+    assert form.panels.field("size").value == 0.5 and form.panels.button("Apply").command is None
+    assert "--env size=0.5" in form.panels.html("wb-env-options")
+    form.panels.ask(ResetEnvOptions())
+    assert form.applied[-1] == TaskOptions(4)
+
+
+VALUES = st.booleans() | st.integers(-5, 5) | st.floats(-5, 5) | st.text(max_size=3) | st.none()
+
+
+@given(st.dictionaries(st.sampled_from(["size", "count", "x"]), VALUES), VALUES)
+def test_merged_gives_what_differs_and_leaves_the_rest(given_before: dict[str, Any], value: Any) -> None:
+    now = given_before.get("size", 0.02)
+    keyword = replace(SIZE, kind="json", value=json.dumps(now))
+    result = merged(given_before, {keyword: value})
+    rest = {name: one for name, one in given_before.items() if name != "size"}
+    assert {name: one for name, one in result.items() if name != "size"} == rest
+    same = value == now and isinstance(value, bool) == isinstance(now, bool)
+    if same:
+        assert result == given_before
+    elif value == 0.02:
+        assert "size" not in result
+    else:
+        assert result["size"] == value

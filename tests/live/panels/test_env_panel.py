@@ -1,0 +1,174 @@
+"""The table of envs on the live page."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.drive.env_rows import FELL, rows_of
+from tests.drive.live import Live
+from tests.drive.scenes import running
+from workbench.live.env_commands import (
+    FilterEnvs,
+    NextFailedEnv,
+    NextFlaggedEnv,
+    ShowEnvAtEvent,
+    SortEnvs,
+    TurnEnvs,
+)
+from workbench.live.events import EpisodeStepShown, SettingsChanged
+from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
+from workbench.live.panels.env_panel import MOST_ROWS, TABLE
+from workbench.page.command import Command
+from workbench.page.commands import TellUnfolded, ToggleTable
+
+pytestmark = pytest.mark.thorough
+
+MANY = MOST_ROWS + 6
+
+
+def many(**changes: Any) -> EnvRows:
+    """So many envs that the table has two pages; those of odd numbers have failed, the last two are flagged."""
+    none, odd = np.zeros(MANY, np.int32), np.arange(MANY) % 2
+    last = LastEpisode(np.where(odd, 2, 0).astype(np.int8), none, np.zeros(MANY), {})
+    values: dict[str, Any] = {
+        "outcome": none.astype(np.int8),
+        "steps": none,
+        "end": none - 1,
+        "total": np.arange(MANY, dtype=float),
+        "followed": np.ones(MANY, bool),
+        "first": {"<b>odd</b>": odd - 1, "success": none - 1},
+        "rewards": np.full((MANY, KEPT_REWARDS), np.nan, np.float32),
+        "outliers": {MANY - 2: (FELL,), MANY - 1: (FELL,)},
+        "last": last,
+        "ended": odd,
+        "succeeded": none,
+    }
+    return rows_of(**{**values, **changes})
+
+
+class Table:
+    """The table on a page, with a hand on it."""
+
+    def __init__(self, live: Live) -> None:
+        self.live = live
+
+    def show(
+        self, step: int = 1, seconds: float = 60.0, env: int = 0, rows: EnvRows | None = None
+    ) -> list[int]:
+        self.live.show(running(MANY, step_serial=step, selected_env=env), rows or many(), seconds)
+        return self.envs()
+
+    def envs(self) -> list[int]:
+        return [int(env) for env in re.findall(r'data-env="(\d+)"', self.html)]
+
+    @property
+    def html(self) -> str:
+        return self.live.part("Envs").html()
+
+    def ask(self, command: Command) -> list[int]:
+        self.live.part("Envs").ask(command)
+        self.live.again(0.1)  # two frames
+        return self.envs()
+
+
+@pytest.fixture
+def table(live_page: Live) -> Table:
+    table = Table(live_page)
+    table.show()
+    live_page.do(ToggleTable())
+    table.show()
+    return table
+
+
+def test_pages_filters_and_rows_are_pressed(table: Table) -> None:
+    assert table.envs() == list(range(MOST_ROWS))
+    assert table.ask(TurnEnvs(by=1)) == list(range(MOST_ROWS, MANY))
+    table.ask(ShowEnvAtEvent(env=MANY - 3))
+    assert table.live.asked == [SettingsChanged({"selected_env": MANY - 3})], "there is no moment to go to"
+    table.ask(ShowEnvAtEvent(env=MANY - 1))
+    assert table.live.asked[1:] == [EpisodeStepShown(MANY - 1, 12)]
+    table.live.do(TurnEnvs(by=1))  # it is pressed on a page that was drawn before the last one was shown
+    table.live.again()
+    assert table.envs() == list(range(MOST_ROWS, MANY))
+    assert table.ask(FilterEnvs(which="flagged")) == [MANY - 2, MANY - 1]
+    assert "&lt;b&gt;odd" in table.html and "<b>odd" not in table.html
+
+
+def test_another_filter_and_another_order_begin_on_the_first_page(table: Table) -> None:
+    table.ask(TurnEnvs(by=1))
+    assert table.ask(FilterEnvs(which="running")) == list(range(MOST_ROWS))
+    assert table.ask(FilterEnvs(which="failed")) == list(range(1, MANY, 2))
+    assert table.ask(FilterEnvs(which="all")) == list(range(MOST_ROWS))
+    table.ask(TurnEnvs(by=1))
+    assert table.ask(SortEnvs(column="return")) == list(range(MOST_ROWS))
+    table.ask(TurnEnvs(by=1))
+    assert table.ask(SortEnvs(column="return")) == list(range(MANY - 1, MANY - 1 - MOST_ROWS, -1))
+    assert table.ask(SortEnvs(column="env")) == list(range(MOST_ROWS)), (
+        "another column begins with its smallest"
+    )
+
+
+def test_a_step_is_in_the_table_a_moment_later_and_a_press_at_once(table: Table) -> None:
+    before = table.html
+    later = many(steps=np.full(MANY, 5, np.int32))
+    table.show(2, 0.0, rows=later)
+    assert table.html == before, "it was drawn a moment ago"
+    table.show(2, 0.0, env=3, rows=later)
+    assert "wb-selected" in table.html and table.html != before
+    before = table.html
+    table.show(3, 0.0, env=3, rows=many(steps=np.full(MANY, 6, np.int32)))
+    table.ask(SortEnvs(column="return"))
+    assert table.html != before
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_the_key_opens_and_closes_the_table_whatever_opened_it(live_page: Live, by_hand: bool) -> None:
+    assert live_page.is_folded("Envs")
+    live_page.do(TellUnfolded(panel=TABLE) if by_hand else ToggleTable())
+    if not by_hand:
+        assert not live_page.is_folded("Envs")
+        live_page.do(TellUnfolded(panel=TABLE))  # as a page says it then
+    for folded in (True, False, True):
+        live_page.do(ToggleTable())
+        assert live_page.is_folded("Envs") == folded
+
+
+def test_a_folded_table_is_not_drawn_while_steps_go_on(table: Table) -> None:
+    def stepped(number: int) -> str:
+        table.show(number, rows=many(steps=np.full(MANY, number, np.int32)))
+        return table.html
+
+    shown = stepped(4)
+    assert stepped(5) != shown
+    table.live.do(ToggleTable())
+    folded = stepped(6)
+    assert stepped(7) == folded
+    table.live.do(ToggleTable())
+    assert stepped(7) != folded, "unfolded it shows what is now"
+
+
+def test_keys_go_round_the_envs_that_failed_and_that_are_flagged(table: Table) -> None:
+    def after(env: int, command: Command) -> int:
+        table.live.asked.clear()
+        table.show(env=env)
+        table.live.do(command)
+        (asked,) = table.live.asked
+        return asked.env if isinstance(asked, EpisodeStepShown) else asked.values["selected_env"]
+
+    assert [after(env, NextFailedEnv()) for env in (0, 1, MANY - 1)] == [1, 3, 1]
+    assert [after(env, NextFlaggedEnv()) for env in (0, MANY - 2, MANY - 1)] == [
+        MANY - 2,
+        MANY - 1,
+        MANY - 2,
+    ]
+
+
+def test_a_press_on_an_env_that_a_smaller_version_lacks_is_refused(table: Table) -> None:
+    table.show()
+    table.live.session.rows = rows_of()
+    table.live.part("Envs").ask(ShowEnvAtEvent(env=40))
+    assert table.live.asked == [] and "no env 40" in table.live.client.notices[-1]

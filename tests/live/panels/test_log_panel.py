@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.color import Color
+from rich.style import Style
+
+from tests.drive.live import Live
+from tests.drive.scenes import running
+from workbench.live.panels.log_panel import (
+    DARK_PAGE,
+    LIGHT_PAGE,
+    LINES_SHOWN,
+    READABLE,
+    contrast,
+    log_html,
+    readable_on,
+    spans_of_lines,
+)
+from workbench.live.process.captured_output import (
+    NOTHING_PRINTED,
+    Printed,
+    PrintedLine,
+    PrintedLog,
+    StyledText,
+)
+
+LINES = (
+    PrintedLine("stdout", "reward 0.5"),
+    PrintedLine("stderr", "a Warning"),
+    PrintedLine("stdout", "done"),
+)
+
+
+def test_the_filter_takes_text_in_any_case_or_a_stream() -> None:
+    def kept(wanted: str) -> list[str]:
+        html = log_html(Printed(1, LINES, 0), wanted)
+        return [line.text for line in LINES if f">{line.text}<" in html]
+
+    assert kept("WARN") == ["a Warning"]
+    assert kept("stderr:") == ["a Warning"]
+    assert kept("stdout: done") == ["done"]
+    assert kept("nothing like it") == []
+
+
+def test_a_flood_is_shown_by_its_end_and_its_number() -> None:
+    lines = tuple(PrintedLine("stdout", f"line {i}.") for i in range(1000))
+    html = log_html(Printed(1, lines, 1234567), "")
+    assert html.count('title="stdout"') == LINES_SHOWN and "line 999." in html and "line 0." not in html
+    assert "1 234 567 more" in html and "lines. <" in html
+
+
+def test_held_still_it_waits_and_cleared_it_does_not(live_page: Live) -> None:
+    log = live_page.part("Log")
+
+    def drawn(printed: Printed) -> str:
+        live_page.show(running(2, printed=printed))
+        return log.html()
+
+    drawn(NOTHING_PRINTED)
+    assert "data-field" not in log.html() and not log.shows("Clear")
+    evil = PrintedLine("stdout", "<script>alert(1)</script>")
+    shown = drawn(Printed(1, (*LINES, evil), 0))
+    assert (
+        shown.index("reward 0.5") < shown.index("a Warning") < shown.index("done") and "<script" not in shown
+    )
+    drawn(Printed(2, LINES[:1], 0))
+    log.set("Pause", True)
+    assert "Warning" not in drawn(Printed(3, LINES[:2], 0))
+    log.type("Filter", "Warn")
+    assert "Warning" in drawn(Printed(3, LINES[:2], 0)), "the filter is of what stands there"
+    assert "data-field" in log.html()
+    log.press("Clear")
+    drawn(Printed(4, (), 0))
+    assert live_page.asked == [("clear_printed",)] and "data-field" not in log.html()
+    drawn(Printed(5, LINES, 0))
+    log.set("Pause", False)
+    log.type("Filter", "")
+    assert "done" in drawn(Printed(6, LINES, 0))
+
+
+CSS = (Path(__file__).parents[3] / "web_assets" / "panels" / "page.css").read_text()
+BYTE = st.integers(0, 255)
+
+
+def shown(*raw: bytes) -> str:
+    log = PrintedLog(lambda lines, dropped: None)
+    for piece in raw:
+        log.feed("stdout", piece)
+    return log_html(log.view(), "")
+
+
+def test_colours_become_spans_and_all_else_is_shown() -> None:
+    html = shown(b"\x1b[1;31mred\x1b[0m plain \x1b[38;2;10;20;30mown\x1b[0m \x1b]0;title\x07\n")
+    assert '<span class="wb-ansi-bold wb-ansi-1">red</span> plain ' in html
+    assert 'class="wb-ansi-rgb" style="--on-light:#0a141e;--on-dark:#' in html
+    assert "\\x1b]0;title\\x07" in html and "\x1b" not in html
+
+
+@given(st.tuples(BYTE, BYTE, BYTE))
+def test_every_colour_can_be_read_on_both_pages(colour: tuple[int, int, int]) -> None:
+    for page in (LIGHT_PAGE, DARK_PAGE):
+        assert contrast(readable_on(colour, page), page) >= READABLE
+    assert readable_on((0, 0, 0), LIGHT_PAGE) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "page"), [("", LIGHT_PAGE), ('[data-mantine-color-scheme="dark"] ', DARK_PAGE)]
+)
+def test_the_sixteen_colours_of_the_page_can_be_read(scheme: str, page: tuple[int, int, int]) -> None:
+    for number in range(16):
+        found = re.search(rf"(?:^|\s){re.escape(scheme)}\.wb-ansi-{number} {{ color: #(\w{{6}}); }}", CSS)
+        assert found is not None, number
+        red, green, blue = bytes.fromhex(found[1])
+        assert contrast((red, green, blue), page) >= READABLE, (number, found[1])
+    stderr = re.search(rf"(?:^|\n){re.escape(scheme)}\.wb-log \.wb-stderr {{ color: #(\w{{6}}); }}", CSS)
+    assert stderr is not None
+    red, green, blue = bytes.fromhex(stderr[1])
+    assert contrast((red, green, blue), page) >= READABLE
+
+
+@given(
+    st.builds(
+        Style,
+        color=st.one_of(st.none(), st.builds(Color.from_ansi, st.integers(0, 15))),
+        bgcolor=st.one_of(st.builds(Color.from_ansi, BYTE), st.builds(Color.from_rgb, BYTE, BYTE, BYTE)),
+    )
+)
+def test_text_can_be_seen_on_any_background(style: Style) -> None:
+    ((span,),) = spans_of_lines([("x", (StyledText("x", style),))])
+    colours = re.fullmatch(r"color:#(\w{6});background:#(\w{6})", span.css)
+    assert colours is not None
+    text, behind = (tuple(bytes.fromhex(colour)) for colour in colours.groups())
+    assert contrast(text, behind) >= READABLE / 2  # type: ignore[arg-type]

@@ -1,0 +1,305 @@
+"""What the page says of the file and the worker: banners, the status line, the version that runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.drive.live import Live
+from tests.drive.scenes import EMPTY, PLAN, problem, running
+from tests.drive.waiting import until
+from workbench.live.commands import (
+    ChooseClass,
+    FillEmptyFile,
+    Interrupt,
+    RebuildScene,
+    ReloadCameras,
+    ReloadCode,
+    ReloadFile,
+    RestartWorker,
+)
+from workbench.live.messages import ReloadReport
+from workbench.live.panels.banners import FILL, INTERRUPT, NEW_WORKER, REBUILD, RELOAD, RESTART, SHOWN_AFTER
+from workbench.live.panels.version_panel import MOST_SHOWN
+from workbench.live.process.heartbeat import Busy, busy_at
+from workbench.live.run import PastLoad
+from workbench.live.view import SessionView
+from workbench.solve.state import SolveView
+
+pytestmark = pytest.mark.thorough
+
+EVIL = "<img src=x onerror=alert(1)><script>alert(2)</script>\"'&"
+LOOP = Busy(6.4, "in evaluate", "/home/me/push.py", 88, "while True:", "Traceback ...")
+
+
+@pytest.fixture
+def live(open_live: Live) -> Iterator[Live]:
+    open_live.show(EMPTY)
+    open_live.asked.clear()
+    open_live.session.answers["knows_file"] = lambda file: True
+    yield open_live
+
+
+def failed(stage: str = "evaluate", serial: int = 1, **changes: Any) -> SessionView:
+    found = replace(problem(), stage=stage)
+    return running(2, **{"problem": found, "problem_serial": serial, "state": "error", **changes})
+
+
+def banner(live: Live) -> str:
+    return live.part("Problem").html() if live.part("Problem").seen else ""
+
+
+def test_a_problem_is_told_with_its_line_as_text_and_leaves_with_it(live: Live) -> None:
+    live.show(failed())
+    title, rest = banner(live).split("</div>", 1)
+    assert all(word in title for word in ("PushEnv", "evaluate", "push.py:88"))
+    assert "KeyError" in rest and "return goal[&lt;0&gt;]" in rest
+    evil = replace(problem(EVIL), file=f"/tmp/{EVIL}.py", code=EVIL, traceback=EVIL, stage=EVIL)
+    live.show(failed(serial=2, problem=evil))
+    assert "<script" not in banner(live) and "<img" not in banner(live)
+    live.show(failed(serial=3, problem=replace(problem(), file=None, line=None, code=None, traceback="")))
+    assert "KeyError" in banner(live) and "<pre" not in banner(live)
+    live.show(running(2))
+    assert banner(live) == ""
+
+
+def test_a_traceback_that_someone_opened_is_not_written_again(live: Live) -> None:
+    live.show(failed())
+    html = live.part("Problem").htmls()[0]
+    html.content = "opened"
+    live.show(failed(step_serial=99))
+    assert html.content == "opened"
+    live.show(failed(serial=2, problem=problem("ValueError: other")))
+    assert "ValueError: other" in banner(live)
+    live.show(running(2))
+    live.show(failed(serial=2, problem=problem("ValueError: other")))
+    assert "ValueError: other" in banner(live), "it comes back"
+
+
+def test_it_says_which_version_runs_now(live: Live) -> None:
+    at_run = failed(state="paused", playing=False, problem_at_run=True)
+    said = []
+    for view in (
+        failed(state="running", stale=True),
+        failed(state="starting", playing=False),
+        failed(state="paused", playing=False),
+        at_run,
+        replace(at_run, spoiled="torch.get_default_dtype() changed"),
+        failed("policy", problem_at_run=True, state="paused", playing=False),
+        failed("worker", state="paused", playing=False),
+    ):
+        live.show(view)
+        said.append(live.part("Problem").htmls()[1].content)
+    assert len({*said}) == len(said)
+    assert "env 0: step 7" in said[3] and "torch.get_default_dtype()" in said[4]
+
+
+@pytest.mark.parametrize(
+    ("stage", "offered"),
+    [("evaluate", True), ("reset", True), ("syntax", False), ("policy", False), ("worker", False)],
+)
+def test_what_can_be_done_about_it_is_offered(live: Live, stage: str, offered: bool) -> None:
+    live.show(failed(stage))
+    part = live.part("Problem")
+    assert part.shows(REBUILD) is offered and part.shows(NEW_WORKER) is (stage == "worker")
+    part.press(RELOAD)
+    if offered:
+        part.press(REBUILD)
+    if stage == "worker":
+        part.press(NEW_WORKER)
+    wanted = [ReloadFile(), *([RebuildScene()] if offered else [])]
+    assert live.asked == [*wanted, *([RestartWorker()] if stage == "worker" else [])]
+
+
+def test_an_empty_file_is_filled_by_a_press_and_only_while_it_is_empty(live: Live, tmp_path: Path) -> None:
+    file, other = tmp_path / "stack_two.py", tmp_path / "other.py"
+    file.write_text("# mine\n\n")
+    other.touch()
+    live.session.answers["knows_file"] = str(file).__eq__
+    view = replace(EMPTY, problem=replace(problem(), file=str(file)), problem_serial=1, state="error")
+    live.show(view)
+    assert live.shows(FILL) and file.read_text() == "# mine\n\n"
+    file.write_text("x = 1\n")
+    live.press(FILL)
+    until(lambda: live.client.notices, "why not")
+    assert file.read_text() == "x = 1\n"
+    file.write_text("# mine\n\n")
+    live.press(FILL)
+    until(lambda: "class StackTwoEnv" in file.read_text(), "the task")
+    assert file.read_text().startswith("# mine\n\n")
+    live.show(replace(view, problem_serial=2))
+    assert not live.shows(FILL), "it holds a task"
+    live.show(replace(view, problem=replace(problem(), file=str(other)), problem_serial=3))
+    assert not live.shows(FILL), "it is not the task's"
+    noticed = len(live.client.notices)
+    live.do(FillEmptyFile())
+    assert other.read_text() == "" and len(live.client.notices) == noticed + 1
+
+
+def test_what_takes_long_can_be_ended_and_stands_instead_of_a_problem(live: Live) -> None:
+    live.show(running(2, busy=replace(LOOP, seconds=SHOWN_AFTER - 1)))
+    assert not live.part("Busy").seen
+    live.show(failed(busy=LOOP))
+    busy = live.part("Busy")
+    html = busy.html()
+    assert all(word in html for word in ("PushEnv", "in evaluate", "6 s", "push.py:88", "while True:"))
+    assert not banner(live) and "Traceback ..." not in html
+    busy.press(INTERRUPT)
+    busy.press(RESTART)
+    assert live.asked == [Interrupt(), RestartWorker()]
+    live.show(running(2, busy=replace(LOOP, ignores_interrupt=True)))
+    assert not busy.shows(INTERRUPT) and busy.shows(RESTART) and "Traceback ..." in busy.html()
+    live.show(running(2, busy=Busy(6.0, EVIL, f"/{EVIL}.py", 1, EVIL, EVIL, ignores_interrupt=True)))
+    assert "<script" not in busy.html() and "<img" not in busy.html()
+    live.show(failed())
+    assert not busy.seen and "KeyError" in banner(live)
+
+
+def test_a_worker_that_gets_ready_leaves_the_reason_in_sight(live: Live) -> None:
+    ready = busy_at(21.0, "warming up", "", (), ignores_interrupt=False)
+    live.show(failed(busy=ready, state="starting", playing=False))
+    assert not live.part("Busy").seen and banner(live)
+    assert "busy" not in live.html("wb-status")
+
+
+def test_an_interrupt_is_not_called_a_failure(live: Live) -> None:
+    live.show(failed(problem=replace(problem("Interrupted: stopped by hand"), interrupted=True)))
+    assert "interrupted in evaluate" in banner(live) and "failed" not in banner(live)
+
+
+# --- the status line -------------------------------------------------------------------------------
+
+
+def status(live: Live, view: SessionView) -> str:
+    live.show(view)
+    return live.html("wb-status")
+
+
+def test_the_status_line_has_state_task_rate_and_step(live: Live) -> None:
+    said = status(live, running(16))
+    for word in (
+        "running",
+        "16 envs",
+        "cpu (batched)",
+        "<b>20</b> steps/s",
+        "1.00 × real time",
+        "env 0: step 7",
+    ):
+        assert word in said
+    assert 'data-title="Push-v1 · Workbench"' in said
+    slow = status(live, running(1, steps_per_second=0.93, real_time_factor=0.0465))
+    assert "<b>0.93</b> steps/s" in slow and "0.046 × real time" in slow
+    for quiet in (
+        running(4, state="paused", playing=False),
+        running(1, steps_per_second=0.0),
+        running(4, busy=LOOP),
+        EMPTY,
+    ):
+        assert "steps/s" not in status(live, quiet)
+    assert "in evaluate for 6 s" in status(live, running(4, busy=LOOP))
+    drawing = running(4, busy=Busy(25.0, "drawing", drawing=True), state="loading", activity="compiling")
+    assert "compiling" in status(live, drawing) and "busy" not in status(live, drawing)
+
+
+def test_a_machine_that_cannot_keep_up_is_said_with_what_slows_it(live: Live) -> None:
+    slow = running(4, speed=4.0, real_time_factor=1.2)
+    assert "cannot reach it" in status(live, slow)
+    assert "cannot reach it" not in status(live, running(4, speed=4.0, real_time_factor=3.9))
+    assert "cannot reach it" not in status(live, running(4, speed=float("inf"), real_time_factor=1.2))
+    assert "recorded" in status(live, replace(slow, recorded_share=0.9, watched_share=0.4))
+    assert "drawn for the page" in status(live, replace(slow, recorded_share=0.1, watched_share=0.4))
+
+
+@pytest.mark.parametrize("word", ["running", "paused", "loading"])
+def test_error_and_stale_are_marks_beside_the_state(live: Live, word: Any) -> None:
+    said = status(live, running(4, state=word, playing=word == "running", stale=True, problem=problem()))
+    assert f"<b>{word}</b>" in said and said.count(">error</span>") == 1
+    assert (">stale</span>" in said) is (word != "loading")
+
+
+def test_while_actions_are_planned_it_says_how_long_a_plan_takes(live: Live) -> None:
+    def planning(**solve: Any) -> str:
+        view = running(4, steps_per_second=0.3, real_time_factor=0.01, solve=SolveView(**solve))
+        return status(live, replace(view, settings=replace(view.settings, action_source="solve")))
+
+    said = planning(state="planning", plan=PLAN)
+    assert "<b>planning</b>" in said and "<b>0.25</b> s a plan" in said and "real time" not in said
+    assert "building 1 env" in planning(state="starting", activity="building 1 env")
+
+
+def test_a_new_version_is_announced_for_some_seconds(live: Live) -> None:
+    live.show(running(4, task_serial=1))
+    view = running(
+        4, task_serial=2, reload=ReloadReport("patched", "only reward changed"), load_milliseconds=43.2
+    )
+    live.show(view, seconds=1.0)
+    assert "patched in 43 ms: only reward changed" in live.html("wb-status")
+    live.again()
+    assert "patched" not in live.html("wb-status")
+
+
+# --- the version -----------------------------------------------------------------------------------
+
+
+def version(live: Live, view: SessionView) -> str:
+    live.show(view)
+    return live.part("Code version").html()
+
+
+def test_a_load_is_told_with_level_time_reason_and_what_it_could_not_carry(live: Live) -> None:
+    said = version(
+        live, running(2, reload=ReloadReport("patched", "only evaluate changed"), load_milliseconds=43.2)
+    )
+    assert all(word in said for word in ("patched", "43 ms", "only evaluate changed"))
+    missing = {f"actor cube_{i}": "<script>why</script>" for i in range(MOST_SHOWN + 3)}
+    report = ReloadReport("rebuilt", "_load_scene changed", ("actor goal",), missing)
+    said = version(live, running(2, reload=report, load_milliseconds=1500.0))
+    assert "1.5 s" in said and "actor cube_0" in said and f"actor cube_{MOST_SHOWN}" not in said
+    assert "and 3 more" in said and "<script" not in said
+
+
+def test_while_the_file_is_broken_the_broken_save_comes_first(live: Live) -> None:
+    """It spoke of the good save before, as if that were what had just been saved."""
+    good = ReloadReport("patched", "only evaluate changed")
+    told = version(live, running(4, reload=good, stale=True, state="error", refused=problem()))
+    assert told.index("push.py:88") < told.index("only evaluate") and "KeyError" in told
+    loading = version(live, running(4, reload=good, stale=True, state="loading", refused=problem()))
+    assert "KeyError" not in loading, "another one is being tried"
+
+
+def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fails(live: Live) -> None:
+    live.show(running(4))
+    assert not live.part("Code version").shows("Task")
+    live.show(running(4, task=None, state="error", refused=problem(), choices=("TwoEnv", "OneEnv")))
+    task = live.part("Code version")
+    assert task.field("Task").value == "TwoEnv" and list(task.field("Task").options) == ["OneEnv", "TwoEnv"]
+    task.set("Task", "OneEnv")
+    assert live.asked[-1] == ChooseClass(name="OneEnv")
+    live.show(running(4, choices=("OneEnv", "TwoEnv")))
+    assert task.field("Task").value == "OneEnv"
+
+
+def test_the_file_is_loaded_again_by_the_level_that_is_pressed(live: Live) -> None:
+    live.show(running(4))
+    part = live.part("Code version")
+    for name in ("Reload", REBUILD, "Only reload code", "Only reload cameras"):
+        part.press(name)
+    assert live.asked == [ReloadFile(), RebuildScene(), ReloadCode(), ReloadCameras()]
+    live.show(running(4, state="stopped"))
+    assert not part.shows("Reload")
+
+
+def test_the_last_loads_are_listed_newest_first(live: Live) -> None:
+    first = PastLoad(1e9, None, "the first version", 900.0)
+    assert "the first version" not in version(live, running(4, loads=(first,))), "one load is no list"
+    refused = PastLoad(1e9 + 60, None, "KeyError: '<goal>'", problem=problem())
+    patched = PastLoad(1e9 + 120, "patched", "only evaluate changed", 43.0)
+    told = version(live, running(4, loads=(patched, refused, first)))
+    told = told[told.index("wb-loads") :]
+    wanted = ("patched", "43 ms", "only evaluate", "refused", "push.py:88", "900 ms")
+    assert [told.index(word) for word in wanted] == sorted(told.index(word) for word in wanted)
+    assert "&lt;goal&gt;" in told

@@ -1,0 +1,435 @@
+"""What each thing that a worker says, and each wish of a page, means for what is seen."""
+
+# The views are of a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.scenes import problem
+from tests.drive.session import DEATH, Told, ToldWorker, told_session
+from tests.drive.waiting import until
+from workbench.envs.camera_data import Picture
+from workbench.envs.gpu_rules import Finding
+from workbench.envs.inspection import Inspection
+from workbench.live.commands import ChooseClass, PauseRun, PlayRun, ReloadFile, SetSeed
+from workbench.live.events import MomentShown, OptionsApplied, PagesCounted, ReadingChosen
+from workbench.live.messages import (
+    CameraFailed,
+    CameraRequest,
+    Inspect,
+    Load,
+    LoadFailed,
+    Loading,
+    Pictures,
+    ReadPolicyAgain,
+    Request,
+    RulesBroken,
+    Settings,
+    SliderAction,
+    Status,
+)
+from workbench.live.process.supervisor import End
+from workbench.live.reading import READ_EVERY
+from workbench.live.run import Run
+from workbench.page.command import Refused
+from workbench.rescore.state import RescoreView, RescoringTold
+from workbench.task.description import TaskOptions
+from workbench.task.reference import RecordedTask
+
+EYE = CameraRequest("eye", "sensor")
+GONE_WRONG = Finding("r", "warn", "m", None, None, "", "", 1, 0)
+
+
+def pictures(env: int, number: int = 0) -> Pictures:
+    rgb = np.zeros((2, 2, 3), np.uint8)
+    return Pictures((Picture("eye", "sensor", env, np.zeros(7, np.float32), rgb),), 12.0, number)
+
+
+def asked_load(told: Told) -> Load:
+    """What the next save asks for."""
+    told.asked(object)
+    told.session.do(ReloadFile())
+    (load,) = told.asked(Load)
+    return load
+
+
+def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on(told: Told) -> None:
+    assert told.view.state == "starting" and told.view.curves is None and told.session.env_rows() is None
+    told.tell(Loading("importing"))
+    assert (told.view.state, told.view.activity) == ("loading", "importing")
+    told.play(3)
+    view = told.view
+    assert (view.state, view.activity, view.playing, view.steps_per_second) == ("running", "", True, 20.0)
+    assert (view.timeline.last, view.step_serial, view.timeline.moments) == (3, 3, 4)
+    assert view.step.elapsed_steps.tolist() == [3, 3, 3] and view.curves.serial == 3
+
+
+def test_the_selected_env_is_one_that_there_is_as_soon_as_it_is_known(told: Told) -> None:
+    told.session.change(selected_env=2**40, speed=2.0)
+    told.load()
+    assert (told.view.selected_env, told.view.settings.speed) == (2, 2.0)
+    told.session.change(selected_env=-5)
+    assert told.view.selected_env == 0
+
+
+def test_curves_are_of_the_selected_env_and_count_control_steps(played: Told) -> None:
+    played.reset()
+    first = played.view.curves
+    assert played.view.curves is first, "nothing is made for a look"
+    played.step()
+    played.session.change(selected_env=1)
+    now = played.view.curves
+    assert (first.serial, first.env, now.serial, now.env) == (3, 0, 4, 1)
+
+
+@pytest.mark.parametrize("level", ["same", "patched", "cameras"])
+def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes(played: Told, level: str) -> None:
+    played.session.change(selected_env=2)
+    before = played.view
+    played.load(level, source_hash="b")
+    after = played.view
+    assert after.task.source_hash == "b" and after.task.geometry is before.task.geometry
+    assert after.task_serial == before.task_serial + 1 and after.scene_serial == before.scene_serial
+    assert after.cameras_serial == before.cameras_serial + (level == "cameras")
+    assert (after.selected_env, after.timeline.moments, after.step_serial) == (2, 4, 3)
+    assert len(played.rescored) == (level == "patched")
+
+
+def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_shown(played: Told) -> None:
+    session = played.session
+    session.change(selected_env=2, cameras=(EYE,))
+    played.load("patched", source_hash="b")
+    assert played.view.of(RescoreView).state == "loading" and played.view.of(RescoreView).total == 3
+    session.happen(RescoringTold(1, RescoreView("rescoring", done=3)))
+    session.happen(RescoringTold(1, RescoreView("done", done=3)))
+    assert (played.view.of(RescoreView).state, played.view.of(RescoreView).done) == ("done", 3)
+    session.happen(MomentShown(1))
+    session.happen(MomentShown(None))
+    told = np.ones((3, 2), np.float32)
+    played.tell(pictures(2), SliderAction(told), Inspection(2, 3), RulesBroken((GONE_WRONG,)))
+    played.tell(CameraFailed(EYE.key, "no shader"))
+    before = played.view
+    assert (
+        before.pictures
+        and before.told is told
+        and before.inspection
+        and before.rules
+        and before.failed_cameras
+    )
+    played.load("rebuilt", num_envs=2)
+    played.reset()
+    after = played.view
+    assert (after.scene_serial, after.cameras_serial) == (before.scene_serial + 1, before.cameras_serial + 1)
+    assert after.pictures_serial > before.pictures_serial and after.rules_serial > before.rules_serial
+    assert (after.pictures, after.told, after.inspection, after.rules) == ({}, None, None, None)
+    assert after.of(RescoreView).state == "none" and after.of(RescoreView).total == 0
+    assert not after.failed_cameras and after.selected_env == 1 and after.timeline_cleared
+    assert (after.timeline.first, after.timeline.moments) == (4, 1) and after.curves.serial == 0
+
+
+def test_what_was_odd_while_playing_goes_with_the_version_and_comes_back_if_that_is_odd_too(
+    played: Told,
+) -> None:
+    odd = (1.0, np.nan, 1.0)
+    played.step(reward=odd)
+    (found,) = played.view.odd
+    assert (found.rule, found.count, found.first_step) == ("reward-finite", 1, 3)
+    played.tell(RulesBroken((GONE_WRONG,)))
+    assert played.view.played == (GONE_WRONG, found)
+    played.load("same")
+    assert played.view.odd == (found,)
+    played.load("patched", source_hash="b")
+    assert played.view.odd == ()
+    played.step(reward=odd)
+    assert [each.first_step for each in played.view.odd] == [4]
+    played.load("rebuilt", source_hash="b")
+    assert played.view.odd == ()
+
+
+# --- failures --------------------------------------------------------------------------------------------
+
+
+def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it(played: Told) -> None:
+    played.session.do(PlayRun())
+    played.die()
+    view = played.view
+    assert "SIGSEGV" in view.problem.message and view.problem_at_run
+    assert (view.state, view.playing, view.steps_per_second) == ("starting", False, 0.0)
+    played.greet()
+    played.load()
+    played.reset()
+    after = played.view
+    assert after.timeline.moments == 5 and after.stale and after.state == "paused"
+    assert after.problem == view.problem, "the reset that a new scene begins with mends nothing"
+    played.step()
+    assert played.view.problem is None
+    played.load(source_hash="b")
+    assert played.view.timeline.moments == 0
+
+
+def test_what_failed_while_running_stands_until_a_step_follows_and_each_time_anew(played: Told) -> None:
+    for _ in range(2):
+        before = played.view
+        played.tell(Status(True, 20.0, 1.0), LoadFailed(problem(), kept=True, at_run=True))
+        view = played.view
+        assert (view.state, view.playing, view.stale, view.refused) == ("paused", False, False, None)
+        assert view.problem_at_run and view.problem_serial > before.problem_serial
+        assert len(view.loads) == 1, "it is no load"
+        played.step()
+        assert played.view.problem is None and not played.view.problem_at_run
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_mended_policy_plays_on_although_the_task_was_loaded_anew_before_its_file_is_read(
+    played: Told, tmp_path: Path, paused: bool
+) -> None:
+    # Both the task's watcher and the policy's notice the save, in either order.
+    policy = tmp_path / "policy.py"
+    policy.write_text("def act(obs): return None\n")
+    played.session.change(action_source="policy", policy=f"{policy}:act")
+    played.session.do(PlayRun())
+    failed = replace(problem(), stage="policy", file=str(policy))
+    played.tell(Status(True, 20.0, 1.0), LoadFailed(failed, kept=True, at_run=True), Status(False, 0.0, 0.0))
+    if paused:
+        played.session.do(PauseRun())
+    played.load("same")
+    played.asked(object)
+    policy.write_text("def act(obs): return obs\n")
+    asked: list[ReadPolicyAgain] = []
+    until(lambda: asked.extend(played.asked(ReadPolicyAgain)) or asked, "the policy is read again")
+    assert asked == [ReadPolicyAgain(play=not paused)]
+
+
+def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before_runs_on(
+    played: Told,
+) -> None:
+    played.tell(Loading("importing"), LoadFailed(problem(), kept=True))
+    played.step()
+    view = played.view
+    assert view.stale and view.refused is view.problem is not None and view.state == "running"
+    played.load("patched")
+    assert not played.view.stale and played.view.problem is None and played.view.refused is None
+
+
+def test_a_worker_that_could_load_nothing_waits_with_the_problem_and_one_too_many_stops_it(
+    told: Told,
+) -> None:
+    told.session.do(PlayRun())
+    told.greet()
+    told.die()
+    (settings,) = told.greet()
+    assert isinstance(settings, Settings) and told.view.state == "error", (
+        "nothing to load, and it does not play"
+    )
+    told.die(replace(DEATH, end=End.ASKED))
+    assert told.view.problem is not None
+    told.die(replace(DEATH, gives_up=True))
+    assert told.view.state == "stopped" and told.view.activity == ""
+
+
+def test_every_load_is_remembered_also_one_that_was_refused(played: Told) -> None:
+    for number in range(30):
+        played.tell(Loading("importing"), LoadFailed(problem(f"NameError: {number}"), kept=True))
+    loads = played.view.loads
+    assert len(loads) == 20 and loads[0].reason == "NameError: 29" and loads[0].problem is not None
+    played.load("patched")
+    assert [load.level for load in played.view.loads[:2]] == ["patched", None]
+
+
+def test_a_camera_that_cannot_be_drawn_is_not_asked_for_until_it_is_ticked_again(played: Told) -> None:
+    other = CameraRequest("hand", "sensor")
+    played.session.happen(PagesCounted(1))
+    played.session.change(cameras=(EYE, other))
+    played.tell(CameraFailed(EYE.key, "no shader"))
+    assert played.view.failed_cameras == {EYE.key: "no shader"}
+    played.asked(object)
+    played.session.change(speed=2.0)
+    (settings,) = played.asked(Settings)
+    assert settings.cameras == (other,)
+    for cameras, sent in (((other,), (other,)), ((EYE, other), (EYE, other))):
+        played.session.change(cameras=cameras)
+        (settings,) = played.asked(Settings)
+        assert settings.cameras == sent and not played.view.failed_cameras
+    played.die(replace(DEATH, doing="drawing"))
+    assert played.view.failed_cameras.keys() == {EYE.key, other.key}, "the next worker would die of it too"
+
+
+# --- what is chosen ----------------------------------------------------------------------------------------
+
+
+def test_pictures_are_those_of_the_env_that_is_looked_at_and_of_the_moment_that_is_shown(
+    played: Told,
+) -> None:
+    played.session.change(cameras=(EYE,))
+    played.tell(pictures(0, number=3))
+    assert set(played.view.pictures) == {EYE.key}
+    serial = played.view.pictures_serial
+    played.session.happen(MomentShown(1))
+    assert played.view.pictures == {} and played.view.pictures_serial > serial
+    played.session.happen(MomentShown(3))
+    assert set(played.view.pictures) == {EYE.key}
+    played.session.change(selected_env=2)
+    assert played.view.pictures == {}
+    played.tell(pictures(0, number=3))
+    assert played.view.pictures == {}
+    played.asked(object)
+    played.session.change(selected_env=2)
+    assert played.asked(Settings) == [], "nothing changed"
+    played.session.happen(PagesCounted(1))
+    played.session.happen(PagesCounted(2))
+    played.session.happen(PagesCounted(0))
+    assert [settings.cameras for settings in played.asked(Settings)] == [(EYE,), ()], "for no page none"
+
+
+def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_for(tmp_path: Path) -> None:
+    file = str(tmp_path / "push.py")
+    found = {
+        "file": file,
+        "source_files": (file,),
+        "source": {file: "text"},
+        "chosen": "One",
+        "others": ("Two",),
+    }
+    with told_session(tmp_path, file) as told:
+        told.load(**found)
+        with pytest.raises(Refused):
+            told.session.do(ChooseClass(name="Nobody"))
+        assert told.asked(Load) == [] and told.view.choices == ("One", "Two")
+        told.session.do(SetSeed(seed=7))
+        told.session.do(ChooseClass(name="Two"))
+        (load,) = told.asked(Load)
+        assert load.task == f"{file}:Two" and load.options.seed == 7 and told.view.choices == ("Two", "One")
+        again = told.session.look(Run.running_load)
+        assert again is not None and (again.task, again.source) == (f"{file}:One", {file: "text"})
+        told.tell(Loading("", load.number))
+        told.die()
+        told.greet()
+        told.load(**found)
+        assert told.view.choices == ("Two", "One"), "it is still what saves bring in"
+        assert asked_load(told).task == f"{file}:Two"
+        told.load("rebuilt", **found, in_place_of="Two")
+        assert asked_load(told).task == f"{file}:One"
+
+
+def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved(tmp_path: Path) -> None:
+    file = tmp_path / "push.py"
+    file.write_text("text")
+    agreed = RecordedTask("Push-v1", str(file), "Push", {str(file): "text"})
+    with told_session(tmp_path, agreed) as told:
+        assert asked_load(told).task is agreed
+        file.write_text("other")
+        (load,) = until(lambda: told.asked(Load), "the load of what was saved")
+        assert load.task == f"{file}:Push" and told.view.stale
+
+
+def test_of_two_who_choose_at_once_the_last_message_has_what_both_chose(tmp_path: Path) -> None:
+    sent: list[Settings] = []
+    other = threading.Thread(target=lambda: told.session.change(episode_end="continue"))
+
+    class Overtaken(ToldWorker):
+        def send(self, request: Request) -> None:
+            if isinstance(request, Settings):
+                if request.speed == 2.0 and not other.ident:
+                    other.start()
+                    other.join(timeout=0.3)  # as long as the other may take to come in between
+                sent.append(request)
+
+    with told_session(tmp_path, worker=Overtaken) as told:
+        told.session.change(speed=2.0)
+        other.join()
+        assert (sent[-1].speed, sent[-1].episode_end) == (2.0, "continue")
+
+
+def test_files_of_the_task_are_known_and_no_others(tmp_path: Path) -> None:
+    task, beside, outside = (tmp_path / name for name in ("lab/push.py", "lab/helper.py", "secret.py"))
+    task.parent.mkdir()
+    for file in (task, beside, outside):
+        file.write_text("")
+    with told_session(tmp_path, str(task)) as told:
+        knows = told.session.knows_file
+        assert knows(str(task)) and knows(str(beside)) and not knows(str(outside))
+        assert not knows(str(task.parent / ".." / "secret.py")) and not knows("/etc/passwd")
+        assert not knows(str(task.parent / "gone.py"))
+        told.session.change(action_source="policy", policy=f"{outside}:act")
+        assert knows(str(outside)), "its policy"
+
+
+# --- readings of an env ----------------------------------------------------------------------------------
+
+
+def test_what_is_looked_at_is_read_once_for_each_step_and_again_when_the_answer_has_come(told: Told) -> None:
+    told.play(2)
+    told.session.happen(ReadingChosen(("joints",)))
+    told.step()
+    assert told.asked(Inspect) == [], "no page is open"
+    told.session.happen(PagesCounted(1))
+    (asked,) = until(lambda: told.asked(Inspect), "a reading")
+    assert (asked.env, asked.sections) == (0, ("joints",))
+    told.step(5)
+    time.sleep(2 * READ_EVERY)
+    assert told.asked(Inspect) == [], "a busy worker gets no queue of questions"
+    told.tell(Inspection(0, 3))
+    assert len(until(lambda: told.asked(Inspect), "the reading of the newest step")) == 1
+    told.tell(Inspection(0, 8))
+    time.sleep(2 * READ_EVERY)
+    assert told.asked(Inspect) == [], "nothing is new"
+    told.session.change(selected_env=1)
+    (asked,) = until(lambda: told.asked(Inspect), "another env")
+    told.load("rebuilt")
+    assert len(until(lambda: told.asked(Inspect), "another scene, although the last was not answered")) == 1
+    told.session.happen(ReadingChosen(()))
+    told.tell(Inspection(1, 0))
+    told.step()
+    time.sleep(2 * READ_EVERY)
+    assert told.asked(Inspect) == []
+
+
+# --- options of the envs -----------------------------------------------------------------------------------
+
+FIRST, MORE = TaskOptions(3), TaskOptions(4, env_kwargs={"size": 2})
+
+
+def test_options_are_in_effect_when_a_load_has_taken_them(played: Told) -> None:
+    played.session.happen(OptionsApplied(MORE))
+    (load,) = played.asked(Load)
+    assert load.options == MORE and played.view.options == FIRST
+    again = played.session.look(Run.running_load)
+    assert again is not None and again.options == FIRST, "the version that ran is brought back as it ran"
+    played.load("same", options=FIRST)
+    assert played.view.options == FIRST and asked_load(played).options == MORE, "it was under way before"
+    played.load("rebuilt", num_envs=4, options=MORE)
+    assert played.view.options == MORE and asked_load(played).options == MORE
+
+
+@pytest.mark.parametrize("kills", [False, True])
+def test_options_with_which_the_task_fails_are_dropped_and_the_file_is_not_to_blame(
+    played: Told, kills: bool
+) -> None:
+    played.session.happen(OptionsApplied(MORE))
+    (load,) = played.asked(Load)
+    if kills:
+        played.tell(Loading("building", load.number))
+        played.die()
+        played.greet()
+    else:
+        played.tell(Loading("building", load.number), LoadFailed(problem(), kept=True, options=MORE))
+        assert played.view.state == "running" and not played.view.stale
+    assert played.view.problem is not None
+    assert (played.view.options, played.view.options_refused) == (FIRST, MORE)
+    assert asked_load(played).options == FIRST, "the next save does not fail for them"
+    played.session.happen(OptionsApplied(FIRST))
+    assert played.view.options_refused is None
+
+
+def test_a_task_that_never_ran_keeps_the_options_that_a_person_chose_last(told: Told) -> None:
+    told.session.happen(OptionsApplied(MORE))
+    told.tell(LoadFailed(problem(), kept=False, options=MORE))
+    assert told.view.options == MORE and asked_load(told).options == MORE

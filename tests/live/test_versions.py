@@ -1,0 +1,256 @@
+"""What a save, a failure and the end of a worker ask for, along every way down."""
+
+# The views are of a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.scenes import description, problem, table_scene
+from tests.drive.session import DEATH, Told, stop_watching, told_session
+from tests.drive.waiting import until
+from workbench.live import recovery
+from workbench.live.commands import PlayRun, RebuildScene, ReloadFile, RestartWorker
+from workbench.live.messages import Load, LoadFailed, Loading, NewProcessNeeded, Play, Settings
+from workbench.live.process.supervisor import End
+from workbench.live.recovery import Recovery
+
+GOOD, NEW = "x = 1\n", "x = 2\n"
+FILE_WAITS = replace(DEATH, end=End.FILE_WAITS)
+HANDED_OVER = replace(DEATH, end=End.HANDED_OVER)
+IDLE = replace(DEATH, doing=None)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    file = tmp_path / "push.py"
+    file.write_text(GOOD)
+    return file
+
+
+@pytest.fixture
+def one(file: Path, tmp_path: Path) -> Iterator[Told]:
+    with told_session(tmp_path / "recordings", str(file)) as told:
+        told.greet()
+        yield told
+
+
+def runs(one: Told, file: Path, text: str = GOOD, level: str | None = None, *beside: Path) -> None:
+    """The worker says that this text was loaded, and the first moment comes."""
+    if file.read_text() != text:
+        stop_watching(one.session)  # what is on the disk would be taken for a save, some moments later
+    files = (str(file), *map(str, beside))
+    one.load(level, file=files[0], source_files=files, source={files[0]: text}, source_hash=text)
+    one.reset()
+    one.asked(object)
+
+
+def next_load(one: Told) -> tuple[str, bool] | None:
+    """The text that a new worker is to load (``disk`` for what is in the file), and whether at a moment."""
+    loads = [request for request in one.greet() if isinstance(request, Load)]
+    if not loads:
+        return None
+    (load,) = loads
+    return ("disk" if load.source is None else next(iter(load.source.values())), load.snapshot is not None)
+
+
+def saved(one: Told) -> Load:
+    loads: list[Load] = []
+    until(lambda: loads.extend(one.asked(Load)) or loads, "the load of what was saved")
+    return loads[-1]
+
+
+def test_a_file_that_never_loaded_is_followed_and_one_beside_it_once_it_was_imported(
+    one: Told, file: Path
+) -> None:
+    beside = file.with_name("parts.py")
+    beside.write_text(GOOD)
+    file.write_text(NEW)
+    load = saved(one)
+    assert one.view.stale and load.any_task
+    one.tell(Loading("", load.number))
+    runs(one, file, NEW, None, beside)
+    assert not one.view.stale
+    beside.write_text(NEW)
+    load = saved(one)
+    assert (load.source, load.snapshot, load.level, load.any_task) == (None, None, "auto", False)
+    assert one.view.stale
+
+
+def test_a_module_that_broke_before_the_task_was_whole_is_followed(one: Told, file: Path) -> None:
+    beside = file.with_name("parts.py")
+    beside.write_text("x =\n")
+    one.tell(Loading("", 1), LoadFailed(replace(problem(), file=str(beside)), kept=False))
+    assert one.view.state == "error" and one.asked(Load) == []
+    beside.write_text(GOOD)
+    saved(one)
+
+
+def test_each_worker_is_greeted_with_what_the_last_one_knew(one: Told, file: Path) -> None:
+    runs(one, file)
+    one.session.change(speed=2.0)
+    one.session.do(PlayRun())
+    one.session.do(ReloadFile())
+    one.die(FILE_WAITS)
+    settings, load, play = one.greet()
+    assert isinstance(settings, Settings) and settings.speed == 2.0 and play == Play(True)
+    assert isinstance(load, Load) and load.source is None and load.snapshot is not None
+    one.tell(Loading("", load.number))
+    runs(one, file, NEW, "restarted")
+    one.die()
+    assert not any(isinstance(request, Play) for request in one.greet()), "a crash pauses"
+
+
+def test_what_ran_comes_back_at_its_newest_moment_then_at_its_start_and_then_nothing_does(
+    one: Told, file: Path
+) -> None:
+    runs(one, file)
+    one.die()
+    assert next_load(one) == (GOOD, True)
+    one.die()
+    assert next_load(one) == (GOOD, False), "a moment that kills is not tried twice"
+    one.die()
+    assert next_load(one) is None and one.view.state == "error"
+    file.write_text(NEW)
+    assert saved(one).source is None
+
+
+def test_a_file_that_kills_before_anything_ran_is_waited_for(one: Told) -> None:
+    one.tell(Loading("", 1))
+    one.die()
+    assert next_load(one) is None and not one.view.problem_at_run
+    one.session.do(RestartWorker())
+    one.die(replace(DEATH, end=End.ASKED))
+    assert one.replaced == 1 and next_load(one) == ("disk", False)
+
+
+@pytest.mark.parametrize("death", [DEATH, HANDED_OVER])
+def test_a_new_version_that_kills_or_is_refused_gives_way_to_the_last_good_one(
+    one: Told, file: Path, death: object
+) -> None:
+    runs(one, file)
+    one.session.do(PlayRun())
+    file.write_text(NEW)
+    one.tell(Loading("", saved(one).number))
+    if death is HANDED_OVER:
+        one.tell(LoadFailed(problem(), kept=True, spoiled="it ran"))
+    one.die(death)  # type: ignore[arg-type]
+    (_, load, *play) = one.greet()
+    assert isinstance(load, Load) and load.source == {str(file): GOOD} and load.snapshot is not None
+    assert play == ([Play(True)] if death is HANDED_OVER else []) and load.because == (
+        "it ran" if play else ""
+    )
+    runs(one, file)
+    assert one.view.stale and one.view.problem is not None, "brought back, and the file holds another"
+
+
+def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Told, file: Path) -> None:
+    runs(one, file)
+    one.session.do(ReloadFile())
+    one.tell(NewProcessNeeded("a class", True))
+    one.die(HANDED_OVER)
+    (load,) = [request for request in one.greet() if isinstance(request, Load)]
+    assert (load.source, load.because, load.same_scene) == (None, "a class", True)
+    one.asked(object)
+    one.tell(Loading("", load.number), LoadFailed(problem(), kept=False))
+    (load,) = one.asked(Load)
+    assert load.source == {str(file): GOOD} and load.snapshot is not None and load.because == ""
+    runs(one, file)
+    one.tell(LoadFailed(problem(), kept=True))
+    assert one.asked(Load) == [], "what ran before still runs"
+
+
+def test_a_save_is_not_lost_with_the_worker_that_dies_before_it_takes_it(one: Told, file: Path) -> None:
+    runs(one, file)
+    one.die()
+    assert next_load(one) == (GOOD, True)
+    one.session.do(ReloadFile())
+    one.die()
+    assert next_load(one) == ("disk", True), "it died at the version that was brought back"
+    runs(one, file)
+    one.die()
+    assert next_load(one) == ("disk", True), "it has not begun yet"
+
+
+def test_a_version_that_crashes_soon_and_again_gives_way_to_the_one_before(
+    one: Told, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs(one, file)
+    one.session.do(ReloadFile())
+    one.tell(Loading("", 2))
+    runs(one, file, NEW, "patched")
+    one.die()
+    assert next_load(one) == (NEW, True)
+    monkeypatch.setattr(recovery, "_PROVEN_SECONDS", -1.0)  # from now on it had worked for long enough
+    for _ in range(3):
+        runs(one, file, NEW)
+        one.die()
+        assert next_load(one) == (NEW, True), "what it did before is forgotten"
+    monkeypatch.undo()
+    runs(one, file, NEW)
+    one.die()
+    assert next_load(one) == (NEW, True)
+    runs(one, file, NEW)
+    one.die()
+    assert next_load(one) == (GOOD, True)
+    for _ in range(4):
+        runs(one, file)
+        one.die(IDLE)
+        assert next_load(one) == (GOOD, True), "there is no other, and it made a step in between"
+        runs(one, file)
+        one.step()
+    one.die(IDLE)
+    assert next_load(one) == (GOOD, True)
+    runs(one, file)
+    one.die(IDLE)
+    assert next_load(one) is None, "twice while nothing was asked of it"
+
+
+def test_after_too_many_deaths_a_reload_starts_another_worker(one: Told, file: Path) -> None:
+    runs(one, file)
+    one.session.do(RebuildScene())
+    (load,) = one.asked(Load)
+    assert load.level == "rebuilt" and one.replaced == 0
+    one.die(replace(DEATH, gives_up=True))
+    one.session.do(ReloadFile())
+    assert one.asked(Load) == [] and one.replaced == 1 and next_load(one) == ("disk", True)
+
+
+@given(st.lists(st.sampled_from(["died", "handed over", "failed", "saved", "began", "loaded"]), max_size=40))
+def test_workers_do_not_die_for_ever(events: list[str]) -> None:
+    """Between two saves only so many processes are started, whatever happens to them."""
+    task = description(table_scene(1)[0])
+    good, new = ({"push.py": text} for text in (GOOD, NEW))
+    newest = lambda: b"newest"  # noqa: E731
+    now = Recovery().next_load(newest)[0]
+    for source in (good, new):
+        now, load = now.file_requested(newest)
+        now = now.began(load.number).loaded(replace(task, source=source), 0.0)
+    loads = 0
+    for event in events:
+        if event == "saved":
+            now, _ = now.file_requested(newest)
+            loads = 0
+        elif event == "began":
+            now = now.began(10**6)
+        elif event == "loaded" and now.loading:
+            now = now.loaded(replace(task, source=now.good_source or good), 0.0)
+        elif event == "failed":
+            now, _ = now.failed(False, newest)
+        elif event in ("died", "handed over"):
+            now = now.died(event == "died", True, 0.0, newest)
+            if event == "died":
+                now, next_one = now.next_load(newest)
+                loads += next_one is not None
+        assert loads <= 8
+    now, last = now.began(10**6), None
+    for _ in range(8):
+        now, last = now.died(True, False, 0.0, newest).next_load(newest)
+    assert last is None

@@ -1,0 +1,572 @@
+"""The attacker's side of the door, over real sockets on loopback and from a real browser."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import http.server
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from urllib.parse import quote
+
+import msgspec
+import psutil
+import pytest
+import viser
+import viser._messages
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.drive.knocking import (
+    CAMERA,
+    PROTOCOL,
+    Bell,
+    ask,
+    both,
+    client,
+    close_code,
+    cookie_of,
+    knock,
+    say,
+    token_of,
+)
+from tests.drive.page import page_at
+from tests.drive.waiting import until
+from workbench.page.door import responses, viser_private
+from workbench.page.door.access import (
+    AccessRules,
+    Admitted,
+    Entered,
+    RefusedRequest,
+    RequestParts,
+    cookie_name,
+    decide,
+)
+from workbench.page.door.client_messages import KINDS, MAX_BYTES, MalformedMessage
+from workbench.page.door.connection_limits import RateLimitedLog
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.page_guard import PageGuard
+
+pytestmark = pytest.mark.thorough
+
+# A busy machine is no failure, and one door is for all that is tried on it.
+with_fixtures = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+LOADED_BY = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"}
+
+
+@pytest.fixture(scope="module")
+def gated_server() -> Iterator[GatedServer]:
+    """One for all that is tried on it."""
+    gated_server = open_server(ServerOptions(port=0))
+    yield gated_server
+    gated_server.close()
+
+
+@pytest.fixture
+def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
+    """An honest client that was there before; call it to see that it still works."""
+    bell = Bell(gated_server)
+    with client(gated_server) as connection:
+        bell.rings(connection)
+        yield lambda: bell.rings(connection)
+    bell.remove()
+
+
+# The gate ----------------------------------------------------------------------------------------
+
+
+def test_an_honest_page_is_let_in(gated_server):
+    assert both(gated_server) == (200, 101)
+    assert both(gated_server, Sec_Fetch_Site="same-origin") == (200, 101)
+    assert ask(gated_server, Sec_Fetch_Site="none")[0] == 200
+
+
+ORIGINS = [
+    "https://evil.example",
+    "http://evil.example:{port}",
+    "null",
+    "",
+    "http://127.0.0.1",
+    "http://127.0.0.1:3000",
+    "http://localhost:{port}",  # another origin than the Host to a browser
+    "http://127.0.0.1:{port}.evil.example",
+    "http://127.0.0.1:{port}@evil.example",
+    "http://evil.example#127.0.0.1:{port}",
+    "file://",
+    "chrome-extension://127.0.0.1:{port}",
+]
+
+
+def test_a_page_of_another_origin_is_refused_even_with_the_cookie(gated_server):
+    for origin in ORIGINS:
+        assert both(gated_server, Origin=origin.format(port=gated_server.port)) == (403, 403)
+
+
+HOSTS = [
+    "evil.example",
+    "evil.example:{port}",
+    "127.0.0.1.nip.io:{port}",
+    "localhost.evil.example:{port}",
+    "127.0.0.1:{port}.evil.example",
+    "127.0.0.1:{port}@evil.example",
+    "evil.example@127.0.0.1:{port}",
+    "192.168.1.5:{port}",
+    "0.0.0.0:{port}",
+    "",
+    None,
+]
+
+
+def test_a_rebound_host_is_refused_even_with_the_token(gated_server):
+    for host in HOSTS:
+        host = host and host.format(port=gated_server.port)
+        origin = f"http://{host}"  # a rebound page is same-origin with its own name
+        assert both(gated_server, Host=host, Origin=origin) == (403, 403)
+        assert ask(gated_server, f"/?token={token_of(gated_server)}", Host=host)[0] == 403
+
+
+def test_two_hosts_or_two_origins_are_refused(gated_server):
+    for name, first, second in (
+        ("Host", f"127.0.0.1:{gated_server.port}", "evil.example"),
+        ("Origin", f"http://127.0.0.1:{gated_server.port}", "https://evil.example"),
+    ):
+        request = (
+            f"GET / HTTP/1.1\r\n{name}: {first}\r\n{name}: {second}\r\nCookie: {cookie_of(gated_server)}\r\n"
+        )
+        if name == "Origin":
+            request += f"Host: 127.0.0.1:{gated_server.port}\r\n"
+        with socket.create_connection(("127.0.0.1", gated_server.port), timeout=20) as raw:
+            raw.sendall(request.encode() + b"\r\n")
+            assert raw.recv(12) == b"HTTP/1.1 403"
+
+
+def test_without_the_token_nothing_is_served(gated_server):
+    for path in ("/", "/index.html", "/workbench/logo.svg", "/no-such-file", "/?token="):
+        assert ask(gated_server, path, Cookie=None)[0] == 403, path
+    assert knock(gated_server, Cookie=None) == 403
+
+
+@pytest.mark.parametrize(
+    "change", [str.lower, lambda t: t[:-1], lambda t: t + "A", lambda t: "", lambda t: "é" + t]
+)
+def test_a_wrong_token_is_refused_wherever_it_is_shown(gated_server, change):
+    wrong = change(token_of(gated_server))
+    status, headers, _ = ask(gated_server, f"/?token={quote(wrong)}", Cookie=None)
+    assert status == 403
+    assert "Set-Cookie" not in headers
+    assert both(gated_server, Cookie=f"{cookie_name(gated_server.port)}={wrong.replace('é', 'e')}") == (
+        403,
+        403,
+    )
+
+
+def test_the_right_token_becomes_a_cookie_and_leaves_the_address(gated_server):
+    status, headers, body = ask(gated_server, f"/some/page?token={token_of(gated_server)}&x=1", Cookie=None)
+    assert (status, headers["Location"], body) == (303, "/some/page?x=1", b"")
+    assert headers["Cache-Control"] == "no-store"
+    cookie = headers["Set-Cookie"]
+    assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= set(cookie.split("; "))
+    assert both(gated_server, Cookie=cookie.partition(";")[0]) == (200, 101)
+
+
+def test_the_cookie_of_another_ports_workbench_is_refused(gated_server):
+    other = open_server(ServerOptions(port=0))
+    try:
+        assert both(gated_server, Cookie=cookie_of(other)) == (403, 403)
+        assert both(gated_server, Cookie=f"{cookie_name(gated_server.port)}={token_of(other)}") == (403, 403)
+        assert both(gated_server, Cookie=f"{cookie_name(other.port)}={token_of(gated_server)}") == (403, 403)
+        # And the browser that is in both shows both, in any order.
+        assert both(gated_server, Cookie=f"{cookie_of(other)}; {cookie_of(gated_server)}") == (200, 101)
+        assert both(other, Cookie=f"{cookie_of(other)}; {cookie_of(gated_server)}") == (200, 101)
+    finally:
+        other.close()
+
+
+PATHS = [
+    "/workbench/../../../../etc/passwd",
+    "/workbench/%2e%2e/%2e%2e/pyproject.toml",
+    "/workbench/%2e%2e%2f%2e%2e%2fpyproject.toml",
+    "/workbench/..%5cpyproject.toml",
+    "/workbench/..\\pyproject.toml",
+    "/workbench/%252e%252e/pyproject.toml",
+    "/workbench//etc/passwd",
+    "/workbench/%2fetc%2fpasswd",
+    "/workbench/logo.svg%00.html",
+    "/workbench/../pyproject.toml",
+    "/workbench/panels/../../pyproject.toml",
+    "/workbench/",
+    "/workbench/panels",
+    "/../../../etc/passwd",
+    "/%2e%2e/%2e%2e/version.py",
+    "/..\\..\\version.py",
+    "//etc/passwd",
+]
+
+
+def test_no_path_leads_out_of_the_served_folders(gated_server):
+    for path in PATHS:
+        status, _, body = ask(gated_server, path)
+        assert status == 404, path
+        assert b"root:" not in body and b"[project]" not in body and b"version" not in body
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"\x00\x01\x02\r\n\r\n",
+        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost\r\n\r\n",
+        b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 1000 + b"\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00",  # TLS
+    ],
+)
+def test_garbage_instead_of_http_harms_nobody(gated_server, bystander, raw, capfd):
+    with socket.create_connection(("127.0.0.1", gated_server.port), timeout=20) as connection:
+        connection.sendall(raw)
+        connection.shutdown(socket.SHUT_WR)
+        answer = connection.recv(64)
+    assert b" 200 " not in answer and b" 101 " not in answer
+    bystander()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+hosts = st.from_regex(r"[A-Za-z0-9.:@\[\]/\\_-]{0,30}", fullmatch=True)
+
+
+@with_fixtures
+@given(host=st.one_of(hosts, st.text(max_size=30)), path=st.text(max_size=40), cookie=st.text(max_size=40))
+def test_the_gate_lets_nobody_in_without_the_token_and_never_fails(host, path, cookie):
+    rules = AccessRules(token="x" * 43, any_address=True)
+    for websocket in (False, True):
+        asked = RequestParts(
+            path=path, host=[host], origin=[f"http://{host}"], cookie=[cookie], websocket=websocket
+        )
+        assert isinstance(decide(rules, asked), RefusedRequest)
+
+
+@with_fixtures
+@given(hosts)
+def test_without_a_token_only_loopback_hosts_are_let_in(host):
+    decision = decide(AccessRules(token=None), RequestParts(path="/", host=[host]))
+    name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
+    loopback = name.lower() == "localhost" or name.startswith(("127.", "["))
+    assert isinstance(decision, RefusedRequest) or loopback
+
+
+@with_fixtures
+@given(st.text(max_size=60))
+def test_what_follows_the_right_token_is_always_a_path_of_ours(path):
+    rules = AccessRules(token="right")
+    decision = decide(rules, RequestParts(path=f"{path}?token=right", host=["localhost:8080"]))
+    if isinstance(decision, Entered):
+        assert decision.location.startswith("/")
+        assert decision.location[1:2] not in ("/", "\\")
+        assert decision.location.isascii() and decision.location.isprintable()
+        assert "token=right" not in decision.location
+
+
+def test_a_page_without_a_token_still_refuses_foreign_pages_and_rebound_names():
+    gated_server = open_server(ServerOptions(port=0, token=False))
+    try:
+        assert both(gated_server, Cookie=None) == (200, 101)
+        assert both(gated_server, Cookie=None, Origin="https://evil.example") == (403, 403)
+        assert both(gated_server, Cookie=None, Host="evil.example", Origin="http://evil.example") == (
+            403,
+            403,
+        )
+        assert ask(gated_server, Cookie=None, Sec_Fetch_Site="cross-site", **LOADED_BY)[0] == 403
+        assert isinstance(
+            decide(AccessRules(token=None), RequestParts("/", [f"localhost:{gated_server.port}"])), Admitted
+        )
+    finally:
+        gated_server.close()
+
+
+def test_a_wide_door_takes_its_addresses_and_no_foreign_name():
+    gated_server = open_server(ServerOptions(host="0.0.0.0", port=0))
+    try:
+        for host in ("192.168.1.5", socket.gethostname().lower(), "localhost"):
+            assert both(
+                gated_server, Host=f"{host}:{gated_server.port}", Origin=f"http://{host}:{gated_server.port}"
+            ) == (
+                200,
+                101,
+            ), host
+            assert ask(gated_server, Host=f"{host}:{gated_server.port}", Cookie=None)[0] == 403
+        assert both(
+            gated_server,
+            Host=f"evil.example:{gated_server.port}",
+            Origin=f"http://evil.example:{gated_server.port}",
+        ) == (
+            403,
+            403,
+        )
+    finally:
+        gated_server.close()
+
+
+# Past the gate: what an authenticated client may say ----------------------------------------------
+
+
+def test_no_client_can_open_the_share_tunnel(gated_server, bystander, caplog):
+    process = psutil.Process()
+    children = set(process.children())
+    threads = {thread.name for thread in threading.enumerate() if "unnel" in thread.name}
+    assert not set(viser_private.REFUSED_FROM_CLIENTS) & set(KINDS)
+    for name in viser_private.REFUSED_FROM_CLIENTS:
+        assert getattr(viser._messages, name) not in gated_server.server._websock_server._incoming_handlers
+    with client(gated_server) as connection:
+        say(connection, {"type": "ShareUrlRequest"})
+        say(connection, {"type": "ShareUrlDisconnect"})
+        Bell(gated_server).rings(connection)  # the same connection lives on, and has been read this far
+    bystander()
+    assert gated_server.server._share_tunnel is None
+    assert set(process.children()) <= children
+    assert {thread.name for thread in threading.enumerate() if "unnel" in thread.name} == threads
+    assert all(
+        link.raddr.ip.startswith("127.")
+        for link in process.net_connections(kind="inet")
+        if link.raddr and link.laddr.port == gated_server.port
+    )
+    assert not [
+        link
+        for link in process.net_connections(kind="inet")
+        if link.raddr and not link.raddr.ip.startswith("127.") and link.raddr.ip != "::1"
+    ]
+    assert "ShareUrlRequest" in caplog.text
+
+
+def test_no_client_can_upload(gated_server, bystander):
+    upload = gated_server.server.gui.add_upload_button("upload")
+    with client(gated_server) as connection:
+        say(
+            connection,
+            {
+                "type": "FileTransferStartUpload",
+                "source_component_uuid": upload._impl.uuid,
+                "transfer_uuid": "t",
+                "filename": "../../etc/passwd",
+                "mime_type": "text/plain",
+                "part_count": 2,
+                "size_bytes": 2**40,
+            },
+        )
+        say(
+            connection,
+            {
+                "type": "FileTransferPart",
+                "source_component_uuid": upload._impl.uuid,
+                "transfer_uuid": "t",
+                "part_index": 0,
+                "content": b"x" * 1000,
+            },
+        )
+        Bell(gated_server).rings(connection)
+    assert gated_server.server.gui._current_file_upload_states == {}
+    upload.remove()
+    bystander()
+
+
+def test_what_is_not_for_a_page_of_ours_to_send_changes_nothing(gated_server, bystander):
+    """No page of ours has an input of viser's. viser would set any attribute of one, and store any value."""
+    slider = gated_server.server.gui.add_slider("x", 0.0, 10.0, 0.1, 5.0)
+    with client(gated_server) as connection:
+        for prop in ("value", "removed", "is_button", "update_cb", "uuid", "props", "__class__", "no_such"):
+            say(connection, {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid, "updates": {prop: 7.0}})
+        say(connection, {"type": "GuiFormSubmitMessage", "uuid": slider._impl.uuid})
+        say(connection, {"type": "RunJavascriptMessage", "source": "alert(1)"})  # only the server says that
+        Bell(gated_server).rings(connection)
+    assert slider.value == 5.0 and not slider._impl.removed and callable(slider.on_update)
+    slider.remove()
+    bystander()
+
+
+def packed(**message: object) -> bytes:
+    return msgspec.msgpack.encode(message)
+
+
+MALFORMED = [
+    *("a text frame", b"", b"\xc1garbage", bytes(range(256)), msgspec.msgpack.encode([1, 2, 3])),
+    *(
+        packed(),
+        packed(type=7),
+        packed(type=["GuiUpdateMessage"]),
+        packed(type="NoSuchMessage"),
+        packed(type="np"),
+    ),
+    packed(**{name: value for name, value in CAMERA.items() if name != "position"}),
+    *(packed(**{**CAMERA, "position": value}) for value in ((1.0, 2.0), "abc", 5)),
+    *(packed(**CAMERA, surplus=1), packed(**{**CAMERA, "fov": "wide"})),
+    b"\x82\xa4type\xb3ViewerCameraMessage\xa3fov\xcb\x7f\xf8" + b"\0" * 6,  # and no more
+    b"\x91" * 100_000,  # nested deeper than any stack
+]
+
+
+def test_a_malformed_frame_closes_its_own_connection_only(gated_server, bystander, capfd):
+    for frame in (*MALFORMED, b"x" * (MAX_BYTES + 1)):
+        with client(gated_server) as connection:
+            connection.send(frame)
+            assert close_code(connection) == (1009 if len(frame) > MAX_BYTES else 1008), frame[:40]
+    bystander()
+    with client(gated_server):  # and the door still opens
+        pass
+    # The author's terminal is no place for a stranger's tracebacks.
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@with_fixtures
+@given(
+    st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers(-(2**63), 2**63)
+        | st.floats()
+        | st.text(max_size=8)
+        | st.binary(max_size=8),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+        max_leaves=8,
+    ),
+    st.sampled_from(sorted(KINDS)),
+    st.data(),
+)
+def test_any_message_is_admitted_dropped_or_called_malformed(value, kind, data):
+    fields = list(KINDS[kind].__struct_fields__)
+    message = {
+        "type": kind,
+        **dict.fromkeys(data.draw(st.lists(st.sampled_from(fields), max_size=9)), value),
+    }
+    judged(msgspec.msgpack.encode(message))
+
+
+@with_fixtures
+@given(st.binary(max_size=200))
+def test_any_bytes_are_admitted_dropped_or_called_malformed(raw):
+    judged(raw)
+
+
+def judged(raw: bytes) -> None:
+    """Let the guard of a page that is on no connection check a frame; any other error fails the test."""
+    guard = PageGuard(lambda kind: False, RateLimitedLog(lambda line: None))
+    with contextlib.suppress(MalformedMessage):
+        assert guard.admits(raw) in (True, False)
+
+
+INPUTS = {"GuiUpdateMessage", "GuiFormDirtyMessage", "GuiFormSubmitMessage"}
+"""What viser hears of inputs, which no page of ours has."""
+
+
+def test_viser_listens_to_nothing_that_the_seam_does_not_know(gated_server, bystander):
+    """An upgrade that adds a kind of message must be looked at before clients may send it."""
+    handled = {kind.__name__ for kind in gated_server.server._websock_server._incoming_handlers}
+    for one in gated_server.server.get_clients().values():
+        handled |= {kind.__name__ for kind in one._websock_connection._incoming_handlers}
+    assert handled - set(viser_private.REFUSED_FROM_CLIENTS) <= set(KINDS) | INPUTS
+    assert len(handled) > 5
+
+
+# From a real browser ------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def hostile_site(html: str, handshakes: list[str] | None = None) -> Iterator[int]:
+    """A web server on another port of this machine, which serves ``html`` and notes who comes with a
+    websocket handshake."""
+
+    class Site(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if "Upgrade" in self.headers and handshakes is not None:
+                handshakes.append(self.path)
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(html.encode())
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    site = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Site)
+    thread = threading.Thread(target=site.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield site.server_port
+    finally:
+        site.shutdown()
+        site.server_close()
+        thread.join()
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_a_link_cannot_send_our_page_to_another_server(gated_server, browser, monkeypatch):
+    """``?websocket=`` is viser's; what such a server sends would run as our page, with our cookie."""
+    came: list[str] = []
+    later: list[str] = []
+    with (
+        # Another for each try: what was begun in the first may arrive late.
+        hostile_site("", came) as first,
+        hostile_site("", later) as second,
+        page_at(browser, "about:blank", 640, 480) as (page, _),
+    ):
+        page.goto(gated_server.url, wait_until="domcontentloaded")
+        link = f"http://127.0.0.1:{gated_server.port}/?websocket=ws://127.0.0.1:"
+        with monkeypatch.context() as without_policy:
+            without_policy.setattr(responses, "page_policy", lambda authority: "frame-ancestors 'self'")
+            page.goto(f"{link}{first}", wait_until="domcontentloaded")
+            until(lambda: came, "the attack, which is real")
+        page.goto("about:blank")
+        page.goto(f"{link}{second}", wait_until="domcontentloaded")
+        page.wait_for_selector("canvas", timeout=60_000)
+        page.wait_for_timeout(4000)  # it tries once a second, and nobody is told what the policy refuses
+        assert later == []
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(gated_server, browser):
+    """The browser holds the cookie. ``127.0.0.1`` on another port is the same *site* to it, so there the
+    cookie is sent along; ``localhost`` is another site."""
+    target = f"127.0.0.1:{gated_server.port}"
+    attack = """
+        <body><script>
+        async function attack() {
+          const seen = {};
+          seen.socket = await new Promise(done => {
+            const socket = new WebSocket("ws://TARGET", "PROTOCOL");
+            socket.onopen = () => done("open"); socket.onerror = () => done("refused");
+          });
+          seen.fetch = await fetch("http://TARGET/", {credentials: "include"}).then(() => "read", () => "refused");
+          seen.image = await new Promise(done => {
+            const image = new Image(); image.onload = () => done("read"); image.onerror = () => done("refused");
+            image.src = "http://TARGET/workbench/logo.svg";
+          });
+          return seen;
+        }
+        </script></body>
+    """
+    attack = attack.replace("TARGET", target).replace("PROTOCOL", PROTOCOL)
+    refused = {"socket": "refused", "fetch": "refused", "image": "refused"}
+    with hostile_site(attack) as port, page_at(browser, "about:blank", 640, 480) as (page, _):
+        page.goto(gated_server.url, wait_until="domcontentloaded")
+        until(gated_server.server.get_clients, "the page")
+        # The attack itself works: from our own page it gets through.
+        own = page.evaluate(
+            "() => {" + attack.partition("<script>")[2].partition("</script>")[0] + "; return attack(); }"
+        )
+        assert own == {"socket": "open", "fetch": "read", "image": "read"}
+        for site in ("127.0.0.1", "localhost"):
+            page.goto(f"http://{site}:{port}/", wait_until="domcontentloaded")
+            assert page.evaluate("attack()") == refused, site
+
+        # A person who follows a link to the printed address in another site's page gets in.
+        page.context.clear_cookies()
+        page.goto(f"http://localhost:{port}/", wait_until="domcontentloaded")
+        page.evaluate(
+            "address => { const a = document.createElement('a'); a.href = address; a.id = 'go'; a.text = 'go';"
+            " document.body.append(a); }",
+            gated_server.url,
+        )
+        page.click("#go")
+        page.wait_for_url(f"http://{target}/", wait_until="domcontentloaded")
+        page.wait_for_selector("canvas", timeout=60_000)

@@ -1,0 +1,197 @@
+"""Files that a route answers with, over a real socket: as long as was announced, whatever becomes of them."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.drive.knocking import ask, cookie_of
+from tests.drive.waiting import until
+from workbench.page.door.file_response import BLOCK, FileReply
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+
+LARGE = 48 * 2**20
+"""More bytes than the kernel takes of a connection whose other end does not read."""
+
+
+@pytest.fixture(scope="module")
+def gated_server() -> Iterator[GatedServer]:
+    """One for all that is tried on it."""
+    gated_server = open_server(ServerOptions(port=0))
+    yield gated_server
+    gated_server.close()
+
+
+@pytest.fixture
+def file(gated_server: GatedServer, tmp_path: Path, request: pytest.FixtureRequest) -> tuple[str, Path]:
+    """An address, and the file that it answers with."""
+    path = tmp_path / "recording.rerun.write"
+    prefix = f"/{request.node.name.partition('[')[0]}-{tmp_path.name}/"
+    gated_server.add_route(
+        prefix, lambda _: FileReply(path, "application/x-rerun", download_as="Größe 1.rrd")
+    )
+    return f"{prefix}x", path
+
+
+def begun(gated_server: GatedServer, address: str) -> tuple[socket.socket, bytes]:
+    """A connection on which the answer has begun and is not read on: its head and a few bytes."""
+    raw = socket.socket()
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
+    raw.settimeout(30)
+    raw.connect(("127.0.0.1", gated_server.port))
+    request = f"GET {address} HTTP/1.1\r\nHost: 127.0.0.1:{gated_server.port}\r\nCookie: {cookie_of(gated_server)}\r\n\r\n"
+    raw.sendall(request.encode())
+    got = b""
+    while b"\r\n\r\n" not in got:
+        got += raw.recv(1 << 10)
+    return raw, got
+
+
+def rest(raw: socket.socket, got: bytes) -> tuple[int, int]:
+    """What was announced, and how many bytes came until the server hung up."""
+    head, _, body = got.partition(b"\r\n\r\n")
+    (announced,) = [int(line[15:]) for line in head.split(b"\r\n") if line.startswith(b"Content-Length:")]
+    count = len(body)
+    with raw:
+        try:
+            while block := raw.recv(1 << 20):
+                count += len(block)
+        except ConnectionResetError:
+            pass  # cut off
+    return announced, count
+
+
+def open_files(path: Path) -> int:
+    return sum(found.path == str(path) for found in psutil.Process().open_files())
+
+
+def position(path: Path) -> int:
+    """How far this process has read the file; -1 where it is not open."""
+    for found in psutil.Process().open_files():
+        if found.path == str(path):
+            return found.position  # type: ignore[attr-defined]
+    return -1
+
+
+@pytest.mark.parametrize("size", [0, 1, BLOCK - 1, BLOCK, 2 * BLOCK + 1])
+def test_a_file_comes_whole_and_under_its_name(
+    gated_server: GatedServer, file: tuple[str, Path], size: int
+) -> None:
+    address, path = file
+    path.write_bytes(os.urandom(size))
+    status, headers, body = ask(gated_server, address)
+    assert (status, body) == (200, path.read_bytes())
+    assert headers["Content-Type"] == "application/x-rerun"
+    assert headers["Content-Length"] == str(size)
+    assert headers["Content-Disposition"] == "attachment; filename*=UTF-8''Gr%C3%B6%C3%9Fe%201.rrd"
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert "Content-Encoding" not in headers
+    until(lambda: open_files(path) == 0, "the end of the reading")
+
+
+def test_of_a_file_that_grows_no_more_comes_than_was_announced(
+    gated_server: GatedServer, file: tuple[str, Path]
+) -> None:
+    address, path = file
+    path.touch()
+    os.truncate(path, LARGE + 100)
+    raw, got = begun(gated_server, address)
+    os.truncate(path, LARGE + 10 * BLOCK)
+    assert rest(raw, got) == (LARGE + 100, LARGE + 100)
+
+
+def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(
+    gated_server: GatedServer, file: tuple[str, Path]
+) -> None:
+    address, path = file
+    path.touch()
+    os.truncate(path, LARGE)
+    raw, got = begun(gated_server, address)
+    os.truncate(path, LARGE // 2)
+    announced, count = rest(raw, got)
+    assert announced == LARGE and count <= LARGE // 2
+    until(lambda: open_files(path) == 0, "the end of the reading")
+
+
+def test_who_goes_away_in_the_middle_holds_nothing_and_is_no_news(
+    gated_server: GatedServer, file: tuple[str, Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    address, path = file
+    path.touch()
+    os.truncate(path, LARGE)
+    raw, _ = begun(gated_server, address)
+    assert open_files(path) == 1
+    raw.close()
+    until(lambda: open_files(path) == 0, "the end of the reading")
+    assert ask(gated_server, "/")[0] == 200
+    assert caplog.records == []
+
+
+def test_for_who_does_not_read_no_more_is_read(gated_server: GatedServer, file: tuple[str, Path]) -> None:
+    address, path = file
+    path.touch()
+    os.truncate(path, LARGE)
+    raw, _ = begun(gated_server, address)
+    with raw:
+        still, at = 0, -1
+        while still < 30:
+            assert ask(gated_server, "/workbench/logo.svg")[0] == 200
+            before, at = at, position(path)
+            still = still + 1 if at == before else 0
+        assert 0 < at < LARGE, "all of it is in memory"
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder"])
+def test_a_file_that_is_gone_is_not_found(
+    gated_server: GatedServer, file: tuple[str, Path], kind: str
+) -> None:
+    address, path = file
+    if kind == "folder":
+        path.mkdir()
+    status, headers, body = ask(gated_server, address)
+    assert (status, body) == (404, b"There is no such file.")
+    assert headers["X-Content-Type-Options"] == "nosniff" and "Content-Security-Policy" in headers
+
+
+def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(
+    gated_server: GatedServer, tmp_path: Path
+) -> None:
+    plain = b"wasm " * BLOCK
+    path = tmp_path / "viewer.wasm.gz"
+    path.write_bytes(gzip.compress(plain))
+    gated_server.add_route("/packed/", lambda _: FileReply(path, "application/wasm", gzipped=True))
+    status, headers, body = ask(gated_server, "/packed/x", Accept_Encoding="br, gzip")
+    assert (status, headers["Content-Encoding"], headers["Vary"]) == (200, "gzip", "Accept-Encoding")
+    assert body == path.read_bytes() and "Content-Disposition" not in headers
+    status, headers, body = ask(gated_server, "/packed/x", Accept_Encoding="identity")
+    assert (status, headers["Vary"], body) == (200, "Accept-Encoding", plain)
+    assert headers["Content-Length"] == str(len(plain)) and "Content-Encoding" not in headers
+    until(lambda: open_files(path) == 0, "the end of the reading")
+
+
+@pytest.mark.parametrize("damage", ["not packed at all", "torn off", "turned"])
+def test_a_packed_file_that_is_damaged_is_cut_off_and_the_terminal_stays_quiet(
+    gated_server: GatedServer, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
+) -> None:
+    packed = bytearray(gzip.compress(os.urandom(6 * BLOCK)))
+    if damage == "not packed at all":
+        packed[:2] = b"no"
+    elif damage == "torn off":
+        packed[3 * BLOCK : -4] = b""
+    else:
+        packed[3 * BLOCK : 3 * BLOCK + 4096] = b"\xff" * 4096
+    path = tmp_path / "viewer.wasm.gz"
+    path.write_bytes(packed)
+    prefix = f"/damaged-{damage.replace(' ', '-')}/"
+    gated_server.add_route(prefix, lambda _: FileReply(path, "application/wasm", gzipped=True))
+    raw, got = begun(gated_server, f"{prefix}x")
+    announced, count = rest(raw, got)
+    assert announced == 6 * BLOCK and count < announced
+    until(lambda: open_files(path) == 0, "the end of the reading")
+    assert caplog.records == []

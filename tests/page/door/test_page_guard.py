@@ -1,0 +1,134 @@
+"""What a page tells viser: impossible numbers and floods reach neither viser nor any other page."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.connection import Connection
+
+from tests.drive.knocking import CAMERA, Bell, client, close_code, say
+from tests.drive.tabs import messages_in
+from tests.drive.waiting import until
+from workbench.page.door import page_guard
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+
+pytestmark = pytest.mark.thorough
+
+
+@pytest.fixture(scope="module")
+def gated_server() -> Iterator[GatedServer]:
+    """One for all that is tried on it."""
+    gated_server = open_server(ServerOptions(port=0))
+    yield gated_server
+    gated_server.close()
+
+
+@pytest.fixture
+def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
+    """A page that was there before; call it to see that it still works, and still hears what others are told."""
+    bell, shown = Bell(gated_server), gated_server.server.gui.add_html("0")
+    heard: list[str] = []
+
+    def listen(connection: Connection) -> None:
+        for frame in connection:
+            assert isinstance(frame, bytes)
+            for message in messages_in(frame):
+                if message["type"] == "GuiUpdateMessage" and "content" in message["updates"]:
+                    heard.append(message["updates"]["content"])
+
+    with client(gated_server) as reader, client(gated_server) as other:
+        thread = threading.Thread(target=listen, args=(reader,))
+        thread.start()
+
+        def works() -> None:
+            bell.rings(other)
+            shown.content = str(bell.rung)
+            until(lambda: str(bell.rung) in heard, "what all pages are told")
+
+        works()
+        yield works
+        reader.close()
+        thread.join()
+    bell.remove()
+    shown.remove()
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"position": (NAN, 0.0, 0.0)},
+        {"look_at": (0.0, INF, 0.0)},
+        {"up_direction": (0.0, 0.0, 1e200)},
+        {"wxyz": (0.0, 0.0, 0.0, 0.0)},
+        {"fov": 0.0},
+        {"fov": NAN},
+        {"image_width": -1},
+        {"image_height": 10**9},
+        {"near": -INF},
+    ],
+    ids=str,
+)
+def test_a_camera_that_cannot_be_is_dropped_and_the_page_stays(gated_server, bystander, change):
+    with client(gated_server) as connection:
+        known = {
+            number: one.camera.position.copy() for number, one in gated_server.server.get_clients().items()
+        }
+        say(connection, {**CAMERA, "position": (7.0, 7.0, 7.0), **change})
+        Bell(gated_server).rings(connection)
+        for number, one in gated_server.server.get_clients().items():
+            assert (one.camera.position == known[number]).all()
+    bystander()
+
+
+def test_a_gizmo_goes_nowhere_that_is_no_place(gated_server, bystander):
+    gizmo = gated_server.server.scene.add_transform_controls("/gizmo")
+    update = {"type": "TransformControlsUpdateMessage", "name": "/gizmo", "owner": gizmo._impl.api._owner_id}
+    with client(gated_server) as connection:
+        for wxyz, position in (
+            ((1.0, 0.0, 0.0, 0.0), (NAN, 0.0, 0.0)),
+            ((NAN, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+            ((0.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+        ):
+            say(connection, {**update, "wxyz": wxyz, "position": position})
+        Bell(gated_server).rings(connection)
+        assert tuple(gizmo.position) == (0.0, 0.0, 0.0)
+        say(connection, {**update, "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (1.0, 2.0, 3.0)})
+        until(lambda: tuple(gizmo.position) == (1.0, 2.0, 3.0), "the gizmo's place")
+    gizmo.remove()
+    bystander()
+
+
+@pytest.mark.parametrize("item", [b"\xc0", b"\x90", b"\x80", b"\xa0", b"\x01"], ids=repr)
+def test_a_large_message_of_tiny_objects_is_not_taken_apart(gated_server, bystander, item):
+    with client(gated_server) as connection:
+        connection.send(b"\xdd" + (20_000_000).to_bytes(4, "big") + item * 20_000_000)
+        assert close_code(connection) == 1009
+    bystander()
+
+
+def test_a_page_that_floods_is_slowed_then_let_go_and_the_others_go_on(gated_server, bystander, monkeypatch):
+    monkeypatch.setattr(page_guard, "PATIENCE", 0.5)
+    flooded = Bell(gated_server)
+    gone = threading.Event()
+
+    def flood() -> None:
+        with client(gated_server) as connection, contextlib.suppress(ConnectionClosed):
+            while True:
+                say(connection, flooded.message)
+        gone.set()
+
+    thread = threading.Thread(target=flood)
+    thread.start()
+    until(lambda: flooded.rung > 0, "the flood")
+    while not gone.is_set():
+        bystander()
+    thread.join()
+    bystander()
+    flooded.remove()

@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import trimesh
+import viser
+
+from tests.drive.scenes import table_scene
+from workbench.envs.scene.shapes import Material, Mesh
+from workbench.page.scene.bodies import LEAVES_AFTER, DrawStyle, SceneView
+from workbench.page.scene.env_grid import lay_out
+
+
+def handle_named(view: SceneView, part: str) -> viser.BatchedGlbHandle:
+    return next(handle for handle in view.handles if part in handle.name)
+
+
+def test_bodies_stand_at_their_pose_plus_their_env_s_place(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(4)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server)
+    view.build(geometry, layout, poses)
+    poses[:, 3, :3] += [0.1, 0.2, 0.3]
+    poses[2, 3, 3:] = [0, 0, 0, 1]
+    view.move(poses, layout, only_env=None)
+    cube = handle_named(view, "cube")
+    np.testing.assert_allclose(cube.batched_positions, poses[:, 3, :3] + layout.offsets, atol=1e-6)
+    np.testing.assert_allclose(cube.batched_wxyzs, poses[:, 3, 3:])
+
+
+def test_floor_is_drawn_once(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(9)
+    view = SceneView(server)
+    view.build(geometry, lay_out(geometry, poses), poses)
+    assert handle_named(view, "ground").batched_positions.shape == (1, 3)
+
+
+def test_one_env_alone_sends_one_env_at_the_origin(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(9)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server)
+    view.build(geometry, layout, poses, only_env=5)
+    np.testing.assert_allclose(handle_named(view, "cube").batched_positions, poses[5:6, 3, :3])
+    view.move(poses, layout, only_env=None)
+    assert handle_named(view, "cube").batched_positions.shape == (9, 3)
+
+
+def test_absent_body_is_left_out_and_hidden_when_no_env_has_it(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(3)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server)
+    view.build(geometry, layout, poses)
+    poses[1, 3] = np.nan
+    view.move(poses, layout, None)
+    cube = handle_named(view, "cube")
+    assert cube.batched_positions.shape == (2, 3)
+    assert np.isfinite(cube.batched_positions).all()
+    poses[:, 3] = np.nan
+    view.move(poses, layout, None)
+    assert not cube.visible
+    poses[:, 3] = poses[:, 2]
+    view.move(poses, layout, None)
+    assert cube.visible
+
+
+def test_what_another_env_alone_has_is_not_seen_in_this_one(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(3)
+    cube = replace(geometry.visuals[4], envs=np.array([0, 2], np.int32), bodies=np.full(2, 3, np.int32))
+    geometry = replace(geometry, visuals=(*geometry.visuals[:4], cube))
+    layout, view = lay_out(geometry, poses), SceneView(server)
+    view.build(geometry, layout, poses, only_env=2)
+    assert handle_named(view, "cube").visible
+    view.move(poses, layout, only_env=1)
+    assert not handle_named(view, "cube").visible
+    view.move(poses, layout, only_env=None)
+    assert handle_named(view, "cube").visible and len(handle_named(view, "cube").batched_positions) == 2
+
+
+def test_reload_keeps_the_nodes_that_look_as_before(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(4)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server)
+    view.build(geometry, layout, poses)
+    before = view.handles
+    again, _ = table_scene(4)
+    blue = replace(again.visuals[4], material=Material((0.0, 0.0, 1.0, 1.0)))
+    again = replace(again, visuals=(*again.visuals[:4], blue))
+    view.build(again, layout, poses)
+    assert all(new is old for new, old in zip(view.handles[:3], before[:3], strict=True))
+    assert view.handles[3] is not before[3]
+
+
+def test_a_dark_floor_is_lighter_in_the_light_theme_and_nothing_else_is_sent(
+    server: viser.ViserServer,
+) -> None:
+    geometry, poses = table_scene(4)
+    layout = lay_out(geometry, poses)
+    ground = next(visual for visual in geometry.visuals if "ground" in visual.name)
+    dark = replace(ground, material=Material((0.05, 0.05, 0.06, 1.0)))
+    geometry = replace(geometry, visuals=tuple(dark if v is ground else v for v in geometry.visuals))
+    view = SceneView(server)
+    view.build(geometry, layout, poses)
+    before = {handle.name: handle.glb_data for handle in view.handles}
+    view.build(geometry, layout, poses, looks=DrawStyle(dark=False))
+    new = [handle for handle in view.handles if handle.name not in before]
+    assert len(new) == 1 and "ground" in new[0].name and len(view.handles) == len(before)
+    scene: Any = trimesh.load(io.BytesIO(new[0].glb_data), file_type="glb", force="scene")
+    (floor,) = scene.geometry.values()
+    assert floor.visual.material.baseColorFactor[:3].min() > 200
+    view.build(geometry, layout, poses)
+    assert {handle.glb_data for handle in view.handles} == set(before.values())
+
+
+def test_simpler_shapes_take_the_place_of_the_finer_ones_a_moment_later(server: viser.ViserServer) -> None:
+    now = 0.0
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32))
+    geometry, poses = table_scene(4)
+    cube = next(visual for visual in geometry.visuals if "cube" in visual.name)
+    visuals = tuple(replace(visual, mesh=mesh) if visual is cube else visual for visual in geometry.visuals)
+    geometry = replace(geometry, visuals=visuals)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server, clock=lambda: now)
+    view.build(geometry, layout, poses)
+    fine = handle_named(view, "cube")
+    rest = [handle.name for handle in view.handles if handle is not fine]
+    view.build(geometry, layout, poses, looks=DrawStyle(error=0.01))
+    simple = handle_named(view, "cube")
+    assert len(simple.glb_data) < 0.5 * len(fine.glb_data)
+    assert [handle.name for handle in view.handles if handle is not simple] == rest
+    poses[:, 3, 0] += 0.1
+    view.move(poses, layout, None)
+    # Both follow, so that nothing is seen of the change.
+    np.testing.assert_array_equal(fine.batched_positions, simple.batched_positions)
+    assert server.scene.get_handle_by_name(fine.name) is fine
+    now = LEAVES_AFTER
+    view.move(poses, layout, None)
+    assert server.scene.get_handle_by_name(fine.name) is None
+    assert server.scene.get_handle_by_name(simple.name) is simple

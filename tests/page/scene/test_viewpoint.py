@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import numpy as np
+import viser
+import websockets.sync.client
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.drive.panels import Panels
+from tests.drive.scenes import running, table_scene
+from tests.drive.tabs import camera_message, handshake
+from tests.drive.waiting import until
+from workbench.envs.camera_data import Picture
+from workbench.live.panels.view_panel import ViewPanel
+from workbench.page.scene.bodies import DrawStyle
+from workbench.page.scene.env_grid import lay_out
+from workbench.page.scene.viewpoint import FOV, ONE, Framing, ViewChoice, Viewpoint, frame_box, frame_one
+
+
+@given(
+    size=st.tuples(st.floats(0.05, 60), st.floats(0.05, 60), st.floats(0.05, 10)),
+    aspect=st.floats(0.35, 3.5),
+    covered=st.floats(0, 0.45),
+)
+@settings(max_examples=80)
+def test_whole_box_is_in_the_picture_above_what_is_covered(
+    size: tuple[float, float, float], aspect: float, covered: float
+) -> None:
+    low, high = -np.array(size) / 2, np.array(size) / 2
+    viewpoint = frame_box(low, high, aspect, covered)
+    forward = viewpoint.look_at - viewpoint.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+    corners = np.where(picks == 0, low, high) - viewpoint.position
+    depth = corners @ forward
+    assert (depth > 0).all()
+    assert (corners @ up <= np.tan(FOV / 2) * depth).all()
+    assert (corners @ up >= -(1 - 2 * covered) * np.tan(FOV / 2) * depth).all()
+    assert (np.abs(corners @ right) <= np.tan(FOV / 2) * aspect * depth).all()
+
+
+def test_the_human_camera_s_picture_is_above_what_is_covered() -> None:
+    geometry, poses = table_scene(1)
+    pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
+    picture, covered, fovy = Picture("render_camera", "human", 0, pose), 0.3, 1.0
+    viewpoint = frame_one(lay_out(geometry, poses), picture, 1.25, covered, fovy)
+    layout = lay_out(geometry, poses)
+    depth = 1.5 - float(layout.low[0] + layout.high[0]) / 2
+    away = viewpoint.position[0] - (1.5 - depth)
+    for part, place in ((0.0, covered), (1.0, 1.0), (-1.0, -(1 - 2 * covered))):
+        # A point of the middle plane at the picture's middle, top and bottom: where it is in the view, -1 to 1.
+        z = 0.4 + part * depth * np.tan(fovy / 2)
+        assert abs((z - viewpoint.position[2]) / (away * np.tan(FOV / 2)) - place) < 1e-5
+
+
+def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:
+    geometry, poses = table_scene(1)
+    # At x = 1.5, turned half round z: it looks along -x.
+    pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
+    viewpoint = frame_one(lay_out(geometry, poses), Picture("render_camera", "human", 0, pose))
+    np.testing.assert_allclose(viewpoint.position, pose[:3], atol=1e-6)
+    towards = viewpoint.look_at - viewpoint.position
+    np.testing.assert_allclose(towards / np.linalg.norm(towards), [-1, 0, 0], atol=1e-6)
+
+
+def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
+    server: viser.ViserServer,
+) -> None:
+    framing = Framing(server)
+
+    def frame(aspect: float, height: float) -> Viewpoint:
+        return frame_box(np.full(3, -1.0), np.full(3, 1.0), aspect)
+
+    framing.frame(frame)
+    address, arguments = handshake(f"http://127.0.0.1:{server.get_port()}")
+    with websockets.sync.client.connect(address, **arguments) as page:
+
+        def shows(width: int, position: np.ndarray) -> np.ndarray:
+            """Where it looks from after it said that it is so wide."""
+            page.send(camera_message(position.tolist(), width))
+            until(
+                lambda: any(one.camera.image_width == width for one in server.get_clients().values()),
+                "its width",
+            )
+            framing.follow()
+            framing.frame_untouched(frame)
+            (client,) = server.get_clients().values()
+            return np.array(client.camera.position)
+
+        at = np.array(server.initial_camera.position)
+        for narrower in (600, 500, 400):
+            before, at = at, shows(narrower, at)
+            assert np.linalg.norm(at) != np.linalg.norm(before), narrower
+        assert np.allclose(at, frame(400 / 720, 720).position)
+        begins = np.array(server.initial_camera.position)
+        assert np.allclose(shows(399, begins), frame(399 / 720, 720).position), "where it begins came after"
+        moved = at + 0.1
+        assert np.allclose(shows(300, moved), moved), "the view is the person's"
+        (client,) = server.get_clients().values()
+        for what in ("live", "review"):
+            assert framing.is_new(what)
+            if what == "review":
+                framing.frame_new(frame)
+        assert not np.allclose(client.camera.position, moved)
+        assert framing.is_new("live")
+        framing.frame_new(frame)
+        assert np.allclose(client.camera.position, moved), "back from the review"
+
+
+def test_what_is_chosen_in_the_view_panel_holds_for_the_pages_to_come(panels: Panels) -> None:
+    choice = ViewChoice()
+    panel = ViewPanel(panels.server, dark=True, chosen=choice)
+    panels.visitors.do = panel.do
+    panel.draw(running(1))
+    assert not panels.shows("Show")
+    panel.draw(running(4))
+    panels.set("Show", ONE)
+    panels.set("Detail", "coarse")
+    panels.set("Theme", "light")
+    panel.draw(running(4))
+    assert [panels.field(name).value for name in ("Show", "Detail", "Theme")] == [ONE, "coarse", "light"]
+    assert panel.only_selected and panel.looks == DrawStyle(50_000, False)
+    panel.toggle_only_selected()
+    panel.toggle_dark()
+    panel.draw(running(4))
+    assert [panels.field(name).value for name in ("Show", "Theme")] == ["all envs", "dark"]
+    with panels.server.gui.add_folder("The next page"):
+        assert ViewPanel(panels.server, chosen=choice).looks == DrawStyle(50_000, True)

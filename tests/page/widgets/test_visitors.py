@@ -1,0 +1,183 @@
+"""The channel of commands: numbered, in order, one reply each; what is no command ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
+
+from tests.drive.tabs import handshake, tabs_of
+from tests.drive.waiting import PATIENCE, until
+from workbench.commands import COMMANDS
+from workbench.live.commands import SetSeed, Step, TogglePlay
+from workbench.live.env_commands import NextEnv, SelectEnv
+from workbench.page.command import Command, Refused
+from workbench.page.door.gated_server import GatedServer
+from workbench.page.widgets.visitors import PATH, Done, Visitor, Visitors
+
+
+@dataclass
+class House:
+    """Two open pages, and what they asked for."""
+
+    gated_server: GatedServer
+    visitors: Visitors
+    came: list[tuple[str, Command]] = field(default_factory=list)
+    go_on: threading.Event = field(default_factory=threading.Event)
+
+    def do(self, command: Command, visitor: Visitor) -> Done:
+        match command:
+            case NextEnv():
+                return self._wait(command, visitor)
+            case SelectEnv(env=env) if env > 3:
+                raise Refused(f"There is no env {env}.")
+            case TogglePlay():
+                raise LookupError("of a test")
+        self.came.append((visitor.name, command))
+        return None
+
+    async def _wait(self, command: Command, visitor: Visitor) -> None:
+        async with asyncio.timeout(PATIENCE):
+            while not self.go_on.is_set():
+                await asyncio.sleep(0.01)
+        self.came.append((visitor.name, command))
+
+    def names(self) -> list[str]:
+        return [visitor.name for visitor in self.visitors.all()]
+
+    def open(self, page: str) -> Connection:
+        address, how = handshake(self.gated_server.url)
+        del how["subprotocols"]
+        return connect(f"{address.rstrip('/')}{PATH}?page={page}", proxy=None, **how)
+
+
+@pytest.fixture
+def house(gated_server: GatedServer) -> Iterator[House]:
+    visitors = Visitors(gated_server.server, COMMANDS)
+    house = House(gated_server, visitors)
+    visitors.do = house.do
+    gated_server.add_channel(PATH, visitors.serve)
+    with tabs_of(gated_server.url) as tabs:
+        tabs.open()
+        tabs.open()
+        until(lambda: len(house.names()) == 2, "both pages")
+        yield house
+        house.go_on.set()
+
+
+def say(channel: Connection, number: int, name: str, **fields: Any) -> None:
+    channel.send(json.dumps({"n": number, "do": [name, fields]}))
+
+
+def reply(channel: Connection) -> dict[str, Any]:
+    return json.loads(channel.recv(PATIENCE))
+
+
+def test_commands_are_done_in_order_and_each_is_answered(house: House) -> None:
+    one, other = house.names()
+    with house.open(one) as channel, house.open(other) as beside:
+        for number in range(1, 21):
+            say(channel, number, "select_env", env=number % 3)
+        say(beside, 1, "step")
+        assert [reply(channel) for _ in range(20)] == [{"n": number} for number in range(1, 21)]
+        assert reply(beside) == {"n": 1}
+    assert [command for who, command in house.came if who == one] == [
+        SelectEnv(env=n % 3) for n in range(1, 21)
+    ]
+    assert (other, Step()) in house.came
+
+
+def test_a_page_that_waits_does_not_hold_up_another(house: House) -> None:
+    one, other = house.names()
+    with house.open(one) as channel, house.open(other) as beside:
+        say(channel, 1, "next_env")
+        say(channel, 2, "step")
+        say(beside, 1, "step")
+        assert reply(beside) == {"n": 1} and house.came == [(other, Step())]
+        house.go_on.set()
+        assert [reply(channel)["n"] for _ in range(2)] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [
+        ("select_env", {"env": 4}),
+        ("select_env", {"env": "three"}),
+        ("select_env", {}),
+        ("select_env", {"env": 1, "more": 1}),
+        ("set_seed", {"seed": 5_000_000_000}),
+        ("set_seed", {"seed": 1.5}),
+        ("set_seed", {"seed": -1}),
+        ("set_seed", {"seed": "NaN"}),
+        ("set_seed", {"seed": True}),
+    ],
+)
+def test_what_a_command_does_not_take_is_refused_in_words_and_the_next_is_done(
+    house: House, name: str, fields: dict[str, Any]
+) -> None:
+    with house.open(house.names()[0]) as channel:
+        say(channel, 1, name, **fields)
+        say(channel, 2, "set_seed", seed=12)
+        first, second = reply(channel), reply(channel)
+    assert first["n"] == 1 and first["refused"].endswith(".") and second == {"n": 2}
+    assert [command for _, command in house.came] == [SetSeed(seed=12)]
+
+
+def test_a_command_that_fails_costs_itself_alone(house: House, caplog: pytest.LogCaptureFixture) -> None:
+    with house.open(house.names()[0]) as channel:
+        say(channel, 1, "toggle_play")
+        say(channel, 2, "step")
+        assert reply(channel)["refused"] and reply(channel) == {"n": 2}
+    assert "of a test" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        "",
+        "no json",
+        "[]",
+        '{"n": 1}',
+        '{"n": "1", "do": ["step", {}]}',
+        '{"n": 1, "do": ["step", {}], "also": 1}',
+        '{"n": 1, "do": ["rm_rf", {}]}',
+        '{"n": 1, "do": ["__class__", {}]}',
+        "[" * 100_000,
+        b"\xff\xfe",
+    ],
+)
+def test_what_is_no_command_ends_that_connection_and_no_other(house: House, raw: str | bytes) -> None:
+    one, other = house.names()
+    with house.open(one) as channel, house.open(other) as beside:
+        channel.send(raw)
+        with pytest.raises(ConnectionClosed) as closed:
+            channel.recv(PATIENCE)
+        assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
+        say(beside, 1, "step")
+        assert reply(beside) == {"n": 1}
+    assert [command for _, command in house.came] == [Step()]
+
+
+def test_who_is_no_open_page_is_sent_away(house: House) -> None:
+    for name in ("", "made-up", house.names()[0][:-1]):
+        with house.open(name) as channel, pytest.raises(ConnectionClosed):
+            channel.recv(PATIENCE)
+    address, how = handshake(house.gated_server.url.replace("token=", "token=x"))
+    del how["subprotocols"]
+    with pytest.raises(InvalidHandshake):
+        connect(f"{address.rstrip('/')}{PATH}?page={house.names()[0]}", proxy=None, **how)
+
+
+def test_each_command_says_what_it_does_and_has_a_key_of_its_own() -> None:
+    helps = [kind.help() for kind in COMMANDS]
+    assert all(helps) and len(set(helps)) == len(helps)
+    for kind, key in COMMANDS.keys().items():
+        assert isinstance(kind(), Command) and key.command in COMMANDS, "a key asks with default values"

@@ -1,0 +1,285 @@
+"""Recording, saving and rescoring as values: any sequence of events and commands, and the order of what has to be done."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.scenes import camera, description, step_of, table_scene
+from tests.drive.session import DEATH, moment
+from workbench.app.state import Effect, SessionEvent, State, apply
+from workbench.cameras.state import first_studio
+from workbench.live.effects import Asked, Then
+from workbench.live.events import (
+    EnvsReset,
+    FileSaved,
+    LoadDone,
+    Now,
+    RunEffect,
+    Send,
+    VersionLoaded,
+    WorkerDied,
+)
+from workbench.live.messages import Loaded, Reset, SetCapture, Settings
+from workbench.live.messages import ReloadReport as Report
+from workbench.live.process.background_jobs import JobProgress, StoppedBy
+from workbench.live.process.supervisor import End
+from workbench.live.run import first_run
+from workbench.live.timeline_commands import StopRescoring
+from workbench.page.command import Command, Refused
+from workbench.record import state as of_recording
+from workbench.record.commands import (
+    ChooseRecordedEnvs,
+    RecordNextEpisode,
+    SavePreviousEpisode,
+    SaveSolved,
+    StopRecording,
+    ToggleRecording,
+    ToggleSavePast,
+)
+from workbench.record.gather import Finished
+from workbench.record.saving_state import BeginSaving, EpisodesSaved, SaveFailed, SaveProgressed, SaveWanted
+from workbench.record.state import (
+    BeginEpisodes,
+    EndEpisodes,
+    EpisodeEnded,
+    EpisodesRecovered,
+    EpisodeWritten,
+    LiveRecording,
+    RecordEffect,
+    RecordingWanted,
+    RunningEpisodes,
+    StepRecorded,
+    TakeStep,
+)
+from workbench.rescore import state as of_rescoring
+from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreEffect, RescoreView, RescoringTold
+from workbench.solve.state import RunningEpisode, Solving
+from workbench.task.description import TaskOptions
+
+ENVS = 3
+NOW = Now(5.0, 1e9)
+
+
+def loaded(level: Any = None, hash: str = "a", envs: int = ENVS) -> VersionLoaded:
+    """The worker has loaded a version; without a level the first."""
+    geometry, poses = table_scene(envs)
+    first = step_of(poses, success=np.zeros(envs, bool))
+    task = replace(description(geometry, (camera(),)), source_hash=hash)
+    report = None if level is None else Report(level, "")
+    return VersionLoaded(Loaded(task, first, {}, report, None), True)
+
+
+def stepped(elapsed: int, jumped: tuple[int, ...] = ()) -> SessionEvent:
+    return moment(np.full(ENVS, elapsed, np.int32), jumped, number=elapsed)
+
+
+RESET, STEP = stepped(0, (0, 1, 2)), stepped(1)
+COMMANDS: list[Command] = [
+    ToggleRecording(),
+    StopRecording(),
+    RecordNextEpisode(),
+    ToggleSavePast(),
+    SavePreviousEpisode(),
+    SaveSolved(),
+    ChooseRecordedEnvs(envs="all"),
+    ChooseRecordedEnvs(envs="selected"),
+    StopRescoring(),
+]
+numbers, envs = st.integers(0, 3), st.lists(st.integers(0, ENVS - 1), unique=True).map(tuple)
+EVENTS = st.one_of(
+    st.sampled_from(COMMANDS).map(Asked),
+    st.builds(
+        loaded, st.sampled_from([None, "same", "patched", "rebuilt", "restarted"]), st.sampled_from("ab")
+    ),
+    st.builds(stepped, st.integers(0, 5), st.sampled_from([(), (), (1,), (0, 1, 2)])),
+    st.builds(WorkerDied, st.builds(replace, st.just(DEATH), end=st.sampled_from(End)), st.just("")),
+    st.sampled_from([LoadDone(), FileSaved(), EnvsReset()]),
+    st.builds(RecordingWanted, st.none() | envs, st.booleans()),
+    st.builds(SaveWanted, st.none() | envs.filter(bool), st.booleans()),
+    st.builds(
+        StepRecorded,
+        numbers,
+        st.just(0),
+        envs,
+        st.builds(RunningEpisodes, numbers, numbers, numbers),
+        st.none() | st.text(min_size=1, max_size=5),
+    ),
+    st.builds(EpisodeEnded, st.booleans()),
+    st.builds(EpisodeWritten, st.builds(Finished, numbers, numbers)),
+    st.builds(EpisodesRecovered, st.just(("a.rrd",)), st.none() | st.just("no folder")),
+    st.builds(SaveProgressed, numbers, st.just(JobProgress("drawing", 1, 2))),
+    st.builds(EpisodesSaved, numbers, st.text(max_size=5)),
+    st.builds(SaveFailed, numbers, st.text(max_size=5)),
+    st.builds(
+        RescoringTold,
+        numbers,
+        st.builds(RescoreView, st.sampled_from(["loading", "rescoring", "done", "failed"]), done=numbers),
+    ),
+)
+
+
+def first() -> State:
+    run = first_run("push.py", TaskOptions(ENVS), 2**20, Settings())
+    return State(run, LiveRecording("recordings"), first_studio(None))
+
+
+Passed = tuple[State, SessionEvent, State, list[Effect]]
+"""The state before, the event, the state after it, and what has to be done."""
+
+
+def apply_of_these(state: State, event: SessionEvent) -> tuple[State, list[Effect]]:
+    """The state after an event, and what these features and the run have to do."""
+    state, effects = apply(state, event, NOW)
+    return state, [
+        effect for effect in effects if isinstance(effect, RecordEffect | RescoreEffect | RunEffect)
+    ]
+
+
+def passed(happened: list[SessionEvent]) -> list[Passed]:
+    """What each event came to; one that is refused changes nothing."""
+    state, came = first(), []
+    for event in happened:
+        before = state
+        effects: list[Effect] = []
+        try:
+            state, effects = apply_of_these(state, event)
+        except Refused as reason:
+            assert str(reason)
+        came.append((before, event, state, effects))
+    return came
+
+
+def after(*happened: SessionEvent) -> tuple[State, list[Effect]]:
+    """The state at the end, and what has to be done then."""
+    return passed(list(happened))[-1][2:]
+
+
+@given(st.lists(EVENTS, max_size=25))
+def test_any_sequence_gives_the_same_values_and_records_nothing_that_was_not_asked_for(
+    happened: list[SessionEvent],
+) -> None:
+    came, again = passed(happened), passed(happened)
+    for (before, event, state, effects), (_, _, other, _) in zip(came, again, strict=True):
+        assert (state.recording, state.rescoring) == (other.recording, other.rescoring)
+        recording, status = state.recording, state.recording.status(state.run)
+        assert status.active == bool(recording.env_idx) and status.saving.failed in (False, True)
+        for effect in effects:
+            match effect:
+                case TakeStep():
+                    assert before.recording.env_idx and event is effect.stepped
+                case BeginEpisodes():
+                    assert isinstance(event, Asked | RecordingWanted | LoadDone)
+                    assert (effect.number, effect.env_idx) == (recording.number, recording.env_idx)
+                case BeginSaving():
+                    assert isinstance(event, Asked | SaveWanted) and effect.what.episodes
+                    assert status.saving.progress is not None
+                case BeginRescoring():
+                    assert isinstance(event, VersionLoaded) and effect.past is state.rescoring.past
+        if before.recording.env_idx and not recording.env_idx:
+            assert EndEpisodes() in effects
+
+
+def test_an_episode_that_a_load_ends_is_followed_by_the_next_one_of_each_env() -> None:
+    begun = loaded(), RESET, Asked(ToggleRecording()), RESET, STEP
+    state, effects = after(*begun, loaded("patched", "b"))
+    assert EndEpisodes() in effects and not state.recording.env_idx
+    again, effects = after(*begun, loaded("patched", "b"), LoadDone())
+    begin, capture = effects
+    assert isinstance(begin, BeginEpisodes) and begin.task.source_hash == "b"
+    assert capture == Send(SetCapture((0,), from_reset=True)), "no reset, which would lose the moment"
+    assert again.recording.since == NOW.wall and again.recording.env_idx == (0,)
+    state, effects = after(*begun, loaded("rebuilt", "b"), LoadDone())
+    assert effects[1:] == [Send(SetCapture((0,), from_reset=True)), Then(EnvsReset((0,)))]
+    state, effects = after(*begun, loaded("same"), LoadDone())
+    assert state.recording.env_idx == (0,) and effects == []
+
+
+def test_envs_that_a_smaller_version_lacks_are_recorded_no_more() -> None:
+    all_envs = Asked(ChooseRecordedEnvs(envs="all")), Asked(ToggleRecording())
+    state, effects = after(loaded(), *all_envs, RESET, loaded("rebuilt", "b", envs=2), LoadDone())
+    assert state.recording.env_idx == (0, 1) and Then(EnvsReset((0, 1))) in effects
+    last = RecordingWanted((2,))
+    state, effects = after(loaded(), last, RESET, loaded("rebuilt", "b", envs=2), LoadDone())
+    assert not state.recording.env_idx and effects == []
+
+
+def test_what_dies_is_not_recorded_again_and_what_is_handed_over_is() -> None:
+    for end in End:
+        died = WorkerDied(replace(DEATH, end=end), "")
+        state, _ = after(loaded(), RESET, Asked(ToggleRecording()), died, loaded(), LoadDone())
+        assert bool(state.recording.env_idx) == (end is End.HANDED_OVER)
+
+
+def test_envs_are_reset_after_their_capture_was_asked_for() -> None:
+    state, effects = after(loaded(), Asked(ChooseRecordedEnvs(envs="all")), Asked(ToggleRecording()))
+    assert effects[1:] == [Send(SetCapture((0, 1, 2), from_reset=True)), Then(EnvsReset())]
+    _, effects = apply_of_these(state, EnvsReset())
+    assert effects == [Send(Reset(None, state.run.seed))]
+
+
+def test_steps_that_wait_for_the_disk_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(of_recording, "MOST_WAITING_BYTES", 1)
+    state, effects = after(loaded(), Asked(ToggleRecording()), RESET)
+    assert (
+        effects == [EndEpisodes(), Send(SetCapture(()))]
+        and state.recording.problem
+        and not state.recording.env_idx
+    )
+
+
+def test_what_an_older_recording_or_job_says_changes_nothing_but_the_bytes_that_wait() -> None:
+    state, _ = after(loaded(), RESET, STEP, Asked(ToggleRecording()), Asked(RecordNextEpisode()))
+    assert state.recording.number == 2
+    said, effects = apply_of_these(state, StepRecorded(1, 10, (), RunningEpisodes(1, 1, 1), "it failed"))
+    assert effects == [] and said.recording == replace(state.recording, waiting_bytes=-10)
+    state, effects = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveWanted((1,)))
+    assert [type(effect) for effect in effects] == [BeginSaving]
+    said = RescoringTold(1, RescoreView("done"))
+    for event in (EpisodesSaved(1, "saved"), SaveFailed(1, "it failed"), said):
+        assert apply_of_these(state, event) == (state, [])
+    state, _ = apply_of_these(state, EpisodesSaved(2, "saved"))
+    assert state.recording.status(state.run).saving.message == "saved"
+
+
+def test_episodes_are_saved_once_they_are_solved_and_one_job_at_a_time() -> None:
+    state, _ = after(loaded(), RESET, STEP)
+    with pytest.raises(Refused):
+        apply_of_these(state, Asked(SaveSolved()))
+    solved = Solving(episodes={env: RunningEpisode(solved_at=1) for env in (0, 2)})
+    state, (begin,) = apply_of_these(replace(state, solving=solved), Asked(SaveSolved()))
+    assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [0, 2]
+    with pytest.raises(Refused):
+        apply_of_these(state, Asked(SaveSolved()))
+
+
+def test_a_rescoring_that_a_save_stopped_begins_again_if_the_version_stays_the_same() -> None:
+    begun = loaded(), RESET, STEP, loaded("patched", "b")
+    state, effects = after(*begun)
+    assert any(isinstance(effect, BeginRescoring) for effect in effects)
+    assert (state.rescoring.view.state, state.rescoring.view.total) == ("loading", 1)
+    state, effects = after(*begun, FileSaved())
+    assert effects[0] == EndRescoring() and state.rescoring.view.stopped_by is StoppedBy.SAVE
+    state, effects = after(*begun, FileSaved(), loaded("same", "b"))
+    assert state.rescoring.view.state == "loading" and isinstance(effects[0], BeginRescoring)
+    state, effects = after(*begun, loaded("rebuilt", "c"))
+    assert state.rescoring.view.state == "none" and effects[0] == EndRescoring()
+    state, _ = after(*begun, Asked(StopRescoring()))
+    assert state.rescoring.view.stopped_by is StoppedBy.HAND
+    with pytest.raises(Refused):
+        apply_of_these(state, Asked(StopRescoring()))
+
+
+def test_an_episode_that_was_saved_of_the_past_is_none_of_the_recording() -> None:
+    state, _ = after(loaded(), Asked(ToggleRecording()), EpisodeEnded(live=True), EpisodeEnded(live=False))
+    assert (state.recording.episodes, state.recording.being_written) == (1, 2)
+
+
+def test_every_command_of_these_features_is_taken() -> None:
+    taken = of_recording.DOES | of_rescoring.DOES
+    assert {type(command) for command in COMMANDS} == taken

@@ -1,0 +1,310 @@
+"""What a save changed and which level that asks for: on the example task, and on code that is hard to tell."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from workbench.task.reload_level import Change, Inherited, find_change, removed_effects
+
+FILE = "/author/task.py"
+PUSH_CUBE = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
+BASE_ENV = Inherited(
+    frozenset(
+        (
+            "__init__ _load_agent _load_scene _load_lighting _initialize_episode evaluate compute_dense_reward "
+            "compute_normalized_dense_reward _get_obs_extra _default_sensor_configs _after_control_step step "
+            "_default_human_render_camera_configs SUPPORTED_ROBOTS SUPPORTED_REWARD_MODES agent"
+        ).split()
+    )
+)
+
+
+def change(
+    old: str, new: str, class_name: str = "Task", inherited: Inherited = BASE_ENV, **more: str
+) -> Change:
+    beside = {f"/author/{name}.py": text for name, text in more.items()}
+    return find_change({FILE: old, **beside}, {FILE: new, **beside}, FILE, class_name, inherited)
+
+
+def of_push_cube(old: str, new: str) -> Change:
+    assert PUSH_CUBE.count(old) >= 1, old
+    return change(PUSH_CUBE, PUSH_CUBE.replace(old, new, 1), "PushCubeEnv")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "level", "says"),
+    [
+        ("# Ahead of the cube", "# Before the cube", "same", ""),
+        ('"""Push the blue cube', '"""Shove the blue cube', "same", "docstrings"),
+        (
+            "reach = 1 - torch.tanh(5 * distance)",
+            "reach = 1 - torch.tanh(9 * distance)",
+            "patched",
+            "dense_reward",
+        ),
+        ('"cube_height": height', '"height": height', "patched", "only evaluate changed"),
+        ('obs["cube_pose"]', 'obs["pose_of_cube"]', "patched", "_get_obs_extra"),
+        ("2 * torch.rand((b, 2)) - 1", "torch.rand((b, 2)) - 1", "patched", "seen from the next reset on"),
+        ("SPAWN_HALF_WIDTH = 0.1", "SPAWN_HALF_WIDTH = 0.2", "patched", "SPAWN_HALF_WIDTH"),
+        (
+            "    def evaluate(self)",
+            "    def more(self):\n        return 1\n\n    def evaluate(self)",
+            "patched",
+            "no hook",
+        ),
+        ("import torch\n", "import torch\nimport math\n", "patched", "math"),
+        ("eye=[0.45, 0, 0.6]", "eye=[0.45, 0, 0.7]", "cameras", "_default_sensor_configs"),
+        ("width=512, height=512", "width=256, height=256", "cameras", "_default_human_render"),
+        ("CUBE_HALF_SIZE = 0.02", "CUBE_HALF_SIZE = 0.03", "rebuilt", "_load_scene uses"),
+        ("base_color=[0.05,", "base_color=[0.5,", "rebuilt", "_load_scene changed"),
+        ("p=[-0.615, 0, 0]", "p=[-0.6, 0, 0]", "rebuilt", "_load_agent changed"),
+        ("max_episode_steps=50", "max_episode_steps=60", "rebuilt", "PushCubeEnv changed"),
+        ('SUPPORTED_ROBOTS = ["panda"', 'SUPPORTED_ROBOTS = ["fetch"', "rebuilt", "SUPPORTED_ROBOTS"),
+        (
+            "self.robot_init_qpos_noise = robot",
+            "self.robot_init_qpos_noise = 2 * robot",
+            "rebuilt",
+            "__init__",
+        ),
+        ("(BaseEnv):", "(BaseEnv, object):", "rebuilt", "PushCubeEnv changed"),
+        ("def compute_normalized_dense_reward", "def compute_normalised", "rebuilt", "reward mode"),
+    ],
+)
+def test_an_edit_of_the_example_asks_for_its_level(old: str, new: str, level: str, says: str) -> None:
+    found = of_push_cube(old, new)
+    assert found.level == level, found.reason
+    assert says in found.reason
+
+
+def test_an_edit_of_two_things_is_told_as_two_and_gets_the_heavier_level() -> None:
+    new = PUSH_CUBE.replace("torch.tanh(5 * distance)", "torch.tanh(6 * distance)").replace(
+        "eye=[0.45,", "eye=[0.5,"
+    )
+    found = change(PUSH_CUBE, new, "PushCubeEnv")
+    assert found.level == "cameras"
+    assert "compute_dense_reward" in found.reason and "_default_sensor_configs" in found.reason
+
+
+def task(body: str, top: str = "") -> str:
+    """A file with a task class that has this body, and `top` above it."""
+    head = (
+        "import functools\nimport numpy as np\nimport torch\nfrom mani_skill.envs.sapien_env import BaseEnv\n"
+    )
+    return f"{head}{textwrap.dedent(top)}\n\nclass Task(BaseEnv):\n{textwrap.indent(textwrap.dedent(body), '    ')}"
+
+
+REWARD = """
+def _load_scene(self, options):
+    self.cube = self.scene.build()
+
+def compute_dense_reward(self, obs, action, info):
+    return {of} * info["distance"]
+"""
+
+
+def test_a_plain_helper_of_the_reward_is_patched_and_one_of_the_scene_too_is_rebuilt() -> None:
+    top = "def scaled(x):\n    return {} * x\n"
+    body = REWARD.format(of="scaled(1)")
+    assert change(task(body, top.format(1)), task(body, top.format(2))).level == "patched"
+    shared = body.replace("self.scene.build()", "self.scene.build(scaled(3))")
+    found = change(task(shared, top.format(1)), task(shared, top.format(2)))
+    assert (found.level, found.reason) == ("rebuilt", "scaled changed, which _load_scene uses")
+
+
+def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
+    body = """
+    def _load_scene(self, options):
+        self.cube = self.scene.build(self._size())
+
+    def _size(self):
+        return SIZES["cube"]
+
+    def evaluate(self):
+        return {"big": self.cube.size > SIZES["cube"]}
+    """
+    top = "EDGE = {}\nSIZES = {{'cube': EDGE}}\n"
+    found = change(task(body, top.format(1)), task(body, top.format(2)))
+    assert found.level == "rebuilt" and "EDGE changed" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("hooks", "top", "says"),
+    [
+        (
+            "def evaluate(self):\n    if not hasattr(self, 'w'):\n        self.w = {n}\n    return {{'w': self.w}}\n",
+            "",
+            "hasattr",
+        ),
+        (
+            "def evaluate(self):\n    if self.w is None:\n        self.w = {n}\n    return {{'w': self.w}}\n",
+            "",
+            "may keep",
+        ),
+        ("def evaluate(self):\n    self.w = self.w or {n}\n    return {{'w': self.w}}\n", "", "may keep"),
+        (
+            "def evaluate(self):\n    if self.done:\n        return {{}}\n    self.w = {n}\n    return {{'w': self.w}}\n",
+            "",
+            "may keep",
+        ),
+        ("def evaluate(self):\n    return {{'w': self.kept.setdefault('w', {n})}}\n", "", "setdefault"),
+        (
+            "@functools.lru_cache\ndef table(self):\n    return {n}\ndef evaluate(self):\n    return {{'w': self.table()}}\n",
+            "",
+            "lru_cache",
+        ),
+        (
+            "@functools.cached_property\ndef table(self):\n    return {n}\ndef evaluate(self):\n    return {{'w': self.table}}\n",
+            "",
+            "cached",
+        ),
+        ("def evaluate(self, kept={{}}):\n    kept['w'] = {n}\n    return kept\n", "", "default"),
+        (
+            "def evaluate(self):\n    global W\n    W = {n}\n    return {{'w': W}}\n",
+            "W = 0\n",
+            "W may be changed",
+        ),
+        (
+            "def evaluate(self):\n    SEEN['w'] = {n}\n    return SEEN\n",
+            "SEEN = {{}}\n",
+            "SEEN may be changed",
+        ),
+        (
+            "def evaluate(self):\n    SEEN.append({n})\n    return {{}}\n",
+            "SEEN = [1]\n",
+            "SEEN may be changed",
+        ),
+        (
+            "def evaluate(self):\n    mine = SEEN\n    mine[0] = {n}\n    return {{}}\n",
+            "SEEN = [1]\n",
+            "SEEN may be changed",
+        ),
+        (
+            "def evaluate(self):\n    return {{'w': RNG.uniform() + {n}}}\n",
+            "RNG = np.random.default_rng(0)\n",
+            "RNG may be changed",
+        ),
+        ("def evaluate(self):\n    return {{'w': getattr(self, 'com' + 'pute')({n})}}\n", "", "getattr"),
+        ("def evaluate(self):\n    return eval('{n}')\n", "", "eval"),
+        (
+            "def evaluate(self):\n    return {{'w': isinstance(self.x, Mode) + {n}}}\n",
+            "class Mode:\n    A = 1\n",
+            "the class Mode",
+        ),
+        (
+            "def __init__(self):\n    super().__init__()\n    self.w = self.first\ndef evaluate(self):\n    self.first = {n}\n    return {{}}\n",
+            "",
+            "super().__init__()",
+        ),
+        (
+            "def __getattr__(self, name):\n    return 1\ndef evaluate(self):\n    return {{'w': self.x + {n}}}\n",
+            "",
+            "__getattr__",
+        ),
+        ("def evaluate(self):\n    return {{'w': {n}}}\n", "from helpers import *\n", "import *"),
+    ],
+)
+def test_code_that_may_keep_or_reach_the_old_version_is_rebuilt(hooks: str, top: str, says: str) -> None:
+    versions = [task(hooks.format(n=n), top.format()) for n in (1, 2)]
+    found = change(versions[0], versions[1], helpers="def f():\n    return 1\n")
+    assert found.level == "rebuilt", found
+    assert says in found.reason
+
+
+@pytest.mark.parametrize(
+    "hooks",
+    [
+        "def evaluate(self):\n    self.best = torch.maximum(self.best, self.d) + {n}\n    return {{'b': self.best}}\n",
+        "def evaluate(self):\n    out = {{}}\n    if self.flag:\n        out['b'] = {n}\n    return out\n",
+        "def compute_dense_reward(self, obs, action, info):\n    r = torch.zeros(3)\n    for i in range(2):\n        if i:\n            r[i] = {n}\n    return r\n",
+        "@torch.no_grad()\ndef evaluate(self):\n    return {{'w': TABLE[1] * {n}}}\n",
+        "def _get_obs_extra(self, info):\n    obs = super()._get_obs_extra(info)\n    if self.flag:\n        obs['b'] = {n}\n    return obs\n",
+    ],
+)
+def test_everyday_code_is_not_taken_for_a_memory(hooks: str) -> None:
+    versions = [task(hooks.format(n=n), "TABLE = [1.0, 2.0]\n") for n in (1, 2)]
+    found = change(versions[0], versions[1])
+    assert found.level == "patched", found.reason
+
+
+def test_an_attribute_that_is_no_longer_written_but_still_read_is_rebuilt() -> None:
+    body = "def _initialize_episode(self, env_idx, options):\n    {}\n\ndef evaluate(self):\n    return {{'g': self.goal}}\n"
+    found = change(task(body.format("self.goal = 1")), task(body.format("pass")))
+    assert found.level == "rebuilt" and "no longer writes goal" in found.reason
+
+
+def test_a_robot_of_the_file_is_what_the_env_was_built_of_though_nobody_names_it() -> None:
+    top = "from mani_skill.agents.base_agent import BaseAgent\n\n\nclass Robot(BaseAgent):\n    uid = 'mine'\n    def reach(self):\n        return {}\n"
+    body = "SUPPORTED_ROBOTS = ['mine']\ndef evaluate(self):\n    return {'r': self.agent.tcp}\n"
+    assert change(task(body, top.format(1)), task(body, top.format(2))).level == "rebuilt"
+    assert (
+        change(task(body, top.format(1)), task(body.replace("'r'", "'s'"), top.format(1))).level == "patched"
+    )
+
+
+def test_another_order_of_an_enums_members_is_rebuilt() -> None:
+    members = "    A = enum.auto()\n", "    B = enum.auto()\n"
+    body, head = (
+        "def evaluate(self):\n    return {'m': Mode.A.value}\n",
+        "import enum\n\n\nclass Mode(enum.Enum):\n",
+    )
+    found = change(task(body, head + "".join(members)), task(body, head + "".join(members[::-1])))
+    assert found.level == "rebuilt" and "Mode" in found.reason
+
+
+def test_a_helper_beside_the_task_is_compared_too() -> None:
+    texts = [
+        {
+            FILE: task(REWARD.format(of="far()"), "from beside import far\n"),
+            "/author/beside.py": f"def far():\n    return {n}\n",
+        }
+        for n in (1, 2)
+    ]
+    found = find_change(texts[0], texts[1], FILE, "Task", BASE_ENV)
+    assert (found.level, found.reason) == ("patched", "only far of beside.py changed")
+    built = [{**t, FILE: t[FILE].replace("scene.build()", "scene.build(far())")} for t in texts]
+    assert find_change(built[0], built[1], FILE, "Task", BASE_ENV).level == "rebuilt"
+
+
+def test_a_name_that_a_library_class_uses_while_it_builds_is_built_of() -> None:
+    body = "def _cube_color(self):\n    return {}\n"
+    library = Inherited(BASE_ENV.names, frozenset({"_cube_color"}))
+    assert change(task(body.format(1)), task(body.format(2)), inherited=library).level == "rebuilt"
+    assert change(task(body.format(1)), task(body.format(2))).level == "patched"
+
+
+@pytest.mark.parametrize("hook", ["self.cube.pose.p", "torch.rand(3)", "self._batched_episode_rng.uniform()"])
+def test_cameras_that_depend_on_the_moment_are_rebuilt(hook: str) -> None:
+    body = f"@property\ndef _default_sensor_configs(self):\n    return [Camera({hook}, {{}})]\n"
+    assert change(task(body.replace("{}", "1")), task(body.replace("{}", "2"))).level == "rebuilt"
+
+
+def test_a_file_that_cannot_be_read_is_no_error() -> None:
+    assert change("def (", task("def evaluate(self):\n    return {}\n")).level == "rebuilt"
+    assert change(task("x = 1\n"), "class Task(BaseEnv):\n    x = 1\n" + "\0").level == "rebuilt"
+
+
+@pytest.mark.parametrize(
+    ("statement", "has_one"),
+    [
+        ("torch.set_num_threads(8)", True),
+        ("torch.backends.flag = True", True),
+        ("np.seterr_of['all'] += 1", True),
+        ("if SIZE:\n    torch.set_num_threads(8)", True),
+        ("SIZE = max(1, 2)", False),
+        ("import math", False),
+    ],
+)
+def test_what_an_import_did_and_a_new_version_does_not_is_told_at_its_line(
+    statement: str, has_one: bool
+) -> None:
+    def removed(old: str, new: str) -> str:
+        return removed_effects({FILE: old}, {FILE: new})
+
+    base = task("x = 1\n", "SIZE = 1\n")
+    old = f"{base}\n{statement}\n"
+    line = base.count("\n") + 2
+    assert removed(old, base) == (f"task.py:{line} ({statement.splitlines()[0]})" if has_one else "")
+    assert removed(base, old) == removed(old, f"import re\n{old}") == removed(old, old) == ""

@@ -1,0 +1,100 @@
+"""A file of the author's that is called like a library: the library stays the library, and the author is told."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import pytest
+
+from tests.drive.task_files import Write
+from workbench.actions.policy import load_policy
+from workbench.task.load import load_task
+from workbench.task.problem import TaskError
+
+pytestmark = pytest.mark.thorough
+
+TASK = """
+@register_env("AuthorNamed-v1", max_episode_steps=5)
+class NamedEnv(BaseEnv):
+    pass
+"""
+LATE = ("colorsys", "sched", "sympy", "jinja2")
+"""Of the standard library and of what we depend on, and not imported so far."""
+
+
+@pytest.fixture
+def late() -> tuple[str, ...]:
+    for name in LATE:
+        for loaded in [key for key in sys.modules if key.partition(".")[0] == name]:
+            del sys.modules[loaded]
+    return LATE
+
+
+def plant(write: Write, *names: str) -> None:
+    for name in names:
+        write(f"{name}.py", "raise RuntimeError('the author\\'s')\n")
+
+
+@pytest.mark.slow
+def test_a_librarys_name_is_the_librarys_wherever_it_is_imported_late(
+    write: Write, late: tuple[str, ...]
+) -> None:
+    plant(write, "numpy", *late)
+    path = write("push.py", "import numpy, helper\n" + TASK, task=True)
+    helper = write("helper.py", "SIZE = 1\n")
+    task = load_task(str(path))
+    for name in late:
+        assert "RuntimeError" not in str(importlib.import_module(name).__file__)
+        assert not str(importlib.import_module(name).__file__).startswith(str(path.parent))
+    assert sys.modules[task.cls.__module__].helper.__file__ == str(helper), (
+        "other names are found beside the file"
+    )
+    assert task.source_files == (path, helper)
+
+
+@pytest.mark.parametrize("name", ["sapien", "torch", "numpy", "random", "sympy", "mani_skill", "workbench"])
+def test_a_task_may_itself_be_called_like_a_library(write: Write, name: str) -> None:
+    library = sys.modules.get(name)
+    path = write(f"{name}.py", f"import {name}\nSEEN = {name}\n" + TASK, task=True)
+    task = load_task(str(path))
+    assert task.file == path
+    seen = sys.modules[task.cls.__module__].SEEN
+    assert seen is not sys.modules[task.cls.__module__] and (library is None or seen is library)
+    path.write_text(path.read_text() + "\nNEXT = 1\n")
+    assert sys.modules[load_task(str(path)).cls.__module__].NEXT == 1
+
+
+def test_a_first_load_that_fails_leaves_no_folder_and_no_finder_behind(write: Write) -> None:
+    path_before, finders = list(sys.path), list(sys.meta_path)
+    plant(write, "numpy")
+    path = write(
+        "push.py", "import sys\nsys.path.insert(0, '/nowhere')\nsys.path.append('/elsewhere')\n1 / 0\n"
+    )
+    with pytest.raises(TaskError):
+        load_task(str(path))
+    assert (sys.path, sys.meta_path) == (path_before, finders)
+    good = write("good.py", TASK, task=True)
+    load_task(str(good))
+    assert sys.path[0] == str(good.parent)
+    before = list(sys.path), list(sys.meta_path)
+    with pytest.raises(TaskError):
+        load_task(str(path))
+    assert (sys.path, sys.meta_path) == before
+
+
+def test_a_policy_imports_what_lies_beside_it_but_no_library(
+    write: Write, late: tuple[str, ...], capsys: pytest.CaptureFixture
+) -> None:
+    plant(write, *late)
+    write("gains.py", "GAIN = 3\n")
+    imports = "".join(f"import {name}\n" for name in late)
+    policy = write("own_policy.py", imports + "from gains import GAIN\ndef act(obs): return GAIN\n")
+    before = list(sys.path), list(sys.meta_path)
+    sys.modules.pop("gains", None)
+    assert load_policy(f"{policy}:act")(None) == 3
+    assert (sys.path, sys.meta_path) == before
+    assert "colorsys.py has the name of a library" in capsys.readouterr().err
+    load_policy(f"{policy}:act")
+    assert "colorsys" not in capsys.readouterr().err, "told once"
+    del sys.modules["gains"]
