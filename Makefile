@@ -4,7 +4,7 @@
 #
 #   make open TASK=path/to/task.py ARGS="--num-envs 4 --port 8123"
 #   make test ARGS="-k camera"
-#   make mutants MODULES="ui/server/access core/snapshots/snapshot"
+#   make mutants MODULES="page/door/access envs/snapshots/snapshot"
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
@@ -60,7 +60,7 @@ help:
 	@echo "make test-all  the slow tests too"
 	@echo "make test-order all of them in random order (SEED=1 makes one order again)"
 	@echo "make test MANISKILL=nightly  the same tests with ManiSkill's nightly build, in .venv-nightly; likewise make open"
-	@echo "make mutants   would a test notice? Slips are planted in copies of MODULES (ui/server/access ..., or all)"
+	@echo "make mutants   would a test notice? Slips are planted in copies of MODULES (page/door/access ..., or all)"
 	@echo "make test-gpu  on a machine with CUDA: what of GPU simulation and GPU pictures works, within 8 minutes"
 	@echo "               (without a network: WHEELS=DIR, filled by make gpu-wheels WHEELS=DIR elsewhere, and PHYSX_GPU=FILE)"
 	@echo "make lint      ruff and pyright, the tests' types too"

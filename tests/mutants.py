@@ -1,6 +1,6 @@
 """Would a test notice? Single slips are planted in a module, and the tests that protect it are run on each.
 
-Not a test: ``make mutants MODULES="ui/server/access core/snapshots/snapshot"`` runs it, ``MODULES=all`` all of `PROTECTED`. Cosmic Ray
+Not a test: ``make mutants MODULES="page/door/access envs/snapshots/snapshot"`` runs it, ``MODULES=all`` all of `PROTECTED`. Cosmic Ray
 makes the slips; the rest is here: which of them, in a copy of the tree, and by which tests they should be found.
 """
 
@@ -39,99 +39,97 @@ ENOUGH = 85
 """Percent of a module's mutants that have to die."""
 
 PROTECTED = {
-    "recording/writing/journal": "recording/writing/test_journal.py",
-    "recording/reader/episode_wire": "recording/episode/test_episode_wire.py",
-    "recording/writing/finish": "recording/writing/test_recover.py recording/writing/test_finish.py",
-    "recording/library/trash": "recording/library/test_trash.py",
-    "recording/episode/document": "recording/episode/test_document.py recording/episode/test_checksums.py",
-    "recording/reader/reading": "recording/reader/test_sources.py",
-    "recording/writing/from_journal": "recording/writing/test_recover.py recording/writing/test_episode_writer.py",
-    "recording/library/library": "recording/library/test_library.py -k 'not two_processes and not follows_the_folder'",
-    "recording/library/index": "recording/library/test_index.py",
-    "recording/episode/made_here": "session/test_clearance.py recording/episode/test_document.py",
-    "recording/writing/episode_writer": "recording/writing/test_episode_writer.py",
-    "machine/files": "recording/test_new_file.py recording/episode/test_tags.py recording/writing/test_publish.py"
-    " machine/test_folders.py authoring/camera_source/test_disk.py",
-    "authoring/loading/registry": "authoring/loading/test_registry.py",
-    "authoring/loading/modules": "authoring/loading/test_load.py authoring/loading/test_task_content.py authoring/loading/test_library_names.py"
-    " authoring/loading/test_named_modules.py",
-    "authoring/source/text": "authoring/camera_source/test_which_camera.py authoring/camera_source/test_members.py"
-    " authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py authoring/source/test_text.py",
-    "authoring/source/read_values": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
-    " authoring/camera_source/test_which_camera.py",
-    "authoring/source/changes": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"
-    " authoring/camera_source/test_which_camera.py authoring/camera_source/test_rotations.py"
-    " authoring/camera_source/test_members.py",
-    "authoring/source/names": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
-    " authoring/camera_source/test_which_camera.py",
-    "authoring/camera_source/disk": "authoring/camera_source/test_disk.py",
-    "authoring/camera_source/edit": "authoring/camera_source/test_which_camera.py"
-    " authoring/camera_source/test_members.py",
-    "authoring/camera_source/plan": "authoring/camera_source/test_which_camera.py"
-    " authoring/camera_source/test_round_trip.py authoring/camera_source/test_shapes.py",
-    "authoring/camera_source/run_hooks": "authoring/camera_source/test_which_camera.py"
-    " authoring/camera_source/test_members.py",
-    "authoring/loading/copy_task": "authoring/loading/test_copy_task.py",
-    "authoring/loading/watch": "authoring/loading/test_watch.py",
-    "core/snapshots/snapshot": "core/snapshots/test_snapshot.py",
-    "core/env/partial_reset": "core/env/test_partial_reset.py",
-    "core/env/task_env": "core/env/test_task_env.py",
-    "core/simulation/contact_queries": "core/simulation/test_contact_queries.py",
-    "core/simulation/mirrors": "core/simulation/test_batched_cpu.py core/simulation/test_drive_targets.py core/env/test_strict.py",
-    "core/simulation/cpu_system": "core/simulation/test_batched_cpu.py core/test_gpu_members.py core/simulation/test_stepping.py core/env/test_strict.py",
-    "core/simulation/strict_system": "core/env/test_strict.py",
-    "core/scene/scene_index": "core/scene/test_scene_index.py core/capture/test_state_columns.py core/scene/test_merged_structs.py",
-    "core/cameras/report": "core/cameras/test_report.py",
-    "core/snapshots/packing": "core/snapshots/test_packing.py",
-    "core/snapshots/task_state": "core/snapshots/test_task_state.py",
-    "core/env/kept_rows": "core/env/test_kept_rows.py",
-    "core/simulation/accessors": "core/env/test_strict.py core/simulation/test_drive_targets.py",
-    "core/capture/outliers": "core/capture/test_outlier_watch.py",
-    "core/env/evaluate_entries": "core/env/test_evaluate_entries.py authoring/test_return_problems.py",
-    "core/snapshots/cpu_state": "core/snapshots/test_snapshot.py core/snapshots/test_fresh_physics.py",
-    "core/capture/state_columns": "core/capture/test_state_columns.py core/capture/test_inspect_env.py core/capture/test_recorded_state.py",
-    "core/cameras/render": "core/test_pictures.py core/cameras/test_step_pictures.py core/cameras/test_mounted_cameras.py",
-    "jobs/pool/deal": "jobs/pool/test_pool.py",
-    "jobs/pool/processes": "jobs/pool/test_pool.py",
+    "episodes/writing/journal": "episodes/writing/test_journal.py",
+    "episodes/reader/episode_wire": "episodes/test_episode_wire.py",
+    "episodes/writing/finish": "episodes/writing/test_recover.py episodes/writing/test_finish.py",
+    "library/trash": "library/test_trash.py",
+    "episodes/document": "episodes/test_document.py episodes/test_checksums.py",
+    "episodes/reader/reading": "episodes/reader/test_sources.py",
+    "episodes/writing/from_journal": "episodes/writing/test_recover.py episodes/writing/test_episode_writer.py",
+    "library/folder": "library/test_library.py -k 'not two_processes and not follows_the_folder'",
+    "library/index": "library/test_index.py",
+    "episodes/seal": "trust/test_clearance.py episodes/test_document.py",
+    "episodes/writing/episode_writer": "episodes/writing/test_episode_writer.py",
+    "machine/files": "episodes/test_new_file.py episodes/test_tags.py episodes/writing/test_publish.py"
+    " machine/test_folders.py task/test_apply_edits.py",
+    "task/registry": "task/test_registry.py",
+    "task/modules": "task/test_load.py task/test_task_content.py task/test_library_names.py"
+    " task/test_named_modules.py",
+    "source/parsed": "cameras/edit/test_which_camera.py cameras/edit/test_members.py"
+    " cameras/edit/test_shapes.py cameras/edit/test_round_trip.py source/test_text.py",
+    "source/read_values": "source/test_read_values.py cameras/edit/test_shapes.py"
+    " cameras/edit/test_which_camera.py",
+    "source/traced_edits": "cameras/edit/test_shapes.py cameras/edit/test_round_trip.py"
+    " cameras/edit/test_which_camera.py cameras/edit/test_rotations.py"
+    " cameras/edit/test_members.py",
+    "source/definitions": "source/test_read_values.py cameras/edit/test_shapes.py"
+    " cameras/edit/test_which_camera.py",
+    "task/apply_edits": "task/test_apply_edits.py",
+    "cameras/edit/camera_edit": "cameras/edit/test_which_camera.py cameras/edit/test_members.py",
+    "cameras/edit/plan": "cameras/edit/test_which_camera.py"
+    " cameras/edit/test_round_trip.py cameras/edit/test_shapes.py",
+    "cameras/edit/run_hooks": "cameras/edit/test_which_camera.py cameras/edit/test_members.py",
+    "task/copy": "task/test_copy_task.py",
+    "task/watch": "task/test_watch.py",
+    "envs/snapshots/snapshot": "envs/snapshots/test_snapshot.py",
+    "envs/partial_reset": "envs/test_partial_reset.py",
+    "envs/task_env": "envs/test_task_env.py",
+    "envs/simulation/contact_queries": "envs/simulation/test_contact_queries.py",
+    "envs/simulation/mirrors": "envs/simulation/test_batched_cpu.py envs/simulation/test_drive_targets.py envs/test_strict.py",
+    "envs/simulation/cpu_system": "envs/simulation/test_batched_cpu.py envs/test_gpu_members.py envs/simulation/test_stepping.py envs/test_strict.py",
+    "envs/simulation/strict_system": "envs/test_strict.py",
+    "envs/scene/scene_index": "envs/scene/test_scene_index.py envs/test_state_columns.py envs/scene/test_merged_structs.py",
+    "pictures/camera_report": "pictures/test_report.py",
+    "envs/snapshots/packing": "envs/snapshots/test_packing.py",
+    "envs/snapshots/task_state": "envs/snapshots/test_task_state.py",
+    "envs/kept_rows": "envs/test_kept_rows.py",
+    "envs/simulation/accessors": "envs/test_strict.py envs/simulation/test_drive_targets.py",
+    "envs/outliers": "envs/test_outlier_watch.py",
+    "envs/evaluate_entries": "envs/test_evaluate_entries.py task/test_return_problems.py",
+    "envs/snapshots/cpu_state": "envs/snapshots/test_snapshot.py envs/snapshots/test_fresh_physics.py",
+    "envs/state_columns": "envs/test_state_columns.py envs/test_inspect_env.py episodes/test_recorded_state.py",
+    "pictures/render": "pictures/test_pictures.py pictures/test_step_pictures.py pictures/test_mounted_cameras.py",
+    "jobs/scheduler": "jobs/test_pool.py",
+    "jobs/local_processes": "jobs/test_pool.py",
     "machine/processes/wire": "machine/processes/test_wire.py machine/processes/test_line.py",
-    "session/process/askers": "session/process/test_askers.py",
-    "session/history/history": "session/history/test_history.py session/history/test_env_table.py",
-    "session/history/env_table": "session/history/test_env_table.py",
-    "session/history/curves": "session/history/test_curves.py",
-    "jobs/rescore/verdict": "jobs/test_verdict.py",
-    "session/rescore/past": "session/rescore/test_past.py session/rescore/test_past_rescorer.py",
-    "session/process/supervisor": "session/process/test_supervisor.py",
-    "session/run/recovery": "session/live/test_versions.py",
-    "session/run/loading": "session/live/test_versions.py session/live/test_live_state.py",
-    "session/run/apply": "session/live/test_live_state.py session/live/test_timeline.py session/live/test_apply.py",
-    "session/run/past": "session/live/test_timeline.py",
-    "session/run/reading": "session/live/test_live_state.py",
-    "jobs/actions": "jobs/test_given_actions.py",
-    "session/record/live": "session/record/test_recorder_thread.py",
-    "session/record/recording": "session/test_record_apply.py session/record/test_recorder_thread.py",
-    "session/record/saving": "session/test_record_apply.py session/record/test_recorder_thread.py",
-    "session/rescore/rescoring": "session/test_record_apply.py",
-    "session/rescore/past_rescorer": "session/rescore/test_past_rescorer.py",
-    "session/cameras/placements": "session/cameras/test_placements.py",
-    "session/cameras/file_edits": "session/cameras/test_studio_state.py session/cameras/test_edit_state.py",
-    "session/cameras/studio": "session/cameras/test_studio_state.py",
-    "session/worker/cameras": "session/worker/test_cameras.py",
-    "ui/server/access": "ui/server/test_access.py",
-    "ui/cameras/pose_math": "ui/cameras/test_pose_math.py ui/cameras/test_fields.py",
-    "ui/cameras/fields": "ui/cameras/test_fields.py",
-    "ui/app/review_page": "ui/app/test_review_page.py -k 'strip or timeline or opened'",
-    "ui/app/go_live": "ui/app/test_go_live.py",
-    "ui/library/listing": "ui/library/test_listing.py ui/library/test_panel.py",
-    "ui/server/gated_server": "ui/server/test_gated_server.py ui/server/test_socket_and_renewal.py ui/server/test_strangers.py::test_a_page_that_has_shown_the_token_is_not_hurried"
-    " ui/server/test_strangers.py::test_what_is_turned_away_is_counted_and_told_once_of_each_kind"
-    " ui/server/test_strangers.py::test_what_was_not_told_yet_is_told_at_the_end_with_the_total"
+    "live/process/ask": "live/process/test_ask.py",
+    "live/history/moments": "live/history/test_history.py live/history/test_env_table.py",
+    "live/history/env_table": "live/history/test_env_table.py",
+    "live/history/curves": "live/history/test_curves.py",
+    "rescore/verdict": "rescore/test_verdict.py",
+    "rescore/past_scores": "rescore/test_past_scores.py rescore/test_past_rescorer.py",
+    "live/process/supervisor": "live/process/test_supervisor.py",
+    "live/recovery": "live/test_versions.py",
+    "live/loading": "live/test_versions.py live/test_live_state.py",
+    "live/apply": "live/test_live_state.py live/test_timeline.py live/test_apply.py",
+    "live/past": "live/test_timeline.py",
+    "live/reading": "live/test_live_state.py",
+    "actions/choose": "actions/test_given_actions.py",
+    "record/live_recorder": "record/test_recorder_thread.py",
+    "record/state": "record/test_apply.py record/test_recorder_thread.py",
+    "record/saving_state": "record/test_apply.py record/test_recorder_thread.py",
+    "rescore/state": "record/test_apply.py",
+    "rescore/past_jobs": "rescore/test_past_rescorer.py",
+    "cameras/placements": "cameras/test_placements.py",
+    "cameras/edit_jobs": "cameras/test_studio_state.py cameras/test_edit_state.py",
+    "cameras/apply": "cameras/test_studio_state.py",
+    "cameras/worker": "cameras/test_worker.py",
+    "page/door/access": "page/door/test_access.py",
+    "cameras/pose_math": "cameras/test_pose_math.py cameras/test_fields.py",
+    "cameras/number_fields": "cameras/test_fields.py",
+    "app/review_page": "app/test_review_page.py -k 'strip or timeline or opened'",
+    "app/go_live": "app/test_go_live.py",
+    "library/listing": "library/test_listing.py library/test_panel.py",
+    "page/door/gated_server": "page/door/test_gated_server.py page/door/test_socket_and_renewal.py page/door/test_connection_limits.py::test_a_page_that_has_shown_the_token_is_not_hurried"
+    " page/door/test_connection_limits.py::test_what_is_turned_away_is_counted_and_told_once_of_each_kind"
+    " page/door/test_connection_limits.py::test_what_was_not_told_yet_is_told_at_the_end_with_the_total"
     " -k 'not nothing_is_printed and not command and not palette and not many_that_start'",
-    "ui/widgets/rescored": "ui/review/test_rescore.py ui/live/test_rescored.py",
-    "ui/widgets/parts": "ui/widgets/test_parts.py",
-    "ui/widgets/paged": "ui/widgets/test_paged.py",
-    "ui/server/responses": "ui/server/test_replies.py",
-    "ui/live/timeline": "ui/live/test_timeline.py ui/live/test_timeline_strip.py",
-    "ui/server/file_response": "ui/server/test_file_response.py",
+    "rescore/result_parts": "rescore/test_recordings_panel.py rescore/test_past_panel.py",
+    "page/widgets/parts": "page/widgets/test_parts.py",
+    "page/widgets/paged": "page/widgets/test_paged.py",
+    "page/door/responses": "page/door/test_replies.py",
+    "live/panels/timeline_panel": "live/panels/test_timeline.py live/panels/test_timeline_strip.py",
+    "page/door/file_response": "page/door/test_file_response.py",
 }
 """The tests below ``tests/`` that should notice a slip in a module below ``workbench/``: the fast ones among them, since
 each mutant runs them all until one fails."""

@@ -23,7 +23,7 @@ from workbench.cameras.events import CameraPlaced
 from workbench.cameras.view import StudioView
 from workbench.live.commands import PauseRun, PlayRun, ReloadFile, SetSeed, Step
 from workbench.live.events import MomentShown
-from workbench.live.messages import CameraRequest, LoadFailed, Loading, Status
+from workbench.live.messages import CameraRequest, TaskFailed, Loading, Status
 from workbench.live.panels.env_panel import TABLE
 from workbench.live.timeline_commands import ContinueFromHere, UndoReset
 from workbench.live.view import SessionView
@@ -40,7 +40,7 @@ def act(name: str, do: Act) -> st.SearchStrategy[tuple[str, Act]]:
 
 
 def fails(kept: bool, at_run: bool) -> Act:
-    return lambda told: told.tell(LoadFailed(PROBLEM, kept=kept, at_run=at_run))
+    return lambda told: told.tell(TaskFailed(PROBLEM, kept=kept, at_run=at_run))
 
 
 def places(told: Told) -> None:

@@ -21,7 +21,7 @@ from workbench.app.pages import Which
 from workbench.app.server import App
 from workbench.app.session import Session
 from workbench.live.commands import PlayRun
-from workbench.live.messages import LoadFailed
+from workbench.live.messages import TaskFailed
 from workbench.machine.loop import do
 from workbench.page.door.gated_server import GatedServer
 from workbench.review.commands import ReturnToFirstTask
@@ -124,12 +124,12 @@ def test_into_the_task_that_is_open_one_goes_at_once_and_the_page_follows_also_i
 
 
 def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason_to(desk: Desk) -> None:
-    desk.live._take(LoadFailed(problem(), kept=True))
+    desk.live._take(TaskFailed(problem(), kept=True))
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
     time.sleep(0.2)  # so long a page would be led there for a failure
     assert desk.go_live.going() == "restoring Push-v1 at step 2 …" and desk.shown == []
-    desk.live._take(LoadFailed(problem(), kept=True))
+    desk.live._take(TaskFailed(problem(), kept=True))
     desk.is_led_to_the_live_page()
 
 

@@ -42,7 +42,7 @@ from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
 from workbench.live.commands import Step
 from workbench.live.effects import Asked
 from workbench.live.events import FileSaved, MomentShown, Now, Send, VersionLoaded, WorkerDied
-from workbench.live.messages import Loaded, LoadFailed, PlaceCamera, Placed
+from workbench.live.messages import Loaded, TaskFailed, PlaceCamera, Placed
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
 from workbench.task.apply_edits import SourceEdit
@@ -154,7 +154,7 @@ events: st.SearchStrategy[object] = st.one_of(
     st.sampled_from([of.FileChanged(), of.StudioClosed()]),
     st.sampled_from([None, Path(FILE)]).map(lambda file: of.TaskCopied(file, EditState())),
     st.sampled_from([None, "same", "cameras", "patched", "rebuilt"]).map(loaded),
-    st.booleans().map(lambda at_run: LoadFailed(problem(), kept=True, at_run=at_run)),
+    st.booleans().map(lambda at_run: TaskFailed(problem(), kept=True, at_run=at_run)),
     st.builds(Placed, keys, st.one_of(st.none(), settings), st.none(), why_not=words),
     st.sampled_from([FileSaved(), WorkerDied(DEATH, "")]),
 )

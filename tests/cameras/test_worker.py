@@ -24,7 +24,7 @@ from workbench.live.messages import (
     CameraRequest,
     DrawPast,
     Event,
-    LoadFailed,
+    TaskFailed,
     PastPictures,
     Pictures,
     PlaceCamera,
@@ -213,7 +213,7 @@ def test_a_moment_of_the_past_is_drawn_after_what_waits_and_a_failure_is_told(de
     assert np.allclose(past.pictures[0].pose[:3], there.position, atol=1e-5)
     desk.cameras.draw_past(DrawPast(poses, 1, (NOTHING,), 8))
     (failed,) = desk.heard()
-    assert isinstance(failed, LoadFailed) and "nothing" in failed.problem.message
+    assert isinstance(failed, TaskFailed) and "nothing" in failed.problem.message
     assert desk.makes() == [] and shown(desk.makes()) == [BASE], "the one that was left is made anew"
 
 

@@ -46,7 +46,7 @@ from workbench.live.events import (
     VersionLoaded,
     WorkerDied,
 )
-from workbench.live.messages import Load, Loaded, LoadFailed, Loading, ReloadReport, Settings, Status
+from workbench.live.messages import Load, Loaded, TaskFailed, Loading, ReloadReport, Settings, Status
 from workbench.live.process.supervisor import End
 from workbench.live.reading import READ_EVERY
 from workbench.live.run import first_run
@@ -98,7 +98,7 @@ EVENTS = st.one_of(
     st.builds(stepped, st.integers(0, 20), st.lists(st.integers(0, ENVS - 1), unique=True).map(tuple)),
     st.builds(Status, st.booleans(), st.just(20.0), st.just(1.0)),
     st.builds(Loading, st.just("importing"), number=st.integers(0, 30)),
-    st.builds(LoadFailed, st.just(PROBLEM), st.booleans(), at_run=st.booleans()),
+    st.builds(TaskFailed, st.just(PROBLEM), st.booleans(), at_run=st.booleans()),
     st.builds(
         lambda end, gives_up: WorkerDied(replace(DEATH, end=end, gives_up=gives_up), "printed"),
         st.sampled_from(list(End)),
@@ -194,7 +194,7 @@ def test_before_the_first_env_comes_the_last_and_after_the_last_the_first() -> N
 
 
 def test_a_file_that_was_saved_stays_unloaded_although_the_version_before_fails_meanwhile() -> None:
-    fails = LoadFailed(PROBLEM, kept=True, at_run=True)
+    fails = TaskFailed(PROBLEM, kept=True, at_run=True)
     assert not state_after(loaded(None, "one"), fails).run.stale
     assert state_after(loaded(None, "one"), FileSaved(), fails).run.stale
 

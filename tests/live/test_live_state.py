@@ -26,7 +26,7 @@ from workbench.live.messages import (
     CameraRequest,
     Inspect,
     Load,
-    LoadFailed,
+    TaskFailed,
     Loading,
     Pictures,
     ReadPolicyAgain,
@@ -178,7 +178,7 @@ def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it(
 def test_what_failed_while_running_stands_until_a_step_follows_and_each_time_anew(played: Told) -> None:
     for _ in range(2):
         before = played.view
-        played.tell(Status(True, 20.0, 1.0), LoadFailed(problem(), kept=True, at_run=True))
+        played.tell(Status(True, 20.0, 1.0), TaskFailed(problem(), kept=True, at_run=True))
         view = played.view
         assert (view.state, view.playing, view.stale, view.refused) == ("paused", False, False, None)
         assert view.problem_at_run and view.problem_serial > before.problem_serial
@@ -197,7 +197,7 @@ def test_a_mended_policy_plays_on_although_the_task_was_loaded_anew_before_its_f
     played.session.change(action_source="policy", policy=f"{policy}:act")
     played.session.do(PlayRun())
     failed = replace(problem(), stage="policy", file=str(policy))
-    played.tell(Status(True, 20.0, 1.0), LoadFailed(failed, kept=True, at_run=True), Status(False, 0.0, 0.0))
+    played.tell(Status(True, 20.0, 1.0), TaskFailed(failed, kept=True, at_run=True), Status(False, 0.0, 0.0))
     if paused:
         played.session.do(PauseRun())
     played.load("same")
@@ -211,7 +211,7 @@ def test_a_mended_policy_plays_on_although_the_task_was_loaded_anew_before_its_f
 def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before_runs_on(
     played: Told,
 ) -> None:
-    played.tell(Loading("importing"), LoadFailed(problem(), kept=True))
+    played.tell(Loading("importing"), TaskFailed(problem(), kept=True))
     played.step()
     view = played.view
     assert view.stale and view.refused is view.problem is not None and view.state == "running"
@@ -237,7 +237,7 @@ def test_a_worker_that_could_load_nothing_waits_with_the_problem_and_one_too_man
 
 def test_every_load_is_remembered_also_one_that_was_refused(played: Told) -> None:
     for number in range(30):
-        played.tell(Loading("importing"), LoadFailed(problem(f"NameError: {number}"), kept=True))
+        played.tell(Loading("importing"), TaskFailed(problem(f"NameError: {number}"), kept=True))
     loads = played.view.loads
     assert len(loads) == 20 and loads[0].reason == "NameError: 29" and loads[0].problem is not None
     played.load("patched")
@@ -420,7 +420,7 @@ def test_options_with_which_the_task_fails_are_dropped_and_the_file_is_not_to_bl
         played.die()
         played.greet()
     else:
-        played.tell(Loading("building", load.number), LoadFailed(problem(), kept=True, options=MORE))
+        played.tell(Loading("building", load.number), TaskFailed(problem(), kept=True, options=MORE))
         assert played.view.state == "running" and not played.view.stale
     assert played.view.problem is not None
     assert (played.view.options, played.view.options_refused) == (FIRST, MORE)
@@ -431,5 +431,5 @@ def test_options_with_which_the_task_fails_are_dropped_and_the_file_is_not_to_bl
 
 def test_a_task_that_never_ran_keeps_the_options_that_a_person_chose_last(told: Told) -> None:
     told.session.happen(OptionsApplied(MORE))
-    told.tell(LoadFailed(problem(), kept=False, options=MORE))
+    told.tell(TaskFailed(problem(), kept=False, options=MORE))
     assert told.view.options == MORE and asked_load(told).options == MORE

@@ -13,7 +13,7 @@ from tests.drive.session import Told, told_session
 from tests.drive.waiting import until
 from workbench.app import session
 from workbench.live.commands import Step
-from workbench.live.messages import LoadFailed, SingleStep
+from workbench.live.messages import TaskFailed, SingleStep
 from workbench.record.commands import StopRecording
 from workbench.record.state import RecordingStatus, RecordingWanted
 from workbench.task.problem import Problem
@@ -52,7 +52,7 @@ def test_files_that_cannot_be_watched_keep_neither_a_step_nor_the_end(
         assert hangs.wait(60)
         assert answers(told)
         problem = Problem("import", "SyntaxError", str(tmp_path / "module.py"), 1, None, "")
-        told.tell(LoadFailed(problem, kept=True))
+        told.tell(TaskFailed(problem, kept=True))
         assert told.view.problem == problem and answers(told)
 
 

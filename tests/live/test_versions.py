@@ -18,7 +18,7 @@ from tests.drive.session import DEATH, Told, stop_watching, told_session
 from tests.drive.waiting import until
 from workbench.live import recovery
 from workbench.live.commands import PlayRun, RebuildScene, ReloadFile, RestartWorker
-from workbench.live.messages import Load, LoadFailed, Loading, NewProcessNeeded, Play, Settings
+from workbench.live.messages import Load, TaskFailed, Loading, NewProcessNeeded, Play, Settings
 from workbench.live.process.supervisor import End
 from workbench.live.recovery import Recovery
 
@@ -87,7 +87,7 @@ def test_a_file_that_never_loaded_is_followed_and_one_beside_it_once_it_was_impo
 def test_a_module_that_broke_before_the_task_was_whole_is_followed(one: Told, file: Path) -> None:
     beside = file.with_name("parts.py")
     beside.write_text("x =\n")
-    one.tell(Loading("", 1), LoadFailed(replace(problem(), file=str(beside)), kept=False))
+    one.tell(Loading("", 1), TaskFailed(replace(problem(), file=str(beside)), kept=False))
     assert one.view.state == "error" and one.asked(Load) == []
     beside.write_text(GOOD)
     saved(one)
@@ -140,7 +140,7 @@ def test_a_new_version_that_kills_or_is_refused_gives_way_to_the_last_good_one(
     file.write_text(NEW)
     one.tell(Loading("", saved(one).number))
     if death is HANDED_OVER:
-        one.tell(LoadFailed(problem(), kept=True, spoiled="it ran"))
+        one.tell(TaskFailed(problem(), kept=True, spoiled="it ran"))
     one.die(death)  # type: ignore[arg-type]
     (_, load, *play) = one.greet()
     assert isinstance(load, Load) and load.source == {str(file): GOOD} and load.snapshot is not None
@@ -159,11 +159,11 @@ def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Tol
     (load,) = [request for request in one.greet() if isinstance(request, Load)]
     assert (load.source, load.because, load.same_scene) == (None, "a class", True)
     one.asked(object)
-    one.tell(Loading("", load.number), LoadFailed(problem(), kept=False))
+    one.tell(Loading("", load.number), TaskFailed(problem(), kept=False))
     (load,) = one.asked(Load)
     assert load.source == {str(file): GOOD} and load.snapshot is not None and load.because == ""
     runs(one, file)
-    one.tell(LoadFailed(problem(), kept=True))
+    one.tell(TaskFailed(problem(), kept=True))
     assert one.asked(Load) == [], "what ran before still runs"
 
 

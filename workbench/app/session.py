@@ -41,7 +41,7 @@ from workbench.live.events import (
 )
 from workbench.live.history.env_table import EnvRows
 from workbench.live.loading import files_at_fault, first_requests, watched_files
-from workbench.live.messages import Answer, Event, Loaded, LoadFailed, Progress, Request, Settings, WarmUp
+from workbench.live.messages import Answer, Event, Loaded, TaskFailed, Progress, Request, Settings, WarmUp
 from workbench.live.policies import ListPolicies, PolicySearch
 from workbench.live.process.ask import Background, QuestionClient
 from workbench.live.process.captured_output import PrintedLine, PrintedLog
@@ -114,7 +114,7 @@ class Session:
             kept: of an earlier session of this task; its options are used in place of `options`.
             check: whether the rules are checked after each load, until a `CheckAfterSave`.
             make_worker: makes the supervisor; tests without a worker process give another.
-            on_event: called with every event of the worker, and with its death as `LoadFailed`, on the supervisor's thread.
+            on_event: called with every event of the worker, and with its death as `TaskFailed`, on the supervisor's thread.
             on_line: called with the lines that the worker printed, from other threads; drops some of a flood.
             on_notice: called, on any thread, with a message for the terminal.
         """
@@ -387,7 +387,7 @@ class Session:
     def _take(self, event: Event) -> None:
         """Take an event of the worker. Called on the supervisor's thread, which continues when the event was taken."""
         # Files are read here: a disk that hangs must not keep the loop.
-        if isinstance(event, LoadFailed):
+        if isinstance(event, TaskFailed):
             # Before a person sees the problem and mends the file.
             files = self.look(lambda run: files_at_fault(run, event))
             wait_for_disk(do(lambda: self._perform(Follow(files))) if files else None)
@@ -404,7 +404,7 @@ class Session:
         """Take the death of a worker. Called on the supervisor's thread."""
         problem, kept = do(lambda: self._died(death))
         if problem is not None:
-            self._on_event(LoadFailed(problem, kept))
+            self._on_event(TaskFailed(problem, kept))
 
     def _died(self, death: Death) -> tuple[Problem | None, bool]:
         """Returns the problem to show, if any, and whether there is a version to bring back."""
@@ -420,7 +420,7 @@ class Session:
             on_disk: of a version that was loaded: whether the files still have its texts.
         """
         match event:
-            case LoadFailed() if self._worker.load_pending and event.problem.interrupted:
+            case TaskFailed() if self._worker.load_pending and event.problem.interrupted:
                 self._happen(LoadPreempted(event))
                 return False  # interrupted because a newer version waits: no failure to report
             case Loaded():

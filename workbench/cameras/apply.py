@@ -67,7 +67,7 @@ from workbench.cameras.state import Change, Studio, info_of, refusal, settings_i
 from workbench.envs.camera_data import CameraKey, why_no_camera
 from workbench.live.effects import Asked
 from workbench.live.events import FileOpened, FileSaved, Now, Send, VersionLoaded, WorkerDied
-from workbench.live.messages import LoadFailed, PlaceCamera, Placed
+from workbench.live.messages import TaskFailed, PlaceCamera, Placed
 from workbench.live.process.ask import Background, QuestionClient
 from workbench.live.process.background_jobs import JobProgress, Jobs
 from workbench.live.run import Run
@@ -133,7 +133,7 @@ def _apply(studio: Studio, event: object, run: Run, now: Now) -> Change:
             return _loaded(
                 studio, run, scene_changed=report is None or report.level not in ("same", "cameras")
             )
-        case LoadFailed(at_run=False):
+        case TaskFailed(at_run=False):
             return edit_failed_to_load(studio), []
         case Placed():
             return _placed(studio, event)

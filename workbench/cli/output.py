@@ -25,7 +25,7 @@ from workbench.trust.clearance import CodeFile, Consent, NotTrusted, Since, Trus
 if TYPE_CHECKING:
     from workbench.envs.gpu_rules import Finding
     from workbench.jobs.scheduler import Failure
-    from workbench.live.messages import Event, LoadFailed
+    from workbench.live.messages import Event, TaskFailed
     from workbench.live.process.captured_output import PrintedLine
     from workbench.task.problem import Problem
 
@@ -197,7 +197,7 @@ def print_finding(finding: Finding) -> None:
 
 def print_event(event: Event) -> None:
     """Print loads and failures, which the page shows too."""
-    from workbench.live.messages import Loaded, LoadFailed, RulesBroken
+    from workbench.live.messages import Loaded, TaskFailed, RulesBroken
 
     if isinstance(event, Loaded):
         parts = ", ".join(f"{plain_text(name)} {ms:.0f}" for name, ms in event.milliseconds.items())
@@ -213,7 +213,7 @@ def print_event(event: Event) -> None:
             if notice not in _printed_notices:
                 _printed_notices.add(notice)
                 warn(notice)
-    elif isinstance(event, LoadFailed):
+    elif isinstance(event, TaskFailed):
         print_problem(event.problem)
         if event.kept:
             err.print(f"[dim]{escape(_what_runs(event))}[/]", soft_wrap=True)
@@ -222,7 +222,7 @@ def print_event(event: Event) -> None:
             print_finding(finding)
 
 
-def _what_runs(failed: LoadFailed) -> str:
+def _what_runs(failed: TaskFailed) -> str:
     """Text: which version runs after a failure, and how to go on."""
     if failed.at_run:
         of = "the policy" if failed.problem.stage == "policy" else "the version"

@@ -23,7 +23,7 @@ from workbench.app.session import HISTORY_BYTES, KeptWork, Session
 from workbench.cli.output import out, print_addresses, print_event, print_line, print_text, refuse, warn
 from workbench.envs.recorded_run import HOW_IT_IS_RUN
 from workbench.episodes.reader.reading import start_reading
-from workbench.live.messages import Event, Loaded, LoadFailed
+from workbench.live.messages import Event, Loaded, TaskFailed
 from workbench.live.process.supervisor import WorkerOptions
 from workbench.machine.kept_choices import kept_choices
 from workbench.machine.loop import BlockingPool, loop_in_main, on_signal
@@ -72,7 +72,7 @@ def open_in_terminal(
         nonlocal shown
         print_event(event)
         # A broken file can be fixed and saved; an env id that fails has nothing to wait for, and gets no page.
-        if not waits_for_a_file and isinstance(event, LoadFailed) and not event.kept:
+        if not waits_for_a_file and isinstance(event, TaskFailed) and not event.kept:
             requests.put(1)
         elif not shown and isinstance(event, Loaded):
             shown = True

@@ -64,7 +64,7 @@ from workbench.live.loading import (
     died,
     file_saved,
     follow,
-    load_failed,
+    task_failed,
     loaded,
     reload_file,
     try_next,
@@ -72,7 +72,7 @@ from workbench.live.loading import (
 from workbench.live.messages import (
     CameraFailed,
     EnterRecording,
-    LoadFailed,
+    TaskFailed,
     Loading,
     NewProcessNeeded,
     PastPictures,
@@ -175,8 +175,8 @@ def _apply(run: Run, event: object, now: Now) -> Change:
         case Loading():
             run = replace(run, recovery=run.recovery.began(event.number))
             return replace(run, state="loading", activity=event.activity), []
-        case LoadFailed():
-            return load_failed(run, event, now)
+        case TaskFailed():
+            return task_failed(run, event, now)
         case LoadDone() if run.to_enter is not None:
             return _enter(replace(run, to_enter=None), run.to_enter)
         case LoadPreempted():

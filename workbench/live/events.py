@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from workbench.envs.inspection import Section
 from workbench.envs.recorded_run import RecordedRun
 from workbench.live.effects import Asked, Later
-from workbench.live.messages import Event, Loaded, LoadFailed, Request
+from workbench.live.messages import Event, Loaded, TaskFailed, Request
 from workbench.live.process.heartbeat import Busy
 from workbench.live.process.supervisor import Death
 from workbench.task.description import TaskOptions
@@ -59,7 +59,7 @@ class LoadDone:
 class LoadPreempted:
     """A load was interrupted because a newer version waits."""
 
-    failed: LoadFailed
+    failed: TaskFailed
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from workbench.envs.step_result import StepResult
 from workbench.live.events import Follow, Now, ReplaceWorker, RunEffect, Send, WorkerDied
 from workbench.live.history.env_table import EnvTable
 from workbench.live.history.moments import History
-from workbench.live.messages import SCENE_KEPT, Loaded, LoadFailed, LoadLevel, NewProcessNeeded, Play, Request
+from workbench.live.messages import SCENE_KEPT, Loaded, TaskFailed, LoadLevel, NewProcessNeeded, Play, Request
 from workbench.live.past import Past
 from workbench.live.process.heartbeat import death_problem
 from workbench.live.process.supervisor import End
@@ -58,7 +58,7 @@ def watched_files(run: Run, paths: Iterable[str] = (), at_fault: str | None = No
     return frozenset({run.own_file, *modules, *([] if at_fault is None else [Path(at_fault)])})
 
 
-def files_at_fault(run: Run, failed: LoadFailed) -> frozenset[Path]:
+def files_at_fault(run: Run, failed: TaskFailed) -> frozenset[Path]:
     """Files to watch where a problem is: a module that the task has never imported without an error is in no
     `source_files`, and it may be in another folder, where a person mends it."""
     if failed.problem.file is None:
@@ -193,7 +193,7 @@ def _new_scene(run: Run, task: TaskDescription, first: StepResult, its_past_stay
     return replace(run, past=past, versions=((begins, task),))
 
 
-def load_failed(run: Run, event: LoadFailed, now: Now) -> Change:
+def task_failed(run: Run, event: TaskFailed, now: Now) -> Change:
     run = with_problem(run, event.problem, event.at_run, event.spoiled)
     run = replace(run, policy_failed=run.policy_failed or event.problem.stage == "policy")
     run, of_options = _refuse_options(run, event.options)
@@ -213,7 +213,7 @@ def load_failed(run: Run, event: LoadFailed, now: Now) -> Change:
     return try_next(run, event)
 
 
-def try_next(run: Run, failed: LoadFailed) -> Change:
+def try_next(run: Run, failed: TaskFailed) -> Change:
     """A worker without a version gets the next attempt of `Recovery`, unless it is spoiled and ends."""
     if failed.spoiled:
         return replace(run, needed=NewProcessNeeded(failed.spoiled, failed.at_run)), []

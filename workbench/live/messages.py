@@ -297,7 +297,7 @@ def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
 
 def hands_over(event: object) -> bool:
     """Whether the worker ends with this event, so that another worker continues."""
-    return isinstance(event, NewProcessNeeded) or (isinstance(event, LoadFailed) and event.spoiled != "")
+    return isinstance(event, NewProcessNeeded) or (isinstance(event, TaskFailed) and event.spoiled != "")
 
 
 @dataclass(frozen=True)
@@ -351,7 +351,7 @@ class Loaded:
 
 
 @dataclass(frozen=True)
-class LoadFailed:
+class TaskFailed:
     """The author's code raised, in a load or later."""
 
     problem: Problem
@@ -499,7 +499,7 @@ Event = (
     Loading
     | NewProcessNeeded
     | Loaded
-    | LoadFailed
+    | TaskFailed
     | Stepped
     | PlanWanted
     | PlanDropped

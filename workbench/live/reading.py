@@ -7,7 +7,7 @@ from dataclasses import replace
 from workbench.envs.inspection import Inspection
 from workbench.live.effects import Later
 from workbench.live.events import Now, ReadingDue, Send, VersionLoaded, WorkerDied
-from workbench.live.messages import Inspect, LoadFailed
+from workbench.live.messages import Inspect, TaskFailed
 from workbench.live.run import Change, Run
 
 READ_EVERY = 0.2
@@ -16,7 +16,7 @@ READ_EVERY = 0.2
 
 def schedule(run: Run, event: object, now: Now) -> Change:
     """Let a reading follow `event`, if it made the last one old and none is on its way."""
-    if run.reading != "none" and isinstance(event, Inspection | LoadFailed | VersionLoaded | WorkerDied):
+    if run.reading != "none" and isinstance(event, Inspection | TaskFailed | VersionLoaded | WorkerDied):
         run = replace(run, reading="none")
     if run.reading != "none" or not run.read_sections or not run.pages or run.task is None:
         return run, []

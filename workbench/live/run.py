@@ -129,7 +129,7 @@ class Run:
     problem_at_run: bool = False
     """Whether `problem` came while the task ran, not while a version was loaded."""
     spoiled: str = ""
-    """Why another process brought the version back that ran when `problem` came, as `LoadFailed` has it."""
+    """Why another process brought the version back that ran when `problem` came, as `TaskFailed` has it."""
     settings: Settings = Settings()
     """Settings chosen on the page."""
     told: NDArray[np.float32] | None = None

@@ -65,7 +65,7 @@ class SessionView:
     problem_at_run: bool = False
     """Whether `problem` came while the task ran, not while a version was loaded."""
     spoiled: str = ""
-    """Why another process brought the version back that ran when `problem` came, as `LoadFailed` has it."""
+    """Why another process brought the version back that ran when `problem` came, as `TaskFailed` has it."""
     refused: Problem | None = None
     """Why the present version of the file does not run."""
     curves: Curves | None = None

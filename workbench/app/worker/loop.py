@@ -37,7 +37,7 @@ from workbench.live.messages import (
     ListenForDebugger,
     Load,
     Loaded,
-    LoadFailed,
+    TaskFailed,
     Loading,
     PlaceCamera,
     Play,
@@ -271,7 +271,7 @@ class Worker:
             self._task.drop_steps_if_interrupted(error)
             kept = self._task.opened is not None
             spoiled = REFUSED if executed_modules() > executed else ""
-            refused = LoadFailed(error.problem, kept, error.classes, request.options, spoiled=spoiled)
+            refused = TaskFailed(error.problem, kept, error.classes, request.options, spoiled=spoiled)
             self._task.refuse(refused)
 
     @property

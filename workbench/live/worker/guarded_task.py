@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from workbench.envs.snapshots.snapshot import restore_snapshot
-from workbench.live.messages import LoadFailed
+from workbench.live.messages import TaskFailed
 from workbench.live.process.heartbeat import Doing, HeartbeatWriter, Interrupts
 from workbench.live.worker.connection import ServerConnection
 from workbench.live.worker.process_state import ProcessState, changed_settings, read_process_state, some_of
@@ -80,7 +80,7 @@ class GuardedTask:
                 self.line.drop_steps()
             problem = problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error))
             if loads:
-                self.refuse(LoadFailed(problem, kept=self.opened is not None, spoiled=REFUSED))
+                self.refuse(TaskFailed(problem, kept=self.opened is not None, spoiled=REFUSED))
             else:
                 self.fail(problem)
             return problem
@@ -120,18 +120,18 @@ class GuardedTask:
         spoiled = self._settings_changed()
         if not spoiled and problem.stage != "policy" and self.restore_last_step() is not None:
             spoiled = "the last step could not be put back"
-        self._send_failure(LoadFailed(problem, self.opened is not None, at_run=True, spoiled=spoiled))
+        self._send_failure(TaskFailed(problem, self.opened is not None, at_run=True, spoiled=spoiled))
         self._on_failure()
 
     def _settings_changed(self) -> str:
         changed = changed_settings(self.when_loaded, read_process_state()) if self.when_loaded else []
         return f"{some_of(changed)} changed since the version was loaded" if changed else ""
 
-    def refuse(self, failed: LoadFailed) -> None:
+    def refuse(self, failed: TaskFailed) -> None:
         """Report that a version was refused."""
         self._send_failure(failed)
 
-    def _send_failure(self, failed: LoadFailed) -> None:
+    def _send_failure(self, failed: TaskFailed) -> None:
         self.spoiled = self.spoiled or failed.spoiled != ""
         self.line.send(failed)
 
