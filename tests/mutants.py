@@ -55,20 +55,19 @@ PROTECTED = {
     "task/registry": "task/test_registry.py",
     "task/modules": "task/test_load.py task/test_task_content.py task/test_library_names.py"
     " task/test_named_modules.py",
-    "source/parsed": "cameras/edit/test_which_camera.py cameras/edit/test_members.py"
-    " cameras/edit/test_shapes.py cameras/edit/test_round_trip.py source/test_text.py",
-    "source/read_values": "source/test_read_values.py cameras/edit/test_shapes.py"
+    "source/parsed": "cameras/edit/test_which_camera.py cameras/edit/test_edits.py"
+    " cameras/edit/test_edits.py source/test_read_values.py",
+    "source/read_values": "source/test_read_values.py cameras/edit/test_edits.py"
     " cameras/edit/test_which_camera.py",
-    "source/traced_edits": "cameras/edit/test_shapes.py cameras/edit/test_round_trip.py"
+    "source/traced_edits": "cameras/edit/test_edits.py"
     " cameras/edit/test_which_camera.py cameras/edit/test_rotations.py"
-    " cameras/edit/test_members.py",
-    "source/definitions": "source/test_read_values.py cameras/edit/test_shapes.py"
+    " cameras/edit/test_edits.py",
+    "source/definitions": "source/test_read_values.py cameras/edit/test_edits.py"
     " cameras/edit/test_which_camera.py",
     "task/apply_edits": "task/test_apply_edits.py",
-    "cameras/edit/camera_edit": "cameras/edit/test_which_camera.py cameras/edit/test_members.py",
-    "cameras/edit/plan": "cameras/edit/test_which_camera.py"
-    " cameras/edit/test_round_trip.py cameras/edit/test_shapes.py",
-    "cameras/edit/run_hooks": "cameras/edit/test_which_camera.py cameras/edit/test_members.py",
+    "cameras/edit/camera_edit": "cameras/edit/test_which_camera.py cameras/edit/test_edits.py",
+    "cameras/edit/plan": "cameras/edit/test_which_camera.py cameras/edit/test_edits.py",
+    "cameras/edit/run_hooks": "cameras/edit/test_which_camera.py cameras/edit/test_edits.py",
     "task/copy": "task/test_copy_task.py",
     "task/watch": "task/test_watch.py",
     "envs/snapshots/snapshot": "envs/snapshots/test_snapshot.py",

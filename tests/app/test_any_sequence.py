@@ -23,7 +23,7 @@ from workbench.cameras.events import CameraPlaced
 from workbench.cameras.view import StudioView
 from workbench.live.commands import PauseRun, PlayRun, ReloadFile, SetSeed, Step
 from workbench.live.events import MomentShown
-from workbench.live.messages import CameraRequest, TaskFailed, Loading, Status
+from workbench.live.messages import CameraRequest, Loading, Status, TaskFailed
 from workbench.live.panels.env_panel import TABLE
 from workbench.live.timeline_commands import ContinueFromHere, UndoReset
 from workbench.live.view import SessionView

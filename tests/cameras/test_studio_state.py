@@ -42,7 +42,7 @@ from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
 from workbench.live.commands import Step
 from workbench.live.effects import Asked
 from workbench.live.events import FileSaved, MomentShown, Now, Send, VersionLoaded, WorkerDied
-from workbench.live.messages import Loaded, TaskFailed, PlaceCamera, Placed
+from workbench.live.messages import Loaded, PlaceCamera, Placed, TaskFailed
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
 from workbench.task.apply_edits import SourceEdit

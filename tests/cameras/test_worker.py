@@ -24,11 +24,11 @@ from workbench.live.messages import (
     CameraRequest,
     DrawPast,
     Event,
-    TaskFailed,
     PastPictures,
     Pictures,
     PlaceCamera,
     Placed,
+    TaskFailed,
 )
 from workbench.live.process.heartbeat import HeartbeatReader, HeartbeatWriter, Interrupts
 from workbench.live.worker.connection import ServerConnection

@@ -46,7 +46,7 @@ from workbench.live.events import (
     VersionLoaded,
     WorkerDied,
 )
-from workbench.live.messages import Load, Loaded, TaskFailed, Loading, ReloadReport, Settings, Status
+from workbench.live.messages import Load, Loaded, Loading, ReloadReport, Settings, Status, TaskFailed
 from workbench.live.process.supervisor import End
 from workbench.live.reading import READ_EVERY
 from workbench.live.run import first_run

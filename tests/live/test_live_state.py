@@ -26,7 +26,6 @@ from workbench.live.messages import (
     CameraRequest,
     Inspect,
     Load,
-    TaskFailed,
     Loading,
     Pictures,
     ReadPolicyAgain,
@@ -35,6 +34,7 @@ from workbench.live.messages import (
     Settings,
     SliderAction,
     Status,
+    TaskFailed,
 )
 from workbench.live.process.supervisor import End
 from workbench.live.reading import READ_EVERY

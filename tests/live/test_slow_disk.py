@@ -13,7 +13,7 @@ from tests.drive.session import Told, told_session
 from tests.drive.waiting import until
 from workbench.app import session
 from workbench.live.commands import Step
-from workbench.live.messages import TaskFailed, SingleStep
+from workbench.live.messages import SingleStep, TaskFailed
 from workbench.record.commands import StopRecording
 from workbench.record.state import RecordingStatus, RecordingWanted
 from workbench.task.problem import Problem

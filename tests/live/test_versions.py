@@ -18,7 +18,7 @@ from tests.drive.session import DEATH, Told, stop_watching, told_session
 from tests.drive.waiting import until
 from workbench.live import recovery
 from workbench.live.commands import PlayRun, RebuildScene, ReloadFile, RestartWorker
-from workbench.live.messages import Load, TaskFailed, Loading, NewProcessNeeded, Play, Settings
+from workbench.live.messages import Load, Loading, NewProcessNeeded, Play, Settings, TaskFailed
 from workbench.live.process.supervisor import End
 from workbench.live.recovery import Recovery
 

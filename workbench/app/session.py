@@ -41,7 +41,7 @@ from workbench.live.events import (
 )
 from workbench.live.history.env_table import EnvRows
 from workbench.live.loading import files_at_fault, first_requests, watched_files
-from workbench.live.messages import Answer, Event, Loaded, TaskFailed, Progress, Request, Settings, WarmUp
+from workbench.live.messages import Answer, Event, Loaded, Progress, Request, Settings, TaskFailed, WarmUp
 from workbench.live.policies import ListPolicies, PolicySearch
 from workbench.live.process.ask import Background, QuestionClient
 from workbench.live.process.captured_output import PrintedLine, PrintedLog

@@ -67,7 +67,7 @@ from workbench.cameras.state import Change, Studio, info_of, refusal, settings_i
 from workbench.envs.camera_data import CameraKey, why_no_camera
 from workbench.live.effects import Asked
 from workbench.live.events import FileOpened, FileSaved, Now, Send, VersionLoaded, WorkerDied
-from workbench.live.messages import TaskFailed, PlaceCamera, Placed
+from workbench.live.messages import PlaceCamera, Placed, TaskFailed
 from workbench.live.process.ask import Background, QuestionClient
 from workbench.live.process.background_jobs import JobProgress, Jobs
 from workbench.live.run import Run

@@ -64,15 +64,14 @@ from workbench.live.loading import (
     died,
     file_saved,
     follow,
-    task_failed,
     loaded,
     reload_file,
+    task_failed,
     try_next,
 )
 from workbench.live.messages import (
     CameraFailed,
     EnterRecording,
-    TaskFailed,
     Loading,
     NewProcessNeeded,
     PastPictures,
@@ -86,6 +85,7 @@ from workbench.live.messages import (
     SingleStep,
     SliderAction,
     Status,
+    TaskFailed,
 )
 from workbench.live.past import Past
 from workbench.live.reading import read, schedule

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from workbench.envs.inspection import Section
 from workbench.envs.recorded_run import RecordedRun
 from workbench.live.effects import Asked, Later
-from workbench.live.messages import Event, Loaded, TaskFailed, Request
+from workbench.live.messages import Event, Loaded, Request, TaskFailed
 from workbench.live.process.heartbeat import Busy
 from workbench.live.process.supervisor import Death
 from workbench.task.description import TaskOptions

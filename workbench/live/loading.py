@@ -11,7 +11,7 @@ from workbench.envs.step_result import StepResult
 from workbench.live.events import Follow, Now, ReplaceWorker, RunEffect, Send, WorkerDied
 from workbench.live.history.env_table import EnvTable
 from workbench.live.history.moments import History
-from workbench.live.messages import SCENE_KEPT, Loaded, TaskFailed, LoadLevel, NewProcessNeeded, Play, Request
+from workbench.live.messages import SCENE_KEPT, Loaded, LoadLevel, NewProcessNeeded, Play, Request, TaskFailed
 from workbench.live.past import Past
 from workbench.live.process.heartbeat import death_problem
 from workbench.live.process.supervisor import End

@@ -37,7 +37,6 @@ from workbench.live.messages import (
     ListenForDebugger,
     Load,
     Loaded,
-    TaskFailed,
     Loading,
     PlaceCamera,
     Play,
@@ -54,6 +53,7 @@ from workbench.live.messages import (
     SingleStep,
     SliderAction,
     Status,
+    TaskFailed,
     WarmUp,
 )
 from workbench.live.process.heartbeat import Doing, HeartbeatWriter, Interrupts
