@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.actions.policy import Policy, find_policy, load_policy, policy_problem
+from workbench.actions.sources import ActionSource
 from workbench.envs import action_vector as actions
 from workbench.envs.recorded_run import RecordedRun
 from workbench.envs.step_result import StepResult
@@ -28,7 +29,6 @@ from workbench.planning.planned_episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
 from workbench.planning.rollouts import require_plannable
 from workbench.task.blame import blamed
-from workbench.task.description import ActionSource
 from workbench.task.load import LoadedTask
 from workbench.task.problem import TaskError, is_ctrl_c
 from workbench.task.reference import find_module, named_file, split_reference

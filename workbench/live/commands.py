@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from workbench.actions.sources import ActionSource
 from workbench.page.command import Command
 
 LARGEST_SEED = 2**31 - 1
@@ -123,7 +124,7 @@ class ChooseEpisodeEnd(Command, frozen=True):
 class ChooseActions(Command, frozen=True):
     """Where the actions come from."""
 
-    source: Literal["hold", "zero", "random", "sliders", "policy", "solve"]
+    source: ActionSource
 
 
 class MoveSlider(Command, frozen=True):

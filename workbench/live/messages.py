@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.actions.sources import ActionSource
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraKind, CameraSettings, Picture
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection, Section
@@ -16,7 +17,7 @@ from workbench.envs.recorded_run import RecordedRun
 from workbench.envs.step_result import StepResult
 from workbench.machine.processes.wire import Call, Question
 from workbench.planning.options import PlanOptions
-from workbench.task.description import ActionSource, ShownPictures, Stepped, TaskDescription, TaskOptions
+from workbench.task.description import ShownPictures, Stepped, TaskDescription, TaskOptions
 from workbench.task.problem import Problem
 from workbench.task.reference import TaskName
 

@@ -22,8 +22,6 @@ from workbench.pictures.camera_report import ObjectToSee
 Backend = Literal["auto", "cpu", "gpu"]
 ShownPictures = Literal["auto", "exact", "fast"]
 """What the page shows of the cameras. ``auto``: fast pictures while something moves, exact ones when it stands still."""
-ActionSource = Literal["hold", "zero", "random", "sliders", "policy", "solve"]
-"""``solve``: planned by rollouts of the task, outside of `ActionChooser`."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import Literal
 
 import viser
 
+from workbench.actions.sources import SOURCES
 from workbench.live.commands import (
     ChooseActions,
     ChooseEpisodeEnd,
@@ -32,7 +33,7 @@ from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Visitor
-from workbench.task.description import ActionDimension, ActionSource
+from workbench.task.description import ActionDimension
 
 ENVS = {"the selected env": "selected", "all envs": "all"}
 """Choices of a field *Envs*, with their values in commands."""
@@ -128,14 +129,6 @@ EPISODE_ENDS: dict[str, EpisodeEnd] = {
     "reset the env": "reset",
     "keep running": "continue",
     "pause": "pause",
-}
-SOURCES: dict[str, ActionSource] = {
-    "hold still": "hold",
-    "zero": "zero",
-    "random": "random",
-    "sliders": "sliders",
-    "policy": "policy",
-    "solve": "solve",
 }
 SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
 STEP, RESET_ALL, RESET_THIS = "Step", "Reset all", "Reset this env"
