@@ -296,7 +296,7 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
         task_file.write_text(text.replace(good, bad))
 
         def found(rule: str) -> Callable[[Any], bool]:
-            return lambda view: any(one.rule == rule for one in view.checks.findings)
+            return lambda view: any(one.rule == rule for one in view.of(ChecksView).findings)
 
         view = wait_until(session, found(FIRST), "the finding")
         (one,) = (each for each in view.of(ChecksView).findings if each.rule == FIRST)

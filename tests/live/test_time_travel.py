@@ -17,7 +17,7 @@ from workbench.live.events import ActionTold, EnvsReset, MomentShown, PagesCount
 from workbench.live.messages import CameraRequest
 from workbench.live.timeline_commands import ContinueFromHere, UndoReset
 from workbench.record.commands import StopRecording
-from workbench.record.state import RecordingWanted
+from workbench.record.state import RecordingStatus, RecordingWanted
 
 N = 3
 
@@ -128,7 +128,7 @@ def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session
 @pytest.mark.slow
 def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     start = fresh(session)
-    written = session.view().recording.episodes_written
+    written = session.view().of(RecordingStatus).episodes_written
     step(session, 1)
     last = session.view().timeline.last
     session.happen(RecordingWanted((0,)))
@@ -136,10 +136,10 @@ def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     step(session, 3)
     session.happen(MomentShown(start + 1))
     jump(session, lambda: session.do(ContinueFromHere(scope="this")))
-    view = wait_until(session, lambda v: v.recording.episodes_written == written + 1, "the file")
-    assert view.recording.active and view.recording.problem is None
+    view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written == written + 1, "the file")
+    assert view.of(RecordingStatus).active and view.of(RecordingStatus).problem is None
     step(session, 1)
-    assert session.view().recording.steps == 0, "what was not begun by a reset is not recorded"
+    assert session.view().of(RecordingStatus).steps == 0, "what was not begun by a reset is not recorded"
     session.do(StopRecording())
 
 

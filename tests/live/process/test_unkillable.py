@@ -31,7 +31,7 @@ from workbench.live.process.worker_process import signal_main_thread
 from workbench.live.timeline_commands import ContinueFromHere
 from workbench.live.view import SessionView
 from workbench.record.commands import StopRecording
-from workbench.record.state import RecordingWanted
+from workbench.record.state import RecordingStatus, RecordingWanted
 from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -275,19 +275,19 @@ def test_a_new_version_that_kills_whoever_imports_it_costs_one_worker(session: S
 
 
 def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, file: Path) -> None:
-    written = another_version(session, file).recording.episodes_written
+    written = another_version(session, file).of(RecordingStatus).episodes_written
     session.happen(RecordingWanted((1,)))
     for count in (1, 2, 3, 4, 5):
         session.do(Step())
-        wait_until(session, lambda v, n=count: v.recording.steps == n, f"recorded step {count}")
+        wait_until(session, lambda v, n=count: v.of(RecordingStatus).steps == n, f"recorded step {count}")
     before, worker = session.view(), session.worker_pid
     provoke(file, "reward", "kill")
     session.do(Step())
-    view = wait_until(session, lambda v: v.recording.episodes_written > written, "the file")
+    view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written > written, "the file")
     calm(file)
-    assert not view.recording.active and view.recording.problem is None
-    assert verify_rrd(view.recording.last_file) is None
-    assert "5" in str(read_properties(Path(view.recording.last_file)))
+    assert not view.of(RecordingStatus).active and view.of(RecordingStatus).problem is None
+    assert verify_rrd(view.of(RecordingStatus).last_file) is None
+    assert "5" in str(read_properties(Path(view.of(RecordingStatus).last_file)))
     # A recording begins an episode of its own.
     view = back(session, before, steps=(8, 5))
     assert "SIGKILL" in view.problem.message and view.problem.code is None
@@ -421,12 +421,12 @@ def test_a_task_that_goes_to_another_folder_is_reloaded_and_recorded_as_before(
             session, lambda v: v.task_serial > before.task_serial and v.problem is None, "the new version"
         )
         session.happen(RecordingWanted())
-        wait_until(session, lambda v: v.recording.active, "the recording")
+        wait_until(session, lambda v: v.of(RecordingStatus).active, "the recording")
         session.do(Step())
-        wait_until(session, lambda v: v.recording.steps == 1, "a recorded step")
+        wait_until(session, lambda v: v.of(RecordingStatus).steps == 1, "a recorded step")
         session.do(StopRecording())
-        view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the file")
-        assert Path(view.recording.last_file).resolve().parent == tmp_path / "recordings"
+        view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written == 1, "the file")
+        assert Path(view.of(RecordingStatus).last_file).resolve().parent == tmp_path / "recordings"
 
 
 def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None:
