@@ -36,7 +36,7 @@ BIN := $(VENV)/bin
 # unless it is told not to, as in many containers: then each process compiles three thousand files again, and its imports
 # take three times as long. What cannot be imported here is told by the command that needs it.
 unexport PYTHONDONTWRITEBYTECODE
-COMPILE := $(BIN)/python -c 'import workbench.app.worker.loop, workbench.app.live_page' >/dev/null 2>&1 || true
+COMPILE := $(BIN)/python -c 'import workbench.app.worker.main_loop, workbench.app.live_page' >/dev/null 2>&1 || true
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -q --no-compile -c constraints.txt
 
 # The first Python that runs and that every pinned package has a release for. A pyenv shim can be on PATH and

@@ -29,7 +29,7 @@ from workbench.start.recents import RecentTasks
 from workbench.start.registered import RegisteredTasks
 from workbench.task.description import TaskOptions
 from workbench.task.reference import TaskName
-from workbench.trust.dialog import ALWAYS, DO_NOT, ONCE
+from workbench.trust.consent_dialog import ALWAYS, DO_NOT, ONCE
 
 TASK = "@register_env('Push-v1')\nclass Push(BaseEnv): pass\n"
 CAMERA: CameraKey = ("sensor", "base_camera")

@@ -149,7 +149,7 @@ def parts(num_envs: int) -> None:
         with part("import mani_skill.envs, with its tasks"):
             import mani_skill.envs  # noqa: F401
         with part("import the worker"):
-            import workbench.app.worker.loop  # noqa: F401
+            import workbench.app.worker.main_loop  # noqa: F401
     torch.set_num_threads(1)
     from workbench.envs.scene.read_scene import read_geometry
     from workbench.envs.snapshots.snapshot import begin_anew

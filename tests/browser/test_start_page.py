@@ -19,7 +19,7 @@ from tests.drive.waiting import until
 from workbench.machine.maniskill_installed import installed_maniskills
 from workbench.start.registered import LIST_FILE
 from workbench.task.new_task import TEMPLATES
-from workbench.trust.dialog import DO_NOT, ONCE
+from workbench.trust.consent_dialog import DO_NOT, ONCE
 
 # The first begins at the start page, which is gone once a task is open.
 pytestmark = [pytest.mark.browser, pytest.mark.random_order(disabled=True)]

@@ -13,7 +13,7 @@ from tests.drive.page import TASK, open_workbench, page_at
 from workbench.record.job import record
 from workbench.record.job_worker import RecordOptions
 from workbench.task.description import TaskOptions
-from workbench.trust.dialog import DO_NOT, ONCE
+from workbench.trust.consent_dialog import DO_NOT, ONCE
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 PATIENT = 120_000

@@ -14,8 +14,8 @@ from workbench.checks.job_items import CheckOptions, ItemOutcome
 from workbench.checks.results import RuleResult, merged
 from workbench.checks.rules import RULES
 from workbench.envs.gpu_rules import Finding
-from workbench.jobs.job_file import JobFile, Kept, job_of, read_parts
 from workbench.jobs.local_processes import Processes
+from workbench.jobs.results_file import JobFile, Kept, job_of, read_parts
 from workbench.jobs.scheduler import Shard, ThisProcess
 from workbench.record.job import record
 from workbench.record.job_worker import RecordOptions

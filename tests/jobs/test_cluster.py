@@ -18,9 +18,9 @@ import pytest
 from tests.jobs.work import Run, Setup
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.jobs import ray_cluster as seam
-from workbench.jobs.job_file import JobFile, Kept, job_of
 from workbench.jobs.ray_cluster import Cluster
 from workbench.jobs.ray_connection import connected
+from workbench.jobs.results_file import JobFile, Kept, job_of
 from workbench.jobs.scheduler import PoolError
 from workbench.record.job import Recorded, record
 from workbench.record.job_worker import RecordOptions

@@ -146,9 +146,9 @@ class SmallWorker:
 
 
 if __name__ == "__main__":
-    instead: Any = types.ModuleType("workbench.app.worker.loop")
+    instead: Any = types.ModuleType("workbench.app.worker.main_loop")
     instead.work = lambda fd, heartbeat: SmallWorker(
         multiprocessing.connection.Connection(fd), heartbeat
     ).run()
-    sys.modules["workbench.app.worker.loop"] = instead
+    sys.modules["workbench.app.worker.main_loop"] = instead
     main()

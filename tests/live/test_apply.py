@@ -46,9 +46,9 @@ from workbench.live.events import (
     VersionLoaded,
     WorkerDied,
 )
+from workbench.live.inspect_polling import READ_EVERY
 from workbench.live.messages import Load, Loaded, Loading, ReloadReport, Settings, Status, TaskFailed
 from workbench.live.process.supervisor import End
-from workbench.live.reading import READ_EVERY
 from workbench.live.run import first_run
 from workbench.live.timeline_commands import ContinueFromHere, GoToLast, NextEvent, Seek, StepBack, UndoReset
 from workbench.live.view import view_of

@@ -21,6 +21,7 @@ from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection
 from workbench.live.commands import ChooseClass, PauseRun, PlayRun, ReloadFile, SetSeed
 from workbench.live.events import MomentShown, OptionsApplied, PagesCounted, ReadingChosen
+from workbench.live.inspect_polling import READ_EVERY
 from workbench.live.messages import (
     CameraFailed,
     CameraRequest,
@@ -37,7 +38,6 @@ from workbench.live.messages import (
     TaskFailed,
 )
 from workbench.live.process.supervisor import End
-from workbench.live.reading import READ_EVERY
 from workbench.live.run import Run
 from workbench.page.command import Refused
 from workbench.rescore.state import RescoreView, RescoringTold

@@ -27,7 +27,7 @@ from workbench.start.recents import RecentTasks
 from workbench.start.registered import RegisteredTasks
 from workbench.task.description import TaskOptions
 from workbench.trust.clearance import Clearances
-from workbench.trust.dialog import TrustDialog
+from workbench.trust.consent_dialog import TrustDialog
 
 
 class App:

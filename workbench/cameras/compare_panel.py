@@ -14,7 +14,7 @@ from workbench.cameras.job_result import JobResult
 from workbench.cameras.pose_math import chosen_camera
 from workbench.cameras.view import StudioCamera, StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
-from workbench.live.live_session import LiveSession
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import choice

@@ -32,7 +32,7 @@ from workbench.cameras.job_result import NewResult
 from workbench.cameras.pose_math import rounded
 from workbench.cameras.view import EditRequest, EditState, StudioView
 from workbench.envs.camera_data import CameraKind, CameraSettings
-from workbench.live.live_session import LiveSession
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import Field

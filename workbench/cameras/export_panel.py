@@ -24,7 +24,7 @@ from workbench.cameras.commands import (
 from workbench.cameras.events import CameraPlaced
 from workbench.cameras.pose_math import chosen_camera
 from workbench.cameras.view import StudioCamera, StudioView
-from workbench.live.live_session import LiveSession
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import Field, choice

@@ -15,8 +15,8 @@ from workbench.cameras.apply import PREVIEW_MODALITIES
 from workbench.cameras.commands import PickPixel, ShowFrustums, ShowPictures
 from workbench.cameras.view import PickedPixel, ShownCameras, StudioCamera, StudioView
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraKind, Picture
-from workbench.live.live_session import LiveSession
 from workbench.live.messages import CameraRequest
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.machine.text import listed
 from workbench.page.command import Command, Refused

@@ -14,7 +14,7 @@ from workbench.cameras.commands import FARTHEST
 from workbench.cameras.events import CameraPlaced
 from workbench.cameras.view import StudioCamera, StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings
-from workbench.live.live_session import LiveSession
+from workbench.live.session_protocol import LiveSession
 from workbench.page.command import Refused
 from workbench.pictures.camera_conventions import (
     LookAt,

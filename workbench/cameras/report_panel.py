@@ -25,7 +25,7 @@ from workbench.cameras.view import StudioCamera, StudioView
 from workbench.envs.camera_data import Picture
 from workbench.live.env_commands import SelectEnv
 from workbench.live.events import MomentShown
-from workbench.live.live_session import LiveSession
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import Field, choice

@@ -48,8 +48,8 @@ from workbench.cameras.report_panel import CameraReportPanel
 from workbench.cameras.suggest_panel import CameraSuggest
 from workbench.cameras.view import StudioCamera, StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings
-from workbench.live.live_session import LiveSession
 from workbench.live.panels.view_panel import ViewPanel
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.commands import TellUnfolded

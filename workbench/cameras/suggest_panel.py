@@ -22,7 +22,7 @@ from workbench.cameras.job_result import JobResult
 from workbench.cameras.pose_math import chosen_camera
 from workbench.cameras.view import StudioCamera, StudioView
 from workbench.envs.camera_data import CameraKey, CameraKind, CameraSettings
-from workbench.live.live_session import LiveSession
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.scene.env_grid import box_corners, line_set

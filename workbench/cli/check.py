@@ -47,7 +47,7 @@ from workbench.cli.output import (
 )
 from workbench.cli.run_by import print_part, run_by, shard_of
 from workbench.envs.gpu_rules import FailOn, Finding
-from workbench.jobs.job_file import JobKey, job_of
+from workbench.jobs.results_file import JobKey, job_of
 from workbench.jobs.scheduler import PoolError
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder

@@ -31,7 +31,7 @@ from workbench.cli.sweep import print_report as print_report_of_sweep
 from workbench.cli.sweep import write_reports as write_sweep_reports
 from workbench.envs.gpu_rules import FailOn
 from workbench.episodes.writing.publish import RecordingError
-from workbench.jobs.job_file import JobFileError, JobParts, read_parts, write_whole
+from workbench.jobs.results_file import JobFileError, JobParts, read_parts, write_whole
 from workbench.machine.files import new_file
 from workbench.machine.text import listed
 from workbench.record.job import collect

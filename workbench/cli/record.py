@@ -40,7 +40,7 @@ from workbench.envs.backends import unused_gpu_text
 from workbench.episodes.reader.reading import recover_confined
 from workbench.episodes.writing.publish import try_folder
 from workbench.episodes.writing.upload import require_place
-from workbench.jobs.job_file import JobKey, job_of
+from workbench.jobs.results_file import JobKey, job_of
 from workbench.machine.text import rate_text
 from workbench.planning.seeds_report import underway_text
 from workbench.record.job import Recorded, RecordProgress, chunk_of, record

@@ -38,7 +38,7 @@ from workbench.envs.gpu_rules import Finding
 from workbench.episodes.reader.reading import find_all_sources
 from workbench.episodes.recorded_source import CannotEnterRecording, recorded_version
 from workbench.episodes.row import Source, UnreadableRecording
-from workbench.jobs.job_file import JobKey, job_of
+from workbench.jobs.results_file import JobKey, job_of
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text

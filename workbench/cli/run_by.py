@@ -14,9 +14,9 @@ from rich.markup import escape
 
 from workbench.cli.arguments import JobArguments
 from workbench.cli.output import Exit, err, interrupted, print_problem, refuse, warn
-from workbench.jobs.job_file import JobFile, JobKey, Kept
 from workbench.jobs.local_processes import Processes
 from workbench.jobs.ray_cluster import Cluster
+from workbench.jobs.results_file import JobFile, JobKey, Kept
 from workbench.jobs.scheduler import Executor, PoolError, Shard, ThisProcess, by_kind, parse_shard
 from workbench.library.job_status import JobFailure, JobState, JobStatus, StatusFile
 from workbench.machine.text import listed

@@ -46,7 +46,7 @@ from workbench.envs.gpu_rules import FailOn, fails
 from workbench.episodes.reader.reading import recover_confined
 from workbench.episodes.writing.publish import try_folder
 from workbench.episodes.writing.upload import require_place
-from workbench.jobs.job_file import JobKey, job_of
+from workbench.jobs.results_file import JobKey, job_of
 from workbench.jobs.scheduler import Failure
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder

@@ -44,7 +44,7 @@ from workbench.episodes.reader.reading import recover_confined
 from workbench.episodes.sweep_results import RESULTS, PointSummary, SweepResults, value_text, write_results
 from workbench.episodes.writing.publish import try_folder
 from workbench.episodes.writing.upload import require_place, upload_file
-from workbench.jobs.job_file import JobKey, job_of
+from workbench.jobs.results_file import JobKey, job_of
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import number_text

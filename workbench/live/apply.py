@@ -59,6 +59,7 @@ from workbench.live.events import (
     WorkerBusy,
     WorkerDied,
 )
+from workbench.live.inspect_polling import read, schedule
 from workbench.live.loading import (
     apply_options,
     died,
@@ -88,7 +89,6 @@ from workbench.live.messages import (
     TaskFailed,
 )
 from workbench.live.past import Past
-from workbench.live.reading import read, schedule
 from workbench.live.run import Change, Run, at_rest, new_pictures, with_problem
 from workbench.live.timeline_commands import (
     ContinueFromHere,

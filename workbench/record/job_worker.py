@@ -192,7 +192,7 @@ def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedR
     Args:
         given: as of `with_given_actions`, if it was read already.
     """
-    torch.set_num_threads(1)  # see workbench.app.worker.loop.work
+    torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # the task may change it
     chunk = None
     # The first is opened before it is asked for: what opening fails in is no chunk's fault.

@@ -222,7 +222,7 @@ class _Stopped(Exception):
 
 def rescore_items(setup: RescoreSetup, queue: ItemQueue) -> None:
     """Rescore the chunks that one worker gets. An exception of the author's code is the verdict of its recordings."""
-    torch.set_num_threads(1)  # see workbench.app.worker.loop.work
+    torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # a task may change it
     chunk = queue.next()
     with suppress(_Stopped):

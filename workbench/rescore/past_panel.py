@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.live.events import MomentShown
-from workbench.live.live_session import LiveSession
+from workbench.live.session_protocol import LiveSession
 from workbench.live.timeline_commands import ChooseRescoredCurve, NextDifference, PreviousDifference
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused

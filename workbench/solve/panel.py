@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from workbench.live.commands import UseControlMode
 from workbench.live.history.env_table import EnvRows
-from workbench.live.live_session import LiveSession
 from workbench.live.run import movable_bodies
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.machine.text import number_text, rate_text
 from workbench.page.command import Command, Refused

@@ -13,7 +13,7 @@ from workbench.checks.panel import list_html
 from workbench.checks.rules import RULES
 from workbench.checks.state import ChecksView
 from workbench.envs.gpu_rules import Finding
-from workbench.live.live_session import LiveSession
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command
 from workbench.page.widgets.editor_links import LinkTo, no_links

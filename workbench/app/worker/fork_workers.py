@@ -40,7 +40,7 @@ def main() -> None:
         os.dup2(fd, standard)
     try:
         with quick_imports():
-            from workbench.app.worker import loop  # noqa: F401
+            from workbench.app.worker import main_loop as loop  # noqa: F401
     except BaseException:
         versions = None  # each worker imports for itself, and says what is wrong
     else:

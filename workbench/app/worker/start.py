@@ -59,7 +59,7 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
             code = 1
         else:
             with quick_imports():
-                from workbench.app.worker.loop import work
+                from workbench.app.worker.main_loop import work
 
             work(connection, heartbeat)
     except BaseException as error:

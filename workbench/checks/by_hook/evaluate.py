@@ -11,8 +11,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.episode_batches import Episodes
 from workbench.checks.evidence.over_seeds import OverSeeds, first_kind, together, tried
-from workbench.checks.evidence.rollouts import Episodes
 from workbench.checks.results import Seen
 from workbench.envs.action_vector import hold_action
 from workbench.envs.broken_rule import Place

@@ -14,8 +14,8 @@ from mani_skill.utils.structs.link import Link
 from numpy.typing import NDArray
 
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.episode_batches import SeenOutlier
 from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
-from workbench.checks.evidence.rollouts import SeenOutlier
 from workbench.checks.results import Seen
 from workbench.envs.action_vector import random_action
 from workbench.envs.broken_rule import Place

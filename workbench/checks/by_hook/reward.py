@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from workbench.checks.by_hook.evaluate import flags
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.episode_batches import Episodes
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, SHORT, OddStates, odd_states
 from workbench.checks.evidence.over_seeds import OverSeeds, first_kind, tried
-from workbench.checks.evidence.rollouts import Episodes
 from workbench.checks.results import Seen
 from workbench.envs.broken_rule import Place
 from workbench.envs.outliers import REWARD_RANGES, ROUNDING

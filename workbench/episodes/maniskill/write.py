@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.episodes.description import describe_json
+from workbench.episodes.describe import describe_json
 from workbench.episodes.document import json_text, with_checksum
 from workbench.episodes.episode import Episode
 

@@ -18,7 +18,7 @@ from rerun.chunk import Chunk
 from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.envs.camera_data import moved_cameras_text
-from workbench.episodes.description import describe
+from workbench.episodes.describe import describe
 from workbench.episodes.document import fields_of, json_text
 from workbench.episodes.episode import Episode, EpisodeInfo, acted_by_text, movable_bounds
 from workbench.episodes.rerun.chunks import STEP, property_chunk, static_chunk

@@ -21,7 +21,7 @@ from workbench.live.commands import (
     SetNumEnvs,
 )
 from workbench.live.events import OptionsApplied
-from workbench.live.live_session import LiveSession
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import Field, Plain, choice, tick

@@ -22,10 +22,10 @@ from workbench.live.env_commands import (
 )
 from workbench.live.events import EpisodeStepShown, SettingsChanged
 from workbench.live.history.env_table import EnvRows, Outcome
-from workbench.live.live_session import LiveSession
 from workbench.live.panels.env_columns import DOT, EnvColumn, levels, wanted_width
 from workbench.live.panels.moment import MomentPart
 from workbench.live.panels.timeline_panel import polylines
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.machine.text import number_text
 from workbench.page.command import Command, Refused

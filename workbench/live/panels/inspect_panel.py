@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from workbench.envs.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section
 from workbench.live.commands import ChooseInspected, ShowForces
 from workbench.live.events import ReadingChosen
-from workbench.live.live_session import LiveSession
-from workbench.live.reading import READ_EVERY
+from workbench.live.inspect_polling import READ_EVERY
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.machine.text import number_text
 from workbench.page.command import Command

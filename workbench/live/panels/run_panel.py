@@ -24,8 +24,8 @@ from workbench.live.commands import (
 )
 from workbench.live.env_commands import NextEnv, PreviousEnv, SelectEnv
 from workbench.live.events import ActionTold
-from workbench.live.live_session import LiveSession
 from workbench.live.messages import EpisodeEnd
+from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import Field, choice, slider

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from workbench.live.events import MomentShown
 from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
-from workbench.live.live_session import LiveSession
 from workbench.live.panels.moment import MomentPart
 from workbench.live.past import Strip, TimelineView
+from workbench.live.session_protocol import LiveSession
 from workbench.live.timeline_commands import (
     ContinueFromHere,
     GoToFirst,

@@ -15,7 +15,7 @@ from workbench.page.command import Command
 from workbench.page.commands import AnswerTrust
 from workbench.page.widgets.visitors import Visitor
 from workbench.trust.clearance import CodeFile, Consent, Since, TrustQuestion
-from workbench.trust.dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
+from workbench.trust.consent_dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
 
 PUSH = CodeFile("/home/me/push.py", "0123456789ab", "import helper\n")
 HELPER = CodeFile("helper.py", "ba9876543210", "A = 1\n")

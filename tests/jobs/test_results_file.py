@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from workbench.jobs.job_file import JobFile, JobFileError, JobKey, Kept, job_of, read_parts, write_whole
+from workbench.jobs.results_file import JobFile, JobFileError, JobKey, Kept, job_of, read_parts, write_whole
 from workbench.jobs.scheduler import ItemQueue, Scheduler, Shard, ThisProcess, Work
 from workbench.record.job_worker import RecordOptions
 from workbench.task.description import TaskOptions
