@@ -40,7 +40,7 @@ def test_a_topic_is_shown(topic: Topic, capsys: pytest.CaptureFixture[str]) -> N
     ("name", "advice"),
     [
         ("camera", "Did you mean 'cameras'?"),
-        ("rollouts reward", "These mention it: solve"),
+        ("planner horizon", "These mention it: solve"),
         ("zzz", "no topic mentions it"),
         ("\x1b[2J", "no topic"),
     ],
