@@ -15,22 +15,23 @@ _STEPS = 8, 20
 
 @dataclass(frozen=True)
 class PlanArguments:
-    """How a plan is searched: candidate actions are rolled out from the present state, and the plan goes to what earned most.
+    """Options of the planner: candidate actions are rolled out from the current state, and the plan moves toward the best.
 
     Args:
-        method: mppi, the mean of all candidates weighted by what they earned (Williams et al., 2017); predictive, the best
+        method: mppi, the mean of all candidates weighted by their returns (Williams et al., 2017); predictive, the best
             candidate (predictive sampling; Howell et al., 2022); cem, mean and spread of the best ones (the
-            cross-entropy method, kept warm as in iCEM; Pinneri et al., 2020).
-        rollouts: candidates that are tried at once, each in an env of its own.
-        horizon: seconds that a plan looks ahead; 0 for half a second, or a whole one where the task has no success to come to,
-            but from 8 to 20 control steps.
-        knots: actions that a candidate is made of, in equal distances; between them it is interpolated.
-        noise: standard deviation of a candidate's knots around the plan, of half the range of each action dimension.
-        temperature: of mppi, in standard deviations of what the best quarter of the candidates earned; the lower, the more
-            the best ones count.
-        elites: of cem, the part of the candidates that make the next plan.
-        rounds: times that candidates are drawn and rolled out for one plan.
-        every: control steps that are taken before the next plan.
+            cross-entropy method, warm-started as in iCEM; Pinneri et al., 2020).
+        rollouts: number of candidates rolled out at once, each in its own env.
+        horizon: planning horizon in seconds; 0 for 0.5 s, or 1 s if the task has no success, within 8 to 20 control
+            steps.
+        knots: number of equally spaced actions that define a candidate, interpolated in between.
+        noise: standard deviation of the candidates' knots around the plan, relative to half the range of each action
+            dimension.
+        temperature: temperature of mppi, in standard deviations of the returns of the best quarter of the candidates; a
+            lower one gives more weight to the best.
+        elites: fraction of the candidates that form the next plan of cem.
+        rounds: sampling and rollout iterations for each plan.
+        every: control steps to take before planning again.
     """
 
     method: Method = "mppi"

@@ -215,21 +215,21 @@ class RecordArguments:
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         out: folder for the files.
-        upload: an address of fsspec, such as s3://bucket/folder: each episode goes there when it is over, and not into
+        upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
             the folder.
-        episodes: how many, over all envs; 4, or as many as a file of actions has.
-        successes: continue until so many episodes succeeded, and keep no others.
-        tries: give up after so many episodes where successes are wanted; 100 for each.
-        actions: random, zero, hold; solve, which plans them by rollouts of the task with its own reward; a policy as
+        episodes: number of episodes over all envs; default: 4, or as many as a file of actions has.
+        successes: continue until this many episodes succeed, and keep only those.
+        tries: with --successes, give up after this many episodes; default: 100 for each success.
+        actions: random, zero, hold; solve, which plans with rollouts of the task and its own reward; a policy as
             module:function or file.py:function; or a file: .npy or .npz with actions, or .h5 with ManiSkill's
             demonstrations, which begin from their own seeds.
-        use_env_states: put every env state of a demonstration back after its step.
-        pictures: record what every camera sees (--no-pictures is much faster).
-        fast_pictures: draw simplified meshes: several times as many pictures a second without a GPU, which differ a little
-            from a GPU's. The recordings say so, in their .json and in the review.
-        max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
-        seconds_per_seed: wall time after which an episode ends at its next step, solved or not. Which ones that cuts off
-            depends on the machine and on what else it does, so a second run may record others.
+        use_env_states: restore the demonstration's env state after each step.
+        pictures: record the images of every camera (--no-pictures is much faster).
+        fast_pictures: render simplified meshes: several times as many images per second without a GPU, slightly different
+            from a GPU's. The recordings are marked, in their .json and in the review.
+        max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
+        seconds_per_seed: wall time limit of an episode: it ends at its next step, solved or not. Which episodes reach it
+            depends on the machine and its load, so a second run may differ.
     """
 
     task: str
