@@ -21,9 +21,9 @@ from workbench.pictures.camera_report import ObjectToSee
 
 Backend = Literal["auto", "cpu", "gpu"]
 ShownPictures = Literal["auto", "exact", "fast"]
-"""What the page shows of the cameras. ``auto``: fast pictures while something moves, exact ones when it stands still."""
+"""Quality of the camera pictures on the page. ``auto``: fast during motion, exact at rest."""
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy", "solve"]
-"""``solve``: planned by rollouts of the task, outside of `ActionChooser`."""
+"""``solve``: planned with rollouts of the task, outside of `ActionChooser`."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class TaskOptions:
     backend: Backend = "auto"
     seed: int = 0
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
+    """More keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
     pictures: PictureDegree = "exact"
-    """Quality of the pictures that the envs draw for observations and recordings."""
+    """Quality of the pictures that the envs render for observations and recordings."""
     rules: Degree | None = None
     """Degree of all rules of GPU simulation; None keeps each rule's own degree, see `envs.gpu_rules`."""
     imports: tuple[str, ...] = ()
@@ -57,7 +57,7 @@ def changed_options(before: TaskOptions, after: TaskOptions) -> list[str]:
 
 
 def command_line(reference: str, options: TaskOptions) -> str:
-    """What to type, in any folder, to open a task with these options."""
+    """Command that opens a task with these options from any folder."""
     words = ["workbench", "open", reference]
     usual = TaskOptions()
     for name in ("num_envs", "backend", "seed", "rules"):
@@ -71,7 +71,7 @@ def command_line(reference: str, options: TaskOptions) -> str:
 
 
 def _argument_text(value: Any) -> str:
-    """The text that ``--env`` reads as this value: JSON, or a text that is none."""
+    """The text that ``--env`` parses to this value: JSON, or plain text that is not JSON."""
     if isinstance(value, str):
         try:
             json.loads(value)
@@ -123,7 +123,7 @@ class TaskDescription:
     """Segmentation id to body name."""
     can_render: bool
     pictures: PictureDegree = "exact"
-    """What its envs draw for observations and recordings."""
+    """Quality of the pictures that its envs render for observations and recordings."""
     chosen: str = ""
     """Its name in the file: the class, or a robot that is shown in a scene."""
     others: tuple[str, ...] = ()
@@ -131,18 +131,18 @@ class TaskDescription:
     in_place_of: str | None = None
     """The class of the file that was tried first and failed."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keywords of ``gym.make`` for such an env, as far as JSON can hold them."""
+    """Keyword arguments of ``gym.make`` for such an env, as far as JSON can represent them."""
     objects: tuple[ObjectToSee, ...] = ()
     """Objects that a camera can be measured on."""
     joints: tuple[str, ...] = ()
     """Names of `StepResult.qpos`."""
     notices: tuple[str, ...] = ()
-    """Notices about a task that works, as sentences."""
+    """Notices about a working task, as sentences."""
     parse_cameras: str = "parse_camera_configs"
-    """ManiSkill's function for what a camera hook returns, by the name that the installed version has."""
+    """Name, in the installed version, of ManiSkill's function for what a camera hook returns."""
     outlier_rules: Mapping[str, Finding] = field(default_factory=dict)
-    """The rules that an outlier can break, by id, each as a finding without a breach at the hook that it guards; without
-    those that are off, or silenced there."""
+    """The rules that an outlier can break, by id; each value is a finding template at the hook that the rule guards. Rules
+    that are off, or silenced at the hook, are left out."""
     made: HowMade = HowMade()
     """How the envs are made: robot, modes and the task's own keyword arguments."""
 
@@ -151,7 +151,7 @@ class TaskDescription:
 
 
 NO_MOMENT = -1
-"""The `Restored.origin` of a state that is not of this history."""
+"""The `Restored.origin` of a state that is not in this history."""
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,8 @@ class Restored:
     number: int = 0
     """Number of the `EnterRecording` that this result answers; 0 for a `Restore`."""
     replayed: tuple[int, ...] = ()
-    """Indices of the envs that were replayed up to the state. For them the state is not an exact point, from which
-    the same actions give the same bits; a restored state is one."""
+    """Indices of the envs that were replayed up to the state. For them the state is not an exact point (from which the same
+    actions give the same bits); a restored state is."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class Stepped:
 
     step: StepResult
     reset_mask: NDArray[np.bool_]
-    """(N,) True where this result does not follow from the one before: the first of a new episode, or a past moment
+    """(N,) True where this result does not follow from the previous one: the first of a new episode, or a past moment
     (`restored`)."""
     captured: tuple[Picture, ...] = ()
     """Pictures of exactly this step (only while capturing)."""
@@ -191,21 +191,21 @@ class Stepped:
     """The body of the snapshot of the whole batch at this moment (see `envs.snapshots.packing`): opaque to the
     server, whose `History.snapshot_at` makes a pickled `Snapshot` of it."""
     part_keys: tuple[int, ...] | None = None
-    """The parts of the snapshot; None if they are those of the previous event."""
+    """The parts of the snapshot; None if unchanged since the previous event."""
     new_parts: dict[int, bytes] = field(default_factory=dict)
-    """Parts that were not sent before."""
+    """Parts that have not been sent yet."""
     number: int = 0
-    """Counts these events since the worker began; `Pictures.number` refers to it."""
+    """Counts these events since the worker started; `Pictures.number` refers to it."""
     restored: Restored | None = None
     columns: dict[str, NDArray] = field(default_factory=dict)
-    """(N, ...) each, as `envs.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
+    """(N, ...) arrays by the names of `envs.state_columns`: ``state/actors/cube``, ``obs/agent/qpos``. Only while
     capturing."""
     acted_by: str = ""
     """Source of this step's action, for a recording; empty if the source is known before the episode."""
     placed: dict[CameraKey, CameraSettings] = field(default_factory=dict)
     """The cameras that are placed by hand (only while capturing)."""
     resumed: bool = False
-    """The envs have the state that the previous worker left: the result follows from none of this worker's, but nothing
+    """The envs have the state that the previous worker left: the result follows from no result of this worker, but nothing
     was reset."""
 
 
