@@ -1,4 +1,4 @@
-"""How a plan is searched, as plain data. Imports no torch."""
+"""Options of the planner, as plain data. Imports no torch."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 Method = Literal["mppi", "predictive", "cem"]
-_FEWEST_ROLLOUTS = 4
-"""Fewest rollouts: the plan itself, holding still, and the two best of the round before."""
-_STEPS = 8, 20
-"""Fewest and most control steps of the usual horizon."""
+_MIN_ROLLOUTS = 4
+"""Minimum number of rollouts: the plan itself, holding still, and the two best of the previous round."""
+_HORIZON_STEPS = 8, 20
+"""Minimum and maximum control steps of the default horizon."""
 
 
 @dataclass(frozen=True)
@@ -53,26 +53,26 @@ class PlanOptions(PlanArguments):
         """Raises ValueError with a sentence that names the option."""
         if self.method not in get_args(Method):
             raise ValueError(f"method must be one of {', '.join(get_args(Method))}, not {self.method!r}")
-        for name, least in (("rollouts", _FEWEST_ROLLOUTS), ("knots", 2), ("rounds", 1), ("every", 1)):
+        for name, least in (("rollouts", _MIN_ROLLOUTS), ("knots", 2), ("rounds", 1), ("every", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
         for name in ("noise", "temperature", "elites"):
             if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be above 0, not {getattr(self, name)}")
+                raise ValueError(f"{name} must be greater than 0, not {getattr(self, name)}")
         if self.elites > 1:
-            raise ValueError(f"elites is a part of the candidates, at most 1, not {self.elites}")
+            raise ValueError(f"elites is a fraction of the candidates, at most 1, not {self.elites}")
         if not 0 <= self.horizon < math.inf:
-            raise ValueError(f"horizon is a time in seconds, 0 for the usual one, not {self.horizon}")
+            raise ValueError(f"horizon is a time in seconds, 0 for the default, not {self.horizon}")
 
     def steps(self, control_dt: float, has_success: bool = True) -> int:
-        """H, the control steps of a plan, at least two and as many as are taken before the next one.
+        """H, the control steps of a plan: at least two, and at least `every`.
 
         Args:
             control_dt: simulated seconds of a control step.
-            has_success: whether the task's ``evaluate`` tells a success. Without one there is something to keep up, such as a
-                pole's balance, and half a second ahead nothing has fallen yet.
+            has_success: whether the task's ``evaluate`` reports success. A task without success keeps something up, such as a
+                pole's balance, and nothing falls within half a second.
         """
-        fewest, most = _STEPS
+        fewest, most = _HORIZON_STEPS
         seconds = 0.5 if has_success else 1.0
         usual = min(most, max(fewest, round(seconds / control_dt)))
         steps = max(2, round(self.horizon / control_dt)) if self.horizon else usual

@@ -18,7 +18,7 @@ from workbench.envs.gpu_rules import Finding
 from workbench.episodes.recorded_source import CannotEnterRecording
 from workbench.episodes.row import Source
 from workbench.jobs.scheduler import Chunk, Executor, Failure, ItemQueue, Scheduler, Work
-from workbench.jobs.worker_files import MOST_BYTES
+from workbench.jobs.worker_files import MAX_BYTES
 from workbench.machine.folders import CurrentFolder
 from workbench.rescore.replay_recordings import RescoredBy, opened_code, rescore
 from workbench.rescore.verdict import Verdict
@@ -207,7 +207,7 @@ def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
         for suffix in _SIDE
         if (file := of.source().path.with_suffix(suffix)).is_file()
     }
-    if sum(file.stat().st_size for file in files) > MOST_BYTES // 2:
+    if sum(file.stat().st_size for file in files) > MAX_BYTES // 2:
         return replace(setup, elsewhere=True), []
     items = {number: replace(of, travels=of.source().path.resolve()) for number, of in setup.items.items()}
     return replace(setup, items=items), sorted(files)
