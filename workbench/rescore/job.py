@@ -26,9 +26,9 @@ from workbench.task.open import OpenedTask
 from workbench.task.problem import Problem, TaskError
 from workbench.task.reference import RecordedTask, named_file
 
-_TRIES = 3
+_MAX_CHUNK_STARTS = 3
 """Maximum number of times that a chunk is started when its workers die."""
-_SIDE = (".rrd", ".h5", ".json")
+_SUFFIXES = (".rrd", ".h5", ".json")
 """Suffixes of the files of one recording."""
 
 
@@ -162,7 +162,7 @@ def rescore_recordings(
             on_progress(len(results), len(setup.items), steps)
 
     scheduler: Scheduler[RescoredRecording, RescoreUpdate] = Scheduler(
-        sorted(setup.items), take, hear, chunk=setup.chunk, tries=_TRIES, on_failure=failed
+        sorted(setup.items), take, hear, chunk=setup.chunk, tries=_MAX_CHUNK_STARTS, on_failure=failed
     )
     folders, files = _needed(setup)
     if executor.elsewhere:
@@ -204,7 +204,7 @@ def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
         file
         for of in setup.items.values()
         if not of.why_not
-        for suffix in _SIDE
+        for suffix in _SUFFIXES
         if (file := of.source().path.with_suffix(suffix)).is_file()
     }
     if sum(file.stat().st_size for file in files) > MAX_BYTES // 2:
