@@ -63,7 +63,7 @@ def test_a_recording_is_done_again_from_its_seed_and_one_without_actions_is_refu
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("a.npy", npy((10**12, 7), b"x" * 100), "says that it holds 56000000000000 bytes"),
+        ("a.npy", npy((10**12, 7), b"x" * 100), "claims 56000000000000 bytes"),
         ("a.npy", npy((2, 2), b"x" * 8), "cannot be read as a NumPy file"),
         ("a.npy", npy((1, 1), b"x" * 8, "|O"), "Python objects"),
         ("a.npy", b"nothing of the kind", "cannot be read as a NumPy file"),

@@ -153,7 +153,7 @@ class _Rrd:
 
 
 rrd = _Rrd()
-many_envs = recorder_module._MANY_ENVS
+many_envs = recorder_module._SUBPROCESS_ENVS
 
 
 def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes: int = 1) -> Run:
@@ -163,7 +163,7 @@ def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes
     if side == "RecordEpisode":
         recorder: Any = RecordEpisode(timed, str(folder), save_video=False, trajectory_name="run")  # type: ignore[arg-type]
     else:
-        recorder_module._MANY_ENVS = 10**9 if side == THREAD else many_envs
+        recorder_module._SUBPROCESS_ENVS = 10**9 if side == THREAD else many_envs
         recorder = workbench.Recorder(timed, folder, pictures=("base_camera",) if camera else False)
     rrd.taken = 0.0
     stepping = 0.0

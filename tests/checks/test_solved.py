@@ -30,7 +30,7 @@ def test_they_are_off_unless_they_are_asked_for() -> None:
 @pytest.mark.parametrize(
     ("name", "state", "why"),
     [
-        ("different_objects", "not_known", "another one in each env"),
+        ("different_objects", "not_known", "different in each env"),
         ("minimal", "not_applicable", "no reward"),
     ],
 )

@@ -85,7 +85,7 @@ def test_a_part_of_another_job_is_refused(place: Path, capsys: pytest.CaptureFix
     assert record("--shard", "2/3", "--out", "demos", "--seed", "5") == 0
     capsys.readouterr()
     assert run("merge", "record-1-of-3.job", "record-2-of-3.job") == 2
-    assert "is of another job: seed is 0 here and 5 there" in capsys.readouterr().err
+    assert "belongs to another job: seed is 0 here and 5 there" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -50,9 +50,7 @@ def test_the_first_template_is_taken_where_none_is_named_and_a_second_time_it_is
     text = (place / "first.py").read_text()
     assert text.startswith('"""The least that a task can be')
     code, out, err = run(capsys, "new", "first", "--from", "tabletop")
-    assert (code, out) == (2, "") and err.startswith(
-        "There is a file first.py already, and it is not written over"
-    )
+    assert (code, out) == (2, "") and err.startswith("first.py exists already and is not overwritten")
     assert (place / "first.py").read_text() == text
 
 

@@ -110,7 +110,7 @@ def test_a_seed_whose_time_is_up_ends_at_its_next_step_and_its_progress_is_told(
     what = replace(options_of(lift, seeds=2), seconds_per_seed=1e-6)
     report = solve(what, on_progress=seen.append)
     assert [one.steps for one in report.seeds] == [1, 1] and all(one.cut_off for one in report.seeds)
-    assert "its time was up after 1 step (" in report.seeds[0].in_the_way and report.verdicts == ()
+    assert "wall time limit reached after 1 step (" in report.seeds[0].in_the_way and report.verdicts == ()
     # The first plan is still to be made, and nothing is done.
     assert (seen[0].by_seed(4), seen[0].limit, seen[0].done) == ({4: 0}, 8, 0)
     assert (seen[1].by_seed(4), seen[1].done) == ({4: 1}, 1 / 8)

@@ -84,7 +84,7 @@ def test_a_job_goes_on_after_what_is_done(
     made = {file: file.stat().st_mtime_ns for file in (tmp_path / "out").glob("*/*")}
     capsys.readouterr()
     assert sweep(*given) == 0
-    assert "going on after 6 results" in capsys.readouterr().err
+    assert "resuming after 6 results" in capsys.readouterr().err
     assert numbers(tmp_path / "out") == before
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "out").glob("*/*")} == made
     # Another one does not take its file.

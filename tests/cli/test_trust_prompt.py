@@ -25,9 +25,9 @@ def test_every_file_is_named_with_its_hash_and_what_became_of_it() -> None:
     lines = said.splitlines()
     assert f"    /w/push.py  {main.hash}  changed since" in lines
     assert all(f"    {one.name}  {one.hash}" in lines for one in MANY)
-    assert "It imports from beside it:" in lines and "gone since: old.py" in said
+    assert "It imports these modules next to it:" in lines and "removed since: old.py" in said
     said = printed(TrustQuestion("Push-v1", False, (main, *MANY), computed=True))
-    assert "it may import everything beside it" in said and "It imports" not in said
+    assert "it may import every module next to it" in said and "It imports" not in said
 
 
 def test_a_text_is_printed_as_it_is_and_no_more_than_text() -> None:

@@ -19,7 +19,7 @@ from tests.episodes.read_rrd import read_rrd
 from tests.episodes.verify_rrd import verify_rrd
 from workbench.envs.evaluate_entries import split_entries
 from workbench.envs.step_result import OtherEntry
-from workbench.episodes.columns import CUT_MESSAGE, MOST_BYTES, TextEntry, TextWriter, text_tracks
+from workbench.episodes.columns import CUT_MESSAGE, MAX_TEXT_BYTES, TextEntry, TextWriter, text_tracks
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.writing.episode_writer import EpisodeFiles
 from workbench.episodes.writing.finish import recover
@@ -51,7 +51,7 @@ def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
         for state in range(5000)
         for line in writer.changes(state, {"clock": said(f"{state:050}"), "a": said("x")})
     ]
-    assert sum(len(line[1]) for line in lines) < MOST_BYTES + 400
+    assert sum(len(line[1]) for line in lines) < MAX_TEXT_BYTES + 400
     tracks = text_tracks(lines)
     last_state, last = tracks["clock"][-1]
     assert last is not None and last.text == CUT_MESSAGE and not last.whole and 100 < last_state < 5000

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from workbench.envs.camera_data import CameraInfo
 from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
-from workbench.episodes.columns import MOST_LINES, TextEntry
+from workbench.episodes.columns import MAX_TEXT_LINES, TextEntry
 from workbench.episodes.encoded_pictures import EncodedPictures, Modality, encode
 from workbench.episodes.episode import BrokenFile, CameraTrack, Episode, EpisodeInfo
 from workbench.episodes.reader.episode_wire import (
@@ -155,7 +155,7 @@ def numbers(*shape: int, kind: str = "f4") -> NDArray:
         (of_episode(geometry=None), "poses of shape"),
         (of_episode(action=numbers(T, 3)), "actions of shape"),
         (of_episode(terminated=numbers(T + 1, kind="?")), "terminated of shape"),
-        (of_episode(texts={"a": ((0, None),) * (MOST_LINES + 1)}), "too many entries"),
+        (of_episode(texts={"a": ((0, None),) * (MAX_TEXT_LINES + 1)}), "too many entries"),
         (of_scene(body_kinds=("static",)), "other bodies"),
         (of_first("visuals", shape=10**9), "without a shape"),
         (of_first("visuals", bodies=np.array([B])), "bodies that are not there"),

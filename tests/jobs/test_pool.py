@@ -17,8 +17,8 @@ from tests.drive.waiting import until
 from tests.jobs.work import BEGUN, PROBLEM, Run, Setup, Squared
 from workbench.jobs.local_processes import Processes
 from workbench.jobs.scheduler import (
-    FIRST_ALIKE,
-    LATER_ALIKE,
+    MAX_ALIKE_FIRST,
+    MAX_ALIKE_LATER,
     Chunk,
     Executor,
     Failure,
@@ -112,8 +112,8 @@ def fails(how: str, says: str, error: type[Exception] = PoolError) -> Any:
         fails("bug", "a process that squares ended with exit code 1"),
         fails("task", "it broke", TaskError),
         fails("no UTF-8", r"there is no .*caf\\udce9"),
-        fails("garbage", "a process that squares sent what cannot be read"),
-        fails("another type", "a process that squares sent what cannot be read"),
+        fails("garbage", "a process that squares sent an unreadable message"),
+        fails("another type", "a process that squares sent an unreadable message"),
         fails("another's", "a process that squares sent the result of an item that it does not have"),
     ],
 )
@@ -138,7 +138,7 @@ def test_a_killed_process_is_replaced_and_its_chunk_done_again(workers: int, tmp
     run = Run(Setup("killed once", 4, folder=tmp_path), range(9), chunk=3, tries=3, goes_on=True)
     told: list[str] = []
     run.by(Processes(workers, told.append))
-    assert told == ["a process that squares was killed by SIGKILL; what it had begun is dealt again"]
+    assert told == ["a process that squares was killed by SIGKILL; its unfinished items are dealt again"]
     assert run.squares() == {number: number**2 for number in range(9)} and not run.failures
     assert len({result.pid for result in run.results.values()}) > 1
 
@@ -247,7 +247,7 @@ def test_the_items_of_a_chunk_that_failed_are_tried_one_by_one_before_all_others
     assert not told.failures
 
 
-@pytest.mark.parametrize(("before", "most"), [(0, FIRST_ALIKE), (1, LATER_ALIKE)])
+@pytest.mark.parametrize(("before", "most"), [(0, MAX_ALIKE_FIRST), (1, MAX_ALIKE_LATER)])
 def test_chunks_that_fail_alike_end_the_job_the_first_ones_soonest(before: int, most: int) -> None:
     told = Told(range(100))
     for number in range(before):
@@ -264,17 +264,17 @@ def test_chunks_that_fail_alike_end_the_job_the_first_ones_soonest(before: int, 
 
 def test_failures_at_different_places_or_between_results_do_not() -> None:
     told = Told(range(100))
-    for number in range(2 * FIRST_ALIKE - 2):
+    for number in range(2 * MAX_ALIKE_FIRST - 2):
         told.scheduler.next(number)
         told.scheduler.failed(number, problem(number % 2))
-    for number in range(20, 20 + 3 * LATER_ALIKE):
+    for number in range(20, 20 + 3 * MAX_ALIKE_LATER):
         chunk = told.scheduler.next(number)
         if number % 2:
             told.scheduler.failed(number, problem(1))
         else:
             assert chunk is not None
             told.scheduler.result(number, chunk.numbers[0], 0)
-    assert told.scheduler.count_left(99) == 100 - (2 * FIRST_ALIKE - 2) - 3 * LATER_ALIKE
+    assert told.scheduler.count_left(99) == 100 - (2 * MAX_ALIKE_FIRST - 2) - 3 * MAX_ALIKE_LATER
 
 
 @given(total=st.integers(1, 200), count=st.integers(1, 40), chunk=st.integers(1, 9))
@@ -300,7 +300,7 @@ def test_a_text_that_is_no_shard_is_refused(text: str) -> None:
     assert str(parse_shard("3/64")) == "3/64"
 
 
-@pytest.mark.parametrize(("stage", "begun"), [("reset", FIRST_ALIKE), ("build", 1)])
+@pytest.mark.parametrize(("stage", "begun"), [("reset", MAX_ALIKE_FIRST), ("build", 1)])
 def test_a_group_that_fails_alike_is_given_up_and_the_others_go_on(stage: str, begun: int) -> None:
     results: list[int] = []
     failures: list[Failure] = []

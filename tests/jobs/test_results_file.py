@@ -70,7 +70,7 @@ def test_another_job_is_refused_with_what_differs(tmp_path: Path) -> None:
     ):
         JobFile(tmp_path / "a.job", other)
     run(tmp_path / "b.job", job=other)
-    with pytest.raises(JobFileError, match="b.job is of another job"):
+    with pytest.raises(JobFileError, match="b.job belongs to another job"):
         read_parts([tmp_path / "a.job", tmp_path / "b.job"])
 
 

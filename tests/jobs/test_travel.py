@@ -77,7 +77,7 @@ def test_a_job_needs_the_folder_of_its_task_and_what_acts(place: Path) -> None:
 
 
 def test_too_much_is_refused_with_what_is_large(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(travel, "MOST_BYTES", 2 << 20)
+    monkeypatch.setattr(travel, "MAX_BYTES", 2 << 20)
     (place / "huge.bin").write_bytes(bytes(5 << 20))
-    with pytest.raises(TooMuch, match=r"are 5 MB, and up to 2 MB travel.*huge\.bin \(5 MB\)"):
+    with pytest.raises(TooMuch, match=r"are 5 MB, and at most 2 MB are sent.*huge\.bin \(5 MB\)"):
         pack_worker_files([place])

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from tests.drive.waiting import until
 from tests.episodes.library_files import describe
 from workbench.cli.arguments import JobArguments
-from workbench.cli.run_by import told_in_folder
+from workbench.cli.run_by import status_in_folder
 from workbench.library.folder import Library
 from workbench.library.job_status import SILENT_SECONDS, JobFailure, JobStatus, StatusFile, read_jobs
 from workbench.library.rows import job_text
@@ -44,8 +44,8 @@ def test_the_rate_of_a_job_that_goes_on_is_that_of_this_run(
 ) -> None:
     clock = SimpleNamespace(monotonic=lambda: now)
     monkeypatch.setattr("workbench.cli.run_by.time", clock)
-    with told_in_folder(JobArguments(), "record", "my_task.py", tmp_path, 100, str) as told:
-        tell = told.beside(lambda progress: None)
+    with status_in_folder(JobArguments(), "record", "my_task.py", tmp_path, 100, str) as told:
+        tell = told.with_status(lambda progress: None)
         now = 50.0
         tell(RecordProgress(80, 0, done=80.0, was_there=True))
         now = 55.0

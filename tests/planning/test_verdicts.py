@@ -59,7 +59,7 @@ def test_good_episodes_show_nothing() -> None:
 def test_an_unsolved_episode_that_simply_ran_out_of_time_shows_nothing() -> None:
     slow = unsolved(np.linspace(0, 0.7, STEPS).tolist())
     assert rules(rises(), slow) == []
-    assert in_the_way(slow, [rises(), slow]) == "not solved when the time was up"
+    assert in_the_way(slow, [rises(), slow]) == "not solved within the step limit"
 
 
 def test_more_pay_without_success_than_with_it_is_an_exploit() -> None:
@@ -67,7 +67,7 @@ def test_more_pay_without_success_than_with_it_is_an_exploit() -> None:
     (verdict,) = of_episodes([rises(0), held])
     assert (verdict.rule, verdict.seeds) == ("reward-exploited", (7,))
     assert "earned 1.000 a step at their end without success" in verdict.message
-    assert "evaluate said at the end of seed 7: success 0, height 0.2" in verdict.message
+    assert "evaluate at the end of seed 7: success 0, height 0.2" in verdict.message
     assert rules(rises(0), unsolved(0.99)) == []
     # What success pays is known from successes only.
     assert rules(held) == []
@@ -80,7 +80,7 @@ def test_where_all_rollouts_earn_the_same_nothing_leads_on() -> None:
     plateau = replace(plateau, terms={"reach": row(0.0), "place": row(2.0)})
     (verdict,) = of_episodes([rises(0), plateau])
     assert (verdict.rule, verdict.seeds) == ("reward-flat", (3,))
-    assert "seed 3 from step 7 on, at 0.400 a step; flat are reach" in verdict.message
+    assert "seed 3 from step 7 on, at 0.400 a step; flat terms: reach" in verdict.message
     assert in_the_way(plateau, [rises(), plateau]) == "all rollouts earned the same from step 7 on"
 
 
@@ -107,7 +107,8 @@ def test_it_is_stuck_where_holding_still_lets_fall_what_is_held() -> None:
     slips = replace(slips, hold=slips.hold - 3, worst=slips.worst - 3)
     assert rules(rises(0), slips) == ["reward-stuck"]
     assert (
-        in_the_way(slips, [rises(0), slips]) == "nothing earned more than was earned already from step 2 on"
+        in_the_way(slips, [rises(0), slips])
+        == "no rollout earned more than the episode already did from step 2 on"
     )
     going_on = unsolved(np.linspace(0, 0.7, STEPS).tolist())
     assert rules(rises(0), replace(going_on, hold=going_on.hold - 3)) == []
@@ -154,7 +155,9 @@ def test_an_episode_that_was_cut_off_by_the_clock_breaks_no_rule() -> None:
         assert rules(rises(0), one) != []
         cut = replace(one, cut_off=True)
         assert rules(rises(0), cut) == []
-        assert in_the_way(cut, [rises(0), cut]) == "its time was up after 20 steps (--seconds-per-seed)"
+        assert (
+            in_the_way(cut, [rises(0), cut]) == "wall time limit reached after 20 steps (--seconds-per-seed)"
+        )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

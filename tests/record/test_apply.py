@@ -224,7 +224,7 @@ def test_envs_are_reset_after_their_capture_was_asked_for() -> None:
 
 
 def test_steps_that_wait_for_the_disk_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(of_recording, "MOST_WAITING_BYTES", 1)
+    monkeypatch.setattr(of_recording, "MAX_PENDING_BYTES", 1)
     state, effects = after(loaded(), Asked(ToggleRecording()), RESET)
     assert (
         effects == [EndEpisodes(), Send(SetCapture(()))]

@@ -116,7 +116,7 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However much a recording holds in all: it ends only where too much waits at once, and the next begins anew."""
-    monkeypatch.setattr(recording, "MOST_WAITING_BYTES", 10_500)
+    monkeypatch.setattr(recording, "MAX_PENDING_BYTES", 10_500)
     taker = Taker()
     monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: taker)
     with told_session(tmp_path) as told:

@@ -25,7 +25,7 @@ from workbench.page.widgets.line_chart import LONGEST
 from workbench.rescore import verdict_text
 from workbench.rescore.past_panel import chart_data
 from workbench.rescore.past_scores import PastRun, RescoredCurve
-from workbench.rescore.result_parts import MOST_ROWS
+from workbench.rescore.result_parts import MAX_ROWS
 from workbench.rescore.state import RescoreView
 from workbench.rescore.verdict import Verdict
 from workbench.task.problem import Problem
@@ -113,12 +113,12 @@ def test_the_new_line_lies_over_the_recorded_one(rescored: Rescored) -> None:
 
 
 def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescored: Rescored) -> None:
-    many = done(same(30), *(episode(env) for env in range(MOST_ROWS + 3)))
-    assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in rescored.draw(many).html()
+    many = done(same(30), *(episode(env) for env in range(MAX_ROWS + 3)))
+    assert f"1 to {MAX_ROWS} of {MAX_ROWS + 3}" in rescored.draw(many).html()
     rescored.panels.ask(ShowRescored(run="2 25"))
     rescored.panels.ask(TurnRescored(by=1))
-    assert f"{MOST_ROWS + 1} to {MOST_ROWS + 3} of" in rescored.draw(many).html(), "the page is turned"
-    last = MOST_ROWS + 2
+    assert f"{MAX_ROWS + 1} to {MAX_ROWS + 3} of" in rescored.draw(many).html(), "the page is turned"
+    last = MAX_ROWS + 2
     rescored.panels.ask(ShowRescored(run=f"{last} {10 * last + 5}"))
     rescored.panels.do(ShowRescored(run="99 1"))  # there is no such run
     asked = rescored.live.asked
@@ -130,7 +130,7 @@ def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescore
     assert asked[-1] == ("change", {"selected_env": 0})
     rescored.panels.ask(TurnRescored(by=1))
     rescored.draw(RescoreView())
-    assert f"1 to {MOST_ROWS} of" in rescored.draw(replace(many, serial=5)).html(), (
+    assert f"1 to {MAX_ROWS} of" in rescored.draw(replace(many, serial=5)).html(), (
         "a new past begins with its first page"
     )
 

@@ -26,7 +26,7 @@ from workbench.rescore.recordings_panel import (
     RescorePanel,
     episode_files,
 )
-from workbench.rescore.result_parts import MOST_ROWS
+from workbench.rescore.result_parts import MAX_ROWS
 from workbench.rescore.state import RescoreView
 from workbench.rescore.verdict import Verdict
 from workbench.review.commands import ChooseRescoreCode
@@ -169,7 +169,7 @@ def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     many = tuple(verdict(str(k), first_difference=1, returns=(0.0, 99.0 - k), seed=k) for k in range(23))
     rescoring.draw(RescoreView("done", 1, many, 23, 23))
     assert (
-        rescoring.panels.html().count('data-do="') == MOST_ROWS + 2
+        rescoring.panels.html().count('data-do="') == MAX_ROWS + 2
         and "1 to 10 of 23" in rescoring.panels.html()
     )
     for _ in range(3):

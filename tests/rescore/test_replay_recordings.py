@@ -289,7 +289,7 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
     os.chdir(here)
     assert relocated(source.path, places).is_file() and len(places) == 1
 
-    monkeypatch.setattr("workbench.rescore.job.MOST_BYTES", 0)
+    monkeypatch.setattr("workbench.rescore.job.MAX_BYTES", 0)
     (result,) = rescore_recordings(setup, executor)
     assert not result.verdict.why_not and list(executor.work.files) == []
     assert executor.work.setup.items[0].travels is None
@@ -365,7 +365,7 @@ def test_parts_that_are_merged_print_what_the_whole_would(
     assert "of the job's recordings are in none of these files" in capsys.readouterr().out
     edit(author, REWARD, f"{REWARD} + 0.5")
     code, _, err = run([*few, "--shard", "1/2"], capsys)
-    assert code == 2 and "is of another job: code is" in err
+    assert code == 2 and "belongs to another job: code is" in err
 
 
 # --- for a page ----------------------------------------------------------------------------------------

@@ -198,7 +198,7 @@ def test_an_argument_of_the_constructor_is_given_to_it(several: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "why"),
     [
-        ("SCALE=4", "SCALE of several.py may be Base.SCALE or several.SCALE: name one of them so"),
+        ("SCALE=4", "SCALE of several.py may be Base.SCALE or several.SCALE: give one of these names"),
         ("weight=4", "weight of several.py may be Swept.__init__.weight or several.weight: name one"),
         ("talll=true", "did you mean tall?"),
         ("parts.HERE=1", "only constants of this file can be set, not those of modules that it imports"),

@@ -122,7 +122,7 @@ def test_another_order_and_other_values_begin_on_the_first_page(
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(sweep, "ROWS", 2)
+    monkeypatch.setattr(sweep, "PAGE_ROWS", 2)
     tab = Tab(server, folder)
     for command in (
         SortSweep(column="set reach_weight"),

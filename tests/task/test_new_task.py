@@ -12,7 +12,7 @@ from workbench.machine.folders import example_tasks
 from workbench.task.find import TaskFile, read_task_file
 from workbench.task.load import load_task
 from workbench.task.new_task import (
-    LONGEST_NAME,
+    MAX_NAME_CHARACTERS,
     TEMPLATES,
     CannotBegin,
     Template,
@@ -62,12 +62,12 @@ def test_a_task_of_maniskill_is_copied_with_its_class_wherever_it_is_named(tmp_p
         ("push-it", "such as push_it."),
         ("../push", "such as push."),
         ("class", "such as stack_two."),
-        ("a" * (LONGEST_NAME + 1), f"at most {LONGEST_NAME}"),
+        ("a" * (MAX_NAME_CHARACTERS + 1), f"at most {MAX_NAME_CHARACTERS}"),
         ("torch", "is the name of a library"),
         ("queue", "such as queue_task."),
         ("taken", "There is a file taken.py already"),
         ("workbench_minimal", "an id of minimal.py already"),
-        ("HERE", "HERE-v1, which is an id of mine.py already"),
+        ("HERE", "HERE-v1, which is already an id of mine.py"),
     ],
 )
 def test_a_name_that_is_invalid_or_taken_is_refused_with_what_to_do(
@@ -113,6 +113,6 @@ def test_only_a_file_of_comments_and_blank_lines_is_filled(
         assert read_task_file(file) == TaskFile(file, ("MyFirst-v1",), ("MyFirstEnv",))
         assert file.read_bytes().startswith(content.rstrip())
     else:
-        with pytest.raises(CannotBegin, match="not empty any more"):
+        with pytest.raises(CannotBegin, match="no longer empty"):
             fill_blank_file(file)
         assert file.read_bytes() == content

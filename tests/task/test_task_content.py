@@ -108,7 +108,7 @@ def test_what_is_no_ordinary_file_of_text_is_refused_at_once(tmp_path: Path) -> 
     (tmp_path / "task.py").write_text("import pipe")
     assert read_content(tmp_path / "task.py").modules == (), "a pipe is no module"
     (tmp_path / "deep.py").write_text("-" * 100_000 + "1")
-    assert "no Python that can be read" in read_content(tmp_path / "deep.py").unseen[0]
+    assert "cannot be parsed as Python" in read_content(tmp_path / "deep.py").unseen[0]
 
 
 def test_what_was_agreed_to_is_what_runs(tmp_path: Path) -> None:

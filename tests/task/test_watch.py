@@ -194,7 +194,7 @@ def many(watcher: SourceWatcher, tmp_path: Path, calls: Calls, monkeypatch: pyte
     unless a look says so."""
 
     def follow(newest: int, turn: int) -> list[Path]:
-        for name, value in (("READ_S", 1e6), ("NEWEST", newest), ("TURN", turn)):
+        for name, value in (("READ_SECONDS", 1e6), ("NEWEST", newest), ("TURN", turn)):
             monkeypatch.setattr(watch, name, value)
         files = [tmp_path / f"folder_{number % 3}" / f"file_{number}.py" for number in range(12)]
         for number, file in enumerate(files):

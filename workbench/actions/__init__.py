@@ -1,1 +1,1 @@
-"""Sources of actions: random, zero, hold, sliders, a policy, a plan, or a file."""
+"""Sources of actions: random, zero, hold, sliders, policies, planning, and files."""

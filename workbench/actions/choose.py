@@ -1,4 +1,4 @@
-"""Chooses actions: random, zero, hold, sliders, a policy, a plan, or a file."""
+"""Chooses actions: random, zero, hold, from sliders, a policy, a plan, or a file."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ActionChooser:
     def __init__(self, folder: CurrentFolder) -> None:
         """
         Args:
-            folder: relative policies are found from here.
+            folder: folder in which relative policies are found.
         """
         self._folder = folder
         self._source: ActionSource = "random"
@@ -53,9 +53,9 @@ class ActionChooser:
         self._task_folder: Path | None = None
         self._rng = np.random.default_rng(0)
         self._sliders: NDArray[np.float32] | None = None
-        """(N, A) deltas, velocities and the like that sliders were moved to; NaN elsewhere."""
+        """(N, A) slider values of deltas, velocities and the like; NaN elsewhere."""
         self._targets: NDArray[np.float32] | None = None
-        """(N, A) the last action of each env, or where a slider was moved since; NaN from a reset to the first action."""
+        """(N, A) the last action of each env, or a later slider value; NaN from a reset to the first action."""
 
     @property
     def name(self) -> str:
@@ -67,15 +67,15 @@ class ActionChooser:
         self._rng = np.random.default_rng(seed)
 
     def fresh_seeds(self, count: int) -> list[int]:
-        # A seed for each episode, or its recording could not say how to start it again.
+        # Each episode has its own seed, so that its recording can name the seed that repeats it.
         return [int(seed) for seed in self._rng.integers(2**31, size=count)]
 
     def use(self, source: ActionSource, policy: str | None, task_folder: Path | None = None) -> None:
         """Set the source of the actions.
 
         Args:
-            policy: as for `load_policy`; None or empty fails only at the next action.
-            task_folder: as for `load_policy`.
+            policy: as in `load_policy`; None or empty fails only at the next action.
+            task_folder: as in `load_policy`.
 
         Raises:
             TaskError: the policy cannot be imported. `next_action` tries again.
@@ -96,7 +96,7 @@ class ActionChooser:
         if self._source == "random":
             return actions.random_action(task.parts, task.num_envs, self._rng)
         if self._source == "policy":
-            # Never another action instead: the page says that the policy acts.
+            # Never fall back to another action: the page shows that the policy acts.
             with self._imported() as policy:
                 return actions.to_flat_action(task.env, task.parts, policy(task.obs))
         low, high = actions.bounds(task.parts)
@@ -107,8 +107,8 @@ class ActionChooser:
         return actions.hold_action(task.parts, task.num_envs)
 
     def slider_action(self, task: TaskEnv) -> NDArray[np.float32]:
-        """(N, A) action that the sliders set: joint targets stay, and other dimensions that no slider has moved
-        hold still."""
+        """(N, A) action that the sliders set: joint targets keep their value; other dimensions without a slider value hold
+        still."""
         low, high = actions.bounds(task.parts)
         action = actions.hold_action(task.parts, task.num_envs)
         is_target = actions.is_target(task.parts)
@@ -120,8 +120,7 @@ class ActionChooser:
     def tell(
         self, task: TaskEnv, env_idx: Sequence[int], dimensions: Sequence[int], values: Sequence[float]
     ) -> None:
-        """Set dimensions of these envs' actions to these values, by slider; without values the envs hold still
-        where they are."""
+        """Set dimensions of these envs' actions to slider values; without values the envs hold still."""
         shape = task.num_envs, actions.width(task.parts)
         if self._sliders is None or self._targets is None:
             self._sliders = np.full(shape, np.nan, np.float32)
@@ -132,13 +131,14 @@ class ActionChooser:
             told[np.ix_(env_idx, dimensions)] = values
 
     def acted(self, action: NDArray[np.float32]) -> None:
-        """Note the action of a control step, whatever its source."""
+        """Record the action of a control step, from any source."""
         self._targets = action.copy()
 
     def begin(
         self, env_idx: Sequence[int] | None, led: Mapping[int, NDArray[np.float32]] | None = None
     ) -> None:
-        """Forget the targets of these envs (all if None): they were reset, or put back to where the actions `led`, by env."""
+        """Forget the targets of these envs (all if None): they were reset, or restored to the state after the actions `led`,
+        by env."""
         if self._targets is None:
             return
         self._targets[slice(None) if env_idx is None else list(env_idx)] = np.nan
@@ -155,7 +155,7 @@ class ActionChooser:
 
     @contextmanager
     def _imported(self) -> Iterator[Policy]:
-        """Give the policy. An exception inside the block becomes the policy's TaskError, and the next call imports
+        """Yield the policy. An exception inside the block becomes the policy's TaskError, and the next call imports
         the policy again."""
         try:
             if self._policy is None:
@@ -176,15 +176,15 @@ def _same_for_all(action: NDArray[Any], task: TaskEnv) -> NDArray[np.float32]:
 class RecordActionChooser:
     """Chooses the actions of a headless recording; an env without an episode holds still.
 
-    Each episode has a generator of its own with its seed, so that a recording holds the same episodes on any number of
-    envs and processes.
+    Each episode has its own generator, seeded with its seed, so that the episodes are the same with any number of envs and
+    processes.
     """
 
     def __init__(self, chooser: ActionChooser | None, planned: PlannedActions | None = None) -> None:
         """
         Args:
             chooser: chooses actions that are neither random, planned nor from a file; None for those three.
-            planned: plans them; None where they are not planned.
+            planned: plans the actions; None if they are not planned.
         """
         self._chooser, self._planned = chooser, planned
         self._rng: dict[int, np.random.Generator] = {}
@@ -207,7 +207,7 @@ class RecordActionChooser:
         self._rng.pop(env, None)
 
     def next_action(self, task: TaskEnv, steps: Mapping[int, int]) -> NDArray[np.float32]:
-        """(N, A); `steps` has the number of steps so far for each env with an episode.
+        """Actions (N, A); `steps` maps each env with an episode to its number of steps so far.
 
         Raises:
             TaskError: the policy raised, or returned no action; or the task raised in a rollout.
@@ -217,7 +217,7 @@ class RecordActionChooser:
             return self._planned.next_action(list(steps))
         action = actions.hold_action(task.parts, task.num_envs)
         if self._chooser is not None:
-            # For the whole batch: that is what a policy expects.
+            # For the whole batch, as a policy expects.
             chosen = self._chooser.next_action(task)
             for env in steps:
                 action[env] = chosen[env]
@@ -246,11 +246,11 @@ class PlannedActions:
         """
         Args:
             task: the live batch.
-            env_kwargs: as of the `TaskOptions` that it was opened with.
+            env_kwargs: as in the `TaskOptions` that the task was opened with.
 
         Raises:
             TaskError: the task fails while the envs of the rollouts are built.
-            NothingToPlan: it has no actions, or no reward.
+            NothingToPlan: the task has no actions, or no reward.
         """
         require_plannable(task.env)
         self._loaded, self._task = loaded, task
@@ -268,11 +268,11 @@ class PlannedActions:
         self._logs[env] = EpisodeLog(seed, self._planner.horizon)
 
     def next_action(self, env_idx: Sequence[int]) -> NDArray[np.float32]:
-        """(N, A): plans for these envs; the others hold still.
+        """Actions (N, A), planned for these envs; the others hold still.
 
         Raises:
             TaskError: the task raised in a rollout.
-            NotAlike: it builds other bodies in each env.
+            NotAlike: the task builds different bodies in each env.
         """
         for env in env_idx:
             self._planner.require_alike(env)
@@ -288,7 +288,7 @@ class PlannedActions:
             self._logs[env].add_step(step, env)
 
     def cut_off(self, env: int) -> None:
-        """Note that the episode of this env ends now because its wall time is up."""
+        """Record that the episode of this env ends now at its wall time limit."""
         self._logs[env].cut_off = True
 
     def episode(self, env: int) -> PlannedEpisode:
@@ -299,7 +299,7 @@ class PlannedActions:
         self._planner.close()
 
 
-# --- what ``--actions`` names ----------------------------------------------------------------------------
+# --- values of ``--actions`` -----------------------------------------------------------------------------
 
 
 KINDS = ("random", "zero", "hold")
@@ -310,14 +310,14 @@ STEPS_WITHOUT_LIMIT = 200
 
 
 def find_actions(name: str, task: str) -> tuple[Sequence[RecordedRun], dict[str, Any]]:
-    """The runs of a file, and the env's keywords that it needs; both empty for a policy, `SOLVE`, or one of `KINDS`.
+    """The runs of a file, and the env's keyword arguments that it needs; both empty for a policy, `SOLVE`, or one of `KINDS`.
 
     Args:
-        name: as `RecordArguments.actions`.
-        task: as `RecordArguments.task`; a policy may be in its folder.
+        name: as in `RecordArguments.actions`.
+        task: as in `RecordArguments.task`; a policy may be in its folder.
 
     Raises:
-        FileNotFoundError, ValueError: as `read_actions`; or it names no policy (`NoPolicy`).
+        FileNotFoundError, ValueError: as `read_actions` does; or it names no policy (`NoPolicy`).
     """
     if Path(name).suffix in SUFFIXES:
         return read_actions(Path(name))
@@ -357,12 +357,12 @@ class Needed:
 
 
 def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Needed:
-    """What a job needs that is not installed.
+    """Files and folders that a job needs and that are not installed.
 
     Args:
-        task: as `RecordArguments.task`: the folder of its file, or of its package.
-        actions: as `RecordArguments.actions`, if it names a file or a policy.
-        imports: as `TaskOptions.imports`.
+        task: as in `RecordArguments.task`; needs the folder of its file, or of its package.
+        actions: as in `RecordArguments.actions`; needs the file or policy that it names.
+        imports: as in `TaskOptions.imports`.
     """
     folders: list[Path] = []
     files: list[Path] = []
@@ -383,7 +383,7 @@ def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Need
         place = find_module(name)
         if place is None or place.file is None or "site-packages" in place.file.parts:
             continue
-        # With the packages above it, and what else they import.
+        # The whole top package, since its packages may import anything in it.
         top = name.partition(".")[0]
         root = next((parent for parent in place.file.parents if parent.name == top), None)
         if root is None:
@@ -396,23 +396,22 @@ def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Need
 # --- actions from a file: NumPy arrays, or demonstrations in ManiSkill's ``.h5`` -----------------------
 
 
-MOST_BYTES = 2**30
-"""Maximum size of a NumPy file in bytes, also unpacked: 20 million steps of a Panda."""
+MAX_BYTES = 2**30
+"""Maximum size of a NumPy file, also unpacked: 20 million steps of a Panda."""
 SUFFIXES = (".npy", ".npz", ".h5")
 
 
 def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
-    """Read a file of actions: a run for each episode, and the env's keywords that it needs, such as its control mode.
+    """Read a file of actions: a run for each episode, and the env's keyword arguments that it needs, such as its control mode.
 
     ``.npy``: (T, A) for every episode, or (E, T, A), one for each. ``.npz``: an array (T, A) for each episode. ``.h5``:
-    trajectories of ManiSkill, or a recording of the workbench; their runs have a seed and env states too, with which a
-    replay is corrected where the same actions lead to another state (another machine or version, a batch that was
-    seeded as one on a GPU). An episode of a file does not stop at success or at the time limit, as in ManiSkill's
-    ``replay_trajectory``.
+    trajectories of ManiSkill, or a recording of the workbench; their runs also have a seed and env states, which correct a
+    replay if the same actions lead to another state (another machine or version, a batch that was seeded as one on a GPU).
+    An episode of a file does not stop at success or at the time limit, as in ManiSkill's ``replay_trajectory``.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it holds no actions; the message says what it holds.
+        ValueError: it holds no actions; the message describes its content.
     """
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
@@ -439,13 +438,13 @@ def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
 
 
 def _arrays(path: Path) -> list[NDArray]:
-    """The arrays of a NumPy file. `np.load` would allocate what a header claims before it checks the file's size."""
-    with open_regular_file(path, MOST_BYTES) as file:
+    """The arrays of a NumPy file. Not `np.load`, which allocates what a header claims before it checks the file's size."""
+    with open_regular_file(path, MAX_BYTES) as file:
         if path.suffix == ".npy":
             return [_array(file, path.stat().st_size)]
         with zipfile.ZipFile(file) as archive:
-            if sum(member.file_size for member in archive.infolist()) > MOST_BYTES:
-                raise ValueError("unpacked it is larger than any file of actions")
+            if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
+                raise ValueError("unpacked it is too large for a file of actions")
             found = []
             for member in archive.infolist():
                 with archive.open(member) as opened:
@@ -456,14 +455,14 @@ def _arrays(path: Path) -> list[NDArray]:
 def _array(file: IO[bytes], size: int) -> NDArray:
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"it is of NumPy's format {version}")
+        raise ValueError(f"it has NumPy's format {version}")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read(file)
     if dtype.hasobject:
         raise ValueError("it holds Python objects")
     length = math.prod(shape) * dtype.itemsize
     if length > size:
-        raise ValueError(f"it says that it holds {length} bytes of {dtype}, and has {size}")
+        raise ValueError(f"its header claims {length} bytes of {dtype}, but it has {size}")
     content = file.read(length)
     return np.frombuffer(content, dtype, math.prod(shape)).reshape(shape, order="F" if fortran else "C")
 

@@ -29,11 +29,11 @@ from workbench.task.problem import Problem, definition_line, problem_from_except
 from workbench.task.watch import SourceWatcher
 
 Policy = Callable[[Any], Any]
-"""Gets the task's observation (batched, as its ``obs_mode`` gives it); returns an array or tensor (N, A), one action (A,)
-for all envs, or a dict for several robots."""
+"""Takes the task's observation (batched, as in its ``obs_mode``); returns an array or tensor (N, A), one action (A,) for all
+envs, or a dict for several robots."""
 
 _warned: set[Path] = set()
-"""Files whose name is that of a library and that a warning has named."""
+"""Files with a library's name that a warning has named already."""
 
 
 class NoPolicy(ValueError):
@@ -47,7 +47,7 @@ def find_policy(reference: str, task_folder: Path | None = None) -> tuple[str | 
         task_folder: the task's folder, searched for a relative file after the current folder.
 
     Raises:
-        NoPolicy: it has another form, or the file does not exist.
+        NoPolicy: the reference has another form, or the file does not exist.
     """
     if not reference.strip():
         raise NoPolicy("name a policy: module:function or file.py:function")
@@ -61,11 +61,11 @@ def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
     """Import the function of `reference`.
 
     Args:
-        task_folder: as for `find_policy`.
+        task_folder: as in `find_policy`.
 
     Raises:
         NoPolicy: the reference has another form, or names nothing callable.
-        Exception: as raised by the policy's module during its import.
+        Exception: raised by the policy's module during its import.
     """
     named, attribute = find_policy(reference, task_folder)
     name = str(named)
@@ -82,7 +82,7 @@ def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
         with searched_first(path.parent):
             spec.loader.exec_module(module)
     elif importlib.util.find_spec(package := name.partition(".")[0]) is None:
-        # A module that is not installed is looked for in the current folder.
+        # A module that is not installed is searched in the current folder.
         with searched_first(Path.cwd()):
             if importlib.util.find_spec(package) is None:
                 raise NoPolicy(f"there is no module {package}: it is neither installed nor in {Path.cwd()}")
@@ -103,7 +103,7 @@ def _hint(name: str, attribute: str, task_folder: Path | None) -> str:
     for folder in (Path.cwd(), task_folder or Path.cwd()):
         file = folder / f"{name}.py"
         if file.is_file() and is_library(name):
-            return f", it is a library's; name the file: {file}:{attribute}"
+            return f", which is a library's module; name the file: {file}:{attribute}"
     return ""
 
 
@@ -114,23 +114,23 @@ class _PolicyLoader(importlib.machinery.SourceFileLoader):
         return read_regular_file(path, MOST_SOURCE_BYTES)
 
     def path_stats(self, path: str) -> Mapping[str, Any]:
-        # Python's bytecode cache compares length and whole seconds: it would miss a second save.
+        # Python's bytecode cache compares size and whole seconds, so it would miss a second save.
         raise OSError("no bytecode is kept")
 
 
 def policy_problem(
     error: BaseException, reference: str, task_folder: Path | None = None, policy: Policy | None = None
 ) -> Problem:
-    """The problem of a policy, at a line of its module or of one in the same folder.
+    """The problem of a policy, at a line of its module or of a module in the same folder.
 
     Args:
-        task_folder: as for `load_policy`.
+        task_folder: as in `load_policy`.
         policy: the function, if it was imported: its ``def`` is the place if the traceback has no line of the author's,
-            as with a wrong return value.
+            such as for a wrong return value.
     """
     if isinstance(error, NoPolicy):
         return Problem("policy", str(error), None, None, None, "")
-    linecache.checkcache()  # the file may have changed since a line of it was last shown
+    linecache.checkcache()  # the file may have changed since linecache read it
     defined = None if policy is None else definition_line(policy)
     if isinstance(error, WrongAction):
         file, line = defined or (None, None)
@@ -138,7 +138,7 @@ def policy_problem(
         return Problem("policy", f"what {reference} returned {error.problem}", file, line, code, "")
     files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
     own = [file for file in files if _is_module_of(file, reference, task_folder)]
-    # Also for a syntax error: the fault is the policy's and not the task's.
+    # The stage is "policy" even for a syntax error: the fault is not the task's.
     return replace(problem_from_exception(error, "policy", own, otherwise=defined), stage="policy")
 
 
@@ -150,13 +150,13 @@ def _is_module_of(file: Path, reference: str, task_folder: Path | None) -> bool:
     module = sys.modules.get(name)
     if module is not None and module.__spec__ is not None:
         return str(file) == module.__spec__.origin
-    # Its import failed.
+    # The import failed: there is no module to compare.
     path = "/" + name.replace(".", "/")
     return str(file).endswith((f"{path}.py", f"{path}/__init__.py"))
 
 
 def _find(name: str, task_folder: Path | None) -> Path:
-    """The file's path: in the current folder, else in the task's."""
+    """The file's path: in the current folder, else in the task's folder."""
     path = Path(os.path.expanduser(name))
     here = path.resolve()
     if here.is_file():
@@ -171,15 +171,16 @@ def _find(name: str, task_folder: Path | None) -> Path:
     return there
 
 
-MOST_FILES, MOST_LISTED = 100, 40
-"""Maximum number of files that are read of a folder, and of policies that are listed."""
-_MOST_BYTES = 256 * 1024
-"""Maximum size in bytes of a file that is searched for policies; a larger file was not written by a person."""
+MAX_FILES, MAX_LISTED = 100, 40
+"""Maximum number of files of a folder that are read, and of policies that are listed."""
+_MAX_FILE_BYTES = 256 * 1024
+"""Maximum size of a file that is searched for policies; no person writes a larger file."""
 
 
 def list_policies(here: Path, task_folder: Path | None) -> tuple[str, ...]:
-    """Functions that may be policies, as ``file.py:function``: those of one required parameter, in the files of a folder and
-    beside the task. They are read, not imported. Those whose parameter is called obs or observation come first.
+    """Functions that may be policies, as ``file.py:function``: functions with one required parameter, in the files of a folder
+    and of the task's folder. Parses the files without importing them. Functions whose parameter is called obs or observation
+    come first.
 
     Args:
         here: the folder where the command was started.
@@ -189,27 +190,27 @@ def list_policies(here: Path, task_folder: Path | None) -> tuple[str, ...]:
     folders = [here.resolve()] if task_folder is None else [here.resolve(), task_folder.resolve()]
     for folder in folders if folders[0] != folders[-1] else folders[:1]:
         for file in _python_files(folder):
-            # Same lookup as `find_policy`: a file of the first folder hides one of the same name.
+            # Same lookup as in `find_policy`: a file of the first folder hides one of the same name.
             name = str(file) if file.name in taken else file.name
             taken.add(file.name)
             found += [(not likely, f"{name}:{function}") for function, likely in _functions_that_fit(file)]
-    return tuple(reference for _, reference in sorted(found, key=lambda one: one[0])[:MOST_LISTED])
+    return tuple(reference for _, reference in sorted(found, key=lambda one: one[0])[:MAX_LISTED])
 
 
 def _python_files(folder: Path) -> list[Path]:
     try:
         files = sorted(file for file in folder.iterdir() if file.suffix == ".py")
     except OSError:
-        return []  # it is gone, or not readable: there is nothing to list
-    return [file for file in files if not file.name.startswith(("test_", "conftest", "setup."))][:MOST_FILES]
+        return []  # the folder is deleted or not readable
+    return [file for file in files if not file.name.startswith(("test_", "conftest", "setup."))][:MAX_FILES]
 
 
 def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
-    """Names of public functions of one required parameter, and whether the parameter is named as an observation."""
+    """Names of public functions with one required parameter, and whether the parameter is named like an observation."""
     try:
-        tree = parse_python(read_regular_file(file, _MOST_BYTES))
+        tree = parse_python(read_regular_file(file, _MAX_FILE_BYTES))
     except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
-        return []  # a file that cannot be read has no policy to list; choosing it by name says why
+        return []  # an unreadable file lists no policy; choosing it by name reports the reason
     found = []
     for node in tree.body:
         if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
@@ -223,7 +224,7 @@ def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
 
 
 class PolicyFile:
-    """Watches the file of the current policy, as the task's file is watched. Thread-safe."""
+    """Watches the file of the current policy, like the task's file. Thread-safe."""
 
     def __init__(self, on_save: Callable[[], None]) -> None:
         """
@@ -235,10 +236,10 @@ class PolicyFile:
         self._files: list[Path] = []
 
     def follow(self, reference: str | None, task_folder: Path | None) -> None:
-        """Watch the file of a ``file.py:function`` from now on; nothing for other references.
+        """Watch the file of a ``file.py:function`` from now on; other references are not watched.
 
         Args:
-            task_folder: as for `find_policy`.
+            task_folder: as in `find_policy`.
         """
         name = (reference or "").rpartition(":")[0]
         files: list[Path] = []

@@ -30,7 +30,7 @@ Rules = Annotated[
         choices=DEGREES,
     ),
 ]
-"""None is each rule's own degree; the command line has no word for it."""
+"""Degree of all rules; None, each rule's own degree, cannot be written on the command line."""
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""
@@ -42,11 +42,11 @@ class PageArguments:
     """Where a page is served, and to whom.
 
     Args:
-        host: address to listen on; anything but this machine's own needs the token.
-        port: port of the page; 0 takes any free one.
-        socket: listen on a Unix socket with this path instead, for machines that others use too: only you can
-            connect, by the ssh line that is printed.
-        token: ask for the token of the printed address (--no-token: this machine only).
+        host: address to listen on; any address other than localhost needs the token.
+        port: port of the page; 0 picks a free one.
+        socket: listen on a Unix socket at this path instead, for shared machines: only you can connect, with the
+            printed ssh command.
+        token: require the token of the printed address (--no-token: localhost only).
     """
 
     host: str = "127.0.0.1"
@@ -57,17 +57,17 @@ class PageArguments:
 
 @dataclass(frozen=True)
 class JobArguments:
-    """Where a job runs, and what is kept of it.
+    """Where a job runs, and where its results are kept.
 
     Args:
-        workers: processes, each with envs of its own; what comes out is the same with any number.
-        cluster: run the workers on Ray: the address of a cluster; local for one that is started on this machine and ends
-            with the job; or auto, which takes one that is there, else does that. Needs maniskill-workbench[cluster].
-        cpus_per_worker: on a cluster, the cores that each worker is given.
-        gpus_per_worker: likewise, the GPUs, or parts of one.
-        job: a file that keeps the results as they come. Where it has some of this very job, the job goes on after them.
-        shard: do only a part of the job, as in 3/64 for the third of 64; workbench merge puts the parts together. Without
-            --job the results are kept in a file that is named after the part.
+        workers: number of processes, each with its own envs; the results are the same with any number.
+        cluster: run the workers on Ray: the address of a cluster; local to start one on this machine that ends with the
+            job; or auto for a running cluster if there is one, else local. Needs maniskill-workbench[cluster].
+        cpus_per_worker: CPU cores for each worker on a cluster.
+        gpus_per_worker: GPUs, or fractions of one, for each worker on a cluster.
+        job: file that keeps the results as they arrive. If it already holds results of the same job, the job resumes.
+        shard: run only one part of the job, as in 3/64 for the third of 64; workbench merge joins the parts. Without
+            --job the results are kept in a file named after the part.
     """
 
     workers: int | None = None
@@ -84,7 +84,7 @@ _OLD_NAMES = {"--envs-per-worker": "--num-envs"}
 
 
 def with_new_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The arguments with the new names of options, and a sentence for each old one."""
+    """Replace old option names; returns the new arguments, and a notice for each old name."""
     given, told = list(arguments), dict[str, str]()
     for place, one in enumerate(given):
         name, equals, value = one.partition("=")
@@ -102,13 +102,13 @@ class EnvArguments:
 
     Args:
         num_envs: environments that run at once.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
-        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
-            given, what writes over the state of other envs stops, all else is a warning.
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (cpu, as no gpu test has passed yet).
+        rules: what happens when the task breaks a rule of GPU simulation: stop, warn, or off (no checks). By
+            default, overwriting the state of other envs stops; everything else warns.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
-        seed: seed of the first env or episode; each further one counts up.
-        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+        seed: seed of the first env or episode; the following ones count up.
+        env: more arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
 
     num_envs: int = 16
@@ -119,7 +119,7 @@ class EnvArguments:
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
 
     def options(self) -> TaskOptions:
-        """Raises ValueError with a message that names the argument, as all functions here."""
+        """Convert to options. Raises ValueError with a message that names the argument, as all functions here do."""
         return _options(self.num_envs, self.backend, self.rules, self.imports, self.seed, self.env)
 
 
@@ -128,15 +128,15 @@ class EpisodeArguments:
     """How the envs of each worker are made.
 
     Args:
-        num_envs: environments that run at once in each worker. The numbers of a policy depend on it by their last bits,
-            and on nothing else of how the job runs.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
-        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
-            given, what writes over the state of other envs stops, all else is a warning.
+        num_envs: environments that run at once in each worker. A policy's results may differ in the last bits with this
+            value (only).
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (cpu, as no gpu test has passed yet).
+        rules: what happens when the task breaks a rule of GPU simulation: stop, warn, or off (no checks). By
+            default, overwriting the state of other envs stops; everything else warns.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
-        seed: seed of the first episode; each further one counts up.
-        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+        seed: seed of the first episode; the following ones count up.
+        env: more arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
 
     num_envs: int = 4
@@ -156,9 +156,9 @@ class RescoreArguments:
 
     Args:
         num_envs: environments that run at once in each worker.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
-        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
-            given, what writes over the state of other envs stops, all else is a warning.
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (cpu, as no gpu test has passed yet).
+        rules: what happens when the task breaks a rule of GPU simulation: stop, warn, or off (no checks). By
+            default, overwriting the state of other envs stops; everything else warns.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
     """
@@ -174,15 +174,15 @@ class RescoreArguments:
 
 @dataclass(frozen=True)
 class CheckArguments:
-    """On what a task is checked.
+    """Envs and seeds that a task is checked on.
 
     Args:
         num_envs: environments that run at once in each worker.
-        seeds: how many seeds are tried. What compares whole batches takes one for each env.
-        seed: the first of them; each further one counts up.
+        seeds: number of seeds to try. Rules that compare whole batches use one seed for each env.
+        seed: the first seed; the following ones count up.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
-        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+        env: more arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
 
     num_envs: int = 8
@@ -214,7 +214,7 @@ def _options(
 
 
 def plan_options(plan: PlanArguments) -> PlanOptions:
-    """Raises ValueError with a message that names the argument."""
+    """Validate the arguments. Raises ValueError with a message that names the argument."""
     try:
         return PlanOptions(**vars(plan))
     except ValueError as error:
@@ -254,12 +254,12 @@ def history_bytes(text: str) -> int:
 
     size = size_in_bytes(text)
     if size is None or not 2**20 <= size <= 2**40:
-        raise ValueError(f"--history takes a size from 1MB on, such as 256MB or 2GB; got {text!r}")
+        raise ValueError(f"--history takes a size of at least 1MB, such as 256MB or 2GB; got {text!r}")
     return int(size)
 
 
 def why_unwritable(*files: Path | None) -> str | None:
-    """Make the folders of these files. Returns why one of the files cannot be written; None if each can."""
+    """Create the folders of these files. Returns why a file cannot be written; None if all can."""
     for file in files:
         if file is None:
             continue
@@ -269,7 +269,7 @@ def why_unwritable(*files: Path | None) -> str | None:
         except OSError as error:
             return f"{file} cannot be written: the folder {folder} cannot be made ({error.strerror})"
         if file.is_dir():
-            return f"{file} is a folder: name a file in it"
+            return f"{file} is a folder: give a file in it"
         if not os.access(folder, os.W_OK):
             return f"{file} cannot be written: you may not write into {folder}"
     return None

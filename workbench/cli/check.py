@@ -55,7 +55,7 @@ from workbench.machine.text import plain_text
 from workbench.task.problem import Problem, TaskError, place_text
 from workbench.task.reference import named_file
 
-MOST_NAMED = 3
+MAX_RULES_PER_LINE = 3
 """Maximum number of rules that are named before their common reason."""
 
 
@@ -64,7 +64,7 @@ class CheckOutput:
     """Output of a check in addition to its text."""
 
     json: bool = False
-    """Print JSON in place of the text."""
+    """Print JSON instead of text."""
     json_file: Path | None = None
     junit: Path | None = None
     sarif: Path | None = None
@@ -109,11 +109,11 @@ def check_in_terminal(
                 if result.state in ("broken", "failed"):
                     line = f"{result.rule}: {result.state}"
                 elif result.problem is not None:
-                    # What a task raises leaves most rules undecided, for one reason.
+                    # An exception of the task leaves most rules undecided for the same reason: printed once.
                     line = f"not known: {result.why}"
                 if line and not err.is_terminal and line not in told:
                     told.add(line)
-                    # A bar in a file or a pipe is drawn once, at the end.
+                    # In a file or a pipe, the bar is drawn only once, at the end.
                     err.print(_safe(line), soft_wrap=True)
 
             try:
@@ -158,14 +158,14 @@ def check_in_terminal(
 
 
 def write_reports(said: Reported, output: CheckOutput) -> None:
-    """Write the files that were asked for. Raises OSError."""
+    """Write the requested files. Raises OSError."""
     for path, made in ((output.json_file, as_json), (output.junit, as_junit), (output.sarif, as_sarif)):
         if path is not None:
             replace_file(path, made(said).encode())
 
 
 def exit_code(said: Reported) -> int:
-    """Exit code of a check: 2 where nothing was checked, 1 for a finding of the degree that fails."""
+    """Exit code of a check: 2 if nothing was checked, 1 if a finding has a degree that fails."""
     if said.error is not None:
         return Exit.REFUSED
     return Exit.FAILED if said.report.fails(said.fail_on) else Exit.DONE
@@ -178,7 +178,7 @@ def _job_of(what: CheckOptions) -> JobKey:
 def _without_result(
     what: CheckOptions, output: CheckOutput, root: Path, problem: Problem, began: float
 ) -> Reported:
-    """Content of the reports where nothing was checked."""
+    """Content of the reports if nothing was checked."""
     file = named_file(what.task)
     named = str(file) if file is not None and file.is_file() else None
     seconds = time.monotonic() - began
@@ -205,7 +205,7 @@ def print_report(said: Reported) -> None:
     if report.task.others:
         name = Path(report.task.file or "").name
         others = ", ".join(f"{name}:{other}" for other in report.task.others)
-        warn(f"Not checked, as one task is checked at a time: {others}")
+        warn(f"Not checked, because each run checks one task: {others}")
 
 
 def _print_finding(finding: Finding, root: Path, style: str) -> None:
@@ -254,12 +254,12 @@ def _print_summary(report: CheckReport, root: Path) -> None:
 
 
 def _print_by_reason(label: str, results: tuple[RuleResult, ...]) -> None:
-    """Print a line for each reason; the reason comes first where many rules share it."""
+    """Print a line for each reason; the reason comes first if many rules share it."""
     rules: dict[str, list[str]] = {}
     for result in results:
         rules.setdefault(result.why, []).append(result.rule)
     for why, of in rules.items():
-        if len(of) <= MOST_NAMED:
+        if len(of) <= MAX_RULES_PER_LINE:
             _print(f"{label} {', '.join(of)}: {_safe(why)}")
         else:
             _print(f"{label} {_safe(why)}")
@@ -267,7 +267,7 @@ def _print_by_reason(label: str, results: tuple[RuleResult, ...]) -> None:
 
 
 def _print_names(label: str, names: Sequence[str]) -> None:
-    """Print the names behind the label, in lines as wide as the terminal."""
+    """Print the names after the label, wrapped to the terminal's width."""
     lines = textwrap.wrap(", ".join(names), max(40, out.width - 6), break_on_hyphens=False)
     _print(f"{label} {lines[0]}" if len(lines) == 1 else label)
     for line in lines if len(lines) > 1 else ():

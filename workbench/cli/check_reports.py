@@ -45,7 +45,7 @@ class Reported:
     """The current folder of the command."""
     fail_on: FailOn
     error: Problem | None = None
-    """Reason why nothing was checked; the report then has no result."""
+    """Reason why nothing was checked; None if something was."""
 
     def fails(self, finding: Finding) -> bool:
         return fails(finding.degree, self.fail_on)
@@ -71,7 +71,7 @@ def shown_path(file: str, root: Path) -> str:
 
 
 def repository_of(folder: Path) -> Path:
-    """The root of the checkout around a folder, from which CI counts paths; else the folder."""
+    """Root of the git checkout that contains the folder, to which CI's paths are relative; else the folder."""
     return next((each for each in (folder, *folder.parents) if (each / ".git").exists()), folder)
 
 
@@ -158,8 +158,8 @@ def _rule(result: RuleResult, root: Path) -> dict[str, Any]:
 
 
 def json_text(value: Any) -> str:
-    """The value as JSON, in ASCII alone."""
-    # Not every program reads bytes of a file's name that are no UTF-8: ASCII alone.
+    """The value as JSON, in ASCII only."""
+    # In ASCII only, because some programs cannot read file names with bytes that are not UTF-8.
     return json.dumps(value, indent=1) + "\n"
 
 
@@ -167,8 +167,8 @@ def json_text(value: Any) -> str:
 
 
 def as_junit(said: Reported) -> str:
-    """A test case for each rule, as pytest writes it and GitLab, Jenkins and GitHub's actions read it. A finding below
-    ``--fail-on`` is output of a test that passes."""
+    """JUnit XML with a test case for each rule, in pytest's format, which GitLab, Jenkins and GitHub Actions read. A finding
+    below ``--fail-on`` is output of a passing test."""
     report = said.report
     root = repository_of(said.root)
     cases = [_case(result, said, root) for result in report.results]
@@ -261,7 +261,7 @@ def _text(finding: Finding, root: Path) -> str:
 
 
 def xml_text(text: str) -> str:
-    """The text with the characters escaped that XML cannot hold."""
+    """Escape the characters that XML cannot represent."""
     return _NOT_IN_XML.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
@@ -269,7 +269,7 @@ def xml_text(text: str) -> str:
 
 
 def as_sarif(said: Reported) -> str:
-    """SARIF 2.1.0 with what GitHub's code scanning asks for. Paths are relative to the repository."""
+    """SARIF 2.1.0 with the fields that GitHub code scanning requires. Paths are relative to the repository."""
     report = said.report
     root = repository_of(said.root)
     ids = [*(result.rule for result in report.results), *report.ignored]
@@ -283,7 +283,7 @@ def as_sarif(said: Reported) -> str:
         }
         for finding, reason in silenced
     ]
-    # A result would be an alert; what is not known is none.
+    # As notifications: a result would be an alert, and an undecided rule is no alert.
     notes = [
         {
             "level": "note" if one.problem is None else "error",
@@ -333,8 +333,8 @@ def as_sarif(said: Reported) -> str:
 _ERROR_RULE = {
     "id": CANNOT_CHECK,
     "shortDescription": {"text": "Task and policy can be imported, and what they need is downloaded."},
-    "fullDescription": {"text": "Otherwise none of its rules can be checked."},
-    "help": {"text": "Mend what is at this line, or fetch what is missing, and check again."},
+    "fullDescription": {"text": "Without that, no rule can be checked."},
+    "help": {"text": "Fix this line, or download what is missing, and check again."},
     "defaultConfiguration": {"level": "error"},
 }
 
@@ -370,7 +370,7 @@ def _sarif_rule(rule_id: str) -> dict[str, Any]:
 
 
 def _result(finding: Finding, ids: list[str], said: Reported, root: Path) -> dict[str, Any]:
-    # A result without a place is shown nowhere: the first line of the task's file.
+    # Code scanning shows no result without a place: fall back to the first line of the task's file.
     file = finding.file or said.report.task.file
     key = [finding.rule, shown_path(file or "", root), finding.function, finding.code]
     return {
@@ -388,7 +388,7 @@ def _fingerprint(key: list[str]) -> str:
 
 
 def _location(file: str, line: int | None, root: Path) -> dict[str, Any]:
-    """SARIF's location. Where no line is known it is the first: code scanning shows no result without a line."""
+    """SARIF location; line 1 if the line is unknown, because code scanning shows no result without a line."""
     path = Path(file)
     if path.is_relative_to(root):
         place = {"uri": quote(path.relative_to(root).as_posix()), "uriBaseId": "%SRCROOT%"}

@@ -1,4 +1,4 @@
-"""The documents in a terminal: the list of topics, and one topic."""
+"""Runs ``workbench help``: lists the topics, or shows one."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from workbench.app.help_pages import GROUPS, RULE_PAGES, Topic, by_path, find_to
 from workbench.cli.output import Exit, out, refuse
 from workbench.machine.text import plain_text
 
-WIDEST = 100
-"""Maximum width of the text in columns: longer lines are hard to read."""
+MAX_COLUMNS = 100
+"""Maximum width of the text: longer lines are hard to read."""
 _HIDDEN = re.compile(r"^<picture>.*?^</picture>\n|^!\[.*?\]\(.*?\)\n|^<!--.*?-->\n", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"\[([^]]+)\]\(([^)]+)\)")
 
 
 def show_help(name: str) -> int:
-    """Show a topic, or the list of all where no name is given; returns the exit code."""
+    """Show a topic, or the list of topics if the name is empty; returns the exit code."""
     if not name.strip():
         _list_topics()
         return Exit.DONE
@@ -30,11 +30,11 @@ def show_help(name: str) -> int:
     if topic is None:
         return refuse(_not_found(name))
     page = Markdown(for_terminal(topic), hyperlinks=False)
-    width = min(out.width, WIDEST)
+    width = min(out.width, MAX_COLUMNS)
     if not out.is_terminal:
         out.print(page, width=width)
         return Exit.DONE
-    # A page that fits the window is printed, and colours are passed on; LESS of the person's own says otherwise.
+    # less prints a text that fits the window, and passes colours on; the person's own LESS takes precedence.
     os.environ.setdefault("LESS", "FRX")
     with out.pager(styles=shutil.which("less") is not None):
         out.print(page, width=width)
@@ -61,13 +61,13 @@ def _not_found(name: str) -> str:
     said = plain_text(name.strip())
     names = [topic.name for topic in topics()]
     about = [topic.name for topic in topics_about(said)]
-    # Several words are no name that was mistyped.
+    # Several words are a search, not a mistyped name.
     close = difflib.get_close_matches(said.lower(), names, 1) if len(said.split()) == 1 or not about else []
     if close:
-        return f"There is no topic {said!r}. Did you mean {close[0]!r}? workbench help lists all."
+        return f"There is no topic {said!r}. Did you mean {close[0]!r}? workbench help lists all topics."
     if about:
         return f"There is no topic {said!r}. These mention it: {', '.join(about)}"
-    return f"There is no topic {said!r}, and no topic mentions it. workbench help lists all."
+    return f"There is no topic {said!r}, and no topic mentions it. workbench help lists all topics."
 
 
 def for_terminal(topic: Topic) -> str:

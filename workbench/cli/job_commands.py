@@ -26,25 +26,25 @@ from workbench.machine.software_vulkan import use_private_driver
 from workbench.planning.options import PlanArguments
 from workbench.task.description import RecordArguments
 
-_FEW = EpisodeArguments()
-_ONE = EpisodeArguments(num_envs=1)
-_HERE = JobArguments()
-_PLAN = PlanArguments()
+_DEFAULT_ENVS = EpisodeArguments()
+_ONE_ENV = EpisodeArguments(num_envs=1)
+_DEFAULT_JOB = JobArguments()
+_DEFAULT_PLAN = PlanArguments()
 
 
 def record(
     recording: Annotated[RecordArguments, tyro.conf.PositionalRequiredArgs],
-    plan: PlanArguments = _PLAN,
-    envs: EpisodeArguments = _FEW,
-    run: JobArguments = _HERE,
+    plan: PlanArguments = _DEFAULT_PLAN,
+    envs: EpisodeArguments = _DEFAULT_ENVS,
+    run: JobArguments = _DEFAULT_JOB,
     debug: bool = False,
 ) -> int:
-    """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json. Episodes that the
-    task's code fails in are told at the end; the exit code is 1 then.
+    """Record episodes of a task without a page: an .rrd, and ManiSkill's own .h5 with its .json, for each. Episodes in
+    which the task's code raises are listed at the end, with exit code 1.
 
     Args:
-        debug: wait for a debugger (debugpy, as of VS Code) before the task is loaded, with one worker; breakpoint() stops for
-            it. Anyone who can log in to this machine can attach too.
+        debug: wait for a debugger (debugpy, such as VS Code's) before the task is loaded, with one worker; breakpoint()
+            stops in it. Anyone who can log in to this machine can attach too.
     """
     if lacks_maniskill("record"):
         return Exit.REFUSED
@@ -77,7 +77,7 @@ def check(
     /,
     *,
     envs: CheckArguments,
-    run: JobArguments = _HERE,
+    run: JobArguments = _DEFAULT_JOB,
     select: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     ignore: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     actions: str = "random",
@@ -88,29 +88,29 @@ def check(
     junit: Path | None = None,
     sarif: Path | None = None,
 ) -> int:
-    """Check a task for what goes wrong on a GPU cluster or in training, with the line of each mistake. The exit code is 1
-    where a rule is broken, and 2 where the task cannot be imported.
+    """Check a task for mistakes that show up on a GPU cluster or in training, with the line of each. The exit code is 1
+    if a rule is broken, and 2 if the task cannot be imported.
 
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
-        select: check only this rule; repeatable, or several with commas. workbench help rules lists them.
-        ignore: do not check this rule; repeatable, or several with commas.
-        actions: zero, hold, a policy as module:function or file.py:function, or a file, as of workbench record: it acts
-            in further episodes, beside random actions, for the rules of evaluate() and of rewards.
-        solve: also plan episodes with the task's own reward, and check what that shows of it: minutes more. See workbench
-            help solve.
-        fail_on: lowest degree of a finding that makes the exit code 1; never is for a job that only reports.
-        json: print the result as JSON in place of text.
+        select: check only this rule; repeatable, or comma-separated. workbench help rules lists them.
+        ignore: do not check this rule; repeatable, or comma-separated.
+        actions: zero, hold, a policy as module:function or file.py:function, or a file, as for workbench record. It acts
+            in additional episodes, besides those with random actions, for the rules of evaluate() and of rewards.
+        solve: also plan episodes with the task's own reward, and check the reward by them: takes minutes more. See
+            workbench help solve.
+        fail_on: lowest degree of a finding that makes the exit code 1; never only reports.
+        json: print the result as JSON instead of text.
         json_file: also write the result to this file, as JSON.
-        junit: also write it to this file as JUnit's XML, with a test case for each rule.
-        sarif: also write it to this file as SARIF 2.1.0, for code scanning.
+        junit: also write the result to this file as JUnit XML, with a test case for each rule.
+        sarif: also write the result to this file as SARIF 2.1.0, for code scanning.
     """
     began = time.monotonic()
     if lacks_maniskill("check"):
         return Exit.REFUSED
     from workbench.task.reference import why_missing
 
-    # A report is to say it too.
+    # With a report, the error belongs in the report as well.
     reports = json or any(file is not None for file in (json_file, junit, sarif))
     if (why := why_missing(task)) is not None and not reports:
         return refuse(why)
@@ -118,7 +118,7 @@ def check(
 
     try:
         options = envs.options()
-        # Before torch is imported: a typo is answered at once.
+        # Checked before torch is imported: a typo is reported at once.
         degree_of_each(separated(select), separated(ignore))
     except ValueError as error:
         return refuse(str(error))
@@ -144,9 +144,9 @@ def solve(
     task: Task,
     /,
     *,
-    plan: PlanArguments = _PLAN,
-    envs: EpisodeArguments = _ONE,
-    run: JobArguments = _HERE,
+    plan: PlanArguments = _DEFAULT_PLAN,
+    envs: EpisodeArguments = _ONE_ENV,
+    run: JobArguments = _DEFAULT_JOB,
     seeds: int = 32,
     max_steps: int | None = None,
     seconds_per_seed: float | None = None,
@@ -160,28 +160,28 @@ def solve(
     csv_file: Path | None = None,
     junit: Path | None = None,
 ) -> int:
-    """Solve a task by planning with its own reward, before anyone trains on it: how many seeds, in how many steps, and what
-    the rollouts tell of the reward. Episodes are recorded. The exit code is 1 where no seed is solved, or where the reward
-    breaks a rule of the degree that --fail-on names, as of workbench check --solve.
+    """Solve a task by planning with its own reward before training on it: reports how many seeds are solved, in how many
+    steps, and reward problems that the rollouts find. Episodes are recorded. The exit code is 1 if no seed is solved, or if
+    the reward breaks a rule of the degree of --fail-on, as in workbench check --solve.
 
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
-        seeds: how many seeds are tried. That no rule is broken says something from 8 on.
-        max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
-        seconds_per_seed: wall time after which a seed ends at its next step, solved or not. What that cuts off depends on
-            the machine and on what else it does, so that a second run may come to another result.
-        pictures: record what every camera sees.
+        seeds: number of seeds to try. At least 8 are needed to conclude that no rule is broken.
+        max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
+        seconds_per_seed: wall time limit of a seed: it ends at its next step, solved or not. Which seeds reach it depends
+            on the machine and its load, so a second run may differ.
+        pictures: record the images of every camera.
         out: folder for the recordings.
-        upload: an address of fsspec, such as s3://bucket/folder: each episode goes there when it is over, and not into
+        upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
             the folder.
-        fail_on: lowest degree of a broken rule that makes the exit code 1, as of workbench check; the rules of the reward
-            are of the degree warn. never: nor does it where no seed is solved.
-        json: print the result as JSON in place of text.
+        fail_on: lowest degree of a broken rule that makes the exit code 1, as for workbench check; the rules of the reward
+            have the degree warn. With never, the exit code is 0 even if no seed is solved.
+        json: print the result as JSON instead of text.
         json_file: also write the result to this file, as JSON.
-        csv: print a row for each seed as CSV in place of text, with the rules that it is an example of; what is said of
-            them is in the JSON.
+        csv: print a row for each seed as CSV instead of text, with the rules that it is an example of; their messages
+            are in the JSON.
         csv_file: also write the rows to this file, as CSV.
-        junit: also write the result to this file as JUnit's XML.
+        junit: also write the result to this file as JUnit XML.
     """
     if lacks_maniskill("solve"):
         return Exit.REFUSED
@@ -219,9 +219,9 @@ def sweep(
     task: Task,
     /,
     *,
-    plan: PlanArguments = _PLAN,
-    envs: EpisodeArguments = _FEW,
-    run: JobArguments = _HERE,
+    plan: PlanArguments = _DEFAULT_PLAN,
+    envs: EpisodeArguments = _DEFAULT_ENVS,
+    run: JobArguments = _DEFAULT_JOB,
     settings: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set")] = (),
     seeds: int = 100,
     actions: str = "random",
@@ -232,22 +232,21 @@ def sweep(
     json_file: Path | None = None,
     csv_file: Path | None = None,
 ) -> int:
-    """Record a task with each combination of several values, and compare: how often it succeeds, its return, the terms of
-    its reward. The task's file is not changed. Values that the task fails with are told at the end; the exit code is 1
-    then.
+    """Record a task with each combination of several values, and compare success rates, returns and reward terms. The
+    task's file is not changed. Values with which the task raises are listed at the end, with exit code 1.
 
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         settings: a name and its values, as in --set reach_weight=0.5,1,2 (each in JSON, or text); repeatable, for all
-            combinations. A constant of the file, of its module or of a class, whose value is written there as it is; or an
-            argument of the task class.
-        seeds: how many episodes for each combination: the same seeds for all.
-        actions: random, zero, hold; solve, which plans them by rollouts of the task with its own reward; or a policy as
+            combinations. Names a module or class constant with a literal value in the file, or an argument of the task
+            class.
+        seeds: number of episodes for each combination, with the same seeds for all.
+        actions: random, zero, hold; solve, which plans with rollouts of the task and its own reward; or a policy as
             module:function or file.py:function.
-        max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
-        pictures: record what every camera sees.
-        out: folder for the recordings and results.parquet; else one in sweeps, with the name of the task.
-        upload: an address of fsspec, such as s3://bucket/folder: each episode goes there when it is over, and not into
+        max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
+        pictures: record the images of every camera.
+        out: folder for the recordings and results.parquet; default: sweeps/, in a folder named after the task.
+        upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
             the folder; results.parquet is in both.
         json_file: also write the results to this file, as JSON.
         csv_file: also write a row for each episode to this file, as CSV.
@@ -296,18 +295,18 @@ def merge(
     sarif: Path | None = None,
     fail_on: FailOn = "stop",
 ) -> int:
-    """Put the parts of a job together that were run with --shard, and print what the whole command would have printed. Nothing
-    is run. The exit code is 1 where parts are missing, or as of the command.
+    """Merge the parts of a job that were run with --shard, and print the output of the whole command. Runs nothing. The exit
+    code is 1 if parts are missing, else that of the command.
 
     Args:
         files: job files of all parts.
-        job: also write one job file for the whole. With it the command goes on where parts are missing.
+        job: also write one job file for the whole; the command resumes from it to run missing parts.
         out: copy the episodes of all parts into this folder.
-        json_file: also write the result to this file, as JSON: of check, rescore, solve and sweep.
-        csv_file: likewise as CSV: of rescore, solve and sweep.
-        junit: likewise as JUnit's XML: of check and solve.
-        sarif: likewise as SARIF: of check.
-        fail_on: lowest degree of a finding that makes the exit code 1, as of check and solve.
+        json_file: also write the result to this file, as JSON (check, rescore, solve and sweep).
+        csv_file: also write the result to this file, as CSV (rescore, solve and sweep).
+        junit: also write the result to this file, as JUnit XML (check and solve).
+        sarif: also write the result to this file, as SARIF (check).
+        fail_on: lowest degree of a finding that makes the exit code 1, as for check and solve.
     """
     for file in files:
         if not file.is_file():
@@ -328,27 +327,27 @@ def rescore(
     use_env_states: bool = False,
     *,
     envs: RescoreArguments,
-    run: JobArguments = _HERE,
+    run: JobArguments = _DEFAULT_JOB,
     csv: bool = False,
     csv_file: Path | None = None,
     json: bool = False,
     json_file: Path | None = None,
     trust: bool = False,
 ) -> int:
-    """Rescore recorded episodes with today's reward and evaluate, and list what differs (on the page: Rescore).
+    """Rescore recorded episodes with the task's current reward and evaluate, and list what differs (on the page: Rescore).
 
     Args:
         places: recordings (.json, .h5 or .rrd of the workbench, .h5 of ManiSkill's RecordEpisode) and folders of them.
-        task: a task file, file.py:ClassName, package.module:ClassName or id to rescore all of them with, in place of the
-            one each names.
-        recorded_source: rescore each with the text that it was recorded with.
-        use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
-        csv: print the table as CSV in place of text.
+        task: a task file, file.py:ClassName, package.module:ClassName or id to rescore all of them with, instead of the
+            task that each recording names.
+        recorded_source: rescore each with the source code that it was recorded with.
+        use_env_states: restore the recorded state after each step, so that the rollout cannot drift from the recording.
+        csv: print the table as CSV instead of text.
         csv_file: also write the table to this file, as CSV.
-        json: print the table as JSON in place of text.
+        json: print the table as JSON instead of text.
         json_file: also write the table to this file, as JSON.
-        trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it. Without
-            it, and without a terminal to ask in, nothing is run and the exit code is 4.
+        trust: run code referenced by or embedded in foreign recordings without asking. Applies to this run only. Without
+            it, and without a terminal to ask in, nothing runs and the exit code is 4.
     """
     if lacks_maniskill("rescore"):
         return Exit.REFUSED
@@ -357,7 +356,7 @@ def rescore(
         from workbench.cli.run_by import require_job
 
     if task is not None and recorded_source:
-        return refuse("--task and --recorded-source name two versions to rescore with: give one of them")
+        return refuse("--task and --recorded-source each choose the code to rescore with: give one of them")
     if csv and json:
         return refuse(
             "--csv and --json both print the table: give one of them, and --csv-file or --json-file"

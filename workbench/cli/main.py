@@ -1,8 +1,8 @@
-"""The commands of ``workbench`` and their arguments, as ``workbench --help`` shows them."""
+"""The commands of ``workbench`` and their arguments."""
 
 from __future__ import annotations
 
-# First: a file in the current folder could have the name of a module that is imported below.
+# Imported first: a file in the current folder could shadow a module that is imported below.
 import workbench.machine.processes.own_path  # noqa: F401
 
 # isort: split
@@ -31,7 +31,7 @@ from workbench.machine.text import guard_terminal
 from workbench.task.description import ShownPictures
 
 app = tyro.extras.SubcommandApp()
-# Commands import what they need when they are chosen, so that ``--help`` and a mistyped option answer at once.
+# Commands import lazily, so that ``--help`` and errors in options appear at once.
 
 
 @app.command
@@ -46,20 +46,20 @@ def start(
     trust: bool = False,
     editor: str = "vscode",
 ) -> int:
-    """Choose a task on a page: recent ones, the files of this folder, ManiSkill's own. This is what workbench without a
-    command does, as in workbench --port 8081.
+    """Choose a task on a page: recent ones, the files of this folder, ManiSkill's own. The default command: workbench
+    --port 8081 does the same.
 
     Args:
         recordings: folder for recorded episodes.
-        history: memory that the steps of the past may take, such as 64MB or 2GB; the oldest go first.
-        memory_limit: memory that the task's process may use, such as 8GB; auto is 80 % of this machine's, none
-            sets no limit. A process that uses more is ended and replaced.
-        spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
-            seconds more, and about 0.8 GB of memory less).
-        trust: run task files from other folders, and what recordings from elsewhere name or hold, without asking, in
-            this run; nothing is kept of it.
-        editor: what a press on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} and {line};
-            as of open.
+        history: memory limit for step history, such as 64MB or 2GB; the oldest steps are dropped first.
+        memory_limit: memory limit of the task's process, such as 8GB; auto is 80 % of this machine's memory, none
+            is no limit. A process that exceeds it is killed and restarted.
+        spare: keep a spare process that takes over when the task's process dies (--no-spare: recovery takes a few
+            seconds longer, and about 0.8 GB of memory is saved).
+        trust: run task files from other folders, and code referenced by or embedded in foreign recordings, without
+            asking. Applies to this run only.
+        editor: what a click on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} and {line};
+            see workbench open --help.
     """
     from workbench.cli.page import start_in_terminal
     from workbench.live.process.memory_limit import parse_memory
@@ -75,7 +75,7 @@ def start(
         address = parse_editor(editor)
     except ValueError as error:
         return refuse(str(error))
-    # Recordings can be reviewed without it.
+    # Recordings can be reviewed without ManiSkill.
     lacks_maniskill("start")
     return start_in_terminal(options, at, worker, recordings, past, trust, address)
 
@@ -103,21 +103,21 @@ def open_page(
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         recordings: folder for recorded episodes.
-        history: memory that the steps of the past may take, such as 64MB or 2GB; the oldest go first.
-        memory_limit: memory that the task's process may use, such as 8GB; auto is 80 % of this machine's, none
-            sets no limit. A process that uses more is ended and replaced.
-        spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
-            seconds more, and about 0.8 GB of memory less).
-        trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
-        editor: what a press on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} (an absolute
+        history: memory limit for step history, such as 64MB or 2GB; the oldest steps are dropped first.
+        memory_limit: memory limit of the task's process, such as 8GB; auto is 80 % of this machine's memory, none
+            is no limit. A process that exceeds it is killed and restarted.
+        spare: keep a spare process that takes over when the task's process dies (--no-spare: recovery takes a few
+            seconds longer, and about 0.8 GB of memory is saved).
+        trust: run code referenced by or embedded in foreign recordings without asking. Applies to this run only.
+        editor: what a click on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} (an absolute
             path) and {line}. If the browser is on another machine than the file, VS Code opens it over ssh with
             vscode://vscode-remote/ssh-remote+HOST{file}:{line}, where HOST is the machine as your ssh config names it.
-        pictures: of the cameras, as the page shows them: exact; fast, of simplified meshes; or auto, which is fast while
-            something moves and exact when it stands still. Observations and recordings are exact.
-        debug: let a debugger (debugpy, as of VS Code) attach to the task's process, from this machine only; breakpoint()
-            stops for it. Anyone who can log in to this machine can attach too.
-        debug_port: port for the debugger; 5678 if it is free, else any. Means --debug.
-        debug_wait: load the task only when a debugger has attached. Means --debug.
+        pictures: how the page renders camera images: exact; fast, with simplified meshes; or auto, which is fast during
+            motion and exact at rest. Observations and recordings are always exact.
+        debug: let a debugger (debugpy, such as VS Code's) attach to the task's process, from this machine only; breakpoint()
+            stops in it. Anyone who can log in to this machine can attach too.
+        debug_port: port for the debugger; 5678 if it is free, else any. Implies --debug.
+        debug_wait: wait for a debugger to attach before the task is loaded. Implies --debug.
     """
     if lacks_maniskill("open"):
         return Exit.REFUSED
@@ -157,11 +157,11 @@ def new(
     *,
     origin: Annotated[str, tyro.conf.arg(name="from", metavar="TEMPLATE")] = "",
 ) -> int:
-    """Write NAME.py into this folder: a task that opens and passes its checks, to go on from. Asks for what is not given.
+    """Write NAME.py into this folder: a starting task that opens and passes its checks. Asks for what is not given.
 
     Args:
-        name: of the file, such as stack_two, whose class is StackTwoEnv and whose id is StackTwo-v1.
-        origin: minimal (also if not given), tabletop, articulated, multi-robot, locomotion, or the id of a task of ManiSkill, such as PickCube-v1, which is copied.
+        name: name of the file, such as stack_two; its class is StackTwoEnv and its id StackTwo-v1.
+        origin: minimal (default), tabletop, articulated, multi-robot, locomotion, or the id of a ManiSkill task to copy, such as PickCube-v1.
     """
     from workbench.cli.new import new_in_terminal
 
@@ -184,29 +184,29 @@ def review(
     trust: bool = False,
     editor: str = "vscode",
 ) -> int:
-    """Look through a folder of recordings in a browser page: play, compare, share. No task file is needed.
+    """Play, compare and share a folder of recordings in a browser page. No task file is needed.
 
     Args:
-        folder: where the recordings are, in folders below it too: .rrd, .h5 and .json of the workbench, and .h5
+        folder: folder of the recordings, searched recursively: .rrd, .h5 and .json of the workbench, and .h5
             with .json of ManiSkill's RecordEpisode.
-        rules: what happens where a task that is opened from here breaks a rule of GPU simulation: stop, warn, or off
-            to check none. If not given, what writes over the state of other envs stops, all else is a warning.
-        task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
-            itself has need none.
-        imports: a module that registers ids that recordings name, such as lab.tasks, imported in the processes that
-            run their tasks; repeatable.
-        trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
-        editor: what a press on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} and {line};
+        rules: what happens when a task opened from here breaks a rule of GPU simulation: stop, warn, or off
+            (no checks). By default, overwriting the state of other envs stops; everything else warns.
+        task: a task file to search for the envs of ManiSkill's recordings; repeatable. Not needed for ManiSkill's
+            own envs.
+        imports: a module that registers the env ids of the recordings, such as lab.tasks, imported in the processes
+            that run their tasks; repeatable.
+        trust: run code referenced by or embedded in foreign recordings without asking. Applies to this run only.
+        editor: what a click on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} and {line};
             see workbench open --help.
     """
     if not folder.is_dir():
-        return refuse(f"there is no folder {folder}; workbench record and the page's Episodes tab make one")
+        return refuse(f"there is no folder {folder}; workbench record and the page's Episodes tab create it")
     for file in task:
         if not file.is_file():
             return refuse(f"there is no file {file}")
     from workbench.episodes.reader.reading import start_reading
 
-    # Meanwhile the page is imported.
+    # Reads the recordings while the page is imported.
     start_reading()
     from workbench.cli.page import review_in_terminal
     from workbench.live.process.memory_limit import parse_memory
@@ -236,14 +236,14 @@ def share(
     sheet: bool = False,
     out: Path = Path("."),
 ) -> int:
-    """Make films, moving 3-D pages and sheets of pictures of recordings.
+    """Make films, animated 3-D pages and sheets of pictures from recordings.
 
     Args:
         files: recordings, or folders of them.
-        mp4: a film of the camera of this name, of "scene" (the 3-D view), or of "cameras" (each of them); repeatable.
-        html: the moving 3-D view as one HTML file that needs no server and no network.
-        sheet: what each camera saw over time, on one picture.
-        out: folder for what is made; nothing that is there is written over.
+        mp4: a film of the camera with this name, of "scene" (the 3-D view), or of "cameras" (one film each); repeatable.
+        html: the animated 3-D view as one HTML file that needs no server and no network.
+        sheet: frames of each camera over time, in one picture.
+        out: folder for the results; existing files are not overwritten.
     """
     from workbench.cli.share import share_in_terminal
 
@@ -265,21 +265,21 @@ def export(
     state: tuple[str, ...] = (),
     environment_state: tuple[str, ...] = (),
 ) -> int:
-    """Make a dataset for training of recordings.
+    """Convert recordings to a training dataset.
 
     Args:
         files: recordings, or folders of them.
-        lerobot: folder that becomes a LeRobot dataset (version 3); must not exist yet.
-        maniskill: file (.h5) that becomes ManiSkill's demonstrations, with its .json, as its baselines load them; must not
-            exist yet. Of the other options it takes --only-successes and --only-fitting.
-        only_successes: leave out recordings that reach success at no step.
-        only_fitting: leave out recordings that cannot be read, or lack what the first one has (cameras, dimensions), and
-            say which; else such a one ends it.
-        task: the task in words, for policies that read; else its id.
-        fps: frames a second, of which the control rate is a whole multiple; else the control rate.
-        cameras: names of cameras; else all. Give none (--cameras) for a dataset without films.
-        state: observations that become observation.state, such as agent/qpos; else all that the robot knows of itself.
-        environment_state: observations that become observation.environment_state, such as extra; else none.
+        lerobot: new folder for a LeRobot dataset (version 3); must not exist yet.
+        maniskill: new file (.h5, with a .json) of ManiSkill demonstrations, as its baselines load them; must not exist
+            yet. Only --only-successes and --only-fitting apply to it.
+        only_successes: leave out recordings that never reach success.
+        only_fitting: leave out recordings that cannot be read or lack what the first one has (cameras, dimensions), and
+            print which. Without it, such a recording ends the export.
+        task: the task in words, for language-conditioned policies; default: its id.
+        fps: frames per second; the control rate must be a whole multiple of it. Default: the control rate.
+        cameras: names of cameras; default: all. Give none (--cameras) for a dataset without films.
+        state: observations that become observation.state, such as agent/qpos; default: the robot's whole proprioception.
+        environment_state: observations that become observation.environment_state, such as extra; default: none.
     """
     if (lerobot is None) == (maniskill is None):
         return refuse("say what to make: --lerobot FOLDER or --maniskill FILE.h5, one of them")
@@ -306,13 +306,13 @@ def view(
     host: str = "127.0.0.1",
     port: int = 0,
 ) -> int:
-    """Open recordings in rerun's own viewer: a window, or a page where there is no screen.
+    """Open recordings in rerun's own viewer: in a window, or in a page if there is no display.
 
     Args:
         files: one or more .rrd files.
-        web: a page, also where there is a screen; it contacts only this program.
+        web: use a page even if there is a display; the page contacts only this program.
         host: address to serve the page on.
-        port: port of the page; 0 takes any free one.
+        port: port of the page; 0 picks a free one.
     """
     from workbench.cli.share import view_in_terminal
 
@@ -321,7 +321,7 @@ def view(
 
 @app.command
 def doctor() -> int:
-    """Say what this machine can do, and for each lack what to do about it."""
+    """Show what this machine can do, and how to fix what is missing."""
     from workbench.machine.doctor import main
 
     return main()
@@ -329,10 +329,10 @@ def doctor() -> int:
 
 @app.command(name="help")
 def show_help(topic: Annotated[str, tyro.conf.Positional] = "", /) -> int:
-    """Show a page of the documents, or list the topics.
+    """Show a page of the documentation, or list the topics.
 
     Args:
-        topic: name of the page, such as cameras; without one, all are listed.
+        topic: name of the page, such as cameras; default: list all.
     """
     from workbench.cli import help
 
@@ -353,7 +353,7 @@ def main(args: Sequence[str] | None = None) -> None:
         try:
             code: Any = app.cli(
                 prog="workbench",
-                description="Workbench: write ManiSkill tasks in front of a live, batched view of them. Without a command it "
+                description="Workbench: write ManiSkill tasks with a live, batched view of them. Without a command it "
                 "opens a page to choose a task from.",
                 args=given,
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
@@ -367,7 +367,7 @@ def main(args: Sequence[str] | None = None) -> None:
     except BrokenPipeError:  # ``workbench open --help | head``
         code = end_quietly()
     except ImportError:
-        # A package that is older than the range lacks what is imported of it.
+        # An installed package that is too old lacks names that are imported from it.
         from workbench.machine.versions import unmet_lines
 
         if (unmet := unmet_lines()) is None:

@@ -1,4 +1,4 @@
-"""Runs ``workbench merge``: merges the parts of a job, and prints the output of the whole command."""
+"""Runs ``workbench merge``: merges the parts of a job and prints the output of the whole command."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from workbench.sweep.job import SweepOptions, collect_sweep
 
 @dataclass(frozen=True)
 class MergeOutput:
-    """Output in addition to the text, where the command that was run in parts has it."""
+    """Output in addition to the text, as far as the command that was run in parts has it."""
 
     json_file: Path | None = None
     csv_file: Path | None = None
@@ -53,7 +53,7 @@ class MergeOutput:
     """Lowest degree of a finding that makes the exit code 1; see `CheckOutput` and `SolveOutput`."""
 
 
-_GIVES = {
+_WRITES = {
     "record": (),
     "check": ("json_file", "junit", "sarif"),
     "rescore": ("json_file", "csv_file"),
@@ -79,10 +79,12 @@ def merge_in_terminal(files: Sequence[Path], job: Path | None, out: Path | None,
 
 def _require_known(merged: JobParts, output: MergeOutput) -> None:
     """Raise JobFileError for a command that does not exist or a file that the command does not write."""
-    if merged.command not in _GIVES:
-        raise JobFileError(f"{merged.files[0]} is of workbench {merged.command}, which merge does not know")
+    if merged.command not in _WRITES:
+        raise JobFileError(
+            f"{merged.files[0]} comes from workbench {merged.command}, which merge does not support"
+        )
     for name in ("json_file", "csv_file", "junit", "sarif"):
-        if getattr(output, name) is not None and name not in _GIVES[merged.command]:
+        if getattr(output, name) is not None and name not in _WRITES[merged.command]:
             option = name.replace("_", "-")
             raise JobFileError(f"workbench {merged.command} has no such result: leave out --{option}")
 
@@ -94,7 +96,7 @@ def _together(merged: JobParts, out: Path | None) -> JobParts:
     results: dict[int, Written | None] = merged.results(Written | None)
     local = {number: one for number, one in results.items() if one is not None and not one.address}
     if out is not None:
-        # The episodes of a sweep are in a folder for each point.
+        # A sweep has a folder for the episodes of each point.
         below = _folder_of_point(merged) if merged.command == "sweep" else lambda number: ""
         for number, one in local.items():
             _copy(Path(merged.folders[number], below(number), one.path.name), out / below(number))
@@ -102,7 +104,7 @@ def _together(merged: JobParts, out: Path | None) -> JobParts:
     folders = {merged.folders[number] for number in local}
     if len(folders) > 1:
         raise JobFileError(
-            f"the episodes are in {len(folders)} folders ({listed(sorted(folders), 3)}): name one for all, --out FOLDER"
+            f"the episodes are in {len(folders)} folders ({listed(sorted(folders), 3)}): copy them into one folder with --out FOLDER"
         )
     return merged
 
@@ -118,14 +120,16 @@ def _copy(rrd: Path, out: Path) -> None:
     for suffix in (".rrd", ".h5", ".json"):
         source, target = rrd.with_suffix(suffix), out / f"{rrd.stem}{suffix}"
         if not source.is_file() and not target.is_file():
-            raise RecordingError(f"{source} is not there: merge where the folders of all parts can be read")
+            raise RecordingError(
+                f"{source} does not exist: merge on a machine that can read the folders of all parts"
+            )
         if not target.exists():
             with new_file(target) as temporary:
                 shutil.copyfile(source, temporary)
 
 
 def _print(merged: JobParts, output: MergeOutput) -> int:
-    """Print as the command does, and write its files; returns its exit code."""
+    """Print the output of the command, and write its files; returns its exit code."""
     if merged.command == "check":
         return _print_check(merged, output)
     if merged.command == "rescore":

@@ -1,4 +1,4 @@
-"""Runs ``workbench new``: writes a task, and asks for what was not typed if there is a terminal."""
+"""Runs ``workbench new``: writes a task, and in a terminal asks for missing arguments."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def new_in_terminal(name: str, origin: str) -> int:
     """Write the task; returns the exit code.
 
     Args:
-        name: of the task; empty to ask for it.
-        origin: a template or an id; empty to ask for it too, or for the first template where a name is given.
+        name: name of the task; empty to ask for it.
+        origin: a template or an id; if empty, asks for it, or uses the first template if a name is given.
     """
     folder = Path.cwd()
     if not name:
@@ -31,7 +31,7 @@ def new_in_terminal(name: str, origin: str) -> int:
             origin = origin or _ask_template()
             name = _ask("Name of the task, such as stack_two", lambda typed: why_not_name(typed, folder))
         except EOFError:
-            out.print()  # the question's line has no end
+            out.print()  # ends the line of the question
             return refuse("Nothing was written.")
     try:
         made = write_new_task(name, origin or TEMPLATES[0].name, folder)
@@ -60,7 +60,7 @@ def _ask_template() -> str:
 
 
 def _ask(question: str, why_not: Callable[[str], str]) -> str:
-    """Ask until the answer is none that `why_not` objects to. Raises EOFError."""
+    """Ask until `why_not` accepts the answer. Raises EOFError."""
     while True:
         out.print(f"[bold]{escape(question)}:[/] ", end="", soft_wrap=True)
         typed = input().strip()

@@ -35,20 +35,20 @@ class Exit(IntEnum):
 
     DONE = 0
     FAILED = 1
-    """The author's code raised, a check found something, or fewer results than requested."""
+    """The author's code raised, a check has findings, or there are fewer results than requested."""
     REFUSED = 2
     """Nothing was done: a wrong argument, a missing file."""
     NOT_TRUSTED = 4
     """Nothing was run: recordings name code that is not trusted (see ``--trust``)."""
     INTERRUPTED = 130
-    """Ctrl-C, as shells have it; what was finished is kept."""
+    """Ended by Ctrl-C (128 + SIGINT); finished results are kept."""
 
 
 class SafeConsole(Console):
-    """A rich console whose own colours, bars and cursor moves reach the terminal, but not those within printed text.
+    """A rich console that removes escape sequences from printed text, and keeps its own colours, bars and cursor moves.
 
-    Text comes from file names, recordings, the author's code and requests. What libraries, loggers and tracebacks print past
-    this console is guarded by `machine.text`.
+    Text comes from file names, recordings, the author's code and requests. `machine.text` filters the output of libraries,
+    loggers and tracebacks that bypass this console.
     """
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
@@ -57,7 +57,7 @@ class SafeConsole(Console):
                 yield segment
                 continue
             style = segment.style
-            # A link's address would be printed unescaped.
+            # rich would print a link's address unescaped.
             if style is not None and style.link is not None:
                 style = style.update_link(None)
             yield Segment(plain_text(segment.text, "\n"), style)
@@ -76,10 +76,10 @@ out = SafeConsole(highlight=False)
 err = SafeConsole(stderr=True, highlight=False)
 
 _LINES = "\n\t"
-_MOST_FAILED = 100
-"""Maximum number of items with the same failure that are named."""
+_MAX_FAILED_ITEMS = 100
+"""Maximum number of items that are listed for each kind of failure."""
 _printed_notices: set[str] = set()
-"""Notices of the task that were printed; each reload sends them again."""
+"""Notices of the task that were printed already; each reload sends them again."""
 
 
 def print_text(text: object) -> None:
@@ -89,8 +89,7 @@ def print_text(text: object) -> None:
 
 @contextmanager
 def stdout_to_stderr() -> Iterator[None]:
-    """Within this block, output of the author's code, native libraries and child processes goes to stderr: stdout
-    is for results."""
+    """Redirect output of the author's code, native libraries and child processes to stderr: stdout is for results."""
     sys.stdout.flush()
     before = os.dup(1)
     try:
@@ -108,7 +107,7 @@ def progress_bar(*columns: ProgressColumn) -> Progress:
 
 
 def print_addresses(addresses: Sequence[str]) -> None:
-    """Print the addresses of a page: the one to open, then those for other machines."""
+    """Print the addresses of a page: first the one to open, then those for other machines."""
     for i, address in enumerate(addresses):
         print_text(f"  {'or' if i else 'page':8}{address}")
 
@@ -123,22 +122,22 @@ def interrupted(kept: str = "") -> int:
     """Print that Ctrl-C ended a command; returns the exit code.
 
     Args:
-        kept: what is kept of it.
+        kept: what was kept.
     """
     refuse(f"interrupted; {kept}" if kept else "interrupted")
     return Exit.INTERRUPTED
 
 
 def end_quietly() -> int:
-    """Exit code where the reader of our output has closed it, as of a command that SIGPIPE ends.
+    """Return the exit code of SIGPIPE if the reader of stdout has closed the pipe.
 
-    To be called while the BrokenPipeError is handled, which is raised again if it is of another pipe.
+    Must be called in an ``except BrokenPipeError`` block; reraises the error if it comes from another pipe.
     """
-    looker = select.poll()
-    looker.register(sys.stdout.fileno(), 0)
-    if not any(event & select.POLLERR for _, event in looker.poll(0)):
+    poller = select.poll()
+    poller.register(sys.stdout.fileno(), 0)
+    if not any(event & select.POLLERR for _, event in poller.poll(0)):
         raise
-    # Else Python says it once more when it flushes at its end.
+    # Prevents a second error when Python flushes stdout at exit.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 128 + signal.SIGPIPE
 
@@ -149,8 +148,7 @@ def warn(message: str) -> None:
 
 
 def lacks_maniskill(command: str) -> bool:
-    """Print what to type where the command cannot run without ManiSkill, and warn of two installed distributions
-    of ManiSkill. Returns whether ManiSkill is missing."""
+    """Return whether ManiSkill is missing; prints how to install it, and warns if two of its distributions are installed."""
     lines = lines_if_lacking(f"workbench {command}", sys.argv[1:])
     for line in lines or ():
         refuse(line)
@@ -171,16 +169,16 @@ def print_problem(problem: Problem) -> None:
 
 
 def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> None:
-    """Print the failures of a job that went on, each kind once with its items.
+    """Print the failures of a job that continued after them: each kind once, with its items.
 
     Args:
-        names: the name of an item.
+        names: returns the name of an item.
     """
     from workbench.jobs.scheduler import by_kind
 
     for problem, numbers in by_kind(failures):
         print_problem(problem)
-        told = listed([names(number) for number in numbers], _MOST_FAILED)
+        told = listed([names(number) for number in numbers], _MAX_FAILED_ITEMS)
         err.print(escape(f"    without a result, {len(numbers)} in all: {told}"), soft_wrap=True)
 
 
@@ -196,8 +194,8 @@ def print_finding(finding: Finding) -> None:
 
 
 def print_event(event: Event) -> None:
-    """Print loads and failures, which the page shows too."""
-    from workbench.live.messages import Loaded, RulesBroken, TaskFailed
+    """Print loads and failures; the page shows them too."""
+    from workbench.live.messages import Loaded, TaskFailed, RulesBroken
 
     if isinstance(event, Loaded):
         parts = ", ".join(f"{plain_text(name)} {ms:.0f}" for name, ms in event.milliseconds.items())
@@ -223,11 +221,11 @@ def print_event(event: Event) -> None:
 
 
 def _what_runs(failed: TaskFailed) -> str:
-    """Text: which version runs after a failure, and how to go on."""
+    """Describe which version runs after a failure, and how to continue."""
     if failed.at_run:
         of = "the policy" if failed.problem.stage == "policy" else "the version"
         process = f"; another process loads the version again: {failed.spoiled}" if failed.spoiled else ""
-        return f"{of} failed while the task ran, which is paused{process}; save a mended file, or go on with a reset"
+        return f"{of} failed while the task ran; the task is paused{process}; save a fixed file, or reset to continue"
     if failed.spoiled or failed.problem.stage == "worker":
         return "the last good version comes back where it was"
     return "the last good version stays as it was, running or paused"
@@ -244,8 +242,8 @@ def print_line(line: PrintedLine) -> None:
 # --- Asking whether code of a recording may run ------------------------------------------------
 
 
-MOST_NAMED = 20
-"""Maximum number of questions that are listed where they cannot be asked."""
+MAX_QUESTIONS = 20
+"""Maximum number of questions that are listed if they cannot be asked."""
 _TAB = "\t"
 _SHOW = ("s", "show")
 _ANSWERS = {
@@ -267,7 +265,7 @@ class TerminalPrompt:
 
     Args:
         out: the console to ask on.
-        quiet: context in which nothing else writes to it.
+        quiet: context in which nothing else writes to the console.
     """
 
     def __init__(self, out: Console, quiet: Callable[[], AbstractContextManager[None]]) -> None:
@@ -307,19 +305,17 @@ def print_question(question: TrustQuestion, out: Console) -> None:
         out.print(f"    {name if place else f'[bold]{name}[/]'}  {_file_mark(file)}", soft_wrap=True)
     if question.nothing_known:
         print_escaped(
-            "You trusted another version of this file and the modules beside it before. Which of them has changed since is "
-            "not known.",
+            "You trusted another version of this file and the modules next to it. It is not known which of them has "
+            "changed.",
             "yellow",
         )
     elif question.trusted_before:
-        gone = f"; gone since: {', '.join(question.gone)}" if question.gone else ""
-        print_escaped(
-            f"You trusted another version of this before. Changes since then are marked{gone}.", "yellow"
-        )
+        gone = f"; removed since: {', '.join(question.gone)}" if question.gone else ""
+        print_escaped(f"You trusted another version of this. Changes since then are marked{gone}.", "yellow")
     for what in question.unseen:
         print_escaped(what, "yellow")
     print_escaped(
-        "It can read and change everything that you can. The digits are the first of each file's sha256sum."
+        "It can read and change everything that you can. The digits are the start of each file's sha256sum."
     )
 
 
@@ -333,9 +329,9 @@ def print_texts(question: TrustQuestion, out: Console) -> None:
 
 
 def not_trusted_lines(error: NotTrusted) -> list[str]:
-    """Lines that say why nothing was run, and what to do."""
+    """Explain why nothing was run, and what to do."""
     lines = [
-        f"Nothing was run: {reason}. Add it, which agrees to all in this run, if you know where the recording comes from."
+        f"Nothing was run: {reason}. Add it, which allows all code in this run, if you know where the recording comes from."
         for reason in error.reasons
     ]
     questions = error.questions
@@ -344,26 +340,26 @@ def not_trusted_lines(error: NotTrusted) -> list[str]:
     if can_ask():
         return [*lines, "Nothing was run: you agreed to none of it."]
     named: list[str] = []
-    for question in questions[:MOST_NAMED]:
+    for question in questions[:MAX_QUESTIONS]:
         named.append(f"    {question_text(question)}")
         named += [f"        with {module.name} ({module.hash})" for module in question.modules]
-    if len(questions) > MOST_NAMED:
-        named.append(f"    and {len(questions) - MOST_NAMED} more")
+    if len(questions) > MAX_QUESTIONS:
+        named.append(f"    and {len(questions) - MAX_QUESTIONS} more")
     return [
         *lines,
         "Nothing was run: the recordings were not made by this installation, and you have not agreed to run the code that they name:",
         *named,
-        "Read it. Then run the command in a terminal, where you are asked, and where show prints the text; or add --trust, which "
-        "agrees for this run; or name your own task file with --task.",
+        "Read the code. Then run the command in a terminal, where it asks you (and show prints the text); or add --trust, which "
+        "allows the code in this run; or give your own task file with --task.",
     ]
 
 
 def _modules_text(question: TrustQuestion) -> str:
     if question.recorded_text:
-        return "Beside it they hold what it may import:"
+        return "They also hold the modules that it may import:"
     if question.computed:
-        return "What it imports cannot be determined by reading it, so it may import everything beside it:"
-    return "It imports from beside it:"
+        return "Its imports cannot be determined by reading it, so it may import every module next to it:"
+    return "It imports these modules next to it:"
 
 
 def _file_mark(file: CodeFile) -> str:

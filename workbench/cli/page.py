@@ -35,9 +35,9 @@ from workbench.task.description import ShownPictures, TaskOptions
 from workbench.task.reference import TaskName, named_file
 
 _CLOSING_SECONDS = 1.4
-"""Seconds without a written episode after which closing is given up: a disk may hang."""
+"""Timeout for closing, restarted by each written episode: a disk may hang."""
 _Requests = queue.SimpleQueue[Callable[[], object] | int]
-"""What the command does next, or the exit code with which it ends."""
+"""What the command does next, or its exit code."""
 
 
 @loop_in_main
@@ -56,8 +56,8 @@ def open_in_terminal(
 
     Args:
         trust: run code that recordings name without asking.
-        editor: address of a line in the author's editor.
-        pictures: of the cameras, as the page shows them.
+        editor: URL template that opens a line in the author's editor.
+        pictures: how the page renders camera images.
     """
     gated_server = _start_server(at, "Workbench")
     if isinstance(gated_server, int):
@@ -71,7 +71,7 @@ def open_in_terminal(
     def on_event(event: Event) -> None:
         nonlocal shown
         print_event(event)
-        # A broken file can be fixed and saved; an env id that fails has nothing to wait for, and gets no page.
+        # A broken file can be fixed and saved; an env id that fails cannot, so it gets no page.
         if not waits_for_a_file and isinstance(event, TaskFailed) and not event.kept:
             requests.put(1)
         elif not shown and isinstance(event, Loaded):
@@ -99,9 +99,9 @@ def start_in_terminal(
     """Serve the page to choose a task from; returns (the exit code) only if the server cannot start.
 
     Args:
-        options: of the tasks that are opened from there.
-        trust: run code without asking, as `open_in_terminal`.
-        editor: as there.
+        options: options of the tasks that are opened from the page.
+        trust: run code without asking, as in `open_in_terminal`.
+        editor: as in `open_in_terminal`.
     """
     gated_server = _start_server(at, "Workbench")
     if isinstance(gated_server, int):
@@ -126,9 +126,9 @@ def review_in_terminal(
     """Serve the page of a folder of recordings; returns (the exit code) only if the server cannot start.
 
     Args:
-        worker, base: options of tasks that are opened from there.
+        worker, base: options of tasks that are opened from the page.
         trust: run code that recordings name without asking.
-        editor: address of a line in the author's editor.
+        editor: URL template that opens a line in the author's editor.
     """
     gated_server = _start_server(at, "Recordings")
     if isinstance(gated_server, int):
@@ -141,7 +141,7 @@ def review_in_terminal(
 
 
 def _start_server(at: ServerOptions, label: str) -> GatedServer | int:
-    """Start the server; returns it, or the exit code if it cannot start."""
+    """Start the server. Returns the server, or the exit code if it cannot start."""
     try:
         gated_server = open_server(at, label=label)
     except (ValueError, ServerError) as error:
@@ -155,7 +155,7 @@ def _start_server(at: ServerOptions, label: str) -> GatedServer | int:
 
 @dataclass(frozen=True)
 class _HowToOpen:
-    """Makes the sessions of this run."""
+    """Creates the sessions of this run."""
 
     recordings: Path
     worker: WorkerOptions
@@ -170,13 +170,13 @@ class _HowToOpen:
         kept: KeptWork | None = None,
         on_event: Callable[[Event], None] = print_event,
     ) -> Session:
-        """Open a session of a task that a person chose; the task is noted among the recent ones once it runs."""
+        """Open a session of a task that a person chose; adds the task to the recent ones once it runs."""
         noted: list[TaskOptions] = []
 
         def on_event_and_note(event: Event) -> None:
             on_event(event)
             if isinstance(event, Loaded):
-                # Not before, since the person waits for the task.
+                # Only now: it would delay the task, for which the person waits.
                 start_reading()
                 made = replace(event.options or options, seed=0)
                 if noted[-1:] != [made]:
@@ -207,7 +207,7 @@ class _HowToOpen:
 
 
 def _for_others(options: TaskOptions) -> TaskOptions:
-    """Options of one task for another, without its own keyword arguments."""
+    """Options without the keyword arguments, which are specific to one task."""
     kwargs = {name: value for name, value in options.env_kwargs.items() if name in HOW_IT_IS_RUN}
     return replace(options, env_kwargs=kwargs)
 
@@ -247,7 +247,7 @@ def _serve(
     if gated_server.options.token:
         app.renew_token = renew
     on_signal(signal.SIGUSR1, renew)
-    # Not SIGHUP, by which a closed terminal ends its processes.
+    # Not SIGHUP: it ends the processes of a closed terminal.
     for number in (signal.SIGINT, signal.SIGTERM):
         on_signal(number, partial(requests.put, 0))
     try:
@@ -263,12 +263,12 @@ def _serve(
 
 
 def _close(app: App, gated_server: GatedServer) -> None:
-    """Close all that is open. What takes longer than `_CLOSING_SECONDS` is left, unless episodes are written meanwhile."""
+    """Close everything. Gives up after `_CLOSING_SECONDS` in which no episode was written."""
     closing = BlockingPool("closing").begin(app.close)
     written = _episodes_written(app)
     while not futures.wait([closing], _CLOSING_SECONDS).done:
         if written == (written := _episodes_written(app)):
-            warn("closing takes too long; what was being recorded is recovered at the next start")
+            warn("closing timed out; unfinished recordings are recovered at the next start")
             break
     gated_server.close()
 
@@ -282,12 +282,12 @@ def _episodes_written(app: App) -> int:
 def _renew_token(gated_server: GatedServer) -> None:
     if gated_server.options.token:
         gated_server.renew_token()
-        print_text("  the token was renewed, and every page was closed; open the new address:")
+        print_text("  the token was renewed and every page was closed; open the new address:")
         print_addresses(gated_server.addresses())
 
 
 def _print_address(gated_server: GatedServer) -> None:
-    # Not through rich, which wraps the address in a narrow terminal.
+    # Not with rich: it wraps the address in a narrow terminal.
     if gated_server.options.socket is not None:
         print_text(f"  socket  {gated_server.options.socket}")
         print_text(f"  first   {gated_server.ssh_hint}   on the machine with the browser")
@@ -299,8 +299,8 @@ def _print_address(gated_server: GatedServer) -> None:
 
 
 def _exit(code: int) -> NoReturn:
-    """End the process; everything must be closed and written."""
-    # Without the interpreter's own shutdown, which takes a second after Ctrl-C, and several on a busy machine.
+    """End the process. Everything must be closed and written."""
+    # Skips the interpreter's shutdown, which takes a second after Ctrl-C, and several on a busy machine.
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

@@ -34,7 +34,7 @@ from workbench.cli.run_by import (
     items_of,
     print_part,
     run_by,
-    told_in_folder,
+    status_in_folder,
 )
 from workbench.envs.backends import unused_gpu_text
 from workbench.episodes.reader.reading import recover_confined
@@ -49,7 +49,8 @@ from workbench.rescore.recording_jobs import hidden_modules_text
 
 
 class RecordBar:
-    """The progress bar, and Ctrl-C: the first ends the recording after the current step; before it, or again, at once."""
+    """Progress bar that handles Ctrl-C: the first one stops after the current step; a second one, or one before the first
+    episode, stops at once."""
 
     def __init__(
         self,
@@ -61,11 +62,11 @@ class RecordBar:
     ) -> None:
         """
         Args:
-            total: episodes that are wanted, if it is known.
-            doing: what the bar says while episodes run.
-            first_seed: where actions are planned, of the first episode: a control step takes long then, so it is said at
-                which one each seed is.
-            named: the name of an episode by its number, where there is no first seed.
+            total: number of requested episodes, if known.
+            doing: text of the bar while episodes run.
+            first_seed: seed of the first episode if actions are planned: a control step takes long then, so the bar shows the
+                current step of each seed.
+            named: name of an episode by its number, if there is no first seed.
         """
         self._doing, self._first_seed, self._named = doing, first_seed, named
         self._bar, self._row = bar, bar.add_task("opening", total=total)
@@ -87,14 +88,14 @@ class RecordBar:
         if self.stop_requested or self._began is None:
             raise KeyboardInterrupt
         self.stop_requested = True
-        # A step may never end.
+        # A step may hang, so a second Ctrl-C stops at once.
         self.describe("stopping after this step; Ctrl-C again stops at once")
 
     def describe(self, text: str, kept: int | None = None) -> None:
         self._bar.update(self._row, description=text, completed=kept)
 
     def _say(self, line: str) -> None:
-        """Print a progress line where there is no terminal: a bar in a file or a pipe is drawn once, at the end,
+        """Print a progress line if there is no terminal: in a file or a pipe the bar is drawn only once, at the end,
         and a log would be silent for hours."""
         if not err.is_terminal:
             self._said = time.monotonic()
@@ -102,19 +103,19 @@ class RecordBar:
 
     def show(self, now: RecordProgress) -> None:
         if now.was_there:
-            # Else the time left would be told by how fast they were read.
+            # Without the reset, the remaining time would be estimated from the speed of reading finished episodes.
             self._bar.reset(self._row, total=self._total, completed=int(now.done))
             return
         self._began = self._began or time.monotonic()
         seconds = max(time.monotonic() - self._began, 1e-3)
         self._bar.update(self._row, completed=now.done)
         if not self.stop_requested:
-            rate = f"{rate_text(now.steps / seconds)} steps a second"
+            rate = f"{rate_text(now.steps / seconds)} steps per second"
             at = "" if self._first_seed is None else underway_text(now.by_seed(self._first_seed), now.limit)
             failed = sum(len(failure.numbers) for failure in now.failures)
             doing = f"{self._doing}, {at or rate}" + (f", {failed} failed" if failed else "")
             self.describe(doing)
-            if time.monotonic() - self._said > _SAY_EVERY:
+            if time.monotonic() - self._said > _LOG_SECONDS:
                 self._say(doing)
         if now.over is not None:
             number, kept = now.over
@@ -122,8 +123,8 @@ class RecordBar:
             self._say(f"{named}: {_ended_text(kept)}, {now.kept} of {self._total} kept")
 
 
-_SAY_EVERY = 30.0
-"""Seconds between two progress lines in a log."""
+_LOG_SECONDS = 30.0
+"""Interval between progress lines in a log."""
 
 
 def _ended_text(kept: Written | None) -> str:
@@ -133,7 +134,7 @@ def _ended_text(kept: Written | None) -> str:
 
 
 def _outcome_texts(kept: Written) -> tuple[str, ...]:
-    """Texts of the return and success, where the task has them."""
+    """Texts of return and success, if the task has them."""
     earned = "no reward" if kept.total_reward is None else f"return {kept.total_reward:.3f}"
     return (earned, *{None: (), True: ("success",), False: ("no success",)}[kept.success])
 
@@ -149,15 +150,15 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
         requested, _ = with_given_actions(what)
         if recovered := recover_confined(what.out):
             err.print(f"{_episodes(len(recovered))} that an earlier recording left half written: recovered")
-        # Before the task is opened: an import that fails for it would be told without its reason.
-        told = hidden_modules_text(what.task)
-        for notice in told:
+        # Before the task is opened: the error of a failed import would not name this cause.
+        hidden = hidden_modules_text(what.task)
+        for notice in hidden:
             warn(notice)
         if (left_alone := unused_gpu_text(what.options.backend)) is not None:
             warn(left_alone)
         if run.shard is not None and requested.successes is not None:
             raise ValueError(
-                "--shard divides episodes, and how many are needed for --successes shows only at the end: give --episodes"
+                "--shard divides episodes, but --successes does not fix their number: give --episodes"
             )
         most = requested.tries if requested.successes is not None else requested.episodes
         assert most is not None
@@ -169,7 +170,7 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
                 run, "record", -(-most // chunk), lambda: job_of_record(requested), is_recorded(what.out)
             ) as (executor, name),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
-            told_in_folder(
+            status_in_folder(
                 run, "record", what.task, None if what.upload else what.out, wanted, _named
             ) as status,
         ):
@@ -178,12 +179,12 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
                 recorded = record(
                     what,
                     record_bar.describe,
-                    status.beside(record_bar.show),
+                    status.with_status(record_bar.show),
                     lambda: record_bar.stop_requested,
                     print_finding,
                     executor,
                     name,
-                    lambda notice: None if notice in told else warn(notice),
+                    lambda notice: None if notice in hidden else warn(notice),
                 )
             record_bar.describe("recorded", len(recorded.written))
             status.end("stopped" if recorded.stopped else "done")
@@ -208,7 +209,7 @@ def _print_kept(requested: RecordOptions, before: set[Path]) -> None:
     if kept:
         folder = shlex.quote(str(requested.out))
         print_text(
-            f"{_episodes(kept)} that had finished before {'is' if kept == 1 else 'are'} kept: workbench review {folder}"
+            f"{_episodes(kept)} that had finished {'is' if kept == 1 else 'are'} kept: workbench review {folder}"
         )
 
 
@@ -237,7 +238,7 @@ def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
         return Exit.FAILED
     if requested.successes is not None and kept < requested.successes:
         wanted = "1 success was" if requested.successes == 1 else f"{requested.successes} successes were"
-        return refuse(f"{wanted} asked for; given up after {_episodes(recorded.tried)}")
+        return refuse(f"{wanted} requested; given up after {_episodes(recorded.tried)}")
     return 0
 
 

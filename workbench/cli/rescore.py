@@ -1,4 +1,4 @@
-"""Runs ``workbench rescore``: a progress bar, then a table of results."""
+"""Runs ``workbench rescore``: progress bar, then a table of results."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ from workbench.task.problem import TaskError
 from workbench.task.reference import RecordedTask, TaskName, named_file
 from workbench.trust.clearance import Clearances, NotCleared, NotTrusted
 
-_MOST_ALIKE = 30
-"""Maximum number of recordings at which unchanged ones are listed too."""
+_MAX_LISTED = 30
+"""Maximum number of recordings up to which unchanged ones are listed too."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ class RescoreOptions:
     places: tuple[Path, ...]
     """Files and folders."""
     task: str | None = None
-    """Reference of the task for all recordings, instead of the one that each names."""
+    """Reference of the task for all recordings, instead of the task that each recording names."""
     recorded_source: bool = False
     use_env_states: bool = False
     num_envs: int = 16
     base: TaskOptions = field(default_factory=TaskOptions)
-    """Backend and other options that are the same for all recordings."""
+    """Options that are the same for all recordings, such as the backend."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,14 @@ class RescoreOutput:
 
 @dataclass(frozen=True)
 class RescoreRequest:
-    """Options of a rescoring, with everything that its verdicts depend on."""
+    """Key of a rescoring: everything that its verdicts depend on."""
 
     recordings: int
     """Number of recordings."""
     recorded: str
     """Hash of the names and sizes of the recordings."""
     code: str
-    """Hash of the texts of the code that rescores them."""
+    """Hash of the source code that rescores them."""
     use_env_states: bool
     recorded_source: bool
     num_envs: int
@@ -108,21 +108,21 @@ def rescore_all(
     on_notice: Callable[[str], None] = lambda notice: None,
     run: JobArguments = ONE_WORKER,
 ) -> tuple[list[Verdict[Source]], tuple[str, ...]]:
-    """The verdicts in the order of the files, and notes about intended differences from the recording.
+    """Rescore; returns the verdicts in the order of the files, and notes about intended differences from the recording.
 
     Args:
-        on_progress: gets the rescored episodes, all episodes, and the control steps so far.
-        clearances: decides which code that recordings name may run; None asks no one.
-        on_notice: gets a sentence for each file in a task's folder that no import finds, before the task is opened.
-        run: where the work runs; the verdicts are the same everywhere.
+        on_progress: called with the number of rescored episodes, of all episodes, and of control steps so far.
+        clearances: decides which code that recordings name may run; None never asks.
+        on_notice: called before the task is opened, for each file in the task's folder that no import finds.
+        run: where the work runs; the verdicts do not depend on it.
 
     Raises:
-        NotTrusted: a recording names code that is not trusted and no one can be asked, or the answer to all was no.
+        NotTrusted: a recording names code that is not trusted, and asking is impossible or every answer was no.
         FileNotFoundError, UnreadableRecording: there is nothing to rescore.
-        TaskError: no task can be opened, or each raises; if some can, the verdicts of the others carry the error.
-        CannotEnterRecording: as TaskError, for a recorded text that cannot be opened.
-        PoolError: as `rescore_recordings`.
-        OSError, ValueError: as `run_by`.
+        TaskError: no task can be opened, or each raises; if only some do, their verdicts carry the error.
+        CannotEnterRecording: like TaskError, for recorded source code that cannot be opened.
+        PoolError: as `rescore_recordings` does.
+        OSError, ValueError: as `run_by` does.
     """
     files = [s for s in find_all_sources([place.absolute() for place in what.places]) if s.kind != "lerobot"]
     if not files:
@@ -146,7 +146,7 @@ def rescore_all(
         results = rescore_recordings(setup, executor, on_activity, on_progress, on_finding)
     place = {file.id: number for number, file in enumerate(files)}
     _require_success(groups, place, results)
-    # Only the numbers of a worker's verdict are used; its file is the local one.
+    # The path in a worker's verdict may be another machine's: replace it with the local file.
     found = [replace(result.verdict, of=files[result.place]) for result in results]
     return found, tuple(dict.fromkeys(group.note for group in groups if group.note))
 
@@ -202,7 +202,7 @@ def _request_of(
         elif isinstance(task, RecordedTask) and task.approved is not None:
             code += sorted(task.approved.values())
         else:
-            # By its text: the folder may be another one on each machine.
+            # Hash the text instead of the path: each machine may have another folder.
             code.append(str(task) if file is None or not file.is_file() else read_content(file).hash)
     return RescoreRequest(
         len(files),
@@ -222,7 +222,7 @@ def _sum(value: Any) -> str:
 def _require_success(
     groups: Sequence[RescoreGroup], place: Mapping[str, int], results: Sequence[RescoredRecording]
 ) -> None:
-    """Raise the error of the first group, if all failed: a folder holds recordings of many tasks, and one may be gone."""
+    """Raise the error of the first group if all groups failed; a single missing task must not end the others."""
     by_place = {result.place: result for result in results}
     first: RescoredRecording | None = None
     for group in groups:
@@ -238,7 +238,7 @@ def _require_success(
 
 
 def _cleared(groups: list[RescoreGroup], clearances: Clearances) -> list[TaskName | NotCleared]:
-    """Task to open for each group, decided before any of them runs: all or nothing where no one can be asked."""
+    """Task to open for each group, decided before any of them runs: all or nothing if asking is impossible."""
     cleared = clearances.clear_all([group.code for group in groups])
     not_cleared = [one for one in cleared if isinstance(one, NotCleared)]
     refused = [one.question for one in not_cleared if one.question is not None]
@@ -264,7 +264,7 @@ def rescore_in_terminal(what: RescoreOptions, output: RescoreOutput, trust: bool
 
 
 def _rescore(what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments) -> int:
-    """Rescore and print; returns the exit code. Raises as `rescore_all`, and OSError for a table."""
+    """Rescore and print; returns the exit code. Raises the errors of `rescore_all`, and OSError for a table."""
     here = CurrentFolder()  # a task may change it
     if (left_alone := unused_gpu_text(what.base.backend)) is not None:
         warn(left_alone)
@@ -311,15 +311,15 @@ def code_of(verdicts: Iterable[Verdict[Source]]) -> Exit:
 
 
 def write_tables(verdicts: list[Verdict[Source]], output: RescoreOutput) -> None:
-    """Write the files that are asked for. Raises OSError."""
+    """Write the requested files. Raises OSError."""
     for path, text in ((output.csv_file, verdict_text.as_csv), (output.json_file, verdict_text.as_json)):
         if path is not None:
-            # Names of files may not be UTF-8.
+            # A file name may contain bytes that are not UTF-8.
             replace_file(path, text(verdicts).encode(errors="backslashreplace"))
 
 
 def warn_of_verdicts(verdicts: list[Verdict[Source]], notes: Iterable[str]) -> None:
-    """Warn where the comparison has limits that the table does not show."""
+    """Warn of limits of the comparison that the table does not show."""
     for note in (*notes, *verdict_text.not_carried(verdicts)):
         warn(note)
     if verdict_text.count_drifted(verdicts):
@@ -329,14 +329,14 @@ def warn_of_verdicts(verdicts: list[Verdict[Source]], notes: Iterable[str]) -> N
 def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:
     """Print the table and a summary.
 
-    Names of recordings take 55 characters. If the rest does not fit, as in 80 columns, each name has its own line, unbroken
-    so that it can be copied.
+    Names of recordings take 55 characters. In a narrow terminal (80 columns), each name has its own unbroken line, so that
+    it can be copied.
     """
     table = Table(box=None, pad_edge=False)
     for name in ("episode", "seed", "steps", "return", "what changed", "drift"):
         table.add_column(name, justify="right" if name in ("seed", "steps") else "left", overflow="fold")
     shown = verdicts
-    if len(verdicts) > _MOST_ALIKE:
+    if len(verdicts) > _MAX_LISTED:
         shown = [one for one in verdicts if one.differs or one.others or one.drifted or one.why_not]
     for verdict in shown:
         table.add_row(*map(escape, _cells(verdict)), style=_style(verdict))
@@ -346,7 +346,7 @@ def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:
         for verdict in shown:
             _print_lines(verdict, out)
     if alike := len(verdicts) - len(shown):
-        out.print(f"{alike} that do not differ are not listed; --csv-file lists all", soft_wrap=True)
+        out.print(f"{alike} unchanged ones are not listed; --csv-file lists all", soft_wrap=True)
     out.print(escape(verdict_text.summary(verdicts)), soft_wrap=True)
 
 

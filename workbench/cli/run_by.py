@@ -1,4 +1,4 @@
-"""Where the work of a command runs: in this process, in others or on a cluster; and the file that keeps its results."""
+"""Chooses the executor of a command (this process, worker processes or a cluster) and its job file."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def exit_after(error: BaseException, kept: str = EPISODES_KEPT) -> int:
 
     Args:
         error: one of `JOB_ENDS`.
-        kept: what is kept after Ctrl-C.
+        kept: what was kept, for the message after Ctrl-C.
     """
     if isinstance(error, TaskError):
         print_problem(error.problem)
@@ -46,7 +46,7 @@ def exit_after(error: BaseException, kept: str = EPISODES_KEPT) -> int:
 
 
 def require_job(arguments: JobArguments) -> None:
-    """Raise ValueError, with a message that names the argument, for an invalid argument."""
+    """Raise ValueError for an invalid argument, with a message that names it."""
     if arguments.workers is not None and arguments.workers < 1:
         raise ValueError(f"--workers must be at least 1, not {arguments.workers}")
     for name, number, least in (
@@ -59,18 +59,18 @@ def require_job(arguments: JobArguments) -> None:
 
 
 def shard_of(arguments: JobArguments) -> Shard:
-    """Part of the job that is to be done. Raises ValueError."""
+    """Part of the job to run. Raises ValueError."""
     return Shard() if arguments.shard is None else parse_shard(arguments.shard)
 
 
 def items_of(arguments: JobArguments, count: int, chunk: int) -> int:
-    """Number of items in the part that is to be done, out of `count` items in chunks of size `chunk`."""
+    """Number of items in the part to run, out of `count` items in chunks of size `chunk`."""
     part = shard_of(arguments).part(-(-count // chunk))
     return min(part.stop * chunk, count) - min(part.start * chunk, count)
 
 
 def job_path(arguments: JobArguments, command: str) -> Path | None:
-    """Path of the job file; None if none is kept."""
+    """Path of the job file; None if there is none."""
     if arguments.job is not None or arguments.shard is None:
         return arguments.job
     shard = shard_of(arguments)
@@ -90,21 +90,21 @@ def run_by(
     job: Callable[[], JobKey],
     is_there: Callable[[Any], bool] = lambda result: True,
 ) -> Iterator[tuple[Executor, str]]:
-    """Executor of a command, and the name of the run (`episodes.RecordSetup.run`).
+    """Yield the executor of a command, and the name of the run (`episodes.RecordSetup.run`).
 
     Args:
-        chunks: of the whole job.
-        job: what the job file is for; called only if there is one.
-        is_there: as of `Kept`.
+        chunks: number of chunks of the whole job.
+        job: returns the key of the job file; called only if there is one.
+        is_there: as in `Kept`.
 
     Raises:
-        ValueError, OSError: as `JobFile`.
+        ValueError, OSError: as `JobFile` does.
     """
     shard, path = shard_of(arguments), job_path(arguments, command)
     mine = len(shard.part(chunks))
     if not mine:
-        told = f"part {shard} has nothing to do: the job has {chunks} batch{'' if chunks == 1 else 'es'}"
-        err.print(escape(told), soft_wrap=True)
+        notice = f"part {shard} has nothing to do: the job has {chunks} batch{'' if chunks == 1 else 'es'}"
+        err.print(escape(notice), soft_wrap=True)
     here = min(arguments.workers or len(os.sched_getaffinity(0)), mine)
     executor: Executor = ThisProcess() if here <= 1 else Processes(here, warn)
     if arguments.cluster is not None:
@@ -116,23 +116,23 @@ def run_by(
     file = JobFile(path, job())
     try:
         if file.count:
-            err.print(escape(f"going on after {file.count} results in {path}"), soft_wrap=True)
+            err.print(escape(f"resuming after {file.count} results in {path}"), soft_wrap=True)
         yield Kept(executor, file, shard, is_there), file.run
     finally:
         file.close()
 
 
-class ToldStatus:
-    """Writes the progress of a job into the folder that it records to: `told_in_folder`."""
+class StatusWriter:
+    """Writes the progress of a job into its folder of recordings; see `status_in_folder`."""
 
     def __init__(self, file: StatusFile | None, status: JobStatus, names: Callable[[int], str]) -> None:
         self._file, self._status, self._names = file, status, names
         self._began: float | None = None
         self._first = 0
-        """Number of episodes that were there when the job began."""
+        """Number of episodes that existed when the job began."""
         self._last: RecordProgress | None = None
 
-    def beside(self, show: Callable[[RecordProgress], None]) -> Callable[[RecordProgress], None]:
+    def with_status(self, show: Callable[[RecordProgress], None]) -> Callable[[RecordProgress], None]:
         """Progress callback that writes the status and also calls `show`."""
 
         def both(now: RecordProgress) -> None:
@@ -140,14 +140,14 @@ class ToldStatus:
             if self._began is None or now.was_there:
                 self._began, self._first = time.monotonic(), now.kept
             self._last = now
-            # It comes with every control step of every worker.
+            # Progress arrives with every control step of every worker: limit the writes.
             if self._file is not None and self._file.is_due():
                 self._write("running")
 
         return both
 
     def end(self, state: JobState) -> None:
-        """Write the final status; a job that was refused before its first episode has none."""
+        """Write the final status; a job that failed before its first episode has none."""
         if self._file is not None and (self._last is not None or state != "failed"):
             self._write(state)
 
@@ -167,43 +167,43 @@ class ToldStatus:
 
 
 @contextmanager
-def told_in_folder(
+def status_in_folder(
     arguments: JobArguments,
     command: str,
     task: str,
     out: Path | None,
     total: int,
     names: Callable[[int], str],
-) -> Iterator[ToldStatus]:
+) -> Iterator[StatusWriter]:
     """Write the progress of a job into its folder of recordings, for a page that shows it.
 
     Args:
-        out: None for no folder.
-        names: the name of an item.
+        out: folder of the recordings; None to write nothing.
+        names: returns the name of an item.
     """
     part = "" if arguments.shard is None else str(shard_of(arguments))
     file = None if out is None else StatusFile(out)
     status = JobStatus(command, task, 0, total, part=part)
     if file is not None:
         file.remove_old(status)
-    told = ToldStatus(file, status, names)
+    writer = StatusWriter(file, status, names)
     try:
-        yield told
+        yield writer
     except BaseException:
-        told.end("failed")
+        writer.end("failed")
         raise
 
 
 def print_part(arguments: JobArguments, command: str, stopped: bool) -> None:
-    """Print how a stopped job is resumed, and what to do with a part."""
+    """Print how to resume a stopped job, or how to merge a finished part."""
     path = job_path(arguments, command)
     if stopped:
         how = (
-            "give --job FILE to be able to go on after what is done"
+            "with --job FILE a stopped job can be resumed"
             if path is None
-            else "the same command goes on"
+            else "run the same command again to resume"
         )
         err.print(escape(how), soft_wrap=True)
     elif arguments.shard is not None:
-        text = f"Part {arguments.shard} is in {path}. Put all parts together with: workbench merge FILE ..."
+        text = f"Part {arguments.shard} is in {path}. Merge all parts with: workbench merge FILE ..."
         err.print(escape(text), soft_wrap=True)

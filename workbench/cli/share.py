@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# What makes files and pages is imported in the functions: `workbench view` must not wait for it.
+# The modules that make files and pages are imported in the functions: `workbench view` must not wait for them.
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ def share_in_terminal(
     sheet: bool,
     out: Path,
 ) -> int:
-    """Make films, pages and sheets of recordings; returns the exit code."""
+    """Make films, pages and sheets from recordings; returns the exit code."""
     from workbench.share.make import EVERY_CAMERA, MakeRequest
 
     def requests(sources: tuple[Source, ...]) -> list[MakeRequest]:
@@ -50,7 +50,7 @@ def share_in_terminal(
 
 
 def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptions) -> int:
-    """Make a LeRobot dataset of recordings; returns the exit code."""
+    """Export recordings to a LeRobot dataset; returns the exit code."""
     from workbench.share.make import MakeRequest
 
     return _make_all(files, lambda sources: [MakeRequest("lerobot", sources, folder, export=options)])
@@ -59,7 +59,7 @@ def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptio
 def demonstrations_in_terminal(
     files: Sequence[Path], file: Path, only_successes: bool, only_fitting: bool
 ) -> int:
-    """Make one file of ManiSkill's demonstrations of recordings; returns the exit code."""
+    """Export recordings to one file of ManiSkill demonstrations; returns the exit code."""
     from workbench.episodes.lerobot.export import ExportOptions
     from workbench.share.make import MakeRequest
 
@@ -114,7 +114,7 @@ def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]],
     for request, one in made:
         for why in (*one.damaged, *one.left_out, *one.incomplete):
             warn(why)
-        # From a dataset they were left out because that was asked for.
+        # A dataset leaves recordings out only on request (--only-fitting).
         fewer = fewer or bool(one.damaged) or (bool(one.left_out) and not request.is_dataset)
     return Exit.FAILED if fewer else Exit.REFUSED if refused else Exit.DONE
 
@@ -122,7 +122,7 @@ def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]],
 def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
     """Show recordings in rerun's viewer until the window is closed or Ctrl-C; returns the exit code.
 
-    In a window, or with `web` or without a screen in a page.
+    Uses a page instead of a window with `web`, or if there is no display.
     """
     from workbench.episodes.rerun.viewer import has_screen, open_window, resolve_recordings
 
@@ -159,7 +159,7 @@ def _in_page(files: Sequence[Path], host: str, port: int) -> int:
         print_text(f"  remote  {gated_server.ssh_hint}")
         print_text("  Ctrl-C ends it.")
         while True:
-            # In short sleeps: a signal that the kernel delivers to another thread does not wake this one.
+            # Short sleeps, because a signal that the kernel delivers to another thread does not wake this one.
             time.sleep(0.2)
     except KeyboardInterrupt:
         print_text("closing")

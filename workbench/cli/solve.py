@@ -1,4 +1,4 @@
-"""Runs ``workbench solve``: a progress bar, a table of the seeds, what they tell of the reward, and reports for other programs."""
+"""Runs ``workbench solve``: progress bar, table of the seeds, verdicts on the reward, and reports for other programs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from workbench.cli.run_by import (
     items_of,
     print_part,
     run_by,
-    told_in_folder,
+    status_in_folder,
 )
 from workbench.envs.gpu_rules import FailOn, fails
 from workbench.episodes.reader.reading import recover_confined
@@ -65,17 +65,17 @@ class SolveOutput:
     """Output in addition to the text."""
 
     json: bool = False
-    """Print JSON in place of the text."""
+    """Print JSON instead of text."""
     json_file: Path | None = None
     csv: bool = False
-    """Print CSV in place of the text."""
+    """Print CSV instead of text."""
     csv_file: Path | None = None
     junit: Path | None = None
     fail_on: FailOn = "stop"
     """Lowest degree of a broken rule that makes the exit code 1."""
 
     def fails(self, report: SolveReport) -> bool:
-        """Whether the exit code is 1: the reward breaks a rule of that degree, or no seed was solved."""
+        """Whether the exit code is 1: the reward breaks a rule of the degree `fail_on`, or no seed was solved."""
         if self.fail_on == "never":
             return False
         return not report.solved or any(self.fails_by(verdict) for verdict in report.verdicts)
@@ -109,7 +109,7 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
                 name,
             ),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
-            told_in_folder(
+            status_in_folder(
                 run, "solve", what.task, None if what.upload else what.out, count, named
             ) as status,
         ):
@@ -117,7 +117,7 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
                 report = solve(
                     what,
                     shown.describe,
-                    status.beside(shown.show),
+                    status.with_status(shown.show),
                     lambda: shown.stop_requested,
                     print_finding,
                     executor,
@@ -196,7 +196,7 @@ def _print_verdict(verdict: RewardVerdict) -> None:
 
 
 def write_reports(report: SolveReport, what: SolveOptions, output: SolveOutput) -> None:
-    """Write the files that were asked for. Raises OSError."""
+    """Write the requested files. Raises OSError."""
     for path, made in ((output.json_file, as_json), (output.csv_file, as_csv), (output.junit, as_junit)):
         if path is not None:
             replace_file(path, made(report, what, output).encode())
@@ -239,8 +239,8 @@ def as_csv(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
 
 
 def as_junit(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
-    """A test case for each rule of `planning.verdicts` that is broken, which fails as the command does, and one for each seed:
-    skipped where it was not solved, which is no fault of the task by itself."""
+    """JUnit XML with a test case for each broken rule of `planning.verdicts`, which fails if the command does, and one for
+    each seed, which is skipped if it was not solved: that alone is no fault of the task."""
     cases = [_case(what, f"seed {one.seed}", one.seconds) for one in report.seeds]
     for case, one in zip(cases, report.seeds, strict=True):
         if not one.solved_at:

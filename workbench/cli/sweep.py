@@ -1,4 +1,4 @@
-"""Runs ``workbench sweep``: a progress bar, a table of the points, and the results as files."""
+"""Runs ``workbench sweep``: progress bar, table of the points, and result files."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from workbench.cli.run_by import (
     print_part,
     run_by,
     shard_of,
-    told_in_folder,
+    status_in_folder,
 )
 from workbench.episodes.reader.reading import recover_confined
 from workbench.episodes.sweep_results import RESULTS, PointSummary, SweepResults, value_text, write_results
@@ -51,7 +51,7 @@ from workbench.machine.text import number_text
 from workbench.record.job_worker import Written
 from workbench.sweep.job import Point, Setting, SweepOptions, SweepReport, recordings_of, sweep
 
-_MOST_POINTS = 50
+_MAX_POINTS = 50
 """Maximum number of points that are printed."""
 _TERMS = "reward_terms/"
 
@@ -67,7 +67,7 @@ class SweepOutput:
 def parse_settings(given: Sequence[str]) -> tuple[Setting, ...]:
     """Parse the ``--set`` values of a command line. Raises ValueError with a message that names the argument."""
     if not given:
-        raise ValueError("--set takes what varies, as in --set reach_weight=0.5,1,2; repeatable")
+        raise ValueError("sweep needs a name and its values, as in --set reach_weight=0.5,1,2; repeatable")
     settings: list[Setting] = []
     for text in given:
         name, equals, values = text.partition("=")
@@ -78,15 +78,15 @@ def parse_settings(given: Sequence[str]) -> tuple[Setting, ...]:
         read = _values(values)
         told = [json.dumps(value, sort_keys=True) for value in read]
         if len({float(one) if _is_number(one) else one for one in told}) < len(told):
-            raise ValueError(f"--set {text}: a value is there twice")
+            raise ValueError(f"--set {text}: a value is given twice")
         settings.append(Setting(name, tuple(read)))
     return tuple(settings)
 
 
 def _values(text: str) -> list[Any]:
-    """Values of a list: each in JSON, else as text."""
+    """Parse comma-separated values: each as JSON, else as text."""
     try:
-        # Lists and texts in quotes have commas of their own.
+        # As one JSON list, since nested lists and quoted texts contain commas.
         values = json.loads(f"[{text}]", parse_constant=_no_constant)
     except (ValueError, RecursionError):
         values = [_value(one.strip()) for one in text.split(",")]
@@ -143,13 +143,13 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
                 name,
             ),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
-            told_in_folder(run, "sweep", what.task, what.out, total, named) as status,
+            status_in_folder(run, "sweep", what.task, what.out, total, named) as status,
         ):
             with RecordBar(bar, total, "sweeping", named=named) as shown:
                 report = sweep(
                     what,
                     shown.describe,
-                    status.beside(shown.show),
+                    status.with_status(shown.show),
                     lambda: shown.stop_requested,
                     print_finding,
                     executor,
@@ -162,7 +162,7 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
         return exit_after(error)
     try:
         with here.again():
-            # What a part has is in its job file; the parts would write over each other's table.
+            # A part keeps its results in its job file: parts would overwrite each other's table.
             if run.shard is None:
                 keep_results(what, report.results)
             write_reports(report.results, output)
@@ -224,14 +224,14 @@ def print_points(results: SweepResults) -> None:
     """Print a row for each point."""
     summaries = results.summaries()
     terms = list(dict.fromkeys(name for one in summaries for name in one.means))
-    # What is added up to the reward, where the task tells it; else all that it tells.
+    # The terms that sum to the reward if the task reports them, else all its terms.
     terms = [name for name in terms if name.startswith(_TERMS)] or terms
-    cells = [_cells(one, terms) for one in summaries[:_MOST_POINTS]]
+    cells = [_cells(one, terms) for one in summaries[:_MAX_POINTS]]
     heads = [*results.names, "success (95 %)", "at the end", "return"]
     heads = [*heads, *(name.removeprefix(_TERMS) for name in terms)]
     widths = [max(map(len, column)) + 2 for column in zip(heads, *(row for _, row in cells), strict=True)]
     first, fit = len(heads) - len(terms), len(heads)
-    # A table that is broken inside its words cannot be read.
+    # Drop columns that do not fit: a table wrapped within words is unreadable.
     while fit > first and sum(widths[:fit]) > out.width:
         fit -= 1
     table = Table(box=None, pad_edge=False)
@@ -243,17 +243,15 @@ def print_points(results: SweepResults) -> None:
     for style, row in cells:
         table.add_row(*map(escape, row[:fit]), style=style)
     out.print(table)
-    if len(summaries) > _MOST_POINTS:
-        print_text(f"... and {len(summaries) - _MOST_POINTS} more points")
-    print_text(
-        "success: at any step, and the interval that holds the rate of all seeds with 95 %; return and terms: means"
-    )
+    if len(summaries) > _MAX_POINTS:
+        print_text(f"... and {len(summaries) - _MAX_POINTS} more points")
+    print_text("success: at any step, with the 95 % confidence interval of the rate; return and terms: means")
     if fit < len(heads):
         print_text(f"More means are in {RESULTS}: {', '.join(heads[fit:])}")
 
 
 def _cells(one: PointSummary, terms: Sequence[str]) -> tuple[str, list[str]]:
-    """Style and texts of a row."""
+    """Returns (style, texts) of a row."""
     values = [value_text(text) for text in one.values.values()]
     if not one.episodes:
         return "yellow", [*values, f"{one.failed} failed" if one.failed else "-", *["-"] * (2 + len(terms))]
@@ -273,7 +271,7 @@ def _cells(one: PointSummary, terms: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def write_reports(results: SweepResults, output: SweepOutput) -> None:
-    """Write the files that were asked for. Raises OSError."""
+    """Write the requested files. Raises OSError."""
     if output.json_file is not None:
         replace_file(output.json_file, as_json(results).encode())
     if output.csv_file is not None:

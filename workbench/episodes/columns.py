@@ -133,13 +133,13 @@ def _column(parts: Sequence[NDArray | int]) -> NDArray:
 
 TEXT = "entry"
 """Kind of a journal entry that holds a text."""
-MOST_BYTES = 64 << 10
+MAX_TEXT_BYTES = 64 << 10
 """Limit of one episode's texts, in bytes."""
-MOST_LINES = MOST_BYTES
+MAX_TEXT_LINES = MAX_TEXT_BYTES
 """A line has at least a byte; a recording with more was not written by the workbench."""
 CUT_MESSAGE = "not recorded from here on: it changes too often"
 
-PageConnection = tuple[int, bytes]
+TextLine = tuple[int, bytes]
 """First state of a text, and its value in the journal. A plain pair: a reader of rows must not import the journal's
 module, since Arrow would start a thread in the process that forks."""
 
@@ -162,7 +162,7 @@ class TextWriter:
 
     def __init__(self) -> None:
         self._last: dict[str, TextEntry] = {}
-        self._left = MOST_BYTES
+        self._left = MAX_TEXT_BYTES
         self._cut: set[str] = set()
 
     @property
@@ -170,7 +170,7 @@ class TextWriter:
         """Whether the previous state had no texts."""
         return not self._last
 
-    def changes(self, state: int, others: Mapping[str, OtherEntry]) -> list[PageConnection]:
+    def changes(self, state: int, others: Mapping[str, OtherEntry]) -> list[TextLine]:
         """Lines for the entries that differ from the previous state; `others` as in an `EpisodeRow`."""
         if not others and not self._last:
             return []
@@ -179,7 +179,7 @@ class TextWriter:
             for name, entry in others.items()
             if entry.numbers is None
         }
-        found: list[PageConnection] = []
+        found: list[TextLine] = []
         for name, entry in now.items():
             if name in self._cut or self._last.get(name) == entry:
                 continue
@@ -196,11 +196,11 @@ class TextWriter:
         return found
 
 
-def _line(state: int, name: str, entry: TextEntry | None) -> PageConnection:
+def _line(state: int, name: str, entry: TextEntry | None) -> TextLine:
     return state, json.dumps([name, None if entry is None else astuple(entry)]).encode()
 
 
-def text_tracks(lines: Sequence[PageConnection]) -> dict[str, TextTrack]:
+def text_tracks(lines: Sequence[TextLine]) -> dict[str, TextTrack]:
     """The tracks of an episode whose journal has these lines."""
     found: dict[str, list[tuple[int, TextEntry | None]]] = {}
     for state, value in lines:

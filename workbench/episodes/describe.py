@@ -18,7 +18,7 @@ from workbench.episodes.encoded_pictures import small_jpeg
 from workbench.episodes.episode import Episode
 from workbench.episodes.seal import seal
 
-THUMBNAIL_WIDTH = 160
+THUMBNAIL_PIXELS = 160
 
 
 def describe(episode: Episode) -> Description:
@@ -85,7 +85,7 @@ def thumbnail(picture: bytes | None) -> str | None:
     if picture is None:
         return None
     with Image.open(io.BytesIO(picture)) as image:
-        return base64.b64encode(small_jpeg(image, THUMBNAIL_WIDTH)).decode()
+        return base64.b64encode(small_jpeg(image, THUMBNAIL_PIXELS)).decode()
 
 
 def _columns(columns: dict[str, NDArray]) -> dict[str, ColumnType]:

@@ -20,8 +20,8 @@ from workbench.envs.camera_data import CameraInfo, CameraKind, MovedCamera, Pict
 from workbench.envs.scene.shapes import BodyKind
 from workbench.episodes.columns import TextTrack
 from workbench.episodes.episode import (
-    DEEPEST,
-    MOST_BODIES,
+    MAX_BODIES,
+    MAX_DEPTH,
     NO_SEED,
     ActedBy,
     Entries,
@@ -45,11 +45,11 @@ from workbench.machine.files import (
 
 FORMAT = 2
 """Since 2 the ``.json`` ends with a checksum of itself (`with_checksum`)."""
-MOST_BYTES = 64 << 20
+MAX_BYTES = 64 << 20
 """ManiSkill's ``.json`` of 100,000 episodes has 40 MB."""
-_BLOCK = 1 << 20
+_BLOCK_BYTES = 1 << 20
 _ESCAPED_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
-MOST_PARTS = 40
+MAX_PATH_PARTS = 40
 """Parts of a recorded path that are tried: the path comes from an untrusted file."""
 
 T = TypeVar("T")
@@ -94,7 +94,7 @@ class CameraJson(Struct, frozen=True):
         return CameraInfo(self.name, self.kind, *size, *numbers, intrinsic, **of)
 
 
-Bodies = Meta(max_length=MOST_BODIES)
+Bodies = Meta(max_length=MAX_BODIES)
 
 
 class SceneJson(Struct, frozen=True):
@@ -119,7 +119,7 @@ class SealJson(Struct, frozen=True):
     place: str
 
 
-MOST_SEGMENTS = 1_000_000
+MAX_SEGMENTS = 1_000_000
 """Ids of a segmentation."""
 
 
@@ -167,7 +167,7 @@ class Description(Struct, frozen=True, kw_only=True):
     fail_once: bool | None
     action_names: Annotated[tuple[Name, ...], Entries]
     cameras: Annotated[list[CameraJson], Entries]
-    segmentation: Annotated[dict[SmallInt, Name], Meta(max_length=MOST_SEGMENTS)]
+    segmentation: Annotated[dict[SmallInt, Name], Meta(max_length=MAX_SEGMENTS)]
     scene: SceneJson
     evaluate: Columns
     batch: Columns = {}
@@ -284,7 +284,7 @@ def read_document(path: Path) -> Document:
         OSError: it cannot be read.
         WrongDocument: as `read_json`, or it was changed since the workbench wrote it.
     """
-    content = _read_content(path, MOST_BYTES)
+    content = _read_content(path, MAX_BYTES)
     data = parse_json(content)
     document = Document(data if isinstance(data, dict) else {})
     _require_unchanged(content, document)
@@ -297,7 +297,7 @@ def description_in(text: str, source: Mapping[str, str]) -> Description:
     return _typed({**data, "source": dict(source)} if isinstance(data, dict) else data, Description, "")
 
 
-def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
+def read_json(path: Path, most_bytes: int = MAX_BYTES) -> Any:
     """The content of a ``.json``.
 
     Raises:
@@ -375,7 +375,7 @@ def _plain(value: object) -> Any:
 def _typed(data: object, kind: type[T], place: str) -> T:
     if not is_shallow(data):
         raise WrongDocument(
-            f"is not as a recording is described: lists and objects nested deeper than {DEEPEST} at $.{place}"
+            f"is not as a recording is described: lists and objects nested deeper than {MAX_DEPTH} at $.{place}"
         )
     try:
         return msgspec.convert(data, kind, str_keys=True)
@@ -399,7 +399,7 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     if os.path.isfile(there := folder / source_path):
         return os.fspath(there.resolve())
     parts = [part for part in Path(source_path).parts if part not in ("..", os.sep)]
-    if not source_path.endswith(".py") or len(parts) > MOST_PARTS:
+    if not source_path.endswith(".py") or len(parts) > MAX_PATH_PARTS:
         return None
     for place in (Path.cwd(), *folder.resolve().parents):
         for begin in range(len(parts)):
@@ -448,7 +448,7 @@ def checksum(path: Path) -> Checksum:
     hashed = xxhash.xxh3_128()
     size = 0
     with open_regular_file(path) as file:
-        while block := file.read(_BLOCK):
+        while block := file.read(_BLOCK_BYTES):
             hashed.update(block)
             size += len(block)
     return Checksum(size, hashed.hexdigest())
@@ -483,7 +483,7 @@ def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str
 # after each episode), in `NAME.notes`, which `mv NAME.*` moves along.
 
 
-MOST_NOTES_BYTES = 16 << 20
+MAX_NOTES_BYTES = 16 << 20
 """Limit in bytes of a ``.notes``, and of the workbench's own ``.json`` files, which hold the task's source and one
 small picture."""
 _NOTES = "workbench_notes"
@@ -521,7 +521,7 @@ def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note:
 def _notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
     """Raises OSError, ValueError."""
     try:
-        entries = read_json(path, MOST_NOTES_BYTES)[_NOTES]
+        entries = read_json(path, MAX_NOTES_BYTES)[_NOTES]
         return {
             str(name): (clean_tags(entry.get("tags")), clean_note(entry.get("note")))
             for name, entry in entries.items()
@@ -537,7 +537,7 @@ def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None
         OSError: it cannot be read or written.
         ValueError: it is not a workbench recording, or was changed: sealing that would hide it. The message ends a sentence.
     """
-    content = _read_content(path, MOST_NOTES_BYTES)
+    content = _read_content(path, MAX_NOTES_BYTES)
     described = parse_json(content)
     if not isinstance(described, dict) or not Document(described).is_ours:
         raise ValueError("is not a recording of the workbench")

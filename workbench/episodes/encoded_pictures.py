@@ -19,12 +19,12 @@ MODALITIES: tuple[Modality, ...] = ("rgb", "depth", "segmentation")
 
 JPEG_QUALITY = 85
 MILLIMETRES_PER_METRE = 1000.0
-MOST_PIXELS = 1 << 24
+MAX_PIXELS = 1 << 24
 """Limit of one picture: 4096 x 4096 pixels. A PNG of 100 kB can claim a hundred times as many."""
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREYSCALE = 0
 _UP = 2
-_LEVEL = 3
+_ZLIB_LEVEL = 3
 """Compression level of zlib. Level 1 makes no smaller files and takes longer on smooth depth; the default 6 takes three
 times as long (measured)."""
 
@@ -100,10 +100,10 @@ def decode(modality: Modality, blob: bytes) -> NDArray:
 
 @contextlib.contextmanager
 def open_picture(blob: bytes) -> Iterator[Image.Image]:
-    """Open a JPEG, PNG or WebP of at most `MOST_PIXELS`. Raises OSError when it is invalid, also while the block decodes it."""
+    """Open a JPEG, PNG or WebP of at most `MAX_PIXELS`. Raises OSError when it is invalid, also while the block decodes it."""
     try:
         with Image.open(io.BytesIO(blob), formats=("JPEG", "PNG", "WEBP")) as image:
-            if image.width * image.height > MOST_PIXELS:
+            if image.width * image.height > MAX_PIXELS:
                 raise OSError(f"it claims {image.width} x {image.height} pixels")
             yield image
     except UnidentifiedImageError as error:
@@ -167,7 +167,7 @@ def encode_png16(pixels: NDArray[np.uint16]) -> bytes:
     header = struct.pack(">IIBBBBB", width, height, 16, _GREYSCALE, 0, 0, 0)
     parts = (
         _chunk(b"IHDR", header),
-        _chunk(b"IDAT", zlib.compress(filtered.data, _LEVEL)),
+        _chunk(b"IDAT", zlib.compress(filtered.data, _ZLIB_LEVEL)),
         _chunk(b"IEND", b""),
     )
     return _SIGNATURE + b"".join(parts)

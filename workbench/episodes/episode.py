@@ -26,20 +26,20 @@ PathText = Annotated[str, Meta(max_length=4096)]
 SmallInt = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Seconds = Annotated[float, Meta(ge=1e-4, le=1e3)]
 """Duration of a control step; the frame rates of films are in the same range."""
-MOST_ENTRIES = 10_000
+MAX_ENTRIES = 10_000
 """Limit of every list in a recording: entries of ``evaluate()``, files, actions."""
-MOST_BODIES = 20_000
+MAX_BODIES = 20_000
 """Limit of the bodies of a scene; a reader takes some seconds for so many."""
-DEEPEST = 32
+MAX_DEPTH = 32
 """Nesting of keywords and options."""
-Entries = Meta(max_length=MOST_ENTRIES)
+Entries = Meta(max_length=MAX_ENTRIES)
 ActedBy = Annotated[tuple[tuple[SmallInt, PathText], ...], Entries]
 
 
 def is_shallow(value: object) -> bool:
-    """Whether lists and dicts in `value` are nested at most `DEEPEST` deep: Python's ``repr`` ends at some hundreds."""
+    """Whether lists and dicts in `value` are nested at most `MAX_DEPTH` deep: Python's ``repr`` ends at some hundreds."""
     level = [value]
-    for _ in range(DEEPEST):
+    for _ in range(MAX_DEPTH):
         inside = (
             one.values() if isinstance(one, dict) else one for one in level if isinstance(one, (dict, list))
         )

@@ -20,16 +20,16 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from transforms3d.quaternions import quat2mat
 
-from workbench.episodes.encoded_pictures import MOST_PIXELS, encode_jpeg
+from workbench.episodes.encoded_pictures import MAX_PIXELS, encode_jpeg
 from workbench.episodes.episode import CameraTrack, Episode, camera_names, movable_bounds
 from workbench.episodes.row import UnreadableRecording
 from workbench.machine.files import new_file, open_regular_file
 from workbench.pictures.camera_conventions import quaternion_from_axes, quaternion_of, triple, upright
 
-MOST_FRAMES = 100_000
-MOST_BYTES = 1 << 29
+MAX_FRAMES = 100_000
+MAX_BYTES = 1 << 29
 """Limit of all encoded frames of one part, in bytes."""
-MOST_SECONDS = 60.0
+FFMPEG_TIMEOUT_SECONDS = 60.0
 """Time limit of ffmpeg for one part."""
 
 
@@ -176,7 +176,7 @@ class FilmPart:
 
     def __init__(self, film: Path, begin: float, count: int, fps: float) -> None:
         """`begin` in seconds, `count` in frames. Raises ValueError when they are out of range."""
-        if not 0 <= count <= MOST_FRAMES or not 0 <= begin < 1e9 or not 0 < fps < 1e6:
+        if not 0 <= count <= MAX_FRAMES or not 0 <= begin < 1e9 or not 0 < fps < 1e6:
             raise ValueError(f"it claims {count} frames from {begin} s on, {fps} a second, of {film.name}")
         self._film, self._begin, self._count, self._fps = film, begin, count, fps
         self._blobs: list[bytes] | None = None
@@ -197,8 +197,8 @@ class FilmPart:
             for frame in film_frames(self._film, max(0.0, self._begin - 0.5 / self._fps), self._count):
                 blobs.append(encode_jpeg(frame))
                 size += len(blobs[-1])
-                if size > MOST_BYTES:
-                    raise OSError(f"its frames have more than {MOST_BYTES >> 20} MB")
+                if size > MAX_BYTES:
+                    raise OSError(f"its frames have more than {MAX_BYTES >> 20} MB")
         except (OSError, ValueError) as error:
             raise UnreadableRecording(f"The film {self._film.name} cannot be read: {error}") from error
         if len(blobs) < self._count:
@@ -221,17 +221,19 @@ def film_frames(film: Path, begin: float, count: int) -> Iterator[NDArray[np.uin
     open_regular_file(film).close()
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-max_alloc", str(1 << 29)]
     # "mov" is MP4's demuxer: it refuses a playlist that is named .mp4.
-    command += ["-protocol_whitelist", "file", "-f", "mov", "-threads", "1", "-max_pixels", str(MOST_PIXELS)]
+    command += ["-protocol_whitelist", "file", "-f", "mov", "-threads", "1", "-max_pixels", str(MAX_PIXELS)]
     command += ["-ss", f"{begin:.6f}", "-i", f"file:{film}", "-map", "0:v:0", "-frames:v", str(count)]
     command += ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
     # In memory: confined readers may not write files.
     with os.fdopen(os.memfd_create("ffmpeg"), "w+b") as stderr:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr)
-        late = threading.Timer(MOST_SECONDS, process.kill)
+        late = threading.Timer(FFMPEG_TIMEOUT_SECONDS, process.kill)
         late.start()
         try:
             assert isinstance(process.stdout, io.BufferedReader)
-            resource.prlimit(process.pid, resource.RLIMIT_CPU, (int(MOST_SECONDS), int(MOST_SECONDS)))
+            resource.prlimit(
+                process.pid, resource.RLIMIT_CPU, (int(FFMPEG_TIMEOUT_SECONDS), int(FFMPEG_TIMEOUT_SECONDS))
+            )
             while (frame := _read_ppm(process.stdout)) is not None:
                 yield frame
             if (status := process.wait()) != 0:
@@ -252,7 +254,7 @@ def _read_ppm(stream: io.BufferedReader) -> NDArray[np.uint8] | None:
     if magic != b"P6\n" or len(size) != 2 or stream.readline(16) != b"255\n":
         raise OSError("ffmpeg's output is not a PPM picture")
     width, height = int(size[0]), int(size[1])
-    if not 0 < width * height <= MOST_PIXELS:
+    if not 0 < width * height <= MAX_PIXELS:
         raise OSError(f"it has pictures of {width} x {height}")
     content = stream.read(3 * width * height)
     if len(content) < 3 * width * height:
@@ -262,7 +264,7 @@ def _read_ppm(stream: io.BufferedReader) -> NDArray[np.uint8] | None:
 
 def _failure(stderr: BinaryIO, status: int) -> str:
     if status < 0:
-        return f"ffmpeg was ended by signal {-status}, after {MOST_SECONDS:.0f} s at most"
+        return f"ffmpeg was ended by signal {-status}, after {FFMPEG_TIMEOUT_SECONDS:.0f} s at most"
     stderr.seek(0)
     lines = stderr.read(4096).decode(errors="replace").strip().splitlines()
     return lines[-1][:200] if lines else f"ffmpeg ended with {status}"
@@ -270,10 +272,10 @@ def _failure(stderr: BinaryIO, status: int) -> str:
 
 # --- pictures of an episode's cameras ---------------------------------------------------------------
 
-SMALLEST_SIDE = 256
+MIN_SIDE_PIXELS = 256
 """Pixels. Policies often see 128 pixels, which players blur; pixels are repeated up to this size."""
 COLUMNS = 8
-CELL = 176
+CELL_PIXELS = 176
 """Pixels of a picture's longer side."""
 GAP, HEAD, CAPTION = 8, 34, 18
 PAPER, INK, PALE = (255, 255, 255), (33, 37, 41), (110, 118, 126)
@@ -317,8 +319,8 @@ def frames(episode: Episode, camera: CameraTrack) -> Iterator[NDArray[np.uint8]]
 
 
 def enlarged(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """`picture` with every pixel repeated until its smaller side has `SMALLEST_SIDE` pixels or more."""
-    times = -(-SMALLEST_SIDE // min(picture.shape[:2]))
+    """`picture` with every pixel repeated until its smaller side has `MIN_SIDE_PIXELS` pixels or more."""
+    times = -(-MIN_SIDE_PIXELS // min(picture.shape[:2]))
     return picture if times <= 1 else picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
@@ -340,11 +342,11 @@ def contact_sheet(episode: Episode, columns: int = COLUMNS) -> Image.Image:
     heights = []
     for camera in cameras.values():
         width, height = camera.info.width, camera.info.height
-        heights.append(max(1, round(height * CELL / max(width, height))))
+        heights.append(max(1, round(height * CELL_PIXELS / max(width, height))))
     sheet = Image.new(
         "RGB",
         (
-            GAP + len(states) * (CELL + GAP),
+            GAP + len(states) * (CELL_PIXELS + GAP),
             HEAD + sum(CAPTION + height + CAPTION + GAP for height in heights),
         ),
         PAPER,
@@ -358,7 +360,7 @@ def contact_sheet(episode: Episode, columns: int = COLUMNS) -> Image.Image:
         top += CAPTION
         assert camera.rgb is not None
         for column, state in enumerate(states):
-            left = GAP + column * (CELL + GAP)
+            left = GAP + column * (CELL_PIXELS + GAP)
             picture = Image.fromarray(camera.rgb[picture_index(camera, state)])
             width = max(1, round(picture.width * height / picture.height))
             # Small pictures keep their pixels; large ones are averaged.
@@ -404,9 +406,9 @@ def _title(episode: Episode) -> str:
 
 # --- frames of the 3-D view ------------------------------------------------------------------------
 
-SIZE = (960, 720)
+SIZE_PIXELS = (960, 720)
 """Width and height in pixels."""
-FOVY = 0.75
+FOVY_RADIANS = 0.75
 """Radians, vertical; as in the page's 3-D view."""
 FROM_THE_FRONT = np.array([1.0, 0.55, 0.75])
 """Direction to the camera: ManiSkill's robots face +x."""
@@ -419,7 +421,7 @@ class FilmEye:
     position: tuple[float, float, float]
     look_at: tuple[float, float, float]
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    fovy: float = FOVY
+    fovy: float = FOVY_RADIANS
 
     @property
     def pose(self) -> NDArray[np.float32]:
@@ -445,7 +447,7 @@ def default_eye(episode: Episode) -> FilmEye:
     # The box holds origins of bodies, not their outlines: leave a margin.
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.25) * 1.1
     direction = FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
-    return FilmEye(triple(middle + direction * radius / np.sin(FOVY / 2)), triple(middle))
+    return FilmEye(triple(middle + direction * radius / np.sin(FOVY_RADIANS / 2)), triple(middle))
 
 
 def scene_frames(episode: Episode, eye: FilmEye | None = None) -> Iterator[NDArray[np.uint8]]:
@@ -464,6 +466,6 @@ def scene_frames(episode: Episode, eye: FilmEye | None = None) -> Iterator[NDArr
     eye = eye or default_eye(episode)
     # Read from a file, the scene holds this env alone as env 0 of 1; in memory it may hold the batch.
     env = 0 if episode.geometry.num_envs == 1 else episode.info.env_index
-    scene = RecordedScene(episode.geometry, env, *SIZE, eye.fovy)
+    scene = RecordedScene(episode.geometry, env, *SIZE_PIXELS, eye.fovy)
     for poses in episode.poses:
         yield scene.picture(poses, eye.pose)

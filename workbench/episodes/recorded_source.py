@@ -63,7 +63,7 @@ def recorded_version(info: EpisodeInfo) -> str:
     return source_hash(texts, Path())
 
 
-MOST_NAMED = 4
+MAX_NAMES = 4
 
 
 def changed_since(
@@ -92,8 +92,8 @@ def changed_since(
     except (SyntaxError, ValueError, RecursionError):
         return ""
     names = list(dict.fromkeys(_symbol_text(path, name, new_main) for path, name in changed))
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return ", ".join(names[:MOST_NAMED]) + more
+    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+    return ", ".join(names[:MAX_NAMES]) + more
 
 
 def changed_on_disk(info: EpisodeInfo) -> str:

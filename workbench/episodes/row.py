@@ -46,9 +46,9 @@ class Source:
 
 
 RecordingKind = Literal["workbench", "maniskill", "rrd only", "lerobot"]
-LONGEST_TAG = 40
-LONGEST_NOTE = 1000
-MOST_TAGS = 20
+MAX_TAG_CHARACTERS = 40
+MAX_NOTE_CHARACTERS = 1000
+MAX_TAGS = 20
 
 
 @dataclass(frozen=True)
@@ -217,12 +217,12 @@ def unix_seconds(value: object) -> float | None:
 
 
 def clean_tags(values: object) -> tuple[str, ...]:
-    """At most `MOST_TAGS` distinct tags, in order; commas separate tags when typed, so they become spaces."""
+    """At most `MAX_TAGS` distinct tags, in order; commas separate tags when typed, so they become spaces."""
     if not isinstance(values, Iterable) or isinstance(values, (str, bytes, Mapping)):
         return ()
-    tags = (clean_text(value, LONGEST_TAG).replace(",", " ").strip() for value in values)
-    return tuple(dict.fromkeys(tag for tag in tags if tag))[:MOST_TAGS]
+    tags = (clean_text(value, MAX_TAG_CHARACTERS).replace(",", " ").strip() for value in values)
+    return tuple(dict.fromkeys(tag for tag in tags if tag))[:MAX_TAGS]
 
 
 def clean_note(value: object) -> str:
-    return clean_text(value, LONGEST_NOTE)
+    return clean_text(value, MAX_NOTE_CHARACTERS)

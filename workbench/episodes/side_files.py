@@ -13,12 +13,12 @@ from pathlib import Path, PurePosixPath
 from workbench.machine.files import NotARegularFile, open_regular_file, read_regular_file
 from workbench.machine.parse_python import parse_python
 
-MOST_FILES = 200
-MOST_LISTED_FILES = 5000
+MAX_FILES = 200
+MAX_LISTED_FILES = 5000
 """Files below the task's folder that are considered: it may be a home folder."""
-NAMING = (".urdf", ".xml", ".srdf", ".obj", ".mtl", ".gltf", ".dae")
+NAMING_SUFFIXES = (".urdf", ".xml", ".srdf", ".obj", ".mtl", ".gltf", ".dae")
 """Suffixes of files that name other files."""
-NAMING_BYTES = 4_000_000
+MAX_NAMING_BYTES = 4_000_000
 _NAMED = re.compile(r"[\w./ -]+\.\w{2,5}")
 _INSTALLED = {"site-packages", "dist-packages"}
 _hashes: dict[tuple[str, int, int], str] = {}
@@ -43,7 +43,7 @@ def side_files(task: str | None, source: Mapping[str, str]) -> dict[str, str]:
     below = {path.relative_to(folder).as_posix(): path for path in _files_below(folder)}
     found: dict[str, str] = {}
     pending = sorted(_named(below, _strings(source.values())))
-    while pending and len(found) < MOST_FILES:
+    while pending and len(found) < MAX_FILES:
         name = pending.pop(0)
         if name in found:
             continue
@@ -120,7 +120,7 @@ def _files_below(folder: Path) -> Iterator[Path]:
         recordings = {name[:-4] for name in names if name.endswith(".rrd")}
         for name in sorted(names):
             looked_at += 1
-            if looked_at > MOST_LISTED_FILES:
+            if looked_at > MAX_LISTED_FILES:
                 return
             stem, suffix = os.path.splitext(name)
             if not name.startswith(".") and suffix not in (".py", ".pyc", ".rrd") and stem not in recordings:
@@ -145,10 +145,10 @@ def _strings(texts: Iterable[str]) -> set[str]:
 
 
 def _names_in(path: Path) -> set[str]:
-    if path.suffix.lower() not in NAMING or path.stat().st_size > NAMING_BYTES:
+    if path.suffix.lower() not in NAMING_SUFFIXES or path.stat().st_size > MAX_NAMING_BYTES:
         return set()
     try:
-        return set(_NAMED.findall(read_regular_file(path, NAMING_BYTES).decode(errors="replace")))
+        return set(_NAMED.findall(read_regular_file(path, MAX_NAMING_BYTES).decode(errors="replace")))
     except NotARegularFile:
         return set()
 

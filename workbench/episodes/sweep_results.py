@@ -16,12 +16,12 @@ from workbench.machine.files import open_regular_file, replace_file
 RESULTS = "results.parquet"
 SET, MEAN = "set.", "mean."
 """Prefixes of columns: of the set values, and of means over an episode."""
-MOST_POINTS = 1000
-MOST_NAMES = 100
+MAX_POINTS = 1000
+MAX_NAMES = 100
 """Set names, and likewise entries with a mean."""
-MOST_ROWS = 1_000_000
-MOST_BYTES = 256 << 20
-LONGEST = 2000
+MAX_ROWS = 1_000_000
+MAX_BYTES = 256 << 20
+MAX_TEXT_CHARACTERS = 2000
 """Characters of a text."""
 _ABOUT = b"workbench.sweep"
 _FORMAT = 1
@@ -221,14 +221,14 @@ def read_results(path: Path) -> SweepResults:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    with open_regular_file(path, MOST_BYTES) as file:
+    with open_regular_file(path, MAX_BYTES) as file:
         try:
             parquet = pq.ParquetFile(file)
             about = json.loads((parquet.schema_arrow.metadata or {}).get(_ABOUT, b"null"))
             if not isinstance(about, dict) or about.get("format") != _FORMAT:
                 raise NoSweep("is not the results of a sweep, or of a later version")
             names = parquet.schema_arrow.names
-            if parquet.metadata.num_rows > MOST_ROWS or len(names) > 2 * MOST_NAMES + 20:
+            if parquet.metadata.num_rows > MAX_ROWS or len(names) > 2 * MAX_NAMES + 20:
                 raise NoSweep("has more rows or columns than a sweep")
             wanted = [name for name in names if not name.startswith(SET)]
             columns = parquet.read(columns=wanted).to_pydict()
@@ -264,7 +264,7 @@ def _results(about: Mapping[str, Any], columns: Mapping[str, Sequence[Any]]) -> 
                 _known(float, columns["return"][k]),
                 known,
                 str(columns["recording"][k] or ""),
-                str(columns["failure"][k] or "")[:LONGEST],
+                str(columns["failure"][k] or "")[:MAX_TEXT_CHARACTERS],
             )
         )
     points = tuple({str(name): str(text) for name, text in point.items()} for point in about["points"])
@@ -283,10 +283,10 @@ def clean_results(results: SweepResults) -> SweepResults:
     Raises:
         NoSweep: there are no points, too many, or points with different names.
     """
-    if not 0 < len(results.points) <= MOST_POINTS:
-        raise NoSweep(f"has {len(results.points)} points, and a sweep has 1 to {MOST_POINTS}")
-    names = list(results.names)[:MOST_NAMES]
-    if any(list(point)[:MOST_NAMES] != names for point in results.points):
+    if not 0 < len(results.points) <= MAX_POINTS:
+        raise NoSweep(f"has {len(results.points)} points, and a sweep has 1 to {MAX_POINTS}")
+    names = list(results.names)[:MAX_NAMES]
+    if any(list(point)[:MAX_NAMES] != names for point in results.points):
         raise NoSweep("has points that do not set the same names")
     points = tuple(
         {clean_text(name, 100): clean_text(point[name], 200) for name in names} for point in results.points
@@ -302,11 +302,11 @@ def clean_results(results: SweepResults) -> SweepResults:
             _finite(row.total_reward),
             {
                 clean_text(name, 100): value
-                for name, value in list(row.means.items())[:MOST_NAMES]
+                for name, value in list(row.means.items())[:MAX_NAMES]
                 if math.isfinite(value)
             },
             row.recording if _is_inside(row.recording) else "",
-            clean_text(row.failure, LONGEST),
+            clean_text(row.failure, MAX_TEXT_CHARACTERS),
         )
         for row in results.episodes
         if 0 <= row.point < len(points) and abs(row.seed) < 2**63
@@ -323,5 +323,5 @@ def _finite(number: float | None) -> float | None:
 def _is_inside(recording: str) -> bool:
     """Whether a path of a row is one below the results' folder."""
     path = PurePosixPath(recording)
-    plain = bool(recording) and len(recording) < LONGEST and recording.isprintable()
+    plain = bool(recording) and len(recording) < MAX_TEXT_CHARACTERS and recording.isprintable()
     return plain and not path.is_absolute() and ".." not in path.parts and str(path) == recording

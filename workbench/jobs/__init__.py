@@ -1,1 +1,1 @@
-"""Deals the items of a job to workers in this process, in others, or on a Ray cluster."""
+"""Deals the items of a job to workers in this process, in other processes, or on a Ray cluster."""

@@ -22,9 +22,9 @@ from workbench.machine.processes.wire import MessageSocket, Unreadable, pack_mes
 from workbench.machine.text import guard_terminal
 from workbench.task.problem import TaskError, treat_ctrl_c_as_error
 
-_LOOK_SECONDS = 0.1
+_POLL_SECONDS = 0.1
 _END_SECONDS = 120.0
-"""Seconds that a stopped process may take to write the items that have ended."""
+"""Timeout for a stopped process to write its finished items."""
 _EXIT_SECONDS = 10.0
 
 
@@ -38,8 +38,8 @@ class Processes:
     def __init__(self, workers: int, on_death: Callable[[str], None] = lambda text: None) -> None:
         """
         Args:
-            workers: how many processes; fewer where there are fewer chunks.
-            on_death: as of `Listener`.
+            workers: maximum number of processes; there are no more than chunks.
+            on_death: as in `Listener`.
         """
         self._workers, self._on_death = workers, on_death
 
@@ -89,7 +89,7 @@ class _ProcessPool:
                 if time.monotonic() - stopped > _END_SECONDS:
                     raise failure or PoolError(f"a process {self._work.name} did not end in time")
             by_end: dict[Any, _Process] = {process.line.end: process for process in busy}
-            for end in wait(by_end, _LOOK_SECONDS):
+            for end in wait(by_end, _POLL_SECONDS):
                 process = by_end[end]
                 try:
                     self._receive(process)
@@ -97,14 +97,14 @@ class _ProcessPool:
                     self._leave(process)
                     failure = failure or error
                     self._scheduler.lower(0)
-            # Also for a chunk that was given back when the others had ended.
+            # A chunk may have been given back after the other processes ended.
             if not self._busy() and self._scheduler.count_left(1):
                 self._start(0)
         if failure is not None:
             raise failure
 
     def end(self) -> None:
-        """Wait for the processes that are done, and end the others, as after a second Ctrl-C: they may not respond."""
+        """Wait for finished processes, and kill the others, as after a second Ctrl-C: they may not respond."""
         for process in self._processes:
             if not process.heard:
                 self._exit_code(process, _EXIT_SECONDS)
@@ -143,10 +143,10 @@ class _ProcessPool:
             self._start(process.place)
 
     def _receive(self, process: _Process) -> None:
-        """Handle its complete messages. The author's code runs at the other end, and may write into any descriptor.
+        """Handle its complete messages. They are untrusted: the author's code in the process may write to any descriptor.
 
         Raises:
-            TaskError, PoolError: it failed, and the job is over.
+            TaskError, PoolError: the process failed, and the job is over.
         """
         try:
             while process.heard and (message := process.line.receive(0)) is not None:
@@ -158,7 +158,7 @@ class _ProcessPool:
                 elif news == "done":
                     process.heard = False
         except Unreadable as error:
-            raise PoolError(f"a process {self._work.name} sent what cannot be read ({error})") from error
+            raise PoolError(f"a process {self._work.name} sent an unreadable message ({error})") from error
         except EOFError:
             code = self._exit_code(process, 2.0)
             self._listener.died(process, describe_exit(code), code)
@@ -174,14 +174,14 @@ class _ProcessPool:
         try:
             process.line.send_bytes(pickle.dumps(message))
         except (BrokenPipeError, ConnectionResetError):
-            pass  # it is gone; `_receive` reports it
+            pass  # the process has ended; `_receive` reports it
 
 
 # --- a process of the pool -----------------------------------------------------------------------------
 
 
 class _SocketQueue(WorkerQueue):
-    """The chunks of a process of the pool: asks the process that started it."""
+    """The chunks of a process of the pool, requested from the parent process."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -203,7 +203,7 @@ class _SocketQueue(WorkerQueue):
 
 
 def main(socket_fd: str) -> None:
-    """Entry of a process of the pool, started through `machine.processes.family`."""
+    """Entry point of a process of the pool, started by `machine.processes.family`."""
     guard_terminal()
     refuse_breakpoints(ONE_PROCESS)
     treat_ctrl_c_as_error()
@@ -211,10 +211,10 @@ def main(socket_fd: str) -> None:
     connection = Connection(int(socket_fd))
     queue = _SocketQueue(connection)
     try:
-        # PhysX and the software renderer start a thread for each core that the process may use.
+        # Limit the cores: PhysX and the software renderer start a thread for each one that the process may use.
         os.sched_setaffinity(0, connection.recv())
         with quick_imports():
             run, setup = connection.recv()
         work_on(run, setup, queue)
     except (ConnectionError, EOFError):
-        return  # the process that started this one is gone
+        return  # the parent process has ended

@@ -1,8 +1,8 @@
-"""Runs a job's work on a Ray cluster: one that is there, or one of this machine alone.
+"""Runs a job's work on a Ray cluster: a running one, or one that is started on this machine.
 
-A worker is a Ray actor that runs the same function as a local process. What it says goes as bytes of `wire` through one
-more actor, the broker, which the process that deals asks: so a worker waits for nobody, and a pickle that the author's code
-made is never read here. When Ray says that an actor is gone, its chunk is dealt again.
+A worker is a Ray actor that runs the same function as a local process. Its messages go as bytes of `wire` to one more actor,
+the broker, which the dealing process polls: so a worker never blocks, and a pickle that the author's code made is never
+loaded here. When Ray reports that an actor has ended, its chunk is dealt again.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
 from workbench.machine.versions import package_versions
 from workbench.task.problem import TaskError, treat_ctrl_c_as_error
 
-_LOOK_SECONDS = 0.1
+_POLL_SECONDS = 0.1
 _ANSWER_SECONDS = 1.0
-"""Seconds to wait for the broker before the cluster is checked; a broker that has ended never answers."""
-_SAY_SECONDS = 1.0
-"""Seconds between two messages of a worker: the broker takes some thousand messages a second from all workers."""
+"""Timeout of a request to the broker, after which the cluster is checked: a broker that has ended never answers."""
+_SEND_SECONDS = 1.0
+"""Interval of a worker's messages: the broker handles a few thousand messages per second from all workers."""
 _END_SECONDS = 120.0
-"""Seconds that a stopped worker may take to write the items that have ended."""
+"""Timeout for a stopped worker to write its finished items."""
 _EXIT_SECONDS = 10.0
 _FOLDER = "workbench-job-"
 
@@ -52,11 +52,11 @@ class Cluster:
     """``local`` starts a cluster on this machine that only this user can connect to and that ends with the job;
     ``auto`` takes a running cluster, or else starts one like ``local``."""
     workers: int | None = None
-    """Number of workers; None for as many as the cluster has room for now."""
+    """Number of workers; None for as many as the cluster has room for."""
     cpus_per_worker: float = 1
     gpus_per_worker: float = 0
     on_death: Callable[[str], None] = lambda text: None
-    """Called with a sentence when a worker has died and the job goes on; see `Listener`."""
+    """Called with a sentence when a worker has died and the job continues; see `Listener`."""
 
     @property
     def elsewhere(self) -> bool:
@@ -66,9 +66,9 @@ class Cluster:
         """Run the work on the cluster; see `Executor.run`.
 
         Raises:
-            NoCluster: as `connected`; or the cluster has no room for a worker.
-            PoolError: a machine has other versions of the packages; the cluster ended; or as `Executor.run`.
-            TooMuch: as `pack_worker_files`.
+            NoCluster: as `connected` does; or the cluster has no room for a worker.
+            PoolError: a machine has other versions of the packages; the cluster ended; or as `Executor.run` does.
+            TooMuch: as `pack_worker_files` does.
         """
         worker_files = pack_worker_files(work.folders, work.files)
         with connected(self.address) as ray:
@@ -80,11 +80,11 @@ class Cluster:
                     finally:
                         pool.end()
             except (ray.exceptions.RayError, ClusterLost) as error:
-                # The text of Ray's is a traceback of its own.
+                # Ray's own message is a traceback: leave it out.
                 why = str(error) if isinstance(error, ClusterLost) else f"Ray raised {type(error).__name__}"
                 raise PoolError(
-                    f"the Ray cluster ended before the job: {why}. What is done is kept. Start the cluster again, and then "
-                    "this command; a job with --job FILE goes on after what is done"
+                    f"the Ray cluster ended before the job: {why}. Finished results are kept. Start the cluster again, and then "
+                    "this command; a job with --job FILE resumes after them"
                 ) from error
 
 
@@ -94,7 +94,7 @@ def versions_here() -> dict[str, str]:
 
 
 class OtherVersions(RuntimeError):
-    """A machine has other versions of the packages; the text names them."""
+    """A machine has other versions of the packages; the message names them."""
 
 
 # --- where the chunks are dealt ----------------------------------------------------------------------------
@@ -149,7 +149,7 @@ class _ActorPool:
                 stopped = stopped or time.monotonic()
                 if time.monotonic() - stopped > _END_SECONDS:
                     raise failure or PoolError(f"a worker {self._work.name} did not end in time")
-            for number, raw in self._said(_LOOK_SECONDS):
+            for number, raw in self._messages(_POLL_SECONDS):
                 failure = self._guarded(
                     number, failure, lambda raw=raw, number=number: self._take(number, raw)
                 )
@@ -162,8 +162,7 @@ class _ActorPool:
             raise failure
 
     def end(self) -> None:
-        """Wait for the actors that are done, and end the others at once, as after a second Ctrl-C: they may not
-        respond."""
+        """Wait for finished actors, and kill the others at once, as after a second Ctrl-C: they may not respond."""
         if self._ending:
             ended = [actor.ended for actor in self._ending]
             self._ray.wait(ended, num_returns=len(ended), timeout=_EXIT_SECONDS)
@@ -171,7 +170,7 @@ class _ActorPool:
             self._ray.kill(actor.handle)
         self._ray.kill(self._broker)
 
-    def _said(self, seconds: float) -> list[tuple[int, bytes]]:
+    def _messages(self, seconds: float) -> list[tuple[int, bytes]]:
         """Messages of the workers since the last call; see `MessageBroker.take`. Raises ClusterLost."""
         said = self._broker.take.remote(seconds)
         while not self._ray.wait([said], timeout=_ANSWER_SECONDS)[0]:
@@ -189,8 +188,7 @@ class _ActorPool:
             self._ending.remove(actor)
 
     def _guarded(self, number: int, failure: Any, act: Any) -> Any:
-        """Call `act` for a worker; after an error that ends the job the other workers finish the items that they
-        have."""
+        """Call `act` for a worker; after an error that ends the job, the other workers finish their items."""
         try:
             act()
         except (TaskError, PoolError) as error:
@@ -203,7 +201,7 @@ class _ActorPool:
         """Number of workers that the cluster has room for.
 
         Raises:
-            NoCluster: for none.
+            NoCluster: there is no room for any.
         """
         asked = {"CPU": self._how.cpus_per_worker, "GPU": self._how.gpus_per_worker}
         rooms = [
@@ -229,11 +227,11 @@ class _ActorPool:
 
     def _take(self, number: int, raw: bytes) -> None:
         if number not in self._busy:
-            return  # late words of a worker whose chunk was dealt again
+            return  # late messages of a worker whose chunk was dealt again
         try:
             news = self._listener.take(number, self._read(raw))
         except Unreadable as error:
-            raise PoolError(f"a worker {self._work.name} sent what cannot be read ({error})") from error
+            raise PoolError(f"a worker {self._work.name} sent an unreadable message ({error})") from error
         if news == "asks":
             self._broker.answer.remote(number, self._scheduler.next(number))
         elif news in ("failed", "done"):
@@ -253,12 +251,12 @@ class _ActorPool:
         Raises:
             TaskError, PoolError: the job is over.
         """
-        for one, raw in self._said(0.0):
+        for one, raw in self._messages(0.0):
             self._take(one, raw)
         actor = self._busy.get(number)
         if actor is None:
             return
-        how = "ended without a word"
+        how = "ended without a message"
         try:
             self._ray.get(actor.ended)
         except self._ray.exceptions.RayTaskError as error:
@@ -289,7 +287,7 @@ class MessageBroker:
         return self._limit
 
     async def ask(self, worker: int, messages: list[bytes]) -> tuple[Chunk | None, int]:
-        """Store messages of which the last asks for a chunk; returns the chunk and the limit."""
+        """Store messages, the last of which requests a chunk; returns the chunk and the limit."""
         future: asyncio.Future[Chunk | None] = asyncio.get_running_loop().create_future()
         self._answers[worker] = future
         await self.put(worker, messages)
@@ -330,15 +328,15 @@ class RayWorker:
         """Do the work.
 
         Args:
-            work: the pickled function and its setup: what it imports takes seconds, and more before `quick_imports`.
+            work: the pickled function and its setup; unpickled after `quick_imports`, since its imports take seconds.
 
         Raises:
-            OtherVersions: this machine has other ones than the submitting side.
+            OtherVersions: this machine has other versions than the submitting side.
         """
         from workbench.machine.software_vulkan import use_private_driver
 
         _require_versions(versions)
-        # Or a line with breakpoint() waits for someone who attaches Ray's debugger.
+        # Without this a line with breakpoint() waits for Ray's debugger.
         os.environ.pop(BREAKPOINT, None)
         refuse_breakpoints(ONE_PROCESS)
         treat_ctrl_c_as_error()
@@ -358,7 +356,7 @@ class RayWorker:
 
 
 def _remove_left_folders() -> None:
-    """Remove the folders that killed actors have left on this machine."""
+    """Remove the folders that killed actors left on this machine."""
     for path in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*-*"):
         pid = path.name.removeprefix(_FOLDER).partition("-")[0]
         if pid.isdigit() and not psutil.pid_exists(int(pid)):
@@ -377,7 +375,7 @@ def _require_versions(versions: Mapping[str, str]) -> None:
 
 
 class _BrokerQueue(WorkerQueue):
-    """The chunks of an actor."""
+    """The chunks of an actor, requested from the broker."""
 
     def __init__(self, broker: Any, worker: int, origin: Mapping[str, str]) -> None:
         self._broker, self._worker, self.origin = broker, worker, origin
@@ -397,7 +395,7 @@ class _BrokerQueue(WorkerQueue):
     def limit(self) -> int:
         import ray
 
-        if time.monotonic() - self._said > _SAY_SECONDS:
+        if time.monotonic() - self._said > _SEND_SECONDS:
             self._send()
         if self._put is not None and ray.wait([self._put], timeout=0)[0]:
             self._limit, self._put = int(ray.get(self._put)), None
@@ -405,7 +403,7 @@ class _BrokerQueue(WorkerQueue):
 
     def send(self, message: Message) -> None:
         self._waiting.append(pack_message(message))
-        if time.monotonic() - self._said > _SAY_SECONDS:
+        if time.monotonic() - self._said > _SEND_SECONDS:
             self._send()
 
     def flush(self) -> None:

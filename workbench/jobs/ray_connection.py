@@ -1,6 +1,6 @@
 """Connects to a Ray cluster, or starts one that only this user can reach.
 
-What is wrong with a connection by Ray's own means is put right here: all of its private names that are used stand in this module.
+Works around problems of Ray's own connection; all uses of Ray's private names are in this module.
 """
 
 from __future__ import annotations
@@ -17,27 +17,26 @@ from typing import Any
 AUTO, LOCAL = "auto", "local"
 BREAKPOINT = "PYTHONBREAKPOINT"
 """Environment variable that Ray sets for its workers and for processes that connect."""
-_DEAF_SECONDS = 5.0
+_CONNECT_SECONDS = 5.0
 _PROBE_SECONDS = 2.0
-_GONE_SECONDS = 20.0
-"""Seconds for which the head may refuse connections, since it may be restarting. After 60 s Ray ends this process
-by itself."""
+_HEAD_DOWN_SECONDS = 20.0
+"""Time for which the head may refuse connections, since it may be restarting. After 60 s Ray itself ends this process."""
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
 _AUTH_MODE = "RAY_AUTH_MODE"
 
 
 class NoCluster(OSError):
-    """There is no such cluster, or it cannot run a worker; the text says what to do."""
+    """There is no such cluster, or it cannot run a worker; the message gives advice."""
 
 
 class ClusterLost(OSError):
-    """The cluster ended while it was used; the text gives what is known of the reason."""
+    """The cluster ended during use; the message gives the reason, as far as known."""
 
 
 class ClusterHealth:
-    """Notices that the daemons of the cluster that is connected to are gone.
+    """Detects that the daemons of the connected cluster have ended.
 
-    Ray itself goes on for seconds, then ends this process from native code, without an exception.
+    Ray itself continues for seconds, then ends this process from native code, without an exception.
     """
 
     def __init__(self) -> None:
@@ -46,15 +45,15 @@ class ClusterHealth:
         self._raylet: socket.socket | None = None
         self._head = ""
         self._probed_at = self._answered_at = time.monotonic()
-        if _global_node is None:  # a ray:// address: its own errors tell
+        if _global_node is None:  # a ray:// address: Ray's own errors report it
             return
         self._head = _global_node.gcs_address
         self._raylet = socket.socket(socket.AF_UNIX)
         self._raylet.connect(_global_node.raylet_socket_name)
 
     def check(self) -> None:
-        """Raise ClusterLost if they are gone. Takes microseconds, and a connection now and then."""
-        # It says nothing to a connection that says nothing: readable means closed.
+        """Raise ClusterLost if they have ended. Takes microseconds, and opens a connection every `_PROBE_SECONDS`."""
+        # The raylet sends nothing on an idle connection: readable means closed.
         if self._raylet is not None and select.select([self._raylet], (), (), 0)[0]:
             raise ClusterLost("Ray's daemon of this machine (raylet) has ended")
         now = time.monotonic()
@@ -64,8 +63,8 @@ class ClusterHealth:
         why = _why_deaf(self._head)
         if why is None:
             self._answered_at = now
-        elif now - self._answered_at > _GONE_SECONDS:
-            raise ClusterLost(f"the head of the cluster, {self._head}, does not answer any more ({why})")
+        elif now - self._answered_at > _HEAD_DOWN_SECONDS:
+            raise ClusterLost(f"the head of the cluster, {self._head}, no longer answers ({why})")
 
     def close(self) -> None:
         if self._raylet is not None:
@@ -74,14 +73,14 @@ class ClusterHealth:
 
 @contextmanager
 def connected(address: str = AUTO) -> Iterator[Any]:
-    """The module ``ray``, connected. A cluster that is started here ends with this.
+    """Yield the module ``ray``, connected. A cluster that is started here ends with this context.
 
     Raises:
         NoCluster: Ray is not installed, or nothing answers at the address.
     """
     try:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        # It would write over the library path of each actor that has no GPU, and warns of that.
+        # Ray would overwrite the library path of each actor without a GPU, and warn of that.
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         import ray
         from ray.exceptions import RayError
@@ -110,16 +109,16 @@ def connected(address: str = AUTO) -> Iterator[Any]:
 
 @contextmanager
 def _token_given(ray: Any, address: str) -> Iterator[None]:
-    """Within this block, give this user's token if the cluster asks for one and ``RAY_AUTH_MODE`` is not set.
+    """Within this block, send this user's token if the cluster requires one and ``RAY_AUTH_MODE`` is not set.
 
-    ``ray start`` asks for one wherever this user has one. Who connects gives none without being told, and is refused after
-    twenty seconds; given to a cluster that asks for none, no worker starts.
+    ``ray start`` requires a token if this user has one, but Ray does not send it by default, and is refused after twenty
+    seconds. If it is sent to a cluster that requires none, no worker starts.
     """
     if not _asks_for_token(ray, address):
         yield
         return
     os.environ[_AUTH_MODE] = "token"
-    ray._raylet.Config.initialize("")  # it was read when Ray was imported
+    ray._raylet.Config.initialize("")  # reread the mode, which Ray read when it was imported
     try:
         yield
     finally:
@@ -138,13 +137,13 @@ def _asks_for_token(ray: Any, address: str) -> bool:
 
 
 def _why_deaf(address: str) -> str | None:
-    """Reason why no cluster can be at the address; None if something listens there. Ray itself retries for minutes."""
+    """Why there can be no cluster at the address; None if something listens there. Ray itself would retry for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
-        with socket.create_connection((host, int(port)), timeout=_DEAF_SECONDS):
+        with socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS):
             return None
     except ValueError:
-        return "it takes host:port"
+        return "not of the form host:port"
     except OSError as error:
         return error.strerror or str(error)
 
@@ -157,10 +156,10 @@ def _no_cluster_text(address: str, why: str) -> str:
 
 
 def _left_here() -> str | None:
-    """The address of a cluster that was started on this machine and still answers."""
+    """Address of a cluster that was started on this machine and still answers; None if there is none."""
     from ray._private.services import find_bootstrap_address
 
-    # Ray keeps the address of one that has ended, and would try it for minutes.
+    # Ray keeps the address of a cluster that has ended, and would try it for minutes.
     address = find_bootstrap_address(None)
     return address if address and _why_deaf(address) is None else None
 
@@ -182,7 +181,7 @@ def _connect(ray: Any, address: str, how: Mapping[str, Any]) -> None:
 
 @contextmanager
 def _standard_output_kept() -> Iterator[None]:
-    """Keep Ray's messages about dead workers off stdout, which holds the results; the pool reports dead workers."""
+    """Keep Ray's messages about dead workers off stdout, which is for results; the pool reports dead workers."""
     from ray._private import worker
 
     before = worker.print_to_stdstream
@@ -195,8 +194,7 @@ def _standard_output_kept() -> Iterator[None]:
 
 @contextmanager
 def _breakpoints_kept() -> Iterator[None]:
-    """Keep the behaviour of ``breakpoint()``: Ray sets its own debugger for this process and all that it starts
-    afterwards."""
+    """Keep the behaviour of ``breakpoint()``: Ray sets its own debugger for this process and its later children."""
     before = os.environ.get(BREAKPOINT)
     try:
         yield
@@ -210,17 +208,17 @@ def _breakpoints_kept() -> Iterator[None]:
 def _only_for_this_user() -> Iterator[None]:
     """Let Ray start on the loopback address, with a token that no other user can read.
 
-    Who can connect to a cluster runs code in it, and Ray listens on all addresses of the machine otherwise.
+    Anyone who can connect to a cluster can run code in it, and by default Ray listens on all addresses of the machine.
     """
     from ray._private import ray_constants
 
     before = ray_constants.ENABLE_RAY_CLUSTER
     ray_constants.ENABLE_RAY_CLUSTER = False
-    # The first is for the daemons, which import the constant again.
+    # The variable is for the daemons, which import the constant again.
     os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"
-    # Same value as for local processes; Ray's own 15 is for machines that others work on.
+    # Same niceness as local processes; Ray's default of 15 is for shared machines.
     os.environ.setdefault("RAY_worker_niceness", "0")
-    # Else Ray writes one into the home folder, where others may read it. It asks for tokens by itself.
+    # Without this Ray writes a token into the home folder, where others may read it. Ray requires tokens by itself.
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
     try:
         yield

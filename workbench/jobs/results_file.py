@@ -1,6 +1,6 @@
-"""Keeps the results of a job in a file as they come: a stopped job resumes from it, and parts are merged.
+"""Keeps the results of a job in a file as they arrive: a stopped job resumes from it, and parts are merged.
 
-An SQLite database: each result is in it as a whole or not at all, also where the process is killed.
+The file is an SQLite database: each result is stored atomically, even if the process is killed.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ CREATE TABLE about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE kept (name TEXT PRIMARY KEY, value BLOB NOT NULL);
 CREATE TABLE result (number INTEGER PRIMARY KEY, value BLOB NOT NULL);
 """
-_DIFFERENT = 5
-"""Number of differences that a message names."""
+_MAX_DIFFERENCES = 5
+"""Maximum number of differences that a message names."""
 
 Request = TypeVar("Request")
 
 
 class JobFileError(ValueError):
-    """The file is of another job, or is none."""
+    """The file belongs to another job, or is no job file."""
 
 
 @dataclass(frozen=True)
@@ -58,20 +58,20 @@ class JobKey:
 def job_of(
     command: str, task: str, request: Any, leaves_out: Iterable[str], files: Sequence[Path] = ()
 ) -> JobKey:
-    """The job of a command.
+    """The key of a command's job.
 
     Args:
-        task: as the person named it.
-        request: a dataclass of all that is asked for.
-        leaves_out: its fields that the results do not depend on.
-        files: further files that they depend on, such as a policy's.
+        task: the task as the person named it.
+        request: a dataclass with all options.
+        leaves_out: fields of `request` that the results do not depend on.
+        files: other files that the results depend on, such as a policy's.
 
     Raises:
         OSError: a file cannot be read.
     """
     about = {"command": command, "python": ".".join(map(str, sys.version_info[:2])), **package_versions()}
     file = named_file(task)
-    # By its text: the folder may be another one on each machine.
+    # The task is identified by its text: its folder may differ between machines.
     about["task"] = task if file is None else task.replace(str(file.parent) + "/", "").rpartition("/")[2]
     if file is not None and file.is_file():
         about["the task's text"] = read_content(file).hash[:12]
@@ -106,8 +106,9 @@ class JobFile:
         """Open or create the file.
 
         Raises:
-            JobFileError: it is of another job (the text says what differs), another process has it open, or it is none.
-            OSError: its folder cannot be made.
+            JobFileError: it belongs to another job (the message lists the differences), another process has it open, or it
+                is no job file.
+            OSError: its folder cannot be created.
         """
         path.absolute().parent.mkdir(parents=True, exist_ok=True)
         self.path = path
@@ -117,7 +118,7 @@ class JobFile:
             self._database = sqlite3.connect(path, timeout=0, isolation_level=None)
         try:
             with _named(path):
-                # The lock lasts while the file is open: two processes with the same job would each do all items.
+                # Locked while the file is open: two processes with the same job would each do all items.
                 self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
                 self._database.execute("BEGIN EXCLUSIVE")
                 if not self._database.execute("PRAGMA schema_version").fetchone()[0]:
@@ -149,7 +150,7 @@ class JobFile:
             self._database.execute("INSERT OR REPLACE INTO result VALUES (?, ?)", (number, pack(result)))
 
     def put(self, packed: Mapping[int, bytes]) -> None:
-        """Write packed results; results of items that are in the file already are written too. Raises JobFileError."""
+        """Write packed results; replaces results that are in the file already. Raises JobFileError."""
         with _named(self.path):
             self._database.execute("BEGIN")
             self._database.executemany("INSERT OR REPLACE INTO result VALUES (?, ?)", packed.items())
@@ -167,7 +168,7 @@ class Kept:
     file: JobFile | None = None
     shard: Shard = Shard()
     is_there: Callable[[Any], bool] = lambda result: True
-    """Whether the files that a result names still exist; if not, its item is done again."""
+    """Returns whether the files that a result names still exist; if not, its item runs again."""
 
     @property
     def elsewhere(self) -> bool:
@@ -182,7 +183,7 @@ class Kept:
             self.executor.run(work, scheduler)
 
 
-# --- parts put together ----------------------------------------------------------------------------------
+# --- merging of parts ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -218,8 +219,8 @@ def write_whole(path: Path, merged: JobParts) -> None:
     """Write a job file with all results of the parts.
 
     Raises:
-        JobFileError: there is a file of another job, or one that lacks none of them.
-        OSError: its folder cannot be made.
+        JobFileError: the file exists and belongs to another job, or is complete already.
+        OSError: its folder cannot be created.
     """
     folder = next(iter(merged.folders.values()), "")
     file = JobFile(path, JobKey(merged.command, merged.about, merged.request, folder))
@@ -231,7 +232,7 @@ def read_parts(files: Sequence[Path]) -> JobParts:
     """The results of these job files.
 
     Raises:
-        JobFileError: they are of different jobs (the text says what differs), or two hold the same item.
+        JobFileError: they belong to different jobs (the message lists the differences), or two hold the same item.
         FileNotFoundError: there is no such file.
     """
     about: Mapping[str, str] | None = None
@@ -255,7 +256,7 @@ def read_parts(files: Sequence[Path]) -> JobParts:
             rows = database.execute("SELECT number, value FROM result").fetchall()
         if (doubled := next((number for number, _ in rows if number in owners), None)) is not None:
             raise JobFileError(
-                f"{owners[doubled]} and {path} hold the same results (number {doubled}, for one): they are the same part, so "
+                f"{owners[doubled]} and {path} hold the same results (such as number {doubled}): they are the same part, so "
                 "leave one of them out"
             )
         owners.update((number, path) for number, _ in rows)
@@ -271,15 +272,15 @@ def _require_same(path: Path, mine: Mapping[str, str], there: Mapping[str, str])
     if names:
         told = "; ".join(
             f"{name} is {mine.get(name, 'not given')} here and {there.get(name, 'not given')} there"
-            for name in names[:_DIFFERENT]
+            for name in names[:_MAX_DIFFERENCES]
         )
-        more = f"; and {len(names) - _DIFFERENT} more differ" if len(names) > _DIFFERENT else ""
-        raise JobFileError(f"{path} is of another job: {told}{more}")
+        more = f"; and {len(names) - _MAX_DIFFERENCES} more differ" if len(names) > _MAX_DIFFERENCES else ""
+        raise JobFileError(f"{path} belongs to another job: {told}{more}")
 
 
 def _about(path: Path, database: sqlite3.Connection) -> dict[str, str]:
     if database.execute("PRAGMA application_id").fetchone()[0] != _MAGIC:
-        raise JobFileError(f"{path} is no job file")
+        raise JobFileError(f"{path} is not a job file")
     return dict(database.execute("SELECT name, value FROM about"))
 
 
@@ -308,4 +309,4 @@ def _named(path: Path) -> Iterator[None]:
         why = "another process has it open" if busy else str(error)
         raise JobFileError(f"{path} cannot be used: {why}") from error
     except (sqlite3.DatabaseError, TypeError) as error:
-        raise JobFileError(f"{path} is no job file ({error})") from error
+        raise JobFileError(f"{path} is not a job file ({error})") from error

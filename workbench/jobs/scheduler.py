@@ -1,4 +1,4 @@
-"""Deals a job's numbered items in fixed chunks, and keeps account of their results."""
+"""Deals a job's numbered items in fixed chunks, and tracks their results."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from typing import Any, Generic, Protocol, TypeVar
 from workbench.task.problem import Problem, TaskError
 
 NO_LIMIT = sys.maxsize
-FIRST_ALIKE, LATER_ALIKE = 5, 20
-"""Maximum number of chunks that fail alike one after another, before the first result and after it; then the
+MAX_ALIKE_FIRST, MAX_ALIKE_LATER = 5, 20
+"""Maximum number of consecutive chunks with the same failure, before the first result and after it; beyond that the
 others would fail too."""
-_STARTS = 3
+_MAX_EARLY_DEATHS = 3
 """Number of workers that may die before their first chunk."""
-_BEFORE_ANY = -1
-"""Stands for the group of a worker that has no chunk yet."""
+_NO_GROUP = -1
+"""Placeholder for the group of a worker that has no chunk yet."""
 
 Setup = TypeVar("Setup")
 Result = TypeVar("Result")
@@ -28,15 +28,15 @@ Update = TypeVar("Update")
 
 
 class PoolError(RuntimeError):
-    """A worker died or failed; the others were stopped and dropped the items under way."""
+    """A worker died or failed; the others were stopped and dropped their running items."""
 
 
 @dataclass(frozen=True)
 class Chunk:
     """Items that one worker runs together.
 
-    The division does not depend on the number of workers, so that what an item gives cannot depend on it either: the
-    numbers of a policy differ by their last bits with the size of its batch and the row in it.
+    The division does not depend on the number of workers, so that the results cannot depend on it either: a policy's
+    results differ in the last bits with the size of its batch and the row in it.
     """
 
     numbers: tuple[int, ...]
@@ -44,7 +44,7 @@ class Chunk:
     wanted: frozenset[int]
     """Items whose results are still missing."""
     again: bool = False
-    """Whether another worker, or an earlier run of the job, may have begun the chunk; files that it wrote may exist."""
+    """Whether another worker, or an earlier run of the job, may have begun the chunk, so that files of it may exist."""
 
 
 class ItemQueue(Protocol):
@@ -52,7 +52,7 @@ class ItemQueue(Protocol):
 
     @property
     def origin(self) -> Mapping[str, str]:
-        """Folder on this worker, to the folder of the submitting side that its files came from."""
+        """Maps a folder on this worker to the folder of the submitting side that its files came from."""
         ...
 
     def next(self) -> Chunk | None:
@@ -81,12 +81,12 @@ class Failure:
 
 
 def kind_of(problem: Problem) -> object:
-    """Key that is equal for failures that are alike: where they were raised."""
+    """Key that is equal for failures of the same kind (raised at the same place)."""
     return problem.stage, problem.file, problem.line
 
 
 def by_kind(failures: Iterable[Failure]) -> list[tuple[Problem, list[int]]]:
-    """The first problem of each kind, and the items of all of them."""
+    """The first problem of each kind, with the items of all failures of that kind."""
     found: dict[object, tuple[Problem, list[int]]] = {}
     for failure in failures:
         found.setdefault(kind_of(failure.problem), (failure.problem, []))[1].extend(failure.numbers)
@@ -98,12 +98,12 @@ class Shard:
     """One of the equal parts of a job."""
 
     index: int = 1
-    """From 1 on."""
+    """Number of the part, counted from 1."""
     count: int = 1
 
     def part(self, total: int) -> range:
-        """Range of the chunks in this part, out of `total` chunks: the parts follow each other, and their sizes
-        differ by at most one."""
+        """Range of the chunks in this part, out of `total` chunks. Parts are consecutive, and their sizes differ by at most
+        one."""
         return range(total * (self.index - 1) // self.count, total * self.index // self.count)
 
     def __str__(self) -> str:
@@ -111,7 +111,7 @@ class Shard:
 
 
 def parse_shard(text: str) -> Shard:
-    """The part that ``--shard`` names, as in ``3/64``. Raises ValueError for another text."""
+    """The part that ``--shard`` names, as in ``3/64``. Raises ValueError for any other text."""
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise ValueError(f"--shard takes a part of a whole, as in 3/64 for the third of 64; got {text!r}")
@@ -130,8 +130,8 @@ class _Held:
 class Scheduler(Generic[Result, Update]):
     """The chunks of a job, and the callbacks for the results of its items. Used on one thread.
 
-    Chunks are dealt in ascending order. From the limit on no item is needed: a caller that has enough lowers it, and stopping
-    is a limit of 0. A chunk whose worker died is dealt again, after the others.
+    Chunks are dealt in ascending order. Items from the limit on are not needed: a caller with enough results lowers the
+    limit, and a limit of 0 stops the job. A chunk whose worker died is dealt again, after the others.
     """
 
     def __init__(
@@ -148,14 +148,15 @@ class Scheduler(Generic[Result, Update]):
     ) -> None:
         """
         Args:
-            numbers: ascending, from 0 on.
-            stop: called often; after True nothing more is needed.
-            chunk: items of a chunk: k belongs to chunk ``k // chunk``.
-            tries: how often a chunk is begun whose workers die.
-            on_failure: called with the items that the author's code failed in, and those whose workers died in each try; the
-                job goes on unless they fail alike. If None the first failure ends the job.
-            group: items of a group, of which each begins a chunk: k belongs to group ``k // group``. Where the chunks of one
-                fail alike, or the task cannot be built for it, what is left of it fails too, and the job goes on.
+            numbers: item numbers, ascending, from 0 on.
+            stop: called often; once it returns True, no more items are needed.
+            chunk: number of items in a chunk: item k belongs to chunk ``k // chunk``.
+            tries: maximum number of times that a chunk is started if its workers die.
+            on_failure: called with the items in which the author's code failed, and those whose workers died in each try; the
+                job continues unless too many fail in the same way. If None, the first failure ends the job.
+            group: number of items in a group, which begins with a new chunk: item k belongs to group ``k // group``. If the
+                chunks of a group fail in the same way, or the task cannot be built for it, the rest of the group fails too,
+                and the job continues.
         """
         self._numbers, self._size, self._tries = numbers, chunk, tries
         self._on_result, self._on_update, self._stop = on_result, on_update, stop
@@ -170,13 +171,13 @@ class Scheduler(Generic[Result, Update]):
         self._ahead: deque[Chunk] = deque()
         """Chunks that were already taken from `_left`."""
         self._alone: deque[Chunk] = deque()
-        """Items of a failed chunk, one per chunk: dealt first, to find out which of them fail."""
+        """Items of failed chunks, as chunks of one item: dealt first, to find out which of them fail."""
         self._returned: deque[Chunk] = deque()
         self._held: dict[Hashable, list[_Held]] = {}
         self._deaths: dict[int, int] = {}
         """Number of workers that died with a chunk, by the chunk's first item."""
         self._failed_alike: dict[int, list[tuple[object, int]]] = {}
-        """Failures of each group since its last result: the kind of each, and the first item of its chunk."""
+        """Failures of each group since its last result: (kind, first item of the chunk)."""
         self._limit = NO_LIMIT
         self.is_going_on = False
         """Whether results of an earlier run are being taken."""
@@ -192,10 +193,10 @@ class Scheduler(Generic[Result, Update]):
         self._left = islice(self._chunks(), part.start, part.stop)
 
     def go_on(self, known: Mapping[int, Result], keep: Callable[[int, Result], None]) -> None:
-        """Take results of an earlier run of the job, and leave only what it did not do.
+        """Take the results of an earlier run of the job, and leave only the items that lack one.
 
         Args:
-            keep: called with each further result before anything else is done with it.
+            keep: called with each new result before anything else uses it.
         """
         self._known, self._keep, self.is_going_on = known, keep, True
         for number in sorted(known):
@@ -214,7 +215,7 @@ class Scheduler(Generic[Result, Update]):
                 self._look(1)
             while waiting and min(waiting[0].wanted) >= limit:
                 if waiting is self._ahead:
-                    break  # all after it are further
+                    break  # all later chunks are beyond the limit too
                 waiting.popleft()
             if waiting and min(waiting[0].wanted) < limit:
                 chunk = waiting.popleft()
@@ -246,7 +247,7 @@ class Scheduler(Generic[Result, Update]):
         if not held.missing:
             self._held[worker].remove(held)
         self._with_results.add(number // self._group)
-        for group in (number // self._group, _BEFORE_ANY):
+        for group in (number // self._group, _NO_GROUP):
             self._failed_alike.pop(group, None)
         self.results += 1
         self._keep(number, result)
@@ -256,17 +257,17 @@ class Scheduler(Generic[Result, Update]):
         self._on_update(update)
 
     def ended(self, worker: Hashable) -> None:
-        """Handle the message that a worker is done. Raises PoolError if it still has items."""
+        """Handle a worker's last message. Raises PoolError if it still has items."""
         held = self._held.pop(worker, [])
         if min((number for one in held for number in one.missing), default=NO_LIMIT) < self.limit():
             raise PoolError("ended before it was done")
 
     def failed(self, worker: Hashable, error: TaskError) -> None:
-        """Handle that the author's code failed in the last chunk of this worker, which has ended. The items of that
+        """Handle a failure of the author's code in the last chunk of this worker, which has ended. The items of that
         chunk are then dealt one by one.
 
         Raises:
-            TaskError: the job is over: no item was begun, or the failure is one too many of its kind.
+            TaskError: the job is over: no item was begun, or there were too many failures of this kind.
         """
         held = self._held.pop(worker, [])
         if not held or self._on_failure is None:
@@ -274,7 +275,7 @@ class Scheduler(Generic[Result, Update]):
         *others, last = held
         for one in others:
             self._give_back(one)
-        # What cannot be built is not built for the next chunk of its group either.
+        # A task that cannot be built fails for the next chunk of its group too.
         unbuilt = self._group != NO_LIMIT and error.problem.stage in ("syntax", "import", "build")
         if not unbuilt and self._divide(last):
             return
@@ -283,11 +284,11 @@ class Scheduler(Generic[Result, Update]):
             self._give_up_group(last, error, error.problem)
 
     def died(self, worker: Hashable, how: str, code: int | None) -> None:
-        """Handle that the worker died without a message.
+        """Handle the death of a worker without a message.
 
         Args:
-            how: the end of a sentence that begins with its name.
-            code: its exit code, if known: by it deaths are alike.
+            how: predicate of a sentence whose subject is the worker's name.
+            code: its exit code, if known; deaths with the same code are of the same kind.
 
         Raises:
             PoolError: the job is over.
@@ -298,10 +299,10 @@ class Scheduler(Generic[Result, Update]):
         if self.limit() == 0:
             return
         if not held:
-            # Before its first chunk: it is the machine, or the import.
-            before = self._failed_alike.setdefault(_BEFORE_ANY, [])
+            # It died before its first chunk: the machine or the import is at fault.
+            before = self._failed_alike.setdefault(_NO_GROUP, [])
             before.append((code, -len(before) - 1))
-            if len(before) >= _STARTS:
+            if len(before) >= _MAX_EARLY_DEATHS:
                 raise PoolError(how)
         for one in held:
             first = one.chunk.numbers[0]
@@ -329,7 +330,7 @@ class Scheduler(Generic[Result, Update]):
             yield tuple(numbers)
 
     def _look(self, most: int) -> int:
-        """Have up to `most` chunks in `_ahead`; returns how many of them are needed."""
+        """Fill `_ahead` with up to `most` chunks; returns the number of them that are needed."""
         while len(self._ahead) < most and (numbers := next(self._left, None)) is not None:
             if wanted := frozenset(numbers) - self._known.keys():
                 if (problem := self._given_up.get(numbers[0] // self._group)) is not None:
@@ -346,7 +347,7 @@ class Scheduler(Generic[Result, Update]):
             self._returned.append(Chunk(held.chunk.numbers, frozenset(held.missing), again=True))
 
     def _divide(self, held: _Held) -> bool:
-        """Have the missing items of a chunk dealt one by one; False if there is only one."""
+        """Deal the missing items of a chunk one by one. Returns False if there is only one."""
         limit = self.limit()
         missing = sorted(number for number in held.missing if number < limit)
         given_up = held.chunk.numbers[0] // self._group in self._given_up
@@ -358,7 +359,7 @@ class Scheduler(Generic[Result, Update]):
         return True
 
     def _give_up_group(self, held: _Held, error: TaskError | PoolError, problem: Problem) -> None:
-        """Let what is left of the chunk's group fail; without groups, raise the error."""
+        """Mark the rest of the chunk's group as failed; without groups, raise the error."""
         if self._group == NO_LIMIT or self._on_failure is None:
             raise error
         group = held.chunk.numbers[0] // self._group
@@ -376,14 +377,14 @@ class Scheduler(Generic[Result, Update]):
             self._on_failure(failure)
 
     def _alike(self, key: object, held: _Held) -> bool:
-        """Record a failure of this kind; returns whether enough chunks of its group failed alike one after another
+        """Record a failure of this kind; returns whether enough consecutive chunks of its group failed in the same way
         to give it up."""
         first = held.chunk.numbers[0]
         group = first // self._group
         before = self._failed_alike.setdefault(group, [])
         before.append((key, first))
         alike = {first for kind, first in before if kind == key}
-        return len(alike) >= (LATER_ALIKE if group in self._with_results else FIRST_ALIKE)
+        return len(alike) >= (MAX_ALIKE_LATER if group in self._with_results else MAX_ALIKE_FIRST)
 
 
 @dataclass(frozen=True)
@@ -391,7 +392,7 @@ class Work(Generic[Setup, Result, Update]):
     """Work of each worker of a job."""
 
     run: Callable[[Setup, ItemQueue], None]
-    """A function that can be imported by its name. It returns when its queue has no next chunk and none is under way.
+    """A function that can be imported by name. It returns when its queue has no next chunk and none is running.
 
     A TaskError from it is the failure of its last chunk; an OSError, ValueError or RuntimeError ends the job.
     """
@@ -403,10 +404,10 @@ class Work(Generic[Setup, Result, Update]):
     name: str
     """Clause that names the process in messages: "a process *that records* was killed by SIGKILL"."""
     folders: Sequence[Path] = ()
-    """Folders of the author that workers on other machines need, each with all that is below it."""
+    """Folders of the author that workers on other machines need, with everything below."""
     files: Sequence[Path] = ()
-    """Likewise, further files. Paths in `setup` that are in neither must be places of all machines; what is below a folder
-    that travels and must not be taken for it, such as where results go, stands there as bytes."""
+    """Other files that workers on other machines need. Paths in `setup` that are in neither must exist on all machines; a path
+    below a copied folder that must not be relocated, such as the folder of the results, is stored as bytes."""
 
 
 class Executor(Protocol):
@@ -418,11 +419,11 @@ class Executor(Protocol):
         ...
 
     def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:
-        """Deal until no chunk is left or needed, and all items under way are finished.
+        """Deal until no chunk is left or needed and all running items are finished.
 
         Raises:
             TaskError, PoolError: as `Scheduler` decides; or a worker failed in our own code. The other workers were stopped
-                and dropped the items under way.
+                and dropped their running items.
         """
         ...
 
@@ -447,7 +448,7 @@ class ThisProcess:
 
 @dataclass(frozen=True)
 class _OwnQueue:
-    """The chunks of the process that deals."""
+    """The chunks of the dealing process itself."""
 
     scheduler: Scheduler[Any, Any]
     origin: Mapping[str, str] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Packs the author's files for workers on other machines: a task with the files of its folder, a policy, recordings."""
+"""Packs the author's files for workers on other machines: the task with its folder, a policy, recordings."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import Any, TypeVar
 
 from workbench.machine.files import read_regular_file
 
-MOST_BYTES = 256 << 20
-"""Maximum size in bytes of all files together; each machine of a cluster gets them all."""
+MAX_BYTES = 256 << 20
+"""Maximum total size of the files; each machine of a cluster gets them all."""
 _LEFT_OUT = {"__pycache__", "node_modules", "site-packages", "venv", "recordings", "sweeps"}
-"""Names of folders that do not travel: packages, caches and recordings."""
+"""Names of folders that are not packed: packages, caches and recordings."""
 
 Value = TypeVar("Value")
 
 
 class TooMuch(ValueError):
-    """The files of the task's folder exceed the maximum size; the text names the large ones."""
+    """The files of the task's folder exceed the maximum size; the message names the large ones."""
 
 
 @dataclass(frozen=True)
@@ -30,22 +30,21 @@ class WorkerFiles:
     """Folders and files of the submitting side, as one zip."""
 
     roots: tuple[str, ...]
-    """Absolute paths of the folders and files that have travelled."""
+    """Absolute paths of the packed folders and files on the submitting side."""
     current: str
     """Current folder on the submitting side."""
     data: bytes
-    """The zip. Names are the absolute paths without their first slash, so that relative paths between files still
-    hold."""
+    """The zip. Names are the absolute paths without their first slash, so that relative paths between files stay valid."""
 
     def unpack(self, folder: Path) -> dict[str, str]:
-        """Write all files below `folder`, which is empty, and change to the place there of the submitting side's
-        current folder.
+        """Write all files below `folder`, which is empty, and change to the counterpart of the submitting side's current
+        folder.
 
         Returns:
-            each root's place here.
+            path here by path on the submitting side, for each root.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: a file cannot be written.
         """
         with zipfile.ZipFile(io.BytesIO(self.data)) as archive:
             archive.extractall(folder)
@@ -59,35 +58,35 @@ def pack_worker_files(folders: Iterable[Path], files: Iterable[Path] = ()) -> Wo
     """Pack the files that a job needs.
 
     Args:
-        folders: each with all that is below it; not what is hidden, a virtual environment, or recordings.
-        files: further ones, each without what is beside it.
+        folders: folders with everything below, except hidden files, virtual environments and recordings.
+        files: other files, packed without their folders.
 
     Raises:
-        TooMuch: together they are larger than `MOST_BYTES`.
+        TooMuch: together they are larger than `MAX_BYTES`.
         OSError: a file cannot be read.
     """
     roots = _outermost(folder.resolve() for folder in folders)
     found = [file for root in roots for file in files_below(root)]
-    # Also below a root: what is left out there is named here, such as recordings beside the task.
+    # They may lie below a root whose packing leaves them out, such as recordings in the task's folder.
     alone = {file.resolve() for file in files}
     sizes = {file: file.stat().st_size for file in sorted({*found, *alone})}
-    if sum(sizes.values()) > MOST_BYTES:
+    if sum(sizes.values()) > MAX_BYTES:
         largest = sorted(sizes, key=lambda file: -sizes[file])[:3]
         raise TooMuch(
-            f"the files beside the task are {sum(sizes.values()) >> 20} MB, and up to {MOST_BYTES >> 20} MB travel to the "
-            f"workers. The largest are {', '.join(f'{file} ({sizes[file] >> 20} MB)' for file in largest)}: put the task "
+            f"the files in the task's folder are {sum(sizes.values()) >> 20} MB, and at most {MAX_BYTES >> 20} MB are sent to "
+            f"the workers. The largest are {', '.join(f'{file} ({sizes[file] >> 20} MB)' for file in largest)}: put the task "
             "into a folder of its own"
         )
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for file in sizes:
-            archive.writestr(zipfile.ZipInfo(str(file).lstrip("/")), read_regular_file(file, MOST_BYTES))
+            archive.writestr(zipfile.ZipInfo(str(file).lstrip("/")), read_regular_file(file, MAX_BYTES))
     outside = sorted(file for file in alone if not any(file.is_relative_to(root) for root in roots))
     return WorkerFiles(tuple(map(str, (*roots, *outside))), str(Path.cwd()), data.getvalue())
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:
-    """The folders that do not lie in another one of them."""
+    """The folders that are not inside another one of them."""
     kept: list[Path] = []
     for folder in sorted(set(folders)):
         if not any(folder.is_relative_to(one) for one in kept):
@@ -96,7 +95,7 @@ def _outermost(folders: Iterable[Path]) -> list[Path]:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """The regular files that travel with a task in `folder`, in a fixed order. Links are not followed."""
+    """The regular files that are packed with a task in `folder`, in a fixed order. Links are not followed."""
     for path, folders, names in os.walk(folder):
         here = Path(path)
         folders[:] = sorted(
@@ -113,9 +112,8 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def relocated(value: Value, places: Mapping[str, str]) -> Value:
-    """Copy of `value` with each of these paths replaced, in every text and path.
-
-    Of dataclasses, sequences and mappings of them; arrays and bytes stay.
+    """Copy of `value` with each of these paths replaced in every text and path, recursively through dataclasses, sequences
+    and mappings. Arrays and bytes stay unchanged.
     """
     return _relocated(value, sorted(places.items(), key=lambda pair: -len(pair[0]))) if places else value
 

@@ -1,5 +1,4 @@
-"""Messages of a worker of a pool, and the code that handles them in the dealing process. Messages are data, never
-a pickle."""
+"""Messages of a worker of a pool, and their handling in the dealing process. Messages are data, never a pickle."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ class ItemResult:
 
 @dataclass(frozen=True)
 class WorkerEnded:
-    """The last message of a worker: it does no further work."""
+    """The last message of a worker."""
 
     why: str = ""
     """Reason of its failure; empty if it did not fail."""
@@ -54,7 +53,7 @@ class WorkerQueue(ABC):
     """The chunks of a worker in another process than the dealing one."""
 
     origin: Mapping[str, str] = {}
-    """Folder on this worker, to the folder of the submitting side; see `ItemQueue.origin`."""
+    """Maps folders on this worker to folders of the submitting side; see `ItemQueue.origin`."""
 
     @abstractmethod
     def next(self) -> Chunk | None: ...
@@ -73,7 +72,7 @@ class WorkerQueue(ABC):
 
 
 def work_on(run: Callable[[Setup, ItemQueue], None], setup: Setup, queue: WorkerQueue) -> None:
-    """Call `Work.run`, and send how it ended."""
+    """Call `Work.run`, and send its outcome."""
     try:
         run(setup, queue)
         queue.send(WorkerEnded())
@@ -93,18 +92,19 @@ class Listener:
     work: Work[Any, Any, Any]
     scheduler: Scheduler[Any, Any]
     on_death: Callable[[str], None]
-    """Called with a sentence when a worker has died and the job goes on."""
+    """Called with a sentence when a worker has died and the job continues."""
     _unpacker: Unpacker = field(default_factory=Unpacker)
 
     def take(self, worker: Hashable, message: Message) -> Literal["asks", "goes on", "failed", "done"]:
-        """Take a message.
+        """Handle a message.
 
         Returns:
-            ``asks``: it waits for a chunk. ``failed``: it is over, and the job goes on. ``done``: it is over.
+            ``asks``: the worker waits for a chunk. ``failed``: the worker has failed, and the job continues. ``done``: the
+            worker has finished.
 
         Raises:
-            TaskError, PoolError: it failed, and the job is over.
-            Unreadable: what it sent is not what the work gives.
+            TaskError, PoolError: the worker failed, and the job is over.
+            Unreadable: the message has other types than the work's.
         """
         if isinstance(message, ChunkRequest):
             return "asks"
@@ -127,7 +127,7 @@ class Listener:
         """Handle the death of a worker. Raises PoolError if the job is over."""
         self._named(lambda: self.scheduler.died(worker, how, code))
         if self.scheduler.limit():
-            self.on_death(f"{self.kind} {self.work.name} {how}; what it had begun is dealt again")
+            self.on_death(f"{self.kind} {self.work.name} {how}; its unfinished items are dealt again")
 
     def _named(self, act: Callable[[], None]) -> None:
         """Call `act`; prefix a PoolError of the scheduler with the name of the worker."""

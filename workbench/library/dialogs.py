@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import viser
 
-from workbench.episodes.row import LONGEST_NOTE, LibraryRow, clean_tags
+from workbench.episodes.row import MAX_NOTE_CHARACTERS, LibraryRow, clean_tags
 from workbench.library.folder import Library, LibraryError
 from workbench.library.rows import in_words
 from workbench.machine.loop import BlockingPool, begin
@@ -84,7 +84,7 @@ class LibraryEdits:
         explained = "" if len(notes) == 1 else "They have different notes; this one replaces them."
 
         def answered(typed: str) -> None:
-            self._library.set_note(ids, typed[:LONGEST_NOTE])
+            self._library.set_note(ids, typed[:MAX_NOTE_CHARACTERS])
 
         self._ask("Note", "", rows, explained, "Save", answered, notes.pop() if len(notes) == 1 else "")
 
@@ -154,7 +154,7 @@ class LibraryEdits:
                     value,
                     live=True,
                     enter=AnswerDialog(),
-                    longest=LONGEST_NOTE,
+                    longest=MAX_NOTE_CHARACTERS,
                 )
             tone = "danger" if value is None else "main"
             gui.add_html(tools_html([Tool(do, AnswerDialog(), tone=tone), Tool("Cancel", CloseDialog())]))

@@ -1,1 +1,1 @@
-"""Plans actions by rollouts of the author's own task, and reports what the rollouts show about its reward."""
+"""Plans actions with rollouts of the author's own task, and reports what the rollouts show about its reward."""

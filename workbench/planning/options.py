@@ -1,4 +1,4 @@
-"""How a plan is searched, as plain data. Imports no torch."""
+"""Options of the planner, as plain data. Imports no torch."""
 
 from __future__ import annotations
 
@@ -7,30 +7,31 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 Method = Literal["mppi", "predictive", "cem"]
-_FEWEST_ROLLOUTS = 4
-"""Fewest rollouts: the plan itself, holding still, and the two best of the round before."""
-_STEPS = 8, 20
-"""Fewest and most control steps of the usual horizon."""
+_MIN_ROLLOUTS = 4
+"""Minimum number of rollouts: the plan itself, holding still, and the two best of the previous round."""
+_HORIZON_STEPS = 8, 20
+"""Minimum and maximum control steps of the default horizon."""
 
 
 @dataclass(frozen=True)
 class PlanArguments:
-    """How a plan is searched: candidate actions are rolled out from the present state, and the plan goes to what earned most.
+    """Options of the planner: candidate actions are rolled out from the current state, and the plan moves toward the best.
 
     Args:
-        method: mppi, the mean of all candidates weighted by what they earned (Williams et al., 2017); predictive, the best
+        method: mppi, the mean of all candidates weighted by their returns (Williams et al., 2017); predictive, the best
             candidate (predictive sampling; Howell et al., 2022); cem, mean and spread of the best ones (the
-            cross-entropy method, kept warm as in iCEM; Pinneri et al., 2020).
-        rollouts: candidates that are tried at once, each in an env of its own.
-        horizon: seconds that a plan looks ahead; 0 for half a second, or a whole one where the task has no success to come to,
-            but from 8 to 20 control steps.
-        knots: actions that a candidate is made of, in equal distances; between them it is interpolated.
-        noise: standard deviation of a candidate's knots around the plan, of half the range of each action dimension.
-        temperature: of mppi, in standard deviations of what the best quarter of the candidates earned; the lower, the more
-            the best ones count.
-        elites: of cem, the part of the candidates that make the next plan.
-        rounds: times that candidates are drawn and rolled out for one plan.
-        every: control steps that are taken before the next plan.
+            cross-entropy method, warm-started as in iCEM; Pinneri et al., 2020).
+        rollouts: number of candidates rolled out at once, each in its own env.
+        horizon: planning horizon in seconds; 0 for 0.5 s, or 1 s if the task has no success, within 8 to 20 control
+            steps.
+        knots: number of equally spaced actions that define a candidate, interpolated in between.
+        noise: standard deviation of the candidates' knots around the plan, relative to half the range of each action
+            dimension.
+        temperature: temperature of mppi, in standard deviations of the returns of the best quarter of the candidates; a
+            lower one gives more weight to the best.
+        elites: fraction of the candidates that form the next plan of cem.
+        rounds: sampling and rollout iterations for each plan.
+        every: control steps to take before planning again.
     """
 
     method: Method = "mppi"
@@ -52,26 +53,26 @@ class PlanOptions(PlanArguments):
         """Raises ValueError with a sentence that names the option."""
         if self.method not in get_args(Method):
             raise ValueError(f"method must be one of {', '.join(get_args(Method))}, not {self.method!r}")
-        for name, least in (("rollouts", _FEWEST_ROLLOUTS), ("knots", 2), ("rounds", 1), ("every", 1)):
+        for name, least in (("rollouts", _MIN_ROLLOUTS), ("knots", 2), ("rounds", 1), ("every", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
         for name in ("noise", "temperature", "elites"):
             if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be above 0, not {getattr(self, name)}")
+                raise ValueError(f"{name} must be greater than 0, not {getattr(self, name)}")
         if self.elites > 1:
-            raise ValueError(f"elites is a part of the candidates, at most 1, not {self.elites}")
+            raise ValueError(f"elites is a fraction of the candidates, at most 1, not {self.elites}")
         if not 0 <= self.horizon < math.inf:
-            raise ValueError(f"horizon is a time in seconds, 0 for the usual one, not {self.horizon}")
+            raise ValueError(f"horizon is a time in seconds, 0 for the default, not {self.horizon}")
 
     def steps(self, control_dt: float, has_success: bool = True) -> int:
-        """H, the control steps of a plan, at least two and as many as are taken before the next one.
+        """H, the control steps of a plan: at least two, and at least `every`.
 
         Args:
             control_dt: simulated seconds of a control step.
-            has_success: whether the task's ``evaluate`` tells a success. Without one there is something to keep up, such as a
-                pole's balance, and half a second ahead nothing has fallen yet.
+            has_success: whether the task's ``evaluate`` reports success. A task without success keeps something up, such as a
+                pole's balance, and nothing falls within half a second.
         """
-        fewest, most = _STEPS
+        fewest, most = _HORIZON_STEPS
         seconds = 0.5 if has_success else 1.0
         usual = min(most, max(fewest, round(seconds / control_dt)))
         steps = max(2, round(self.horizon / control_dt)) if self.horizon else usual

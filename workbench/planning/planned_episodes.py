@@ -1,4 +1,4 @@
-"""What is known of an episode whose actions were planned: what it earned, and what its rollouts earned at each step.
+"""Record of an episode with planned actions: its rewards, and the returns of the rollouts at each step.
 
 Imports no torch."""
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PlannedEpisode:
-    """T control steps of one env, from a reset on. A plan that serves several steps counts at each of them."""
+    """T control steps of one env, from a reset on. A plan that is used for several steps counts at each of them."""
 
     seed: int
     horizon: int
@@ -27,9 +27,9 @@ class PlannedEpisode:
     reward: NDArray[np.float32]
     """(T,)"""
     success: NDArray[np.bool_]
-    """(T,) after each step; False throughout where the task has no success."""
+    """(T,) after each step; all False if the task has no success."""
     fail: NDArray[np.bool_]
-    """(T,) likewise."""
+    """(T,) after each step; all False if the task has no fail."""
     best: NDArray[np.float32]
     """(T,) return of the best rollout, before each step."""
     hold: NDArray[np.float32]
@@ -37,13 +37,13 @@ class PlannedEpisode:
     worst: NDArray[np.float32]
     """(T,) return of the worst rollout among those with a finite return."""
     terms: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """(T,) per term of ``info["reward_terms"]``: range of the rollouts' sums of the term."""
+    """(T,) for each term of ``info["reward_terms"]``: range of the rollouts' sums of the term."""
     evaluate: Mapping[str, float] = field(default_factory=dict)
     """Entries of ``evaluate`` at the last step that have one number per env."""
     plan_seconds: float = 0.0
     """Wall time of all plans."""
     cut_off: bool = False
-    """Whether the episode ended because its wall time was up, which says nothing about the task."""
+    """Whether the episode ended at its wall time limit, which says nothing about the task."""
 
     @property
     def steps(self) -> int:
@@ -61,7 +61,7 @@ class PlannedEpisode:
 
 
 class EpisodeLog:
-    """Collects a `PlannedEpisode`, a step at a time."""
+    """Collects a `PlannedEpisode` step by step."""
 
     def __init__(self, seed: int, horizon: int) -> None:
         self._seed, self._horizon = seed, horizon
@@ -72,10 +72,10 @@ class EpisodeLog:
         self._last: Plan | None = None
         self._seconds = 0.0
         self.cut_off = False
-        """Whether the wall time ran out; see `PlannedEpisode.cut_off`."""
+        """Whether the wall time limit was reached; see `PlannedEpisode.cut_off`."""
 
     def add_plan(self, plan: Plan) -> None:
-        """Note the plan whose action comes next."""
+        """Record the plan of the next action."""
         if plan is not self._last:
             self._seconds += plan.seconds
         self._last = plan
@@ -86,7 +86,7 @@ class EpisodeLog:
         self._terms.append({name: float(np.ptp(term)) for name, term in plan.terms.items()})
 
     def add_step(self, step: StepResult, env: int) -> None:
-        """Note what the step of the whole batch gave this env."""
+        """Record this env's part of a step of the whole batch."""
         flags = [
             bool(step.evaluate[name][env]) if name in step.evaluate else False for name in ("success", "fail")
         ]
@@ -94,7 +94,7 @@ class EpisodeLog:
         self._evaluate = {name: float(row[env]) for name, row in step.evaluate.items() if np.ndim(row) == 1}
 
     def episode(self) -> PlannedEpisode:
-        """The episode so far; a plan whose step was not made does not count."""
+        """The episode so far, without a plan whose step was not taken."""
         count = len(self._steps)
         reward, success, fail = _columns(self._steps, 3)
         best, hold, worst = _columns(self._plans[:count], 3)

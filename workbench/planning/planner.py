@@ -1,4 +1,4 @@
-"""``workbench.Planner``: actions for an env of `workbench.make`, planned by rollouts of its own task."""
+"""``workbench.Planner``: actions for an env of `workbench.make`, planned with rollouts of its own task."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from workbench.planning.rollouts import Plan, RolloutPlanner, make_rollout_env, 
 
 
 class Planner:
-    """Plans the actions of an env that `workbench.make` gave, by rollouts of its task with its own reward::
+    """Plans the actions of an env of `workbench.make`, with rollouts of its task and its own reward::
 
         env = workbench.make("PickCube-v1", control_mode="pd_ee_delta_pose")
         planner = workbench.Planner(env, rollouts=64)
@@ -30,7 +30,7 @@ class Planner:
         planner.close()
 
     The same seeds, options and actions in between give the same actions to the last bit. The env itself is only read, and
-    the process's random generators stay as they were.
+    the state of the process's random generators is preserved.
     """
 
     def __init__(
@@ -44,15 +44,15 @@ class Planner:
     ) -> None:
         """
         Args:
-            env: as `workbench.make` gives it, wrapped or not.
+            env: an env of `workbench.make`, wrapped or not.
             threads: threads that step the rollouts on the CPU; None for one per core that the process may use.
-            exact: False restores faster, and may give another plan from the last bit of a contact on.
-            made_with: keyword arguments that the env was made with; None for those that its ``spec`` tells.
+            exact: False restores faster, but plans may differ because contacts differ in the last bits.
+            made_with: keyword arguments that the env was made with; None for those of its ``spec``.
             options: fields of `PlanOptions`: ``method``, ``rollouts``, ``horizon`` (seconds), ``knots``, ``noise``,
                 ``temperature``, ``elites``, ``rounds``, ``every``.
 
         Raises:
-            TypeError: `env` is no ManiSkill env, or there is no option of a name.
+            TypeError: `env` is not a ManiSkill env, or an option does not exist.
             NothingToPlan: the task has no actions, or no reward.
             ValueError: an option is out of its range.
             Exception: raised by the author's class while the envs for the rollouts are built.
@@ -71,13 +71,13 @@ class Planner:
         self.plans: dict[int, Plan] = {}
         """Last plan of each env, with the results of its rollouts."""
         self._taken: dict[int, int] = {}
-        """Number of actions of each plan that were returned."""
+        """Number of actions of each plan that were returned already."""
 
     def reset(self, env_idx: Sequence[int] | int | None = None, seed: int | None = None) -> None:
         """Begin an episode of these envs, or of all: forget their plans.
 
         Args:
-            seed: of the candidates, the same in each of these envs; None for the seed of each env's episode.
+            seed: seed of the candidates in each of these envs; None for the seed of each env's episode.
         """
         seeds = episode_seeds(self._live)
         for env in self._chosen(env_idx):
@@ -88,7 +88,7 @@ class Planner:
 
     @property
     def horizon(self) -> int:
-        """H, control steps that a plan looks ahead."""
+        """H, control steps of a plan."""
         return self._rollouts.horizon
 
     @property
@@ -97,15 +97,15 @@ class Planner:
         return self._rollouts.env
 
     def actions(self, env_idx: Sequence[int] | int | None = None) -> Any:
-        """The next action, as ``env.step`` takes it: a tensor (N, A), or a dict of them for several robots.
+        """The next action for ``env.step``: a tensor (N, A), or a dict of tensors for several robots.
 
-        An env that was not begun (`reset`) is begun by this.
+        Begins an env that was not begun with `reset`.
 
         Args:
             env_idx: the envs to plan for, in turn; None for all. The others hold still.
 
         Raises:
-            NotAlike: the task builds other bodies in each env, so that no env can stand for another.
+            NotAlike: the task builds different bodies in each env, so that no env can stand for another.
             IndexError: there is no such env.
             Exception: raised by the author's task in a step of a rollout.
         """
@@ -113,7 +113,7 @@ class Planner:
         return actions.to_env_action(self._live, self._parts, self.flat_actions(chosen))
 
     def flat_actions(self, env_idx: Sequence[int] | int) -> NDArray[np.float32]:
-        """Next actions like `actions`, as one array (N, A), robots side by side."""
+        """Next actions as in `actions`, as one array (N, A) with the robots' dimensions concatenated."""
         chosen = self._chosen(env_idx)
         self.reset([env for env in chosen if env not in self._taken])
         flat = actions.hold_action(self._parts, self._live.num_envs)
@@ -130,11 +130,11 @@ class Planner:
         return flat
 
     def require_alike(self, env: int) -> None:
-        """Raise NotAlike if the rollouts' envs are built otherwise than this env; see `RolloutPlanner.require_alike`."""
+        """Raise NotAlike if the rollouts' envs are built differently from this env; see `RolloutPlanner.require_alike`."""
         self._rollouts.require_alike(self._live, env)
 
     def close(self) -> None:
-        """Close the envs of the rollouts; the env that is planned for stays open."""
+        """Close the envs of the rollouts, but not the env that is planned for."""
         self._rollouts.close()
 
     def _chosen(self, env_idx: Sequence[int] | int | None) -> list[int]:

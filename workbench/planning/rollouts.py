@@ -1,4 +1,4 @@
-"""Plans for any env of a task, on a batch of envs of the same task that are its rollouts."""
+"""Plans for any env of a task, with rollouts on a separate batch of envs of the same task."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from workbench.envs.task_env import EnvOptions, build_env
 from workbench.planning.options import PlanOptions
 from workbench.planning.sampling import Sampler
 
-_OF_ABSOLUTE = 0.2
+_ABSOLUTE_NOISE_FACTOR = 0.2
 """Factor on the noise for absolute joint positions: they range over the whole joint, which no plan crosses."""
 _PLANNED_MODE = "pd_ee_delta_pose"
 _NOT_FOR_ROLLOUTS = ("num_envs", "obs_mode", "render_mode", "render_backend", "sim_backend")
@@ -32,7 +32,7 @@ _NOT_FOR_ROLLOUTS = ("num_envs", "obs_mode", "render_mode", "render_backend", "s
 
 
 class NotAlike(ValueError):
-    """The envs of the task are not built alike, so that none can stand for another."""
+    """The envs of the task are built differently, so that none can stand for another."""
 
 
 class NothingToPlan(ValueError):
@@ -40,7 +40,7 @@ class NothingToPlan(ValueError):
 
 
 def require_plannable(env: BaseEnv) -> None:
-    """Raise NothingToPlan, before anything is built."""
+    """Raise NothingToPlan if the task cannot be planned; builds nothing."""
     if env.reward_mode == "none":
         raise NothingToPlan(
             "the task has no reward, and actions are planned by the reward: there is nothing to plan"
@@ -51,37 +51,37 @@ def require_plannable(env: BaseEnv) -> None:
 
 @dataclass(frozen=True)
 class Plan:
-    """What was found for one env, and what the last round of its rollouts earned."""
+    """Plan for one env, with the results of the last round of rollouts."""
 
     actions: NDArray[np.float32]
     """(H, A) flat actions, the next one first."""
     rewards: NDArray[np.float32]
-    """(K, H) of all rollouts; 0 after a fail. Rollout 0 is the plan as it was, and rollout 1 holds still."""
+    """(K, H) of all rollouts; 0 after a fail. Rollout 0 is the previous plan, and rollout 1 holds still."""
     terms: Mapping[str, NDArray[np.float32]]
     """(K,) sums of ``info["reward_terms"]`` over each rollout, by name; empty if the task has none."""
     success_at: NDArray[np.int32]
-    """(K,) the step at which each rollout succeeded, from 1 on; 0 if it did not."""
+    """(K,) step at which each rollout succeeded, counted from 1; 0 if it did not."""
     seconds: float
     paths: NDArray[np.float32] | None = None
-    """(K, H + 1, 3) where the body that was asked for went in each rollout, metres in the env's frame."""
+    """(K, H + 1, 3) path of the traced body in each rollout, metres in the env's frame."""
 
     @property
     def returns(self) -> NDArray[np.float32]:
-        """(K,) what each rollout earned; NaN or infinite where a reward was."""
+        """(K,) return of each rollout; NaN or infinite if one of its rewards was."""
         return self.rewards.sum(1)
 
     @property
     def best(self) -> int:
-        """The rollout that earned most; one that is NaN or infinite counts as the worst."""
+        """The rollout with the highest return; NaN and infinite returns count as the worst."""
         returns = self.returns
         return int(np.where(np.isfinite(returns), returns, -np.inf).argmax())
 
 
 def control_mode_to_plan(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, str]:
-    """The keyword argument of the control mode in which a plan is found soonest; empty where `env` has it, where one is
-    `given`, or where there is no choice.
+    """Keyword argument of the control mode that is planned fastest; empty if `env` has it, if a mode is `given`, or if there
+    is no choice.
 
-    Six numbers that move the hand have one meaning each for a task that is about bodies; joints have none.
+    For a task about bodies, each of the six dimensions of a hand motion has a direct effect; single joints have not.
     """
     modes = getattr(env.agent, "supported_control_modes", ())
     if (
@@ -96,19 +96,19 @@ def control_mode_to_plan(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, st
 def make_rollout_env(
     env: BaseEnv, kwargs: Mapping[str, Any], rollouts: int, threads: int | None = None
 ) -> BaseEnv:
-    """Envs for rollouts of the task of `env`, made as it was but for what only a person or a policy sees.
+    """Make envs for rollouts of the task of `env`: like `env`, but without what only a person or a policy sees.
 
     Args:
-        env: the live env, whose simulation (CPU or GPU) they share.
-        kwargs: the keyword arguments that it was made with.
-        rollouts: how many envs.
-        threads: threads that step them on the CPU; None for one on each core that the process may use.
+        env: the live env; the new envs use the same kind of simulation (CPU or GPU).
+        kwargs: the keyword arguments that `env` was made with.
+        rollouts: number of envs.
+        threads: threads that step the envs on the CPU; None for one on each core that the process may use.
 
     Raises:
         Exception: raised by the author's class while it builds.
     """
     kept = {name: value for name, value in kwargs.items() if name not in _NOT_FOR_ROLLOUTS}
-    # The reward gets the same parts with "state", which makes one vector of them for a policy.
+    # With "state" the reward gets the same parts, but they are also flattened to a vector for a policy.
     plain = "state_dict" if "state_dict" in env.SUPPORTED_OBS_MODES else "state"
     kept["obs_mode"] = "none" if env.obs_mode == "none" else plain
     kept["reward_mode"] = env.reward_mode
@@ -119,13 +119,13 @@ def make_rollout_env(
         backend="gpu" if env.device.type == "cuda" else "cpu",
         render=False,
         threads=threads,
-        rules="off",  # the live env has them
+        rules="off",  # the live env checks them
         kwargs=kept,
     )
     try:
         rolled = build_env(task_class(env), options)
     except Exception:
-        # A task may want a renderer to be built, in many ways: only trying says whether that was it.
+        # A task may need a renderer while it builds, for many reasons: only a second try shows whether that was the cause.
         if not env.scene.can_render():
             raise
         rolled = build_env(task_class(env), replace(options, render=True))
@@ -140,25 +140,25 @@ def make_rollout_env(
 class RolloutPlanner:
     """Plans for the envs of a task, one after the other, on a batch of K envs of the same task.
 
-    The author's reward decides, unchanged: a rollout is worth the sum of its rewards over the horizon, up to a fail. The envs
-    keep their own state, so a rollout is a restored snapshot and control steps.
+    The author's reward is used unchanged: the return of a rollout is the sum of its rewards over the horizon, up to a fail. A
+    rollout restores a snapshot and takes control steps.
     """
 
     def __init__(self, env: BaseEnv, options: PlanOptions, exact: bool = True) -> None:
         """
         Args:
-            env: K envs as `make_rollout_env` gives them, used by this alone.
+            env: K envs of `make_rollout_env`, for exclusive use.
             exact: whether to restore exactly, so that the same snapshot, options and seed give the same plan to the last bit.
 
         Raises:
-            ValueError: another number of envs than rollouts.
+            ValueError: the number of envs differs from the number of rollouts.
         """
         if env.num_envs != options.rollouts:
             raise ValueError(f"{options.rollouts} rollouts need as many envs, not {env.num_envs}")
         self.env, self._options, self._exact = env, options, exact
         self._parts = actions.action_parts(env)
         self.horizon = options.steps(env.control_timestep, "success" in env.get_info())
-        """H, control steps that a plan looks ahead."""
+        """H, control steps of a plan."""
         low, high = actions.bounds(self._parts)
         bounded = np.isfinite(low) & np.isfinite(high)
         self._low = torch.from_numpy(np.where(bounded, low, -1.0).astype(np.float32))
@@ -168,17 +168,17 @@ class RolloutPlanner:
         self._scale = torch.tensor([_noise_scale(part) for part in dimensions])
         self._samplers: dict[int, Sampler] = {}
         self._alike: tuple[object, set[int]] = (None, set())
-        """Scene of the live batch, and the envs of it that are known to have the same bodies."""
+        """Scene of the live batch, and its envs that are known to have the same bodies."""
 
     def begin(self, env: int, seed: int) -> None:
-        """Begin an episode in this env of the live batch: forget its plan, and draw candidates from this seed."""
+        """Begin an episode in this env of the live batch: forget its plan, and seed its candidates."""
         self._samplers[env] = Sampler(self._options, self.horizon, self._switches, self._scale, seed)
 
     def require_alike(self, live: BaseEnv, env: int) -> None:
-        """Check that the rollouts' envs have the same bodies as this env of the live batch; what is known is not asked again.
+        """Check that the rollouts' envs have the same bodies as this env of the live batch. The result is cached.
 
         Raises:
-            NotAlike: they have not, as where a scene is built at random; the message names a body.
+            NotAlike: they have not, such as in a randomly built scene; the message names a body.
         """
         scene, known = self._alike
         if scene is not live.scene:
@@ -188,7 +188,7 @@ class RolloutPlanner:
             known.add(env)
 
     def require_bodies(self, wanted: Mapping[str, bytes]) -> None:
-        """Check like `require_alike`, for a live env in another process.
+        """Check as `require_alike` does, for a live env in another process.
 
         Args:
             wanted: bodies of the live env, from `bodies_of`.
@@ -198,17 +198,17 @@ class RolloutPlanner:
                 continue
             other = sorted(name for name in {*bodies, *wanted} if bodies.get(name) != wanted.get(name))
             raise NotAlike(
-                f"{', '.join(other)}: another one in each env. A plan is tried in envs that are built alike, so a task whose "
-                "scene is built at random has none: build the same bodies in each env, and place them at random"
+                f"{', '.join(other)}: different in each env. A plan is tried in envs that are built alike, which is impossible "
+                "for a randomly built scene: build the same bodies in each env, and place them at random"
             )
 
     def plan(self, snapshot: Snapshot, env: int, traced: int | None = None) -> Plan:
-        """Plan from the state that this env has in the snapshot, going on from its last plan.
+        """Plan from the state that this env has in the snapshot, starting from its last plan.
 
-        The process's random generators are left as they were.
+        Preserves the state of the process's random generators.
 
         Args:
-            traced: the body, by its place in `envs.scene.scene_index.SceneIndex.names`, that `Plan.paths` follows.
+            traced: body that `Plan.paths` follows, as an index into `envs.scene.scene_index.SceneIndex.names`.
 
         Raises:
             KeyError: the env's episode was not begun.
@@ -222,7 +222,7 @@ class RolloutPlanner:
             for _ in range(self._options.rounds):
                 every = range(self.env.num_envs)
                 restore_snapshot(self.env, snapshot, every, source=env, fresh_physics=self._exact)
-                # What a task draws in a step would else depend on all that was drawn in this process.
+                # Without this the random numbers of a task's step would depend on all earlier draws of this process.
                 _seed_shared_rng(sampler.draw_seed())
                 knots = sampler.candidates(self._hold())
                 paths: list[NDArray[np.float32]] = []
@@ -256,10 +256,11 @@ class RolloutPlanner:
     def _roll_out(
         self, sequences: torch.Tensor, traced: int | None, paths: list[NDArray[np.float32]]
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]:
-        """Rewards (K, H), sums of the terms (K,), and the steps of success (K,), of actions (K, H, A) from the present state.
+        """Roll out actions (K, H, A) from the current state; returns rewards (K, H), sums of the terms (K,), and the steps of
+        success (K,).
 
         Args:
-            traced: the body whose places (K, 3), now and after each step, are put into `paths`; None for none.
+            traced: body whose positions (K, 3), at the start and after each step, are appended to `paths`; None for none.
         """
         count, horizon, _ = sequences.shape
         env, device = self.env, self.env.device
@@ -288,7 +289,7 @@ class RolloutPlanner:
 
 
 def _row(value: Any, like: torch.Tensor) -> torch.Tensor:
-    """A number for each env, with the type and device of `like`."""
+    """One number per env, with the type and device of `like`."""
     return torch.as_tensor(value, device=like.device).to(like.dtype)
 
 
@@ -298,23 +299,23 @@ def _seed_shared_rng(seed: int) -> None:
 
 
 def _switches(part: actions.ActionPart) -> bool:
-    """Whether a controller is a gripper's: what lies between open and closed is of no use to it."""
+    """Whether a controller is a gripper's: values between open and closed are useless for it."""
     return isinstance(part.controller, PDJointPosMimicController) and len(part.names) == 1
 
 
 def _noise_scale(part: actions.ActionPart) -> float:
     controller: Any = part.controller
     absolute = isinstance(controller, PDJointPosController) and not controller.config.use_delta
-    return _OF_ABSOLUTE if absolute and not _switches(part) else 1.0
+    return _ABSOLUTE_NOISE_FACTOR if absolute and not _switches(part) else 1.0
 
 
-# --- are the envs built alike? ---------------------------------------------------------------------------
+# --- comparison of the envs' bodies ----------------------------------------------------------------------
 
 
 @once_a_scene
 def bodies_of(env: BaseEnv) -> list[dict[str, bytes]]:
-    """Hash of each body by name, one dict per env; covers what decides how the body moves and collides, not its state.
-    Equal in every process."""
+    """Hash of each body by name, one dict per env. Covers what determines how the body moves and collides, not its state.
+    The same in every process."""
     index = scene_index(env)
     return [
         {

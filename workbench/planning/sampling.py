@@ -1,4 +1,4 @@
-"""Candidate actions around a plan, and the plan that their returns make of them: predictive sampling, MPPI, CEM."""
+"""Samples candidate actions around a plan, and updates the plan from their returns: predictive sampling, MPPI, CEM."""
 
 from __future__ import annotations
 
@@ -6,31 +6,32 @@ import torch
 
 from workbench.planning.options import PlanOptions
 
-_SMALL = 0.05, 0.5
-"""Smallest and largest factor on the noise, for a third of the candidates: large steps do not improve a nearly right
+_NOISE_FACTORS = 0.05, 0.5
+"""Minimum and maximum factor on the noise, for a third of the candidates: large steps do not improve a nearly right
 plan."""
-_MOVED = 0.5
-"""Probability that a dimension differs from the plan, in a third of the candidates."""
-_FLIPS = 0.3
+_MOVE_PROBABILITY = 0.5
+"""Probability that a dimension is changed from the plan, in a third of the candidates."""
+_FLIP_PROBABILITY = 0.3
 """Probability that a knot of a switching dimension is redrawn, in half of the candidates: candidates that drop an
 object do not find how to carry it."""
-_TOP = 0.25
-"""Fraction of the candidates, the best ones, whose spread of returns scales MPPI's temperature: where many candidates
-drop an object, the spread of all is so wide that the good ones all get the same weight."""
-_KEPT = 2
-"""Best candidates of a round that are tried again in the next."""
-_QUIET = 1.0
-"""MPPI's penalty on motion, in spreads of the best candidates: what full motion in every dimension must earn more than
-holding still. Without the penalty, turns that earn nothing add up, and a hand that arrives tilted grasps badly."""
-_LEAST_SPREAD = 0.2
-"""CEM's smallest spread, as a fraction of the noise: a spread of zero finds nothing new."""
+_TOP_FRACTION = 0.25
+"""Fraction of best candidates whose spread of returns scales MPPI's temperature: if many candidates drop an object, the
+spread of all is so wide that all good ones get the same weight."""
+_KEPT_CANDIDATES = 2
+"""Number of best candidates of a round that are tried again in the next."""
+_MOTION_PENALTY = 1.0
+"""MPPI's penalty on motion, in spreads of the best candidates: the extra return that full motion in every dimension needs
+over holding still. Without it, useless rotations add up, and a hand that arrives tilted grasps badly."""
+_MIN_SPREAD = 0.2
+"""CEM's minimum spread, as a fraction of the noise: a spread of zero finds nothing new."""
 
 
 class Sampler:
     """Plan of one env: knots of actions from -1 to 1, and candidates around the plan.
 
-    A knot is an action at a time of the horizon: the first is now, the last at its end. Between knots a dimension goes along
-    a straight line; one that switches (a gripper) stays as at the knot before, since what is half closed holds nothing.
+    A knot is an action at a time of the horizon: the first knot is now, the last at the end. Between knots a dimension is
+    interpolated linearly; a switching one (a gripper) keeps the value of the previous knot, since a half-closed gripper holds
+    nothing.
     """
 
     def __init__(
@@ -51,27 +52,27 @@ class Sampler:
         self._kept: torch.Tensor | None = None
         self._hold = torch.zeros(len(switches))
         self._taken: torch.Tensor | None = None
-        """(A,) the action that was taken last; None before the first."""
+        """(A,) the last action; None before the first."""
         self._times = torch.linspace(0, steps - 1, options.knots)
         self._weights = _weights(torch.arange(steps, dtype=torch.float32), self._times)
 
     @property
     def plan(self) -> torch.Tensor:
-        """(P, A) knots of the plan; there is one from the first `candidates` on."""
+        """(P, A) knots of the plan; exists after the first call of `candidates`."""
         assert self._mean is not None
         return self._mean
 
     def draw_seed(self) -> int:
-        """A seed of this plan's own random numbers."""
+        """Draw a seed from this plan's own generator."""
         return int(torch.randint(2**31, (1,), generator=self._generator))
 
     def candidates(self, hold: torch.Tensor) -> torch.Tensor:
         """(K, P, A) knots within -1 to 1: the plan itself, holding still, the best of the last round, others around the plan,
-        and a sixth around holding still, since a plan that leads nowhere is not left by small steps.
+        and a sixth around holding still, since small steps do not escape from a bad plan.
 
         Args:
-            hold: (A,) the action that changes nothing; the plan that an episode begins with. What switches stays as it was
-                last: a gripper that is told to stay at the width of what it holds lets it fall.
+            hold: (A,) the action that changes nothing; the initial plan of an episode. Switching dimensions keep their last
+                value: a gripper that is commanded to the width of the object that it holds drops it.
         """
         if self._taken is not None:
             hold = torch.where(self._switches, self._taken, hold)
@@ -80,14 +81,14 @@ class Sampler:
             self._mean = hold.expand(self._options.knots, -1).clone()
         shape = (self._options.rollouts, *self._mean.shape)
         drawn = torch.randn(shape, generator=self._generator)
-        flips = torch.rand(shape, generator=self._generator) < _FLIPS
+        flips = torch.rand(shape, generator=self._generator) < _FLIP_PROBABILITY
         flips &= torch.rand((shape[0], 1, 1), generator=self._generator) < 0.5
-        some = torch.rand((shape[0], 1, shape[2]), generator=self._generator) < _MOVED
-        # What only a long motion shows is found by a third of one action throughout, in some of the dimensions.
+        some = torch.rand((shape[0], 1, shape[2]), generator=self._generator) < _MOVE_PROBABILITY
+        # A third of the candidates repeat one action throughout, in some dimensions, to find the effect of long motions.
         drawn[0::3], flips[0::3] = drawn[0::3, :1].clone(), flips[0::3, :1].clone()
         side = torch.sign(drawn)
         drawn[0::3] *= some[0::3]
-        least, most = _SMALL
+        least, most = _NOISE_FACTORS
         power = torch.rand((len(drawn[2::3]), 1, 1), generator=self._generator)
         drawn[2::3] *= least * (most / least) ** power
         around = self._mean.repeat(shape[0], 1, 1)
@@ -104,12 +105,12 @@ class Sampler:
         return self._between(knots, self._weights)
 
     def improve(self, knots: torch.Tensor, returns: torch.Tensor) -> None:
-        """Make the plan of the returns (K,) of candidates (K, P, A). One that is NaN or infinite counts as the worst."""
+        """Update the plan from the returns (K,) of candidates (K, P, A). NaN and infinite returns count as the worst."""
         finite = torch.isfinite(returns)
         if not finite.any():
             return
         returns = torch.where(finite, returns, -torch.inf)
-        # Stable: equal returns would else be in an order that depends on the machine.
+        # Stable, because otherwise the order of equal returns depends on the machine.
         best = returns.argsort(descending=True, stable=True)
         if self._options.method == "predictive":
             self._mean = knots[best[0]].clone()
@@ -117,23 +118,23 @@ class Sampler:
             count = max(2, round(self._options.elites * len(knots)))
             elites = knots[best[: min(count, int(finite.sum()))]]
             self._mean = elites.mean(0)
-            least = _LEAST_SPREAD * self._noise
+            least = _MIN_SPREAD * self._noise
             self._spread = 0.5 * self._spread + 0.5 * torch.maximum(elites.std(0, correction=0), least)
         else:
-            top = returns[best[: min(max(2, round(_TOP * len(knots))), int(finite.sum()))]]
+            top = returns[best[: min(max(2, round(_TOP_FRACTION * len(knots))), int(finite.sum()))]]
             spread = top.std(correction=0)
             moved = torch.where(self._switches, 0.0, (knots - self._hold).square()).mean((1, 2))
-            returns = returns - _QUIET * spread * moved
+            returns = returns - _MOTION_PENALTY * spread * moved
             best = returns.argsort(descending=True, stable=True)
             width = self._options.temperature * spread
             weights = torch.softmax((returns - returns[best[0]]) / (width + 1e-12), 0)
             mean = (weights[:, None, None] * knots).sum(0)
-            # The mean of open and closed would be neither.
+            # A switching dimension takes the best candidate's value: the mean of open and closed is neither.
             self._mean = torch.where(self._switches, knots[best[0]], mean)
-        self._kept = knots[best[:_KEPT]].clone()
+        self._kept = knots[best[:_KEPT_CANDIDATES]].clone()
 
     def shift(self, steps: int) -> None:
-        """Move the plan on by control steps that were taken: what was planned for then is at its beginning now."""
+        """Shift the plan by the control steps that were taken, so that it begins at the current time."""
         if self._mean is not None:
             self._taken = self.sequences(self._mean[None])[0, min(steps, self._steps) - 1]
         weights = _weights((self._times + steps).clamp(max=self._steps - 1), self._times)
@@ -149,7 +150,7 @@ class Sampler:
 
 
 def _weights(at: torch.Tensor, times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """(T, P) parts of each knot in the value at times (T,): along straight lines, and as at the knot before."""
+    """(T, P) weights of the knots at times (T,): for linear interpolation, and for holding the previous knot."""
     after = torch.searchsorted(times, at, right=True).clamp(1, len(times) - 1)
     part = ((at - times[after - 1]) / (times[after] - times[after - 1])).clamp(0, 1)
     return _rows(after, part, len(times)), _rows(after, (part >= 1).float(), len(times))

@@ -1,4 +1,4 @@
-"""What came of a task's seeds that were solved by planning, as far as they are done.
+"""Results of solving a task's seeds by planning, complete or so far.
 
 Imports no torch."""
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from workbench.planning.verdicts import ENOUGH_SEEDS, MOST_OF, RewardVerdict
+from workbench.planning.verdicts import MIN_EPISODES, MIN_SEEDS, RewardVerdict
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class SolvedSeed:
 
     seed: int
     solved_at: int
-    """Control step of the first success, from 1 on; 0 without success."""
+    """Control step of the first success, counted from 1; 0 without success."""
     steps: int
     total_reward: float
     """Sum of the rewards of all steps, including the steps after success."""
@@ -27,24 +27,24 @@ class SolvedSeed:
     in_the_way: str
     """Why it was not solved; empty if it was."""
     path: Path
-    """Its recording."""
+    """Path of its recording."""
     cut_off: bool = False
-    """Whether the seed ended because its wall time was up."""
+    """Whether the seed ended at its wall time limit."""
 
 
 @dataclass(frozen=True)
 class SolveReport:
-    """Results of all seeds that were tried to the end."""
+    """Results of all finished seeds."""
 
     seeds: tuple[SolvedSeed, ...]
     verdicts: tuple[RewardVerdict, ...]
     """Verdicts over the seeds so far; empty unless there are enough seeds (`tells`). May change with more seeds."""
     seconds: float
-    """Wall time, opening the task included."""
+    """Wall time, including the opening of the task."""
     stopped: bool
-    """It was stopped before all seeds were tried."""
+    """Whether it was stopped before all seeds were tried."""
     wanted: int
-    """Seeds that were asked for."""
+    """Number of requested seeds."""
 
     @property
     def solved(self) -> tuple[SolvedSeed, ...]:
@@ -57,8 +57,8 @@ class SolveReport:
 
     @property
     def tells(self) -> bool:
-        """Whether there are seeds enough for verdicts: what the first ones show, the next may refute."""
-        return len(self.seeds) >= min(MOST_OF, self.wanted)
+        """Whether there are enough seeds for verdicts: the next seeds may refute what the first ones show."""
+        return len(self.seeds) >= min(MIN_EPISODES, self.wanted)
 
     @property
     def so_far(self) -> str:
@@ -78,30 +78,28 @@ class SolveReport:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """A sentence each: what the result leaves open."""
+        """Limits of the result, as sentences."""
         found = []
         if not self.tells:
-            found.append(f"What the seeds tell of the reward is said from {MOST_OF} seeds on.")
-        if self.wanted < ENOUGH_SEEDS:
+            found.append(f"Verdicts on the reward need at least {MIN_EPISODES} seeds.")
+        if self.wanted < MIN_SEEDS:
             found.append(few_seeds_text(self.wanted))
         if cut := sum(one.cut_off and not one.solved_at for one in self.seeds):
             found.append(
-                f"{_seeds(cut)} ended because {'its' if cut == 1 else 'their'} time was up: on another machine, or in "
-                "another run, others may be solved."
+                f"{_seeds(cut)} reached the wall time limit: on another machine, or in another run, others "
+                "may be solved."
             )
         return tuple(found)
 
 
 def few_seeds_text(count: int) -> str:
-    """What so few seeds leave open: fewer than `verdicts.ENOUGH_SEEDS`."""
+    """Warning about a result of fewer seeds than `verdicts.MIN_SEEDS`."""
     be = "is" if count == 1 else "are"
-    return (
-        f"{_seeds(count)} {be} few: what is wrong with a reward may not show with fewer than {ENOUGH_SEEDS}."
-    )
+    return f"{_seeds(count)} {be} few: problems of a reward may not show with fewer than {MIN_SEEDS}."
 
 
 def underway_text(running: Mapping[int, int], limit: int) -> str:
-    """``seed 2 at step 12 of 50``; ``seeds 2 and 3 at steps 12 and 7 of 50``; empty where none runs.
+    """``seed 2 at step 12 of 50``; ``seeds 2 and 3 at steps 12 and 7 of 50``; empty if none runs.
 
     Args:
         running: control steps so far, by seed.

@@ -1,4 +1,4 @@
-"""What planned episodes tell of the reward: each verdict from numbers, with the seeds of the episodes that show it.
+"""Judges a reward by planned episodes: each verdict follows from numbers and names the seeds that show it.
 
 Imports no torch."""
 
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 
 from workbench.planning.planned_episodes import PlannedEpisode
 
-_SAME = 0.002
+_EQUAL_FRACTION = 0.002
 """Rewards count as equal if they differ by less than this fraction of the range of all rewards seen."""
-_FALL = 0.25
-"""Smallest fall of the reward that counts, as a fraction of the rise from the first reward to the reward at success."""
-MOST_OF = 3
-"""Fewest episodes among which a majority counts as evidence."""
-ENOUGH_SEEDS = 8
-"""Fewest seeds from which a report without verdicts is evidence: reward that pays without success shows only where some
-seeds are solved and others are not."""
-_LAST = 10
+_MIN_FALL_FRACTION = 0.25
+"""Minimum fall of the reward that counts, as a fraction of the rise from the first reward to the reward at success."""
+MIN_EPISODES = 3
+"""Minimum number of episodes among which a majority counts as evidence."""
+MIN_SEEDS = 8
+"""Minimum number of seeds for which a report without verdicts is evidence: a reward that pays without success shows only
+if some seeds are solved and others are not."""
+_LAST_STEPS = 10
 """Control steps at the end of an episode that are compared, at most half of the episode."""
 
 
 @dataclass(frozen=True)
 class RewardVerdict:
-    """What some episodes show."""
+    """A rule of the reward that some episodes break."""
 
     rule: str
     """Id of the rule in the table of rules."""
@@ -39,7 +39,7 @@ class RewardVerdict:
 
 @dataclass(frozen=True)
 class PlannedEpisodes:
-    """The planned episodes of a task, and what is compared within them."""
+    """The planned episodes of a task, with values derived for comparisons."""
 
     all: tuple[PlannedEpisode, ...]
 
@@ -53,21 +53,21 @@ class PlannedEpisodes:
 
     @property
     def at_success(self) -> float | None:
-        """The median reward of the step that succeeds; None without one."""
+        """Median reward of the step that succeeds; None if no episode does."""
         rewards = [one.reward[one.solved_at - 1] for one in self.solved]
         return float(np.median(rewards)) if rewards else None
 
     @property
     def same(self) -> float:
-        """Rewards of a control step that differ by less are the same."""
+        """Difference below which two rewards of a control step count as equal."""
         seen = [one.reward[np.isfinite(one.reward)] for one in self.all]
         rewards = np.concatenate([*seen, np.zeros(0, np.float32)])
-        return _SAME * float(np.ptp(rewards)) if len(rewards) else 0.0
+        return _EQUAL_FRACTION * float(np.ptp(rewards)) if len(rewards) else 0.0
 
     @property
     def without_reward(self) -> bool:
-        """Whether no rollout earned more than another before a success: a sparse reward, or none."""
-        with np.errstate(invalid="ignore"):  # of infinite rewards
+        """Whether no rollout earned more than another before a success: the reward is sparse or constant."""
+        with np.errstate(invalid="ignore"):  # infinite rewards
             flat = [(one.best - one.worst)[: (one.solved_at or one.steps + 1) - 1] for one in self.all]
         return bool(self.all) and all(not len(each) or float(each.max()) == 0 for each in flat)
 
@@ -86,7 +86,7 @@ def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> s
         return f"failed at step {episode.failed_at}"
     if episode.cut_off:
         steps = f"{episode.steps} step{'' if episode.steps == 1 else 's'}"
-        return f"its time was up after {steps} (--seconds-per-seed)"
+        return f"wall time limit reached after {steps} (--seconds-per-seed)"
     every = PlannedEpisodes(tuple(episodes))
     if every.without_reward:
         return "no rollout earned more than another"
@@ -95,20 +95,20 @@ def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> s
     if _is_flat(every, episode):
         return f"all rollouts earned the same from step {_since(_spread_a_step(episode), every.same)} on"
     if _is_stuck(every, episode):
-        return f"nothing earned more than was earned already from step {_since(_gain_a_step(episode), every.same)} on"
-    return "not solved when the time was up"
+        return f"no rollout earned more than the episode already did from step {_since(_gain_a_step(episode), every.same)} on"
+    return "not solved within the step limit"
 
 
 # --- one function each -----------------------------------------------------------------------------------
 
 
 def exploited(episodes: PlannedEpisodes) -> RewardVerdict | None:
-    """Episodes without success that earn at their end at least what successful ones earn when they succeed."""
+    """Episodes without success whose final reward is at least that of successful ones at success."""
     found = [one for one in episodes.unsolved if _earns_like_success(episodes, one)]
     if not found:
         return None
     told = ", ".join(f"{name} {value:.4g}" for name, value in found[0].evaluate.items())
-    said = f"; evaluate said at the end of seed {found[0].seed}: {told}" if told else ""
+    said = f"; evaluate at the end of seed {found[0].seed}: {told}" if told else ""
     rate = float(np.median([_end(one).mean() for one in found]))
     return RewardVerdict(
         "reward-exploited",
@@ -119,11 +119,11 @@ def exploited(episodes: PlannedEpisodes) -> RewardVerdict | None:
 
 
 def flat(episodes: PlannedEpisodes) -> RewardVerdict | None:
-    """Unsolved episodes at whose end all rollouts earned the same, so that nothing leads on."""
+    """Unsolved episodes at whose end all rollouts earned the same, so that the reward gives no direction."""
     if episodes.without_reward and episodes.unsolved:
         return RewardVerdict(
             "reward-flat",
-            "no rollout earned more than another before success: with a sparse reward planning finds only what it happens on. "
+            "no rollout earned more than another before success: with a sparse reward planning succeeds only by chance. "
             "Give the task a dense reward, or record demonstrations in another way (workbench record --actions FILE)",
             _seeds(episodes.unsolved),
         )
@@ -137,7 +137,7 @@ def flat(episodes: PlannedEpisodes) -> RewardVerdict | None:
         for name, spread in first.terms.items()
         if not (_end(first, spread) > _least(episodes, first)).any()
     ]
-    named = f"; flat are {', '.join(still)}" if still else ""
+    named = f"; flat terms: {', '.join(still)}" if still else ""
     return RewardVerdict(
         "reward-flat",
         f"at the end of {len(found)} of {len(episodes.all)} episodes all rollouts earned the same, whatever they did: seed "
@@ -147,12 +147,12 @@ def flat(episodes: PlannedEpisodes) -> RewardVerdict | None:
 
 
 def stuck(episodes: PlannedEpisodes) -> RewardVerdict | None:
-    """Unsolved episodes at whose end no rollout earned more than one that holds still, nor than the episode did already."""
+    """Unsolved episodes at whose end no rollout earned more than holding still, or than the episode already did."""
     found = [
         one
         for one in episodes.unsolved
         if not _ended_early(one)
-        and "success" in one.evaluate  # without one, what earns most stays there
+        and "success" in one.evaluate  # without success, the best episode stays where it is
         and not _earns_like_success(episodes, one)
         and not _is_flat(episodes, one)
         and _is_stuck(episodes, one)
@@ -163,21 +163,21 @@ def stuck(episodes: PlannedEpisodes) -> RewardVerdict | None:
     since = _since(_gain_a_step(first), episodes.same)
     return RewardVerdict(
         "reward-stuck",
-        f"at the end of {len(found)} of {len(episodes.all)} episodes nothing earned more than was earned already, "
-        f"within {first.horizon} steps: seed {first.seed} from step {since} on, at {first.reward[-1]:.3f} a step. What leads on costs "
-        "reward first, or is further away than a plan looks (--horizon)",
+        f"at the end of {len(found)} of {len(episodes.all)} episodes no rollout of {first.horizon} steps earned more than the "
+        f"episode already did: seed {first.seed} from step {since} on, at {first.reward[-1]:.3f} a step. Progress costs reward "
+        "first, or is beyond the horizon of a plan (--horizon)",
         _seeds(found),
     )
 
 
 def against(episodes: PlannedEpisodes) -> RewardVerdict | None:
-    """Solved episodes on whose way the reward fell."""
+    """Solved episodes in which the reward fell before success."""
     falls = [(one, *_largest_fall(one.reward[: one.solved_at])) for one in episodes.solved]
     found = [
         (one, high, low)
         for one, high, low in falls
         if one.reward[high] - one.reward[low]
-        > max(_FALL * abs(one.reward[one.solved_at - 1] - one.reward[0]), episodes.same)
+        > max(_MIN_FALL_FRACTION * abs(one.reward[one.solved_at - 1] - one.reward[0]), episodes.same)
     ]
     if not _are_most([each for each, *_ in found], episodes.solved):
         return None
@@ -192,7 +192,7 @@ def against(episodes: PlannedEpisodes) -> RewardVerdict | None:
 
 
 def lost(episodes: PlannedEpisodes) -> RewardVerdict | None:
-    """Solved episodes that were not solved any more a few steps later, though the reward was sought all the time."""
+    """Solved episodes that lost success a few steps later, while the planner kept maximizing the reward."""
     found = [one for one in episodes.solved if not one.success[one.solved_at - 1 :].all()]
     if not _are_most(found, episodes.solved):
         return None
@@ -201,13 +201,13 @@ def lost(episodes: PlannedEpisodes) -> RewardVerdict | None:
     return RewardVerdict(
         "success-lost",
         f"success comes and goes in {len(found)} of {len(episodes.solved)} solved episodes: seed {first.seed} had it at step "
-        f"{first.solved_at} and not {again} {'step' if again == 1 else 'steps'} later, while it was after reward",
+        f"{first.solved_at} and not {again} {'step' if again == 1 else 'steps'} later, while maximizing the reward",
         _seeds(found),
     )
 
 
 def failing_pays(episodes: PlannedEpisodes) -> RewardVerdict | None:
-    """Episodes that failed where each step costs, so that an early end earns more than going on."""
+    """Episodes that failed while rewards are negative, so that an early end earns more than continuing."""
     found = [one for one in episodes.unsolved if one.failed_at and float(one.reward.mean()) < 0]
     if not _are_most(found, episodes.all):
         return None
@@ -215,8 +215,8 @@ def failing_pays(episodes: PlannedEpisodes) -> RewardVerdict | None:
     return RewardVerdict(
         "failing-pays",
         f"{len(found)} of {len(episodes.all)} episodes end by failing, and rewards are below 0: seed {first.seed} failed at "
-        f"step {first.failed_at}, with {first.reward.mean():.3f} a step until then. Nothing is paid after a fail, so that the "
-        "earliest one earns most",
+        f"step {first.failed_at}, with {first.reward.mean():.3f} a step until then. Steps after a fail earn nothing, so that the "
+        "earliest fail earns most",
         _seeds(found),
     )
 
@@ -232,17 +232,17 @@ RULES: dict[str, Callable[[PlannedEpisodes], RewardVerdict | None]] = {
 """Check of each rule by its id, in the order of the report."""
 
 
-# --- what is looked at -----------------------------------------------------------------------------------
+# --- numbers of an episode -------------------------------------------------------------------------------
 
 
 def _end(episode: PlannedEpisode, row: NDArray[Any] | None = None) -> NDArray[Any]:
-    """The last steps of an episode: of its rewards, or of another row (T,)."""
+    """The last steps of an episode's rewards, or of another row (T,)."""
     row = episode.reward if row is None else row
-    return row[-max(1, min(_LAST, episode.steps // 2)) :]
+    return row[-max(1, min(_LAST_STEPS, episode.steps // 2)) :]
 
 
 def _are_most(found: Sequence[PlannedEpisode], among: Sequence[PlannedEpisode]) -> bool:
-    return len(among) >= MOST_OF and 2 * len(found) > len(among)
+    return len(among) >= MIN_EPISODES and 2 * len(found) > len(among)
 
 
 def _ended_early(episode: PlannedEpisode) -> bool:
@@ -255,12 +255,13 @@ def _earns_like_success(episodes: PlannedEpisodes, episode: PlannedEpisode) -> b
 
 
 def _spread_a_step(episode: PlannedEpisode) -> NDArray[Any]:
-    with np.errstate(invalid="ignore"):  # of infinite rewards
+    with np.errstate(invalid="ignore"):  # infinite rewards
         return (episode.best - episode.worst) / episode.horizon
 
 
 def _gain_a_step(episode: PlannedEpisode) -> NDArray[Any]:
-    """(T,) what the best rollout earned a step more than holding still, or than the step before it: what is held may slip."""
+    """(T,) gain per step of the best rollout over the better of holding still and repeating the previous reward: an object may
+    slip while holding still."""
     before = np.concatenate([[-np.inf], episode.reward[:-1]])
     return episode.best / episode.horizon - np.maximum(episode.hold / episode.horizon, before)
 
@@ -278,13 +279,13 @@ def _is_stuck(episodes: PlannedEpisodes, episode: PlannedEpisode) -> bool:
 
 
 def _since(row: NDArray[Any], most: float) -> int:
-    """The step, from 1 on, after which a row stays at or below `most`."""
+    """The step, counted from 1, after which a row stays at or below `most`."""
     above = np.flatnonzero(row > most)
     return int(above[-1]) + 2 if len(above) else 1
 
 
 def _largest_fall(row: NDArray[np.float32]) -> tuple[int, int]:
-    """Where the highest value before the lowest one after it is, and that one: the two between which a row falls most."""
+    """Indices (high, low) between which a row falls most, with high before low."""
     highest = np.maximum.accumulate(row)
     low = int((highest - row).argmax())
     return int(row[: low + 1].argmax()), low

@@ -24,12 +24,12 @@ from workbench.record.job_worker import (
     with_given_actions,
 )
 
-TRIES = 2
+MAX_CHUNK_STARTS = 2
 """Maximum number of times that a chunk of episodes is started when its workers die, before they are tried one by one."""
-_LONG_JOB = 256
+_LONG_JOB_BATCHES = 256
 """Number of batches from which on a chunk holds several: the envs of a batch wait for each other only at the end
 of a chunk."""
-_BATCHES = 4
+_CHUNK_BATCHES = 4
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Recorded:
 
 def chunk_of(episodes: int, num_envs: int) -> int:
     """Number of episodes that a worker with `num_envs` envs runs together, for `episodes` episodes in all."""
-    return num_envs * (_BATCHES if episodes >= _LONG_JOB * num_envs else 1)
+    return num_envs * (_CHUNK_BATCHES if episodes >= _LONG_JOB_BATCHES * num_envs else 1)
 
 
 def record(
@@ -268,7 +268,7 @@ class _Recording:
             self._on_update,
             stop,
             chunk=chunk_of(most, what.options.num_envs),
-            tries=TRIES,
+            tries=MAX_CHUNK_STARTS,
             on_failure=self._failed,
         )
 

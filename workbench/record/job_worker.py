@@ -50,9 +50,9 @@ from workbench.task.description import RecordArguments, Stepped, TaskOptions
 from workbench.task.load import undo_load
 from workbench.task.open import OpenedTask, open_task
 
-_TRIES = 100
+_TRIES_PER_SUCCESS = 100
 """Episodes that are tried for each requested success."""
-_SAME_START = 1e-4
+_START_TOLERANCE = 1e-4
 """Metres or radians: a start further from the demonstration's is a different one."""
 
 
@@ -182,7 +182,7 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
         if several and episodes > several:
             raise ValueError(f"{what.actions} has {several} episodes, and --episodes asks for {episodes}")
         return replace(what, episodes=episodes), given
-    most = what.tries or _TRIES * what.successes
+    most = what.tries or _TRIES_PER_SUCCESS * what.successes
     return replace(what, tries=min(most, several) if several else most), given
 
 
@@ -447,7 +447,7 @@ class _Episodes:
 
     def _correct_start(self, env: int, given: RecordedRun, step: StepResult) -> StepResult:
         first, task = given.state(0), self._opened.env
-        if max(state_distance(states_of(read_state_columns(task), env), first)) <= _SAME_START:
+        if max(state_distance(states_of(read_state_columns(task), env), first)) <= _START_TOLERANCE:
             return step
         self._start_corrected.add(self._running[env])
         return restore_recorded(self._opened, {env: first})

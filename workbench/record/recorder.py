@@ -36,13 +36,13 @@ from workbench.task.load import task_of_class
 from workbench.task.open import describe
 
 logger = logging.getLogger(__name__)
-_MOST_PENDING = 2048
+_MAX_PENDING_STEPS = 2048
 """Maximum number of steps times envs that wait for the gatherer: 3 MB. Fewer wait after half a second, or when an
 episode begins."""
-_MOST_PICTURES = 1 << 25
+_MAX_PENDING_PICTURE_BYTES = 1 << 25
 """Maximum size in bytes of the pictures that wait for the gatherer."""
 
-_MANY_ENVS = 4
+_SUBPROCESS_ENVS = 4
 """Env count from which a subprocess makes the files; below it, start-up costs more than it saves."""
 
 
@@ -119,7 +119,7 @@ class Recorder(gym.Wrapper):
             if notice := recovered_text(recovered):
                 logger.warning("%s", notice)
         self._task = TaskEnv(base)
-        many = len(chosen) >= _MANY_ENVS and usable_cores() > 1
+        many = len(chosen) >= _SUBPROCESS_ENVS and usable_cores() > 1
         self._finisher = EpisodeFinisher(in_process=many)
         self._made: list[Future[EpisodeFiles | str]] = []
         """Files of finished episodes that are being written."""
@@ -229,7 +229,10 @@ class Recorder(gym.Wrapper):
         self._waiting_pictures += sum(picture.nbytes for picture in pictures)
         follows = np.array_equal(step.elapsed_steps, self._elapsed + 1)
         self._elapsed = step.elapsed_steps
-        full = len(self._pending) * len(reset_mask) > _MOST_PENDING or self._waiting_pictures > _MOST_PICTURES
+        full = (
+            len(self._pending) * len(reset_mask) > _MAX_PENDING_STEPS
+            or self._waiting_pictures > _MAX_PENDING_PICTURE_BYTES
+        )
         # A step that does not continue its episode raises at once.
         if full or not follows:
             self._gather()

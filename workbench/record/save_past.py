@@ -43,7 +43,7 @@ def moments_of(episodes: Sequence[PastEpisode]) -> list[tuple[Moment, dict[int, 
     return [found[serial] for serial in sorted(found)]
 
 
-_SAME_START = 1e-6
+_START_TOLERANCE = 1e-6
 """Tolerance of the start state: metres, and quaternion components."""
 
 
@@ -191,7 +191,7 @@ class PastSaver:
         first, env = episode.moments[0]
         step = await self._process.ask(Reset((env,), episode.seed))
         now, then = step.poses[env], first.as_recorded.poses[env]
-        return episode.seed if np.allclose(now, then, rtol=0, atol=_SAME_START, equal_nan=True) else -1
+        return episode.seed if np.allclose(now, then, rtol=0, atol=_START_TOLERANCE, equal_nan=True) else -1
 
     def _failed(self, failure: JobFailed) -> None:
         why, problem = str(failure), failure.problem

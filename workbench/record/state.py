@@ -24,7 +24,7 @@ DOES: frozenset[type[Command]] = of_saving.DOES | {
     ChooseRecordedEnvs,
 }
 """Commands that `apply` takes."""
-MOST_WAITING_BYTES = 256 * 1024**2
+MAX_PENDING_BYTES = 256 * 1024**2
 """Maximum bytes of steps that may wait for the disk."""
 TOO_SLOW = (
     "the recording ended: the disk is slower than the simulation. Record fewer envs, or choose another folder"
@@ -316,7 +316,7 @@ def _ended(recording: LiveRecording, problem: str | None = None) -> LiveRecordin
 def _take(recording: LiveRecording, stepped: Stepped) -> Change:
     size = _size(stepped)
     waiting = recording.waiting_bytes + size
-    if waiting > MOST_WAITING_BYTES:
+    if waiting > MAX_PENDING_BYTES:
         return _ended(recording, TOO_SLOW), [EndEpisodes(), Send(SetCapture(()))]
     return replace(recording, waiting_bytes=waiting), [TakeStep(stepped, size)]
 

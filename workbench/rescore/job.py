@@ -18,7 +18,7 @@ from workbench.envs.gpu_rules import Finding
 from workbench.episodes.recorded_source import CannotEnterRecording
 from workbench.episodes.row import Source
 from workbench.jobs.scheduler import Chunk, Executor, Failure, ItemQueue, Scheduler, Work
-from workbench.jobs.worker_files import MOST_BYTES
+from workbench.jobs.worker_files import MAX_BYTES
 from workbench.machine.folders import CurrentFolder
 from workbench.rescore.replay_recordings import RescoredBy, opened_code, rescore
 from workbench.rescore.verdict import Verdict
@@ -26,9 +26,9 @@ from workbench.task.open import OpenedTask
 from workbench.task.problem import Problem, TaskError
 from workbench.task.reference import RecordedTask, named_file
 
-_TRIES = 3
+_MAX_CHUNK_STARTS = 3
 """Maximum number of times that a chunk is started when its workers die."""
-_SIDE = (".rrd", ".h5", ".json")
+_SUFFIXES = (".rrd", ".h5", ".json")
 """Suffixes of the files of one recording."""
 
 
@@ -162,7 +162,7 @@ def rescore_recordings(
             on_progress(len(results), len(setup.items), steps)
 
     scheduler: Scheduler[RescoredRecording, RescoreUpdate] = Scheduler(
-        sorted(setup.items), take, hear, chunk=setup.chunk, tries=_TRIES, on_failure=failed
+        sorted(setup.items), take, hear, chunk=setup.chunk, tries=_MAX_CHUNK_STARTS, on_failure=failed
     )
     folders, files = _needed(setup)
     if executor.elsewhere:
@@ -204,10 +204,10 @@ def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
         file
         for of in setup.items.values()
         if not of.why_not
-        for suffix in _SIDE
+        for suffix in _SUFFIXES
         if (file := of.source().path.with_suffix(suffix)).is_file()
     }
-    if sum(file.stat().st_size for file in files) > MOST_BYTES // 2:
+    if sum(file.stat().st_size for file in files) > MAX_BYTES // 2:
         return replace(setup, elsewhere=True), []
     items = {number: replace(of, travels=of.source().path.resolve()) for number, of in setup.items.items()}
     return replace(setup, items=items), sorted(files)

@@ -18,8 +18,8 @@ from workbench.rescore.verdict import RescoredMoments, RescoreMoments
 
 _CHUNK_SECONDS = 0.1
 """Desired seconds of one question: it decides how soon progress is shown and a stop takes effect."""
-_MOST_AT_ONCE = 64
-_SUMMARY_EVERY = 0.5
+_MAX_MOMENTS = 64
+_SUMMARY_SECONDS = 0.5
 """Seconds between two summaries."""
 
 
@@ -74,7 +74,7 @@ class PastRescorer:
             nonlocal summed_up
             missed.update(answer.not_carried)
             now, done, summary = time.monotonic(), past.rescored_steps, {}
-            if answer.problem is not None or done == past.steps or now - summed_up > _SUMMARY_EVERY:
+            if answer.problem is not None or done == past.steps or now - summed_up > _SUMMARY_SECONDS:
                 summed_up = now
                 names, differing = past.names()
                 summary = {"verdicts": tuple(past.verdicts()), "names": names, "differing_names": differing}
@@ -131,7 +131,7 @@ class PastRescorer:
                     raise JobFailed(f"the episodes cannot be compared: {error}") from error
             on_answer(answer, took)
             in_time = count * _CHUNK_SECONDS / max(took, 1e-3)
-            count = max(1, min(int(in_time), 2 * count, _MOST_AT_ONCE))
+            count = max(1, min(int(in_time), 2 * count, _MAX_MOMENTS))
             at = chunk.stop
 
     async def _ask(self, past: RescoredPast, rows: range) -> RescoredMoments:

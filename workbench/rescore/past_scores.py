@@ -13,7 +13,7 @@ from workbench.envs.step_result import StepResult
 from workbench.live.history.moments import History, Moment
 from workbench.rescore.verdict import MomentToRescore, Scores, Verdict, compare, scalar_entries
 
-MOST_ENTRIES = 24
+MAX_ENTRIES = 24
 """Most entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""
 
 
@@ -209,7 +209,7 @@ class RescoredPast:
     def _write(self, table: dict[str, NDArray[np.float32]], row: int, step: StepResult) -> None:
         for name, value in (("reward", step.reward), *scalar_entries(step.evaluate).items()):
             if name not in table:
-                if len(table) > MOST_ENTRIES:
+                if len(table) > MAX_ENTRIES:
                     continue
                 table[name] = np.full(self._jumped.shape, np.nan, np.float32)
             table[name][row] = value

@@ -141,9 +141,9 @@ def _info_of(source: Source) -> EpisodeInfo:
         return read_recording(source).info
 
 
-MOST_AT_ONCE = 16
+MAX_ENVS = 16
 """Most envs that rescore at once."""
-MOST_NAMED = 3
+MAX_VERSIONS = 3
 """Most versions that a note lists."""
 
 
@@ -192,7 +192,7 @@ class Rescorer:
         self._rescoring = self._rescoring.begun(RescoreView("loading", total=len(files), unit="episodes"))
 
         def group() -> tuple[list[RescoreGroup], list[Verdict[Source]]]:
-            return group_episodes(files, MOST_AT_ONCE, self._base, file=file, recorded_source=recorded_source)
+            return group_episodes(files, MAX_ENVS, self._base, file=file, recorded_source=recorded_source)
 
         self._jobs.start("rescoring", lambda job: self._rescore_all(job, group, use_env_states))
 
@@ -228,8 +228,8 @@ class Rescorer:
     ) -> None:
         try:
             groups, broken_files = await self._aside.run(group)
-            notes = [f"with {_code_text(group)}" for group in groups[:MOST_NAMED]]
-            notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
+            notes = [f"with {_code_text(group)}" for group in groups[:MAX_VERSIONS]]
+            notes += [f"and {len(groups) - MAX_VERSIONS} more"] if len(groups) > MAX_VERSIONS else []
             notes += dict.fromkeys(g.note for g in groups if g.note)
             self._tell(broken_files, state="asking", notes=tuple(notes))
             cleared = await self._aside.run(

@@ -33,7 +33,7 @@ from workbench.review.view import ReviewView
 from workbench.task.reference import RecordedTask, named_file
 
 TODAYS, RECORDED = "today's", "as recorded"
-MOST_NAMED = 3
+MAX_NAMES = 3
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code
 def _todays(infos: Sequence[EpisodeInfo], named: Sequence[RecordedTask]) -> str:
     if not infos:
         return "Each recording with the file it names, as it is now."
-    told = [_in_words(reference) for reference in named[:MOST_NAMED]]
-    more = f", and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
+    told = [_in_words(reference) for reference in named[:MAX_NAMES]]
+    more = f", and {len(named) - MAX_NAMES} more" if len(named) > MAX_NAMES else ""
     return f"With {', '.join(told)}{more}."
 
 
@@ -83,7 +83,7 @@ def _in_words(reference: RecordedTask) -> str:
 
 def _recorded(infos: Sequence[EpisodeInfo]) -> str:
     hashes = list(dict.fromkeys(version for info in infos if (version := recorded_version(info))))
-    version = f" (version {', '.join(hashes[:MOST_NAMED])})" if hashes else ""
+    version = f" (version {', '.join(hashes[:MAX_NAMES])})" if hashes else ""
     return f"With the code stored in each recording{version}. It runs here; for recordings made elsewhere you are asked first."
 
 

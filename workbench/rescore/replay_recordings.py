@@ -31,7 +31,7 @@ from workbench.task.open import OpenedTask, open_task
 from workbench.task.problem import TaskError
 from workbench.task.reference import TaskName
 
-_PROGRESS_PERIOD = 0.2
+_PROGRESS_SECONDS = 0.2
 """Seconds between two progress messages."""
 
 
@@ -135,7 +135,7 @@ def rescore(
             steps += len(rescorings)
         ended = [env for env, rescoring in rescorings.items() if rescoring.at == rescoring.run.length]
         verdicts = tuple(rescorings.pop(env).verdict() for env in ended)
-        if verdicts or time.monotonic() - reported > _PROGRESS_PERIOD:
+        if verdicts or time.monotonic() - reported > _PROGRESS_SECONDS:
             yield Rescored(verdicts, steps)
             reported, steps = time.monotonic(), 0
 

@@ -20,7 +20,7 @@ from workbench.rescore import verdict_text
 from workbench.rescore.state import RUNNING, RescoreView
 from workbench.rescore.verdict import Verdict
 
-MOST_ROWS = 10
+MAX_ROWS = 10
 """Maximum number of rows of the list that are shown at a time."""
 RECORD_COLOUR = "#adb5bd"
 View = TypeVar("View")
@@ -53,7 +53,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
 
     def _add_list(self) -> None:
         self._list = self._server.gui.add_html("", visible=False)
-        self._pages = Paged(MOST_ROWS)
+        self._pages = Paged(MAX_ROWS)
 
     def _add_chart(self) -> None:
         self._chart = LineChart(self._server, self._server.gui.add_folder(None), height=160)

@@ -17,7 +17,7 @@ from workbench.rescore.verdict import FLAGS, MAIN, Verdict
 
 PUT_IN = " With the recorded states restored at every step, nothing drifts."
 """Advice about drift from a recording."""
-_MOST_NAMED = 4
+_MAX_NAMES = 4
 
 
 def change_text(verdict: Verdict[Any]) -> str:
@@ -91,7 +91,7 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
         listed = f"{', '.join(has[:-1])} and {has[-1]} are" if len(has) > 1 else f"{has[0]} is"
         unchanged = f"{listed} unchanged"
     sentence = f"Nothing differs in {counted(len(rescored), 'episode')}{yet}: {unchanged}."
-    named = sorted({*others, *(name for verdict in rescored for name in verdict.differing)})[:_MOST_NAMED]
+    named = sorted({*others, *(name for verdict in rescored for name in verdict.differing)})[:_MAX_NAMES]
     return sentence + (f" Other entries differ: {', '.join(named)}." if named else "")
 
 

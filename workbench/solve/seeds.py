@@ -19,7 +19,7 @@ from workbench.machine.loop import BlockingPool, do, post
 from workbench.page.command import Command, Refused
 from workbench.planning.options import PlanOptions
 from workbench.planning.seeds_report import SolveReport, underway_text
-from workbench.planning.verdicts import ENOUGH_SEEDS
+from workbench.planning.verdicts import MIN_SEEDS
 from workbench.task.description import TaskOptions
 from workbench.task.problem import Problem, TaskError
 
@@ -52,7 +52,7 @@ class SeedsView:
     """Why solving failed, as text."""
     problem: Problem | None = None
     """What the author's code raised."""
-    chosen: int = ENOUGH_SEEDS
+    chosen: int = MIN_SEEDS
     """Seeds that a person chose to solve next."""
 
 

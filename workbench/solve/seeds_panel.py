@@ -23,12 +23,12 @@ from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Visitor
 from workbench.planning.seeds_report import SolveReport
-from workbench.planning.verdicts import ENOUGH_SEEDS
+from workbench.planning.verdicts import MIN_SEEDS
 from workbench.solve.seeds import RUNNING, SeedsView
 
 TITLE = "Solve many seeds"
 SOLVE, STOP_SOLVING = "Solve", "Stop solving"
-HINT = f"From 0 on. That no rule is broken says something from {ENOUGH_SEEDS} seeds on."
+HINT = f"From 0 on. That no rule is broken says something from {MIN_SEEDS} seeds on."
 
 
 class SolveSeedsPanel(PagePart[SessionView]):

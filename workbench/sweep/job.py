@@ -15,11 +15,11 @@ from typing import Any
 from workbench.actions.choose import SOLVE
 from workbench.envs.broken_rule import warn_of
 from workbench.envs.gpu_rules import Finding
-from workbench.episodes.sweep_results import MOST_POINTS, SweepEpisode, SweepResults, value_text
+from workbench.episodes.sweep_results import MAX_POINTS, SweepEpisode, SweepResults, value_text
 from workbench.jobs.local_processes import Processes
 from workbench.jobs.scheduler import Executor, Failure, Scheduler, ThisProcess
 from workbench.planning.options import PlanOptions
-from workbench.record.job import TRIES, RecordProgress, ToldByWorkers, chunk_of, do_record
+from workbench.record.job import MAX_CHUNK_STARTS, RecordProgress, ToldByWorkers, chunk_of, do_record
 from workbench.record.job_worker import RecordOptions, RecordUpdate, Written, with_given_actions
 from workbench.task import registry
 from workbench.task.constructor_arguments import class_arguments
@@ -29,11 +29,11 @@ from workbench.task.problem import TaskError
 from workbench.task.reference import file_and_class, find_module, named_file, split_reference
 from workbench.task.settings_in_text import Argument, Constant, SettingError, TaskText
 
-_CHUNKS = 64
+_MIN_CHUNKS = 64
 """Minimum number of chunks of a whole sweep that has enough episodes; each chunk opens the task once in its worker."""
-_AFTER_SUCCESS = 5
+_STEPS_AFTER_SUCCESS = 5
 """Control steps that a planned episode continues after its success, as in `solve.job`."""
-_LONGEST_NAME = 80
+_MAX_NAME_CHARACTERS = 80
 """Maximum length of a folder's name in characters."""
 
 
@@ -81,7 +81,7 @@ class SweepOptions:
         """Number of episodes that a worker runs together. It does not depend on how the job runs."""
         envs = self.options.num_envs
         points = math.prod(len(one.values) for one in self.settings)
-        enough = -(-self.seeds * points // (_CHUNKS * envs)) * envs
+        enough = -(-self.seeds * points // (_MIN_CHUNKS * envs)) * envs
         return min(max(chunk_of(self.seeds, envs), enough), -(-self.seeds // envs) * envs)
 
     @property
@@ -112,7 +112,7 @@ class Point:
 def _point(index: int, values: dict[str, Any], count: int) -> Point:
     texts = ((name.rpartition(".")[2], value_text(json.dumps(value))) for name, value in values.items())
     named = "_".join(f"{name}={text}" for name, text in texts)
-    plain = re.sub(r"[^A-Za-z0-9._=+-]+", "-", named)[:_LONGEST_NAME].strip("-.")
+    plain = re.sub(r"[^A-Za-z0-9._=+-]+", "-", named)[:_MAX_NAME_CHARACTERS].strip("-.")
     return Point(index, values, f"{index:0{len(str(count - 1))}d}_{plain}")
 
 
@@ -139,8 +139,8 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
     """
     if what.seeds < 1:
         raise ValueError(f"--seeds must be at least 1, not {what.seeds}")
-    if (count := math.prod(len(one.values) for one in what.settings)) > MOST_POINTS:
-        raise ValueError(f"--set gives {count} combinations, and a sweep has at most {MOST_POINTS}")
+    if (count := math.prod(len(one.values) for one in what.settings)) > MAX_POINTS:
+        raise ValueError(f"--set gives {count} combinations, and a sweep has at most {MAX_POINTS}")
     file, text, arguments = None, None, None
     if (file := _own_file(what.task)) is not None:
         try:
@@ -171,7 +171,7 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
             max_steps=what.max_steps,
             options=options,
             plan=what.plan,
-            after_success=_AFTER_SUCCESS if planned else 0,
+            after_success=_STEPS_AFTER_SUCCESS if planned else 0,
             source=source,
             upload=f"{what.upload.rstrip('/')}/{point.folder}" if what.upload else "",
         )
@@ -272,7 +272,7 @@ class _Sweep:
             self._on_update,
             stop,
             chunk=what.chunk,
-            tries=TRIES,
+            tries=MAX_CHUNK_STARTS,
             on_failure=self._failed,
             group=what.stride if len(self._points) > 1 else None,
         )

@@ -31,14 +31,14 @@ from workbench.review.commands import (
 )
 from workbench.review.view import ReviewView
 
-ROWS = 12
+PAGE_ROWS = 12
 """Number of rows of a page of the table."""
-MOST_AXES = 9
-MOST_TICKS = 8
+MAX_AXES = 9
+MAX_TICKS = 8
 """Maximum number of labels of an axis."""
-MOST_PRESSED = 64
+MAX_CLICKABLE_LINES = 64
 """Maximum number of lines that can be pressed."""
-MOST_SHOWN = 5
+MAX_SHOWN_EPISODES = 5
 """Number of best and of worst episodes of a point that are shown."""
 WIDTH, TOP, BOTTOM, SIDE = 500, 34, 196, 34
 """Sizes in pixels of the plot and of its axes."""
@@ -69,7 +69,7 @@ def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Ax
     places.append(("return", [one.mean_return for one in summaries]))
     for name in terms_of(summaries):
         places.append((name.removeprefix(_TERMS), [one.means.get(name) for one in summaries]))
-    places = places[: max(MOST_AXES, len(results.names) + 2)]
+    places = places[: max(MAX_AXES, len(results.names) + 2)]
     gap = (WIDTH - 2 * SIDE) / max(len(places) - 1, 1)
     made = []
     for k, (name, values) in enumerate(places):
@@ -116,9 +116,9 @@ def _of_set(name: str, x: float, texts: Sequence[str], summaries: Sequence[Point
 
 
 def _spread(texts: Sequence[str]) -> Sequence[str]:
-    if len(texts) <= MOST_TICKS:
+    if len(texts) <= MAX_TICKS:
         return texts
-    return [texts[round(k * (len(texts) - 1) / (MOST_TICKS - 1))] for k in range(MOST_TICKS)]
+    return [texts[round(k * (len(texts) - 1) / (MAX_TICKS - 1))] for k in range(MAX_TICKS)]
 
 
 def _of_numbers(name: str, x: float, values: Sequence[float | None], is_rate: bool) -> Axis:
@@ -162,7 +162,7 @@ class Shown:
     the best one."""
     only: frozenset[tuple[str, str]] = frozenset()
     """Names of settings and values of the shown points; all values of a setting that is not here."""
-    pages: Paged = field(default_factory=lambda: Paged(ROWS))
+    pages: Paged = field(default_factory=lambda: Paged(PAGE_ROWS))
 
     def keeps(self, one: PointSummary) -> bool:
         """Whether it has the values of `only`."""
@@ -287,10 +287,10 @@ class SweepPanel(PagePart[ReviewView]):
     ) -> str:
         rows = [row for row in results.episodes if row.point == point.index]
         ordered = best_first(rows)
-        if len(ordered) > 2 * MOST_SHOWN:
+        if len(ordered) > 2 * MAX_SHOWN_EPISODES:
             lists = [
-                ("Best episodes", ordered[:MOST_SHOWN]),
-                ("Worst episodes", ordered[: -MOST_SHOWN - 1 : -1]),
+                ("Best episodes", ordered[:MAX_SHOWN_EPISODES]),
+                ("Worst episodes", ordered[: -MAX_SHOWN_EPISODES - 1 : -1]),
             ]
         else:
             lists = [("Episodes, the best first", ordered)] if ordered else []
@@ -334,7 +334,7 @@ def _note_html(read: LoadedSweep) -> str:
     if results is None:
         return render("note", text=f"Reading {RESULTS}.")
     actions = results.actions.rpartition("/")[2]
-    failed, lines = sum(one.failed for one in read.summaries), len(read.summaries) <= MOST_PRESSED
+    failed, lines = sum(one.failed for one in read.summaries), len(read.summaries) <= MAX_CLICKABLE_LINES
     return render("sweep_head", results=results, actions=actions, failed=failed, lines=lines)
 
 
@@ -376,7 +376,9 @@ def _plot_html(
                 "part": round(100 * (rate or 0.0)),
                 "chosen": one is point,
                 "failed": not one.episodes,
-                "press": ShowSweepPoint(index=one.index) if kept and len(summaries) <= MOST_PRESSED else None,
+                "press": ShowSweepPoint(index=one.index)
+                if kept and len(summaries) <= MAX_CLICKABLE_LINES
+                else None,
                 "about": _about(one),
             }
         )
@@ -401,7 +403,7 @@ def _plot_html(
             for axis in axes
         ],
         lines=lines,
-        faint=len(lines) > MOST_PRESSED,
+        faint=len(lines) > MAX_CLICKABLE_LINES,
         width=WIDTH,
         top=TOP,
         bottom=BOTTOM,

@@ -41,14 +41,14 @@ class SourceEdit(FileChange):
     """A planned change of one of the author's files, and of `others` if constants of other modules change too.
 
     The author may save the same files in an editor meanwhile. So a file must still have `old_text`, is replaced by a
-    rename, and keeps its line ends, encoding, byte order mark, permissions and symbolic links. With several files all are
-    checked before the first is written, and if one fails those written are reverted.
+    rename, and keeps its line ends, encoding, byte order mark, permissions and symbolic links. All files are checked before
+    the first is written; if writing one fails, those already written are reverted.
     """
 
     notes: tuple[str, ...]
-    """Sentences for the author about parts of the edit that they may not expect."""
+    """Sentences for the author about unexpected parts of the edit."""
     settings: CameraSettings | None
-    """The camera's settings by the new text, rounded as written. None for a removed camera."""
+    """The camera's settings in the new text, rounded as written. None for a removed camera."""
     others: tuple[FileChange, ...] = ()
     """Changes of further files, applied and reverted together."""
 
@@ -75,7 +75,7 @@ def revert(edit: SourceEdit) -> None:
 
 
 def check_own(path: str) -> None:
-    """Raises `RefusedEdit` for a file of an installed package: the next installation would overwrite the edit."""
+    """Raise `RefusedEdit` for a file of an installed package: the next installation would overwrite the edit."""
     if LIBRARY_FOLDERS & {*PurePath(path).parts}:
         raise RefusedEdit(
             f"{path} belongs to an installed package; copy the task into a folder of your own first"
@@ -110,7 +110,9 @@ def _replace_all(changes: tuple[FileChange, ...], since: str) -> None:
             _replace_text(change.file, change.old_text, change.new_text, since)
         except RefusedEdit as refused:
             left = [made.name for made in changes[:done] if not _reverted(made, since)]
-            incomplete = f"; {' and '.join(left)} could not be put back, and has the change without the other"
+            incomplete = (
+                f"; {' and '.join(left)} could not be restored, and has the change without the other file"
+            )
             raise RefusedEdit(f"{refused.reason}{incomplete if left else ''}") from refused
 
 
@@ -130,10 +132,10 @@ def _replace_text(path: str, expected: str, new_text: str | None, since: str) ->
     try:
         raw, text, encoding = read_exactly(real)
         if text != expected:
-            raise RefusedEdit(f"{real.name} was edited {since}, so it is left as it is; ask again")
+            raise RefusedEdit(f"{real.name} was edited {since}, so it was not changed; try again")
         if new_text is not None and not replace_file(real, new_text.encode(encoding), raw):
             raise RefusedEdit(
-                f"{real.name} was saved by another program just now, so it is left as it is; ask again"
+                f"{real.name} was saved by another program just now, so it was not changed; try again"
             )
     except (UnicodeError, SyntaxError) as exc:
         raise RefusedEdit(f"{real.name} cannot be written in its encoding: {exc}") from exc

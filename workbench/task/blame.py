@@ -1,4 +1,4 @@
-"""Turns an exception of the author's code, wherever it was raised, into a `TaskError` at their line."""
+"""Turns an exception of the author's code into a `TaskError` at their line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _DTYPE_AT_START = torch.get_default_dtype()
 
 
 class blamed:
-    """A context that turns an exception of the author's code into a TaskError with their line."""
+    """Context manager that turns an exception of the author's code into a TaskError with their line."""
 
     def __init__(self, stage: str, loaded: LoadedTask, task: TaskEnv | None = None) -> None:
         self._stage, self._loaded, self._task = stage, loaded, task
@@ -40,17 +40,17 @@ class blamed:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         self._call.__exit__(kind, error, trace)
         if isinstance(error, Interrupted):
-            # Call no more of the author's code to explain the error: it may be what does not end.
+            # Call no more of the author's code to explain the error: it may hang again.
             files, cls = self._loaded.source_files, self._loaded.cls
             raise TaskError(problem_from_exception(error, self._stage, files, cls)) from error
-        # Also SystemExit and an author's BaseException, which must not end the worker. Here and not in a caller: the
-        # previous version and its texts may be restored by then.
+        # Also SystemExit and an author's BaseException, which must not end the worker. Done here, because a caller may
+        # have restored the previous version and its texts already.
         if error is None or isinstance(error, TaskError) or is_ctrl_c(error) or self._is_closed(error):
             return
         raise TaskError(self._problem(error)) from error
 
     def _is_closed(self, error: BaseException) -> bool:
-        """Whether one of our generators is being closed, and not the author's code raised GeneratorExit."""
+        """Whether the GeneratorExit closes one of our generators, and was not raised by the author's code."""
         if not isinstance(error, GeneratorExit):
             return False
         files = {str(file) for file in self._loaded.source_files}
@@ -66,24 +66,24 @@ class blamed:
         dtype = torch.get_default_dtype()
         if problem.line is not None or dtype == _DTYPE_AT_START:
             return problem
-        # It fails in ManiSkill's lines, far from the one that changed it.
+        # A changed default dtype fails in ManiSkill's code, far from the line that changed it.
         was = f"torch's default dtype is {dtype}, and was {_DTYPE_AT_START} before the task was imported"
         return replace(problem, message=f"{problem.message} ({was})")
 
     def _wrong_return(self, error: BaseException) -> Problem | None:
-        """What ``evaluate`` returns and ManiSkill cannot use, if `error` comes from ManiSkill's use of it."""
+        """The problem of ``evaluate``'s return value, if `error` comes from ManiSkill's use of it."""
         loaded, env = self._loaded, _env_that_reads(error)
         if env is None:
             return None
         try:
             returned = env.evaluate()
         except Exception:
-            return None  # the first error is the one to tell
+            return None  # report the first error
         return check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
 
 
 def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
-    """The check that `TaskEnv` calls with the returns of ``evaluate`` and the reward; raises TaskError for wrong shapes."""
+    """The check that `TaskEnv` calls with the results of ``evaluate`` and the reward; raises TaskError for wrong shapes."""
 
     def check(evaluate: Mapping[str, Any], reward: Any) -> None:
         problem = check_step_returns(loaded.cls, num_envs, evaluate, reward, loaded.source_files)
@@ -94,10 +94,10 @@ def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, A
 
 
 _READERS = tuple(getattr(BaseEnv, name).__code__ for name in ("step", "get_info", "compute_sparse_reward"))
-"""ManiSkill's functions that use what ``evaluate`` returned, and check nothing of it."""
+"""ManiSkill's functions that use the result of ``evaluate`` without checking it."""
 
 
 def _env_that_reads(error: BaseException) -> BaseEnv | None:
-    """The env whose ManiSkill code failed while it used what ``evaluate`` returned; None for any other error."""
+    """The env whose ManiSkill code failed on the result of ``evaluate``; None for any other error."""
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
     return frames[-1].f_locals.get("self") if frames and frames[-1].f_code in _READERS else None

@@ -16,7 +16,7 @@ Key = tuple[str, str]
 """File and name within it: ``("/x/push.py", "PushEnv.evaluate")``."""
 
 STATEMENTS = "(statements)"
-"""Name of the symbol of all statements that are no definition; they run in order when the file is imported."""
+"""Name of the symbol of all statements that are not definitions; they run in order when the file is imported."""
 
 _INTROSPECTION = frozenset(
     (
@@ -47,7 +47,7 @@ class Symbol:
     name: str
     kind: Kind
     parts: Sequence[ast.AST]
-    """The nodes that make its text; for a class without its members."""
+    """The nodes that form its text; for a class, without its members."""
     nodes: Sequence[ast.AST]
     """Nodes of the symbol: a property with its setter is one symbol."""
     short_names: frozenset[str]
@@ -105,7 +105,7 @@ def _scope(path: str, body: list[ast.stmt], owner: str | None) -> Iterator[Symbo
     for name, statements in list(groups.items()):
         several = len(statements) > 1 and not all(isinstance(s, ast.FunctionDef) for s in statements)
         if name in taken or several:
-            # Which definition holds depends on what ran, so they are not separated.
+            # The definition in effect depends on what ran, so they form one symbol.
             loose += groups.pop(name)
     prefix = "" if owner is None else f"{owner}."
     for name, statements in groups.items():
@@ -265,7 +265,7 @@ def _remove_docstrings(tree: ast.Module) -> None:
 class TwoVersions:
     """One graph of both versions: nodes are symbols by file and name, edges the names that either version mentions.
 
-    A name that either version mentions may be used by whichever runs. Pure: nothing is imported or executed.
+    Either version may use a name that one of them mentions. Pure: nothing is imported or executed.
     """
 
     def __init__(self, old: Mapping[str, str], new: Mapping[str, str]) -> None:
@@ -426,7 +426,7 @@ def _code_text(node: ast.stmt) -> str:
 
 
 def _matching_line(old: str, new: str, line: int, before: ast.stmt, after: ast.stmt) -> int:
-    """The line of `after` with the same text that is nearest to the same offset; the offset itself if none has it."""
+    """The line of `after` with the same text that is nearest to the same offset; the offset itself if there is none."""
     text = old.splitlines()[line - 1].strip()
     at = after.lineno + line - before.lineno
     end = after.end_lineno or after.lineno

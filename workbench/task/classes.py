@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mani_skill.envs.sapien_env import BaseEnv
 
 _SCENE = "Empty-v1"
-"""ManiSkill's scene for looking at robots. A robot's file has no task, and opens with the robot alone in this scene."""
+"""ManiSkill's scene for viewing a robot. A file with a robot and no task opens with the robot alone in this scene."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ def choose_task(
     """The class `requested` of a module that was just executed, or the default: its last registered task, or a robot.
 
     Args:
-        text: of the file.
-        registrations: those that the module made.
+        text: text of the file.
+        registrations: registrations that the module made.
 
     Raises:
         TaskError: there is no such class, or no task class at all.
@@ -93,7 +93,7 @@ def choose_task(
 
 
 def _alternatives(cls: type, candidates: list[type], registered: Collection[type]) -> tuple[str, ...]:
-    """Classes to try if `cls` fails, without its base classes: one may open and show nothing."""
+    """Classes to try if `cls` fails, without its base classes: a base may open and show nothing."""
     return tuple(
         other.__name__
         for other in reversed(candidates)
@@ -114,7 +114,7 @@ def _robot_in_scene(
 
 
 def robot_scene_text(robot: Robot, file: Path) -> str:
-    """Notice for the author of a robot: which scene is shown, and how to see it in a task."""
+    """Notice for the author of a robot: which scene is shown, and how to open the robot in a task."""
     place = module_name(file)
     name = place.name if (file.parent / "__init__.py").is_file() else file.stem
     return (
@@ -125,7 +125,7 @@ def robot_scene_text(robot: Robot, file: Path) -> str:
 
 
 def missing_class(requested: str, found: object, name: str, file: Path, names: list[str]) -> TaskError:
-    """Error that `name`, which has the task classes `names`, has no task class `requested`."""
+    """Error for a class `requested` that is no task class of `name`, whose task classes are `names`."""
     if found is not None:
         return task_error(f"{requested} in {name} is not a class that inherits BaseEnv", file)
     close = difflib.get_close_matches(requested, names, n=1)

@@ -13,8 +13,8 @@ from workbench.task.library_names import is_library
 from workbench.task.modules import read_source
 from workbench.task.reference import find_in, find_module
 
-_DEEPEST = 20
-"""Most classes through which a constructor is followed."""
+_MAX_DEPTH = 20
+"""Maximum number of base classes through which a constructor is followed."""
 
 
 def class_arguments(cls: type) -> tuple[str, ...]:
@@ -23,8 +23,8 @@ def class_arguments(cls: type) -> tuple[str, ...]:
 
 
 def arguments_of(file: SourceFile, path: Path, cls: ast.ClassDef, depth: int = 0) -> tuple[str, ...] | None:
-    """Names of the arguments of a class of the author's, as far as it hands others on to its bases; None where a base is
-    not found."""
+    """Names of the constructor arguments of an author's class, including those that it passes on to its bases; None if a base
+    is not found."""
     init = next(
         (one for one in cls.body if isinstance(one, ast.FunctionDef) and one.name == "__init__"), None
     )
@@ -34,7 +34,7 @@ def arguments_of(file: SourceFile, path: Path, cls: ast.ClassDef, depth: int = 0
         if init.args.kwarg is None:
             return tuple(own)
     for base in cls.bases:
-        inherited = _base_arguments(file, path, base, depth + 1) if depth < _DEEPEST else None
+        inherited = _base_arguments(file, path, base, depth + 1) if depth < _MAX_DEPTH else None
         if inherited is None:
             return None
         own += inherited
@@ -73,7 +73,7 @@ def _imported_arguments(
     if not module:
         return None
     if not level and is_library(module[0]):
-        # Not the author's code: it is imported for the task anyway.
+        # Not the author's code, and imported for the task anyway.
         try:
             cls = getattr(importlib.import_module(".".join(module)), name, None)
         except ImportError:

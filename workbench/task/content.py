@@ -1,4 +1,4 @@
-"""Collects the texts that opening a task file would run, by reading its imports without running them."""
+"""Collects the source code that opening a task file would run, by parsing its imports."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from workbench.task.library_names import is_library, is_own_file
 from workbench.task.modules import module_name, read_exactly
 from workbench.task.reference import find_in
 
-MOST_MODULES = 300
+MAX_MODULES = 300
+"""Maximum number of modules of a task."""
 _DYNAMIC = frozenset(
     "__import__ import_module spec_from_file_location spec_from_loader module_from_spec exec_module load_module "
     "find_spec run_path run_module exec eval SourceFileLoader addsitedir meta_path path_hooks".split()
@@ -31,19 +32,19 @@ class CannotRead(OSError):
 
 @dataclass(frozen=True)
 class TaskContent:
-    """The texts that a task consists of: those that are asked about, hashed, and, for a recording's task, all that
-    `load_task` executes."""
+    """Source code of a task: the texts that a person is asked to trust and that are hashed; for a recording's task,
+    everything that `load_task` executes."""
 
     main: str
     """Path of the task's own file, or its name in a recording."""
     texts: dict[str, str]
     """Text by path; the task's own file first."""
     unseen: tuple[str, ...] = ()
-    """Sentences about code that may run and is not in `texts`."""
+    """Sentences about code that may run but is not in `texts`."""
     computed: bool = False
-    """Whether a text imports by computed names, so that `texts` has every module of the folder."""
+    """Whether a text imports by computed names; `texts` then has every module of the folder."""
     sums: Mapping[str, str] = field(default_factory=dict)
-    """sha256 of each file's bytes, by path; the text does not determine it (line ends, encoding)."""
+    """sha256 of each file's bytes, by path; equal texts may have different bytes (line ends, encoding)."""
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -71,8 +72,8 @@ class TaskContent:
 def read_content(file: Path) -> TaskContent:
     """The texts that opening `file` would run.
 
-    Imports by name are found also inside functions. A text that imports by computed names could load any module of the
-    folder, so then all of them count.
+    Finds imports inside functions too. A text that imports by computed names could load any module of the folder, so then
+    all of them are included.
 
     Raises:
         CannotRead: it is not an ordinary file of Python text, or there is too much of it.
@@ -99,7 +100,7 @@ class _ContentReader:
             try:
                 tree = parse_python(self._texts[str(path)])
             except (SyntaxError, ValueError, RecursionError, MemoryError):
-                self._unseen[f"{self._short(path)} is no Python that can be read."] = None
+                self._unseen[f"{self._short(path)} cannot be parsed as Python."] = None
                 continue
             self._add_imports(path, tree)
         return TaskContent(str(self._file), self._texts, tuple(self._unseen), self._computed, self._sums)
@@ -115,8 +116,8 @@ class _ContentReader:
         name = str(path)
         if name in self._texts:
             return
-        if len(self._texts) >= MOST_MODULES:
-            raise CannotRead(f"{self._file} has more than {MOST_MODULES} modules.")
+        if len(self._texts) >= MAX_MODULES:
+            raise CannotRead(f"{self._file} has more than {MAX_MODULES} modules.")
         self._texts[name], self._sums[name] = _read(path)
         self._waiting.append(path)
 
@@ -136,7 +137,7 @@ class _ContentReader:
                     self._import(base, [*parts, alias.name])
             if (name := _dynamic(node)) is not None:
                 line = getattr(node, "lineno", 1)
-                self._unseen[f"{self._short(path)}:{line} may run further code ({name})."] = None
+                self._unseen[f"{self._short(path)}:{line} may run other code ({name})."] = None
                 self._add_all()
 
     def _import(self, folder: Path, parts: list[str]) -> None:
@@ -212,7 +213,7 @@ def _read(path: Path) -> tuple[str, str]:
         raw, text, _ = read_exactly(path)
         return plain_line_ends(text), sha256(raw).hexdigest()
     except SyntaxError as error:
-        raise CannotRead(f"{path} is no Python text: {error.msg}") from error
+        raise CannotRead(f"{path} is not Python source: {error.msg}") from error
     except OSError as error:
         raise CannotRead(f"{path} cannot be read: {error.strerror or error}.") from error
 

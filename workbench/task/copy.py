@@ -13,7 +13,8 @@ from workbench.machine.files import create_file
 from workbench.source.parsed import RefusedEdit, Replacement, SourceFile
 from workbench.task.modules import module_name, read_exactly
 
-MOST_COPIES = 99
+MAX_COPIES = 99
+"""Maximum number of copies of a file in one folder."""
 _VERSION = re.compile(r"-v\d+$")
 
 
@@ -23,7 +24,7 @@ class CannotCopy(Exception):
 
 @dataclass(frozen=True)
 class NewNames:
-    """Names that a copy has in place of the original's."""
+    """New names for a copy."""
 
     ids: dict[str, str] = field(default_factory=dict)
     """New ids by the original's id; an id that is missing here is renamed as in any copy."""
@@ -34,7 +35,7 @@ class NewNames:
 class TaskCopy:
     file: Path
     ids: tuple[tuple[str, str], ...]
-    """Each id that the task registers, and the id that its copy registers."""
+    """Pairs of the id that the task registers and the id that its copy registers."""
 
 
 def copy_task(source: Path, folder: Path) -> TaskCopy:
@@ -51,7 +52,7 @@ def copy_task(source: Path, folder: Path) -> TaskCopy:
         raise CannotCopy(f"{source.name} cannot be read ({error})") from error
     if not folder.is_dir():
         raise CannotCopy(f"there is no folder {folder}")
-    for number in range(1, MOST_COPIES + 1):
+    for number in range(1, MAX_COPIES + 1):
         file = folder / f"{source.stem}{'' if number == 1 else f'_{number}'}.py"
         if file.exists():
             continue
@@ -61,7 +62,7 @@ def copy_task(source: Path, folder: Path) -> TaskCopy:
                 return TaskCopy(file, ids)
         except OSError as error:
             raise CannotCopy(f"{file} cannot be written: {error.strerror}") from error
-    raise CannotCopy(f"{folder} has {MOST_COPIES} copies of {source.name} already")
+    raise CannotCopy(f"{folder} has {MAX_COPIES} copies of {source.name} already")
 
 
 def copied_text(
@@ -69,16 +70,16 @@ def copied_text(
 ) -> tuple[str, tuple[tuple[str, str], ...]]:
     """The text of the copy, and pairs of the original's and the copy's id.
 
-    Only what depends on the file's place and ids changes: relative imports name their package, `__file__` becomes the
-    installed module's (its assets are there), and registered ids get another name. The rest is the same to the character.
+    Only what depends on the file's place and ids changes: relative imports become absolute, `__file__` becomes the
+    installed module's (its assets are there), and registered ids get another name. The rest is identical.
 
     Args:
         source: the file of `text`; its packages are found by their ``__init__.py``.
-        number: of the copy; it is part of the ids from 2 on.
-        names: chosen for the copy; they stand in its docstrings too.
+        number: number of the copy; part of its ids from 2 on.
+        names: names chosen for the copy, also used in its docstrings.
 
     Raises:
-        CannotCopy: it cannot be copied, such as a file without a package that imports modules of its folder relatively.
+        CannotCopy: it cannot be copied, such as a file that imports relatively but is in no package.
     """
     try:
         file = SourceFile(str(source), text)
@@ -116,7 +117,7 @@ def copied_text(
 
 
 def _renamed(file: SourceFile, names: NewNames) -> Iterator[Replacement]:
-    """The classes where they are defined and named, and ids and classes within docstrings.
+    """Replacements of class names where they are defined and used, and of ids and class names in docstrings.
 
     Raises:
         CannotCopy: the file has another meaning for a new name.
@@ -134,7 +135,7 @@ def _renamed(file: SourceFile, names: NewNames) -> Iterator[Replacement]:
         elif isinstance(node, ast.Name) and node.id in names.classes:
             yield Replacement(*file.inner_span(node), names.classes[node.id])
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            # A text that stands alone: a docstring, or what is written below a constant.
+            # A string statement: the docstring of a definition or of a constant.
             start, end = file.inner_span(node.value)
             for found in any_word.finditer(file.text, start, end):
                 yield Replacement(*found.span(), words[found[0]])

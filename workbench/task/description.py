@@ -21,7 +21,7 @@ from workbench.pictures.camera_report import ObjectToSee
 
 Backend = Literal["auto", "cpu", "gpu"]
 ShownPictures = Literal["auto", "exact", "fast"]
-"""What the page shows of the cameras. ``auto``: fast pictures while something moves, exact ones when it stands still."""
+"""Quality of the camera pictures on the page. ``auto``: fast during motion, exact at rest."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class TaskOptions:
     backend: Backend = "auto"
     seed: int = 0
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
+    """More keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
     pictures: PictureDegree = "exact"
-    """Quality of the pictures that the envs draw for observations and recordings."""
+    """Quality of the pictures that the envs render for observations and recordings."""
     rules: Degree | None = None
     """Degree of all rules of GPU simulation; None keeps each rule's own degree, see `envs.gpu_rules`."""
     imports: tuple[str, ...] = ()
@@ -55,7 +55,7 @@ def changed_options(before: TaskOptions, after: TaskOptions) -> list[str]:
 
 
 def command_line(reference: str, options: TaskOptions) -> str:
-    """What to type, in any folder, to open a task with these options."""
+    """Command that opens a task with these options from any folder."""
     words = ["workbench", "open", reference]
     usual = TaskOptions()
     for name in ("num_envs", "backend", "seed", "rules"):
@@ -69,7 +69,7 @@ def command_line(reference: str, options: TaskOptions) -> str:
 
 
 def _argument_text(value: Any) -> str:
-    """The text that ``--env`` reads as this value: JSON, or a text that is none."""
+    """The text that ``--env`` parses to this value: JSON, or plain text that is not JSON."""
     if isinstance(value, str):
         try:
             json.loads(value)
@@ -121,7 +121,7 @@ class TaskDescription:
     """Segmentation id to body name."""
     can_render: bool
     pictures: PictureDegree = "exact"
-    """What its envs draw for observations and recordings."""
+    """Quality of the pictures that its envs render for observations and recordings."""
     chosen: str = ""
     """Its name in the file: the class, or a robot that is shown in a scene."""
     others: tuple[str, ...] = ()
@@ -129,18 +129,18 @@ class TaskDescription:
     in_place_of: str | None = None
     """The class of the file that was tried first and failed."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keywords of ``gym.make`` for such an env, as far as JSON can hold them."""
+    """Keyword arguments of ``gym.make`` for such an env, as far as JSON can represent them."""
     objects: tuple[ObjectToSee, ...] = ()
     """Objects that a camera can be measured on."""
     joints: tuple[str, ...] = ()
     """Names of `StepResult.qpos`."""
     notices: tuple[str, ...] = ()
-    """Notices about a task that works, as sentences."""
+    """Notices about a working task, as sentences."""
     parse_cameras: str = "parse_camera_configs"
-    """ManiSkill's function for what a camera hook returns, by the name that the installed version has."""
+    """Name, in the installed version, of ManiSkill's function for what a camera hook returns."""
     outlier_rules: Mapping[str, Finding] = field(default_factory=dict)
-    """The rules that an outlier can break, by id, each as a finding without a breach at the hook that it guards; without
-    those that are off, or silenced there."""
+    """The rules that an outlier can break, by id; each value is a finding template at the hook that the rule guards. Rules
+    that are off, or silenced at the hook, are left out."""
     made: HowMade = HowMade()
     """How the envs are made: robot, modes and the task's own keyword arguments."""
 
@@ -149,7 +149,7 @@ class TaskDescription:
 
 
 NO_MOMENT = -1
-"""The `Restored.origin` of a state that is not of this history."""
+"""The `Restored.origin` of a state that is not in this history."""
 
 
 @dataclass(frozen=True)
@@ -169,8 +169,8 @@ class Restored:
     number: int = 0
     """Number of the `EnterRecording` that this result answers; 0 for a `Restore`."""
     replayed: tuple[int, ...] = ()
-    """Indices of the envs that were replayed up to the state. For them the state is not an exact point, from which
-    the same actions give the same bits; a restored state is one."""
+    """Indices of the envs that were replayed up to the state. For them the state is not an exact point (from which the same
+    actions give the same bits); a restored state is."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class Stepped:
 
     step: StepResult
     reset_mask: NDArray[np.bool_]
-    """(N,) True where this result does not follow from the one before: the first of a new episode, or a past moment
+    """(N,) True where this result does not follow from the previous one: the first of a new episode, or a past moment
     (`restored`)."""
     captured: tuple[Picture, ...] = ()
     """Pictures of exactly this step (only while capturing)."""
@@ -189,21 +189,21 @@ class Stepped:
     """The body of the snapshot of the whole batch at this moment (see `envs.snapshots.packing`): opaque to the
     server, whose `History.snapshot_at` makes a pickled `Snapshot` of it."""
     part_keys: tuple[int, ...] | None = None
-    """The parts of the snapshot; None if they are those of the previous event."""
+    """The parts of the snapshot; None if unchanged since the previous event."""
     new_parts: dict[int, bytes] = field(default_factory=dict)
-    """Parts that were not sent before."""
+    """Parts that have not been sent yet."""
     number: int = 0
-    """Counts these events since the worker began; `Pictures.number` refers to it."""
+    """Counts these events since the worker started; `Pictures.number` refers to it."""
     restored: Restored | None = None
     columns: dict[str, NDArray] = field(default_factory=dict)
-    """(N, ...) each, as `envs.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
+    """(N, ...) arrays by the names of `envs.state_columns`: ``state/actors/cube``, ``obs/agent/qpos``. Only while
     capturing."""
     acted_by: str = ""
     """Source of this step's action, for a recording; empty if the source is known before the episode."""
     placed: dict[CameraKey, CameraSettings] = field(default_factory=dict)
     """The cameras that are placed by hand (only while capturing)."""
     resumed: bool = False
-    """The envs have the state that the previous worker left: the result follows from none of this worker's, but nothing
+    """The envs have the state that the previous worker left: the result follows from no result of this worker, but nothing
     was reset."""
 
 
@@ -213,21 +213,21 @@ class RecordArguments:
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         out: folder for the files.
-        upload: an address of fsspec, such as s3://bucket/folder: each episode goes there when it is over, and not into
+        upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
             the folder.
-        episodes: how many, over all envs; 4, or as many as a file of actions has.
-        successes: continue until so many episodes succeeded, and keep no others.
-        tries: give up after so many episodes where successes are wanted; 100 for each.
-        actions: random, zero, hold; solve, which plans them by rollouts of the task with its own reward; a policy as
+        episodes: number of episodes over all envs; default: 4, or as many as a file of actions has.
+        successes: continue until this many episodes succeed, and keep only those.
+        tries: with --successes, give up after this many episodes; default: 100 for each success.
+        actions: random, zero, hold; solve, which plans with rollouts of the task and its own reward; a policy as
             module:function or file.py:function; or a file: .npy or .npz with actions, or .h5 with ManiSkill's
             demonstrations, which begin from their own seeds.
-        use_env_states: put every env state of a demonstration back after its step.
-        pictures: record what every camera sees (--no-pictures is much faster).
-        fast_pictures: draw simplified meshes: several times as many pictures a second without a GPU, which differ a little
-            from a GPU's. The recordings say so, in their .json and in the review.
-        max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
-        seconds_per_seed: wall time after which an episode ends at its next step, solved or not. Which ones that cuts off
-            depends on the machine and on what else it does, so a second run may record others.
+        use_env_states: restore the demonstration's env state after each step.
+        pictures: record the images of every camera (--no-pictures is much faster).
+        fast_pictures: render simplified meshes: several times as many images per second without a GPU, slightly different
+            from a GPU's. The recordings are marked, in their .json and in the review.
+        max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
+        seconds_per_seed: wall time limit of an episode: it ends at its next step, solved or not. Which episodes reach it
+            depends on the machine and its load, so a second run may differ.
     """
 
     task: str

@@ -1,4 +1,4 @@
-"""Finds the task files below a folder by reading them; runs and imports none of them."""
+"""Finds the task files below a folder by parsing them, without running or importing any."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from workbench.machine.files import read_regular_file
 from workbench.machine.parse_python import parse_python
 from workbench.task.library_names import LIBRARY_FOLDERS
 
-DEEPEST = 6
-"""Levels of folders below the first that are searched."""
-MOST_LOOKED_AT = 5_000
-"""Most Python files that are opened."""
-MOST_FOUND = 200
-LARGEST = 512 * 1024
-"""Largest file that is read, in bytes; the largest task of ManiSkill has 60 kB."""
-LONGEST = 5.0
-"""Time limit of one search, in seconds."""
-LONGEST_NAME = 120
-"""Characters of an id or a class name that are kept."""
+MAX_DEPTH = 6
+"""Maximum depth of searched folders below the first."""
+MAX_FILES_READ = 5_000
+"""Maximum number of Python files that are opened."""
+MAX_FOUND = 200
+MAX_FILE_BYTES = 512 * 1024
+"""Maximum size of a file that is read; the largest task of ManiSkill has 60 kB."""
+TIMEOUT_SECONDS = 5.0
+"""Timeout of one search."""
+MAX_NAME_CHARACTERS = 120
+"""Length to which an id or a class name is cut."""
 _NO_TASKS_IN = LIBRARY_FOLDERS | {"node_modules", "__pycache__", "build", "dist"}
 _ENVIRONMENT_HAS = ("pyvenv.cfg", "conda-meta")
 """Files and folders that only the root of a Python environment has."""
@@ -44,7 +44,7 @@ class TaskFile:
     not_python: bool = False
     """Whether the text does not parse."""
     line: int | None = None
-    """Line at which the text does not parse, if known."""
+    """Line of the syntax error, if known."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class FoundTasks:
     """The result of a search."""
 
     files: tuple[TaskFile, ...] = ()
-    """Files in order: those of the folder itself first, then by path."""
+    """Files of the folder itself first, then by path."""
     left_out: str = ""
-    """Why the search may have missed files, as a sentence; empty if it has seen all."""
+    """Why the search may have missed files, as a sentence; empty if it is complete."""
 
 
 class TaskFileReader:
-    """Reads task files, each again only when its ``stat`` has changed."""
+    """Cache of `read_task_file` by path; rereads a file when its ``stat`` has changed."""
 
     def __init__(self) -> None:
         self._known: dict[Path, tuple[tuple[int, ...], TaskFile | None]] = {}
@@ -80,24 +80,24 @@ class TaskFileReader:
 def find_task_files(folder: Path, read: Callable[[Path], TaskFile | None] | None = None) -> FoundTasks:
     """The task files in and below a folder.
 
-    Hidden folders, Python environments, installed packages and links are left out. The search ends early, and says so, in
-    a folder that has too many files or takes too long.
+    Hidden folders, Python environments, installed packages and links are left out. With too many files, or after the
+    timeout, the search ends early and says so in the result.
 
     Args:
         read: reads a file; None for `read_task_file`.
     """
     read = read or read_task_file
     root = Path(os.path.realpath(folder))
-    ends_at = time.monotonic() + LONGEST
+    ends_at = time.monotonic() + TIMEOUT_SECONDS
     found: list[TaskFile] = []
     left_out = ""
     for number, path in enumerate(_python_files(root)):
-        if number >= MOST_LOOKED_AT:
-            left_out = f"Only the first {MOST_LOOKED_AT} Python files were searched."
-        elif len(found) >= MOST_FOUND:
-            left_out = f"Only the first {MOST_FOUND} task files are listed."
+        if number >= MAX_FILES_READ:
+            left_out = f"Only the first {MAX_FILES_READ} Python files were searched."
+        elif len(found) >= MAX_FOUND:
+            left_out = f"Only the first {MAX_FOUND} task files are listed."
         elif time.monotonic() > ends_at:
-            left_out = f"The search ended after {LONGEST:.0f} s."
+            left_out = f"The search ended after {TIMEOUT_SECONDS:.0f} s."
         if left_out:
             break
         if (task := read(path)) is not None:
@@ -107,16 +107,16 @@ def find_task_files(folder: Path, read: Callable[[Path], TaskFile | None] | None
 
 
 _BEGUN = re.compile(rb"^[ \t]*(class[ \t][^(\n]*\([^)\n]*\bBaseEnv\b|@[\w.]*\bregister_env\b)", re.MULTILINE)
-"""Pattern in a text that does not parse: most likely a task that somebody is writing."""
+"""Pattern of a text that does not parse but is most likely an unfinished task."""
 
 
 def read_task_file(path: Path) -> TaskFile | None:
-    """What the text of a file says about its tasks; None if it has none, or cannot be read."""
+    """Tasks of a file, according to its text; None if it has none or cannot be read."""
     try:
-        raw = read_regular_file(path, LARGEST)
+        raw = read_regular_file(path, MAX_FILE_BYTES)
     except (OSError, ValueError):
         return None
-    # Before parsing, which takes 20 ms for a large file.
+    # Checked before parsing, which takes 20 ms for a large file.
     if b"BaseEnv" not in raw and b"register_env" not in raw:
         return None
     try:
@@ -139,15 +139,15 @@ def _python_files(root: Path) -> Iterator[Path]:
         try:
             entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
         except OSError:
-            continue  # no right to read it, or gone
+            continue  # not permitted, or deleted meanwhile
         if depth and any(entry.name in _ENVIRONMENT_HAS for entry in entries):
             continue
         for entry in entries:
             if entry.name.startswith("."):
                 continue
-            # Not through links: they make circles, and lead out of the folder.
+            # Not through links: they can form cycles and lead out of the folder.
             if _is(entry.is_dir):
-                if depth < DEEPEST and entry.name not in _NO_TASKS_IN:
+                if depth < MAX_DEPTH and entry.name not in _NO_TASKS_IN:
                     waiting.append((Path(entry.path), depth + 1))
             elif entry.name.endswith(".py") and _is(entry.is_file):
                 yield Path(entry.path)
@@ -174,7 +174,7 @@ def _tasks_of(tree: ast.Module) -> tuple[tuple[str, ...], tuple[str, ...]]:
             continue
         registrations = [call for call in node.decorator_list if _name(call) == "register_env"]
         if registrations or any(_name(base) in ("BaseEnv", *tasks) for base in node.bases):
-            tasks.append(node.name[:LONGEST_NAME])
+            tasks.append(node.name[:MAX_NAME_CHARACTERS])
         ids += filter(None, map(_registered_id, registrations))
     return tuple(dict.fromkeys(ids)), tuple(dict.fromkeys(tasks))
 
@@ -202,9 +202,9 @@ def _name(node: ast.expr) -> str:
 
 
 def _registered_id(call: ast.expr) -> str:
-    """The id in ``@register_env("Push-v1")``; empty where it is computed."""
+    """The id in ``@register_env("Push-v1")``; empty if it is computed."""
     if not isinstance(call, ast.Call):
         return ""
     given = [*call.args[:1], *(word.value for word in call.keywords if word.arg == "uid")]
     texts = [one.value for one in given if isinstance(one, ast.Constant) and isinstance(one.value, str)]
-    return texts[0][:LONGEST_NAME] if texts else ""
+    return texts[0][:MAX_NAME_CHARACTERS] if texts else ""

@@ -30,7 +30,7 @@ from workbench.task.problem import definition_line
 from workbench.task.reference import split_reference
 
 _STATE_MODES = {"state", "state_dict", "none"}
-"""The parts of an ``obs_mode`` for which nothing is drawn."""
+"""The parts of an ``obs_mode`` that need no rendering."""
 
 
 def make(
@@ -44,37 +44,37 @@ def make(
     pictures: PictureDegree = "exact",
     **kwargs: Any,
 ) -> gym.Env:
-    """A gymnasium env of `num_envs` envs, as ``gym.make`` gives it for a GPU.
+    """Make a gymnasium env of `num_envs` envs, like ``gym.make`` on a GPU.
 
     gymnasium's own ``make`` is called with a spec whose entry point builds the batched env, so training code, ManiSkill's
     wrappers and its baselines find the usual spec, time limit and class. Nothing is registered or replaced: ``gym.make`` of
     the same id stays ManiSkill's, and the arguments in ``env.spec`` are those of stock ManiSkill, so that its own tools
-    replay what ``RecordEpisode`` writes. It differs from ``gym.make`` where stock would fail:
+    replay what ``RecordEpisode`` writes. It differs from ``gym.make`` where stock ManiSkill would fail:
 
     * ``num_envs`` above 1 works without a GPU.
-    * A task whose first reward mode is not implemented (its ``step`` raises NotImplementedError in stock) gets the richest
-      one that is. Else the default is stock's: the first of ``SUPPORTED_REWARD_MODES``.
-    * ``render_backend`` is found if it is not given; without a driver an env without pictures is made as with
+    * A task whose first reward mode is not implemented (its ``step`` raises NotImplementedError in stock ManiSkill) gets
+      the richest one that is. Else the default is stock ManiSkill's: the first of ``SUPPORTED_REWARD_MODES``.
+    * ``render_backend`` is found if it is not given; without a driver an env without pictures gets
       ``render_backend="none"``, and one that needs pictures is refused.
     * ``max_episode_steps=-1`` gives an env without a limit; ManiSkill's wrapper would end every episode.
-    * Assets to download are named in an error, not asked for on standard input.
+    * Missing assets raise an error that names them, instead of a question on standard input.
 
     Args:
         task: a registered id (``PickCube-v1``), a file (``push.py``, ``push.py:PushEnv``), a class of a module
-            (``lab.tasks:PushEnv``) or a class that inherits BaseEnv. A file is executed again by each call, as by the
-            page; an id that it registers is then known to ``gym.make`` too. A module is imported as by ``import``.
+            (``lab.tasks:PushEnv``) or a class that inherits BaseEnv. Each call executes a file again, as the page does;
+            ``gym.make`` then knows an id that it registers too. A module is imported as by ``import``.
         num_envs: number of envs in the batch.
         backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation, which needs CUDA and PhysX's GPU
-            library. ``auto``: the CPU, also if there is a GPU, since the tests of GPU simulation have passed nowhere
+            library. ``auto``: the CPU, even if there is a GPU, since the tests of GPU simulation have passed nowhere
             so far. Replaces ``sim_backend``.
         max_episode_steps: the time limit; None for the registered one, -1 for none.
         threads: threads that step the envs on the CPU; None for one per core that the process may use.
-        rules: of GPU simulation, checked on the CPU: ``stop`` raises where one is broken, ``warn`` warns, ``off``
-            checks none. None stops if other envs' state is overwritten and warns otherwise; for an installed task it
-            only warns.
-        pictures: ``exact``: those of stock ManiSkill, to the bit. ``fast``: several times as many a second on the CPU,
-            since robots and other heavy meshes are simplified to what the cameras can see of them; it warns that a policy
-            trained on them sees other pictures than on a GPU.
+        rules: rules of GPU simulation, checked on the CPU: ``stop`` raises if one is broken, ``warn`` warns, ``off``
+            checks none. None raises if other envs' state is overwritten, else warns; for an installed task it only
+            warns.
+        pictures: ``exact``: identical to stock ManiSkill, to the bit. ``fast``: several times as many per second on the
+            CPU, since robots and other heavy meshes are simplified to the detail that the cameras can see; warns that a
+            policy trained on them sees different pictures on a GPU.
         kwargs: arguments of ``gym.make`` for the task: ``obs_mode``, ``reward_mode``, ``control_mode``,
             ``render_mode``, ``robot_uids``, ``sensor_configs``, ``reconfiguration_freq``, ``sim_config`` ...
 
@@ -90,7 +90,7 @@ def make(
     if rules is None and not found.followed and class_is_installed(found.cls):
         rules = "warn"  # an installed task cannot be fixed here
     if given.get("reward_mode") is None and not _stock_reward_works(found.cls):
-        # Among the spec's arguments, so that a replay by gym.make has a reward too.
+        # Stored in the spec's arguments, so that a replay with gym.make has a reward too.
         kwargs["reward_mode"] = default_reward_mode(found.cls)
     limits = ()
     if max_episode_steps == -1:
@@ -107,7 +107,7 @@ def make(
         id=found.env_id,
         entry_point=partial(_build, found.cls, found.asset_ids, options),
         max_episode_steps=limit,
-        disable_env_checker=True,  # it knows nothing of batches
+        disable_env_checker=True,  # it does not support batches
         kwargs=dict(found.default_kwargs),
         additional_wrappers=limits,
     )
@@ -118,14 +118,14 @@ def make(
 
 
 _FAST_PICTURES = (
-    'pictures="fast" draws simplified meshes: a policy that is trained on these pictures sees others on a GPU, with stock '
+    'pictures="fast" renders simplified meshes: a policy trained on these pictures sees different ones on a GPU, with stock '
     "ManiSkill and with the default, exact. In ManiSkill's tabletop tasks they differ by 0.3 of 255 on average, and by more "
     "than 10 in 0.4 % of the pixels (128 x 128; more in `workbench help benchmarks`)."
 )
 
 
 class _RaisedInConstructor(Exception):
-    """Carries a TypeError past gymnasium, which would replace it by one without the author's frames."""
+    """Carries a TypeError past gymnasium, which would replace it with one that lacks the author's frames."""
 
     def __init__(self, error: TypeError) -> None:
         super().__init__(error)
@@ -171,7 +171,7 @@ def _built(
 def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
     whole = isinstance(num_envs, (int, float, np.integer)) and not isinstance(num_envs, bool)
     if not whole or num_envs != num_envs // 1 or num_envs < 1:
-        raise ValueError(f"num_envs must be a whole number from 1 on, not {num_envs!r}")
+        raise ValueError(f"num_envs must be an integer of at least 1, not {num_envs!r}")
     if "sim_backend" in kwargs:
         raise ValueError(
             f"sim_backend={kwargs['sim_backend']!r}: leave it out. backend= names the simulation here: "
@@ -181,7 +181,7 @@ def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
     if kwargs.get("render_backend", "found") in (None, "none"):
         needs = _what_needs_pictures(None, kwargs)
         if needs is not None:
-            raise ValueError(f"{needs} needs pictures, and render_backend='none' says that none are made")
+            raise ValueError(f"{needs} needs pictures, but render_backend='none' disables rendering")
 
 
 def _what_needs_pictures(cls: type[BaseEnv] | None, kwargs: Mapping[str, Any]) -> str | None:

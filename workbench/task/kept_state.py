@@ -1,4 +1,4 @@
-"""Finds code by which state of an old version outlives its code: memoized values and mutable globals."""
+"""Finds code that keeps state of an old version after its code is replaced: memoized values and mutable globals."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _HOOK_ARGUMENTS = {"info", "obs", "action"}
 
 
 def memoizing_statement(function: ast.AST, imported: Collection[str]) -> str | None:
-    """Line and text of a statement of `function` by which a value may outlive a call without being written again, or None.
+    """Line and text of a statement of `function` that may keep a value beyond a call without rewriting it; None if none does.
 
-    A value written at every call is exchanged with the code; one written once is not::
+    A value written at every call is replaced with the code; one written once is not::
 
         if not hasattr(self, "weights"):
             self.weights = make_weights()      # edited: a fresh env has other weights, this one never will
 
     This is undecidable, so every write to something that outlives the call (an attribute, an item of anything but a fresh
     local value, a global) counts if it is conditional: in an ``if``, ``while``, ``try`` or nested function, after a
-    ``return``, or as a value chosen by ``or``. So do ``hasattr``, ``setdefault`` and decorators that may cache, but not
-    accumulators (``self.best = torch.maximum(self.best, d)``), which are state of the moment.
+    ``return``, or as a value chosen by ``or``. ``hasattr``, ``setdefault`` and decorators that may cache count too, but not
+    accumulators (``self.best = torch.maximum(self.best, d)``), which are episode state.
 
     Args:
         imported: names of libraries in the module (``torch``, ``np``): their functions return new values.
@@ -231,7 +231,7 @@ def changed_while_running(
 
     Executing a file again creates its values again: right for a constant, wrong for a cache. ``MESHES = {}`` that
     `_load_scene` filled would be empty under an env whose scene is still the old one. A value may be changed if code assigns
-    to its items or attributes, calls a mutating method, or passes it where that cannot be seen.
+    to its items or attributes, calls a mutating method, or passes it to other code.
     """
     values = {symbol.short: symbol for symbol in symbols if symbol.kind == "value"}
     natures: dict[str, _Nature] = {}
@@ -333,7 +333,7 @@ def _written(node: ast.AST, natures: dict[str, _Nature], libraries: Collection[s
 def _may_change(
     use: ast.AST, nature: _Nature, parents: dict[int, ast.AST], libraries: Collection[str]
 ) -> bool:
-    """Whether this use of a value may change it, or pass it where that cannot be seen."""
+    """Whether this use of a value may change it, or pass it to code that may."""
     here, parent = use, parents.get(id(use))
     while isinstance(parent, (ast.Attribute, ast.Subscript)) and parent.value is here:
         if not isinstance(parent.ctx, ast.Load):

@@ -51,15 +51,15 @@ def is_own_file(path: str, folder: Path) -> bool:
 
 
 def is_library(name: str) -> bool:
-    """Whether the top-level module `name` is a library's, also if an author has a file of that name."""
-    # In this order: reading what the distributions contain takes 0.1 s, once.
+    """Whether the top-level module `name` is a library's, even if an author has a file of that name."""
+    # In this order, since reading the contents of the distributions takes 0.1 s, once.
     if _library_spec(name) is None or name in _INSTALLED_BY_MISTAKE:
         return False
     return name in sys.stdlib_module_names or name in _dependency_names()
 
 
 def files_named_like_libraries(folder: Path) -> tuple[Path, ...]:
-    """The author's files in `folder` that ``import`` does not find, because a library has their name."""
+    """The author's files in `folder` that ``import`` does not find because a library has the same name."""
     found: list[Path] = []
     try:
         entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
@@ -89,8 +89,8 @@ def search_first(folder: Path, permanent: bool = False) -> None:
     """Put an author's folder first on ``sys.path``, except for the names of libraries.
 
     As with ``python task.py``, the folder comes first. A ``numpy.py`` or ``queue.py`` in it would replace the library
-    wherever one imports it late: in the middle of an episode, in the renderer, in the workbench. So names of the standard
-    library and of the workbench's dependencies are found as if the folder were not there.
+    for every late import: in the middle of an episode, in the renderer, in the workbench. So names of the standard
+    library and of the workbench's dependencies are found as if the folder were not on the path.
 
     Args:
         permanent: the folder stays, and `remove_library_finder` does nothing from now on.
@@ -98,7 +98,7 @@ def search_first(folder: Path, permanent: bool = False) -> None:
     global _permanent_folder
     _permanent_folder = _permanent_folder or permanent
     name = str(folder)
-    # site-packages is no author's folder, also if a task in it is opened.
+    # site-packages is no author's folder, even if a task in it is opened.
     if folder.name not in LIBRARY_FOLDERS and is_own_file(os.path.join(name, "x.py"), folder):
         _author_folders.add(name)
     if not _finder_is_installed():
@@ -128,7 +128,8 @@ def remove_library_finder() -> None:
 
 
 class LibraryFinder(MetaPathFinder):
-    """Finds a library where an author's file has its name; other names are left to the next finder."""
+    """Import finder that finds a library instead of an author's file of the same name; leaves other names to the next
+    finder."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None

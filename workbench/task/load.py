@@ -77,9 +77,9 @@ class LoadedTask:
     default_kwargs: dict[str, Any]
     """Constructor arguments from ``@register_env``."""
     followed: bool
-    """True if the file is watched; False for an id that was registered elsewhere."""
+    """Whether the file is watched; False for an id that was registered elsewhere."""
     others: tuple[str, ...] = ()
-    """Further task classes of the file (robots if it has no task), which ``file.py:Name`` opens."""
+    """Other task classes of the file (robots if it has no task), which ``file.py:Name`` opens."""
     alternatives: tuple[str, ...] = ()
     """Names in `others` to try if this class fails, in order; empty if a class was named."""
     in_place_of: RefusedClass | None = None
@@ -87,7 +87,7 @@ class LoadedTask:
     robot: Robot | None = None
     """The robot, shown in a scene of ManiSkill, for a file without a task."""
     replaced: tuple[registry.Registration, ...] = ()
-    """Names that another task or robot had (``PickCube-v1``): plain ManiSkill would skip this file's class."""
+    """Names that another task or robot has (``PickCube-v1``): plain ManiSkill would skip this file's class."""
     named_like_libraries: tuple[Path, ...] = ()
     """Files of its folder that no import finds, because a library has their name."""
 
@@ -98,13 +98,13 @@ class LoadedTask:
 
     @property
     def asset_ids(self) -> tuple[str, ...]:
-        """Assets that its registration names, to be downloaded."""
+        """Assets that the task's registration requires to be downloaded."""
         spec = registry.environment(self.env_id)
         return () if spec is None else tuple(spec.asset_download_ids or ())
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """Sentences for the author about a task that works."""
+        """Notices for the author about a working task, as sentences."""
         found = [named_like_library_text(file) for file in self.named_like_libraries]
         if self.in_place_of is not None:
             name, why = self.in_place_of.name, self.in_place_of.why
@@ -139,15 +139,15 @@ _loads: dict[Path, _Load] = {}
 def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> LoadedTask:
     """Import the task that `reference` names: ``file.py``, ``file.py:ClassName``, ``package.module:ClassName`` or an id.
 
-    All or nothing: the file is executed afresh with the modules of its folder. If that fails, the modules, registrations
+    All or nothing: the file is executed again with the modules of its folder. If that fails, the modules, registrations
     and tracebacks of the last good version are restored: it may be running, and import lazily.
 
     Args:
-        reference: of a `RecordedTask` only a registered id or approved texts are opened, never a path.
+        reference: a `RecordedTask` opens only a registered id or approved texts, never a path.
         source: texts by path that replace the files on disk; those files need not exist.
 
     Raises:
-        TaskError: with the author's line where there is one. KeyboardInterrupt by a person is passed on.
+        TaskError: with the author's line if there is one. A person's KeyboardInterrupt is not converted.
     """
     if isinstance(reference, RecordedTask):
         return _load_recorded(reference, source or {})
@@ -163,7 +163,7 @@ def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> L
 
 
 def with_late_imports(task: LoadedTask) -> LoadedTask:
-    """`task` with the modules that its hooks have imported since added."""
+    """`task`, plus the modules that its hooks have imported since."""
     load = _load_of(task)
     return task if load is None else dataclasses.replace(task, **_source_fields(load.finder))
 
@@ -188,7 +188,7 @@ def _load_of(task: LoadedTask) -> _Load | None:
 
 def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
     if task.approved is None:
-        # A file that was not approved is not opened; `env_id` may look like a path and is not read as one.
+        # A file without approval is not opened; `env_id` may look like a path but is never used as one.
         if registry.environment(task.env_id) is None:
             raise task_error(
                 f"a recording names the task {task.env_id!r}, and no installed package registers one of that id. {IMPORT_HINT}"
@@ -200,7 +200,7 @@ def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
 
 
 def import_module(name: str) -> ModuleType:
-    """Import a module that a person named, as Python does; `find_module` says where it is searched. Raises TaskError."""
+    """Import a module that a person named, as Python does; `find_module` lists the searched places. Raises TaskError."""
     if name in sys.modules:
         return sys.modules[name]
     found = find_module(name)
@@ -235,7 +235,7 @@ def class_of_module(name: str, class_name: str) -> type[BaseEnv]:
 def _load_named(name: str, class_name: str, given: dict[str, str]) -> LoadedTask:
     """Load ``package.module:ClassName`` as its file, with the package's modules.
 
-    A library's module is imported as it is: it is not edited, and other code has its classes.
+    A library's module is imported normally: it is not edited, and other code uses its classes.
     """
     found = find_module(name)
     if found is None:
@@ -270,7 +270,7 @@ def _load_file(
     named: ModuleName | None = None,
 ) -> LoadedTask:
     finder = AuthorFinder(file, given, only_given, named)
-    # Every module of a named package is read again, also the one that defines its task.
+    # Every module of a named package is read again, including the one that defines its task.
     package = None if named is None else named.own_folder
     others = {
         load.finder.main
@@ -283,7 +283,7 @@ def _load_file(
             module = importlib.import_module(finder.main)
             task = _task_in(module, class_name, load)
         except BaseException as exc:
-            # Before the modules are restored: the problem's lines are those of the text that failed.
+            # Computed before the modules are restored: the problem's lines are those of the text that failed.
             problem = None if is_ctrl_c(exc) else _import_problem(exc, finder)
             _revert(load)
             if problem is None:
@@ -292,7 +292,7 @@ def _load_file(
     for earlier in _loads.values():
         if earlier is not load:
             earlier.unloaded = None
-    # Else every earlier version would stay in memory.
+    # Without this every earlier version would stay in memory.
     if load.before is not None:
         load.before.unloaded = load.before.before = None
     return task
@@ -331,7 +331,7 @@ def _revert(load: _Load) -> None:
 
 
 def _parse(reference: str) -> tuple[Path, str | None]:
-    """File and class of a reference that is no registered id."""
+    """File and class of a reference that is not a registered id."""
     if not reference.strip():
         raise task_error(
             "no task named; give a .py file, file.py:ClassName, or a registered id like PickCube-v1"
@@ -370,7 +370,11 @@ def _exists(reference: str) -> bool:
 def _resolve(path: str | Path) -> Path:
     try:
         return Path(path).expanduser().resolve()
-    except (OSError, RuntimeError, ValueError) as exc:  # no such user's home; a loop of links; a null byte
+    except (
+        OSError,
+        RuntimeError,
+        ValueError,
+    ) as exc:  # home of an unknown user; a loop of links; a null byte
         raise task_error(f"{str(path)!r} is not a path that can be opened: {exc}") from exc
 
 
@@ -400,7 +404,7 @@ def task_of_class(cls: type[BaseEnv], env_id: str) -> LoadedTask:
     With the executed texts if `load_task` loaded its file, else with the text on disk.
     """
     for load in _loads.values():
-        # Not a class that the file only imports.
+        # Excludes a class that the file only imports.
         registered = any(made.cls is cls and made.name == env_id for made in load.registrations.made)
         if registered or cls.__module__ in load.finder.names:
             return _task(cls, env_id, load.finder.file, followed=True, **_source_fields(load.finder))
@@ -454,7 +458,7 @@ def _task_in(module: ModuleType, requested: str | None, load: _Load) -> LoadedTa
         **_source_fields(finder),
     )
     task = dataclasses.replace(task, default_kwargs={**task.default_kwargs, **chosen.kwargs})
-    # The limit of the scene for looking, 200,000 steps, is no length of an episode.
+    # The empty scene's limit of 200,000 steps is no episode length.
     return task if task.robot is None else dataclasses.replace(task, max_episode_steps=None)
 
 
@@ -463,7 +467,7 @@ def _source_fields(finder: AuthorFinder) -> dict[str, Any]:
 
 
 def _fields(source: Mapping[str, str], file: Path | None, folder: Path) -> dict[str, Any]:
-    # In a package a helper may have been read first.
+    # In a package a helper may be read before the task's file.
     files = sorted((Path(path) for path in source), key=lambda path: path != file)
     return {
         "source_files": tuple(files),
@@ -476,7 +480,7 @@ def _fields(source: Mapping[str, str], file: Path | None, folder: Path) -> dict[
 
 
 def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
-    """The problem for the author of the file whose import raised `exc`, with a hint what to do."""
+    """The problem for the author of the file whose import raised `exc`, with advice."""
     if isinstance(exc, TaskError):
         return exc.problem
     problem = problem_from_exception(exc, "import", [Path(path) for path in finder.texts])
@@ -485,7 +489,7 @@ def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
         message = str(exc)
     elif isinstance(exc, SystemExit):
         message = (
-            f"the file ended the program (SystemExit: {exc.code}) while being imported; what is only for "
+            f"the file ended the program (SystemExit: {exc.code}) while being imported; code that is only for "
             'running it as a script belongs under `if __name__ == "__main__":`'
         )
     elif isinstance(exc, ModuleNotFoundError) and exc.name:
@@ -494,32 +498,32 @@ def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
         message = f"{message}; {named_like_library_text(file)}"
     elif isinstance(exc, ImportError) and (installed := _installed(exc.name)) is not None:
         message = (
-            f"{message}; installed here is {installed}: write what that has, or install the version that the file was "
+            f"{message}; installed here is {installed}: use what it has, or install the version that the file was "
             "written for"
         )
     elif isinstance(exc, OSError) and exc.filename == str(finder.file) and problem.file is None:
         message = f"{finder.file} cannot be read: {exc.strerror}; is it being written just now?"
     if problem.file is None:
-        # None of the author's code ran yet, but this file is the one that cannot be loaded.
+        # None of the author's code has run, but this is the file that cannot be loaded.
         problem = dataclasses.replace(problem, file=str(finder.file))
     return dataclasses.replace(problem, message=message)
 
 
 def _named_module_problem(exc: BaseException, module: NamedModule) -> Problem:
-    """The problem of a named module that is imported as Python does."""
+    """The problem of a module that a person named and that is imported as Python does."""
     problem = problem_from_exception(exc, "import", [module.file])
     message = f"{module.name} cannot be imported: {problem.message}"
     return dataclasses.replace(problem, message=message, file=problem.file or str(module.file))
 
 
 def _named_like(name: str | None, finder: AuthorFinder) -> Path | None:
-    """The author's file that has the name of the library `name`."""
+    """The author's file that has the same name as the library `name`."""
     top = (name or "").partition(".")[0]
     return next((file for file in files_named_like_libraries(finder.search_folder) if file.stem == top), None)
 
 
 def _installed(name: str | None) -> str | None:
-    """The package, or Python, that the module `name` belongs to, with its version; None for a module of the author's."""
+    """Name and version of the package (or Python) that the module `name` belongs to; None for an author's module."""
     top = (name or "").partition(".")[0]
     if top in sys.stdlib_module_names:
         return f"Python {platform.python_version()}"

@@ -61,8 +61,8 @@ class AuthorFinder(MetaPathFinder):
     """Finds and executes the modules of one task: its file, and those of its folder.
 
     `importlib.reload` runs new text in the old namespace, so deleted names live on, and ignores the other modules of the
-    folder. Python's own import trusts a ``.pyc`` whose modification time (in whole seconds) and size match, so of two saves
-    within a second that change ``0.1`` to ``0.2`` it misses the second. This finder compiles from text alone and keeps every
+    folder. Python's own import trusts a ``.pyc`` whose modification time (in whole seconds) and size match, so it misses the
+    second of two saves within a second that change ``0.1`` to ``0.2``. This finder compiles from text alone and keeps every
     text it executed, for the watcher, for recordings, and for `linecache`, whose tracebacks must show the text that ran.
     """
 
@@ -73,7 +73,10 @@ class AuthorFinder(MetaPathFinder):
         only_given: bool = False,
         named: ModuleName | None = None,
     ) -> None:
-        """`named` is the module as a person named it; None derives the name from the file's path."""
+        """
+        Args:
+            named: the module as a person named it; None derives the name from the file's path.
+        """
         self.file = file
         place = named or module_name(file)
         self.main, self.search_folder, self.own_folder = place.name, place.search_folder, place.own_folder
@@ -124,7 +127,7 @@ class AuthorFinder(MetaPathFinder):
     def _given_folder(
         self, fullname: str, last: str, path: Sequence[str] | None
     ) -> importlib.machinery.ModuleSpec | None:
-        """The spec for a name without a given text: an installed module, else a folder of given texts without
+        """The spec for a name that has no given text: an installed module, else a folder of given texts without
         ``__init__.py``.
 
         Raises ModuleNotFoundError for other files of the folder: if an earlier task, or the code itself, has put the folder
@@ -166,7 +169,7 @@ class AuthorFinder(MetaPathFinder):
         try:
             return decode(path, raw)
         except SyntaxError:
-            # So that the problem's line can be shown.
+            # Keep it, so that the problem's line can be shown.
             self.add_text(path, raw.decode(errors="replace"))
             raise
 
@@ -207,7 +210,7 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
         text = self.finder.text(path)
-        # Before compile(): the line of a SyntaxError is looked up in this text.
+        # Added before compile(): the line of a SyntaxError is looked up in this text.
         self.finder.add_text(path, text)
         if "\0" in text:
             # Python's own error names neither file nor line.
@@ -239,14 +242,14 @@ def read_source(path: str | Path) -> str:
     """The text of a Python source file, see `decode`.
 
     Raises:
-        OSError: it cannot be read, is not a regular file, or is larger than any program.
+        OSError: it cannot be read, is not a regular file, or is too large for a program.
         SyntaxError: it is not text.
     """
     return plain_line_ends(read_exactly(path)[1])
 
 
 def read_exactly(path: str | Path) -> tuple[bytes, str, str]:
-    """A Python source file's bytes, its text with its own line ends, and its encoding. Raises as `read_source`."""
+    """Bytes of a Python source file, its text with its own line ends, and its encoding. Raises as `read_source` does."""
     raw = read_regular_file(path, MOST_SOURCE_BYTES)
     return raw, *exact_text(str(path), raw)
 
@@ -257,7 +260,7 @@ def decode(path: str, raw: bytes) -> str:
 
 
 def exact_text(path: str, raw: bytes) -> tuple[str, str]:
-    """The text of a Python source file with its own line ends, and its encoding: its coding line's or UTF-8.
+    """The text of a Python source file with its own line ends, and its encoding (from its coding line, else UTF-8).
 
     Raises SyntaxError, with `path` and line, where Python's own functions raise a
     UnicodeDecodeError that names neither.
@@ -284,7 +287,7 @@ def _is_in(path: str, root: str) -> bool:
 
 @dataclass(frozen=True)
 class UnloadedModules:
-    """The author's modules and their `linecache` entries, while a new version is tried."""
+    """The author's modules and their `linecache` entries, kept while a new version is tried."""
 
     modules: dict[str, ModuleType]
     lines: dict[str, Any]
@@ -292,15 +295,15 @@ class UnloadedModules:
 
 
 _libraries: dict[str, ModuleType] = {}
-"""Modules known to be a library's, since checking three thousand takes 7 ms."""
+"""Cache of modules known to be a library's: checking three thousand takes 7 ms."""
 
 
 def unload_modules(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> UnloadedModules:
     """Remove the author's modules from ``sys.modules``, so that edited helpers are read again.
 
-    Those of the folder, and helpers of other tasks: ``helper`` of another folder would be found before this one's. Main
-    modules of other tasks stay (`is_other_task` of their name): they are not imported by name, and their classes may be in
-    use.
+    Removes the modules of the folder, and helpers of other tasks: ``helper`` of another folder would be found before this
+    one's. Main modules of other tasks stay (`is_other_task` of their name): they are not imported by name, and their
+    classes may be in use.
     """
     folder = finder.own_folder
     unloaded: dict[str, ModuleType] = {}
@@ -309,7 +312,7 @@ def unload_modules(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -
             continue
         if _libraries.get(name) is module and name != finder.main:
             continue
-        # Not getattr, which makes lazy modules import.
+        # Not getattr: it triggers the imports of lazy modules.
         attributes = getattr(module, "__dict__", {})
         spec, file = attributes.get("__spec__"), attributes.get("__file__")
         if name == finder.main or isinstance(getattr(spec, "loader", None), _AuthorLoader):
@@ -320,8 +323,8 @@ def unload_modules(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -
             elif file.startswith(LIBRARY_ROOTS):
                 _libraries[name] = module
         elif spec is not None and spec.origin is None and spec.submodule_search_locations is not None:
-            # A folder without __init__.py: ``from robots import arm`` takes the attribute ``arm``
-            # of the namespace module, and would get the old one without any import.
+            # A folder without __init__.py: ``from robots import arm`` would take the old attribute ``arm`` of the
+            # namespace module, without an import.
             places = [os.path.join(place, "x.py") for place in spec.submodule_search_locations]
             if any(is_own_file(place, folder) for place in places):
                 unloaded[name] = module
@@ -350,7 +353,7 @@ def restore_modules(unloaded: UnloadedModules, finder: AuthorFinder) -> None:
 
 
 def show_in_tracebacks(path: str, text: str) -> None:
-    """Make `linecache` serve `text` for `path`, also after the file has changed.
+    """Make `linecache` return `text` for `path`, even after the file has changed.
 
     `linecache.checkcache`, which runs before every traceback, skips entries without a modification time.
     """

@@ -1,4 +1,4 @@
-"""Writes a new task into the user's folder: from an example, which is its template, or from an installed task."""
+"""Writes a new task into the user's folder, from an example (its template) or an installed task."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from workbench.task.library_names import is_library
 from workbench.task.modules import read_exactly
 
 TemplateName = Literal["minimal", "tabletop", "articulated", "multi-robot", "locomotion"]
-LONGEST_NAME = 60
-_MOST_BLANK = 64 * 1024
-"""Most bytes of a file that may be filled; a larger file holds something."""
+MAX_NAME_CHARACTERS = 60
+_MAX_BLANK_BYTES = 64 * 1024
+"""Maximum size of a file that counts as blank."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _WORD = re.compile(r"[A-Za-z0-9]+")
 
 
 @dataclass(frozen=True)
 class Template:
-    """An example that a new task may begin from."""
+    """An example that a new task can start from."""
 
     name: TemplateName
     """Name for ``workbench new --from``."""
@@ -73,8 +73,8 @@ def write_new_task(name: str, origin: str, folder: Path) -> NewTask:
     """Write ``NAME.py`` into a folder.
 
     Args:
-        name: of the file; class and id are made of it: ``stack_two`` gives ``StackTwoEnv`` and ``StackTwo-v1``.
-        origin: a template's name, or the id of a task of ManiSkill.
+        name: name of the file, which gives the class and the id: ``stack_two`` gives ``StackTwoEnv`` and ``StackTwo-v1``.
+        origin: a template's name, or the id of a ManiSkill task.
 
     Raises:
         CannotBegin: nothing was written.
@@ -92,21 +92,21 @@ def write_new_task(name: str, origin: str, folder: Path) -> NewTask:
 
 
 def is_blank(file: Path) -> bool:
-    """Whether a file holds nothing but comments and blank lines; False if it cannot be read."""
+    """Whether a file contains only comments and blank lines; False if it cannot be read."""
     return _blank_content(file) is not None
 
 
 def fill_blank_file(file: Path) -> None:
-    """Write the first template into a file that holds nothing but comments and blank lines; they stay above it.
+    """Write the first template into a file that contains only comments and blank lines, which stay above it.
 
-    Class and id are made of the file's name.
+    The file's name gives the class and the id.
 
     Raises:
         CannotBegin: the file is unchanged.
     """
     content = _blank_content(file)
     if content is None:
-        raise CannotBegin(f"{file.name} is not empty any more, and was not written over.")
+        raise CannotBegin(f"{file.name} is no longer empty, and was not overwritten.")
     text, _, _ = _new_text(file, camel_case(file.stem), TEMPLATES[0].name)
     above = content.rstrip()
     try:
@@ -114,12 +114,12 @@ def fill_blank_file(file: Path) -> None:
     except OSError as error:
         raise CannotBegin(f"{file} cannot be written: {error.strerror}.") from error
     if not done:
-        raise CannotBegin(f"{file.name} was saved meanwhile, and was not written over.")
+        raise CannotBegin(f"{file.name} was saved meanwhile, and was not overwritten.")
 
 
 def _blank_content(file: Path) -> bytes | None:
     try:
-        content = read_regular_file(file, _MOST_BLANK)
+        content = read_regular_file(file, _MAX_BLANK_BYTES)
         lines = content.decode().splitlines()
     except (OSError, ValueError):
         return None
@@ -137,35 +137,35 @@ def why_not_name(name: str, folder: Path) -> str:
 
 
 def _check_name(name: str, folder: Path) -> None:
-    if not _NAME.fullmatch(name) or len(name) > LONGEST_NAME or keyword.iskeyword(name):
+    if not _NAME.fullmatch(name) or len(name) > MAX_NAME_CHARACTERS or keyword.iskeyword(name):
         words = _WORD.findall(name.removesuffix(".py"))
-        better = "_".join(words)[:LONGEST_NAME]
+        better = "_".join(words)[:MAX_NAME_CHARACTERS]
         if not _NAME.fullmatch(better) or keyword.iskeyword(better):
             better = "stack_two"
         raise CannotBegin(
-            f"{name[:LONGEST_NAME]!r} cannot be the name of a task: take letters, digits and underscores, at most "
-            f"{LONGEST_NAME}, with a letter first, such as {better}."
+            f"{name[:MAX_NAME_CHARACTERS]!r} cannot be the name of a task: use letters, digits and underscores, at most "
+            f"{MAX_NAME_CHARACTERS}, with a letter first, such as {better}."
         )
     if (folder / f"{name}.py").exists():
         raise CannotBegin(_taken(folder / f"{name}.py"))
     if is_library(name):
         raise CannotBegin(
-            f"{name} is the name of a library, and no import would find {name}.py: take another name, such as {name}_task."
+            f"{name} is the name of a library, and no import would find {name}.py: use another name, such as {name}_task."
         )
 
 
 def _taken(file: Path) -> str:
-    return f"There is a file {file.name} already, and it is not written over: take another name, or move it."
+    return f"{file.name} exists already and is not overwritten: use another name, or move the file."
 
 
 def camel_case(name: str) -> str:
-    """``stack_two`` becomes ``StackTwo``; a name that begins with a digit gets a word before it."""
+    """``stack_two`` becomes ``StackTwo``; a name that begins with a digit gets a prefix."""
     joined = "".join(word[0].upper() + word[1:] for word in _WORD.findall(name))
     return joined if joined[:1].isalpha() else f"Task{joined}"
 
 
 def _new_text(file: Path, bare: str, origin: str) -> tuple[str, str, NewTask]:
-    """Text and encoding of a new task, whose names begin with `bare`, and what it will be."""
+    """Text and encoding of a new task whose names begin with `bare`, and its description."""
     env_id = f"{bare}-v1"
     class_name = bare if bare.endswith("Env") else f"{bare}Env"
     template = next((one for one in TEMPLATES if one.name == origin), None)
@@ -176,7 +176,7 @@ def _new_text(file: Path, bare: str, origin: str) -> tuple[str, str, NewTask]:
         close = difflib.get_close_matches(origin, [*names, *installed], 1, 0.5)
         more = f" Did you mean {close[0]}?" if close else ""
         raise CannotBegin(
-            f"There is neither a template nor a task of ManiSkill named {origin!r}: take {', '.join(names)}, or an id such "
+            f"There is neither a template nor a ManiSkill task named {origin!r}: use {', '.join(names)}, or an id such "
             f"as PickCube-v1.{more}"
         )
     source = installed[origin] if template is None else _example(template)
@@ -209,7 +209,7 @@ def _check_id(env_id: str, file: Path) -> None:
         owners.update(dict.fromkeys(() if task is None else task.ids, path.name))
     if env_id in owners:
         raise CannotBegin(
-            f"The task would register {env_id}, which is an id of {owners[env_id]} already: take another name, such as "
+            f"The task would register {env_id}, which is already an id of {owners[env_id]}: use another name, such as "
             f"my_{file.stem}."
         )
 
@@ -223,7 +223,7 @@ def _example(template: Template) -> Path:
 
 @cache
 def maniskill_ids() -> Mapping[str, Path]:
-    """File of each id of the installed ManiSkill, as the texts say; nothing is imported. Empty without ManiSkill."""
+    """File of each id of the installed ManiSkill, found by parsing; nothing is imported. Empty without ManiSkill."""
     spec = importlib.util.find_spec("mani_skill")
     folders = [] if spec is None else spec.submodule_search_locations or ()
     return {

@@ -89,12 +89,12 @@ def with_advice(
     """The error of a task that failed to open, with advice: another task of the file, or one env.
 
     Args:
-        again: imports it again; the failed import was undone.
-        knows_others: give no advice about the other tasks of the file.
+        again: imports the task again; the failed import was undone.
+        knows_others: give no advice about other tasks of the file.
     """
     advice: list[str] = []
     if options.num_envs > 1 and _may_be_of_the_batch(error):
-        tried = min(options.num_envs, _MOST_TRIED)
+        tried = min(options.num_envs, _MAX_SEEDS_TRIED)
         if _runs_alone(again, options, tried):
             advice.append(
                 f"this works with 1 env, from each of {tried} seeds, and not with {options.num_envs}; --num-envs 1 opens it"
@@ -112,12 +112,12 @@ def with_advice(
     return TaskError(replace(error.problem, message=message), classes)
 
 
-_MOST_TRIED = 8
-"""Maximum number of seeds with which one env is tried: an error of 16 envs may come from the state of one of them."""
+_MAX_SEEDS_TRIED = 8
+"""Maximum number of seeds that one env is tried with: an error of 16 envs may come from the state of one of them."""
 
 
 def _may_be_of_the_batch(error: TaskError) -> bool:
-    """Whether torch, numpy or a check raised the error for a wrong shape, and the error has no advice yet."""
+    """Whether the error is a wrong shape (from torch, numpy or a check) and has no advice yet."""
     cause = error.__cause__
     if isinstance(cause, BrokenRule):
         return True
@@ -162,7 +162,7 @@ def open_task(
     """Import, build, rehearse and reset a task, without a page.
 
     Args:
-        source: as `load_task`.
+        source: as in `load_task`.
 
     Raises:
         TaskError: with the author's file and line; the import is undone.
@@ -185,7 +185,7 @@ def import_task(
     """Import a task's class, with `source` in place of the files on disk if given. Raises TaskError."""
     opening.on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
     if "render_backend" not in options.env_kwargs and (renderer := find_renderer()) is not None:
-        # SAPIEN refuses it while a material of the author's is alive, of their module or of a build that failed.
+        # SAPIEN refuses another device while a material of the author's module or of a failed build is alive.
         keep_render_device(renderer.render_backend)
     import_modules(options.imports)
     loaded = load_task(reference, source=source)
@@ -194,8 +194,8 @@ def import_task(
 
 
 def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
-    """Build, rehearse and reset an imported task. A task that uses what exists for one env only gets one env, and a
-    notice says so.
+    """Build, rehearse and reset an imported task. A task that uses features that exist only for one env gets one env and a
+    notice.
 
     On TaskError the caller undoes the import (`undo_load`).
     """
@@ -261,12 +261,12 @@ def _built(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Opened
 
 
 def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
-    """Do one reset, one step and one partial reset, and check the returns.
+    """Do one reset, one step and one partial reset, and check what they return.
 
-    A task that imports and builds can still fail in these; that must be known before the running version is replaced.
+    A task that imports and builds can still fail in these, which must be known before the running version is replaced.
 
     Raises:
-        TaskError: the task fails in one.
+        TaskError: one of them fails.
     """
     with blamed("reset", loaded, task):
         task.reset(seed)
@@ -280,7 +280,7 @@ def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
 def describe(
     loaded: LoadedTask, task: TaskEnv, given: Mapping[str, Any], max_episode_steps: int | None
 ) -> TaskDescription:
-    """The task as plain data; `given` are the keywords that it was made with."""
+    """The task as plain data; `given` are the keyword arguments that it was made with."""
     env = task.env
     dimensions = [
         ActionDimension(name, float(low), float(high))
@@ -323,7 +323,7 @@ def describe(
 
 
 def notices_of(loaded: LoadedTask, options: TaskOptions, cameras: Iterable[CameraInfo]) -> tuple[str, ...]:
-    """Notices about a task that works, as sentences."""
+    """Notices about a working task, as sentences."""
     own = loaded.notices if loaded.followed else ()
     of_cameras = [f"{each.file}:{each.line}: {each.message}" for each in findings_of_shaders(cameras)]
     of_machine = (unused_gpu_text(options.backend), version_notice(), rerun_notice())
@@ -344,16 +344,15 @@ _SMALL_TASK = "PickCube-v1"
 
 
 def warm_up(options: TaskOptions, keep_going: Callable[[], bool]) -> None:
-    """Do the slow first steps of a process: make a small env, draw it, and close it. Ends early when `keep_going`
-    returns False.
+    """Warm up a process: make a small env, render it, and close it. Ends early when `keep_going` returns False.
 
     The first env of a process and its shapes take 1.2 s with N = 4 on two cores, the second 0.12 s, and the first picture
     of each kind of camera compiles its shaders. The robot's files, the render system and the shaders are the same for
     any task.
 
-    It fails only where the author's own load would fail (no renderer, no GPU), which reports it better.
+    Fails only if the author's own load would fail too (no renderer, no GPU), which reports the error better.
     """
-    # The only one of the author's arguments that decides whether drawing is possible.
+    # The only one of the author's arguments that decides whether rendering is possible.
     renderer = {name: value for name, value in options.env_kwargs.items() if name == "render_backend"}
     try:
         opened = open_task(_SMALL_TASK, replace(options, num_envs=1, env_kwargs=renderer, imports=()))

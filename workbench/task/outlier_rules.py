@@ -1,4 +1,4 @@
-"""The rules that outliers of a loaded task break, at the hooks that they guard."""
+"""Rules that outliers of a loaded task break, and the hooks that these rules guard."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from workbench.task.problem import hook_definition
 _OTHER_HOOKS = {
     "reward-finite": ("compute_normalized_dense_reward", "compute_sparse_reward"),
     "reward-normalized": ("compute_dense_reward", "compute_sparse_reward"),
-    "bodies-stay": ("_initialize_episode",),  # no author writes `step`: what flies off was placed in a reset
+    "bodies-stay": (
+        "_initialize_episode",
+    ),  # authors do not write `step`: a body that flies off was placed in a reset
 }
-"""Where a rule's own hook is not the author's."""
+"""Hooks to blame for rules whose own hook is not the author's."""
 
 
 def rules_of_outliers(loaded: LoadedTask, choice: Degree | None) -> dict[str, Finding]:
-    """The rules that an outlier can break, by id, each as a finding without a breach at the hook that it guards; without those
-    that are off, or silenced there.
+    """The rules that an outlier can break, by id; each value is a finding template at the hook that the rule guards. Rules that
+    are off, or silenced at the hook, are left out.
 
     Args:
-        choice: the degree of all rules; None for each rule's own.
+        choice: degree of all rules; None for each rule's own.
     """
     found: dict[str, Finding] = {}
     for name in sorted(OUTLIER_RULES):

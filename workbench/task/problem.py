@@ -56,8 +56,8 @@ def hooks_of(stage: str) -> tuple[str, ...]:
 
 _REWARD_HOOKS = hooks_of("reward")
 
-MESSAGE_LIMIT = 500
-TRACEBACK_LINE_LIMIT = 1000
+MAX_MESSAGE_CHARACTERS = 500
+MAX_TRACEBACK_LINE_CHARACTERS = 1000
 TRACEBACK_HEAD_LINES = 60
 TRACEBACK_TAIL_LINES = 140
 
@@ -66,7 +66,7 @@ _MACHINERY = ("workbench", "importlib", "_frozen_importlib", "_frozen_importlib_
 
 
 class Interrupted(BaseException):
-    """A person stopped the task. Not an Exception: ``except Exception`` in a loop must not swallow it."""
+    """A person stopped the task. Not an Exception, so that ``except Exception`` in a loop does not swallow it."""
 
 
 _ctrl_c: tuple[type[BaseException], ...] = (KeyboardInterrupt,)
@@ -79,7 +79,7 @@ def treat_ctrl_c_as_error() -> None:
 
 
 def is_ctrl_c(error: BaseException | None) -> bool:
-    """Whether a person pressed Ctrl-C: to be raised again, never reported as the task's error."""
+    """Whether a person pressed Ctrl-C. Must be reraised, never reported as the task's error."""
     return isinstance(error, _ctrl_c)
 
 
@@ -139,7 +139,7 @@ def place_text(file: str | None, line: int | None) -> str:
 
 
 def task_error(message: str, file: Path | None = None) -> TaskError:
-    """The error for a task that cannot be loaded for a reason that no line of the author raised."""
+    """Error for a task that cannot be loaded, raised by no line of the author's code."""
     return TaskError(Problem("import", shorten(message), None if file is None else str(file), None, None, ""))
 
 
@@ -150,13 +150,13 @@ def problem_from_exception(
     cls: type | None = None,
     otherwise: tuple[str, int] | None = None,
 ) -> Problem:
-    """The problem that `exc` is for the author of `own_files`.
+    """The problem of `exc` for the author of `own_files`.
 
-    Its line is the innermost frame in `own_files`, or in a file called from there that no package has installed; of `exc`,
-    or else of the exceptions that caused it. A hook of `HOOK_STAGES` on the traceback replaces `stage`, except while
-    importing. If no frame is the author's but a note names a place, it is that; else, if a hook is known and `cls` (the
-    task's class) is given, that hook's ``def``; else the file and line `otherwise`. The message begins with the first exception of the chain, and with what the
-    core's notes say came before.
+    Its line is the innermost frame of `exc`, or else of its causes, in `own_files` or in a file called from there that no
+    package has installed. A hook of `HOOK_STAGES` on the traceback replaces `stage`, except while importing. If no frame is
+    the author's, the line is the place that a note names; else, if a hook is known and `cls` (the task's class) is given,
+    that hook's ``def``; else `otherwise` (file and line). The message begins with the first exception of the chain, and
+    with what the core's notes say came before.
     """
     own = {str(path) for path in own_files}
     chain = [*chain_of(exc)]
@@ -196,7 +196,7 @@ def problem_from_exception(
     return Problem(stage_found, message, file, line, code or None, format_traceback(exc), stopped)
 
 
-def shorten(text: str, limit: int = MESSAGE_LIMIT) -> str:
+def shorten(text: str, limit: int = MAX_MESSAGE_CHARACTERS) -> str:
     """`text` on one line of at most `limit` characters."""
     line = " ".join(text[: 8 * limit].split())
     return line if len(line) <= limit else line[: limit - 1] + "…"
@@ -205,7 +205,7 @@ def shorten(text: str, limit: int = MESSAGE_LIMIT) -> str:
 def format_traceback(exc: BaseException) -> str:
     """The traceback of `exc` without the workbench's own frames at its start, and without its middle if it is long.
 
-    Python folds a function that calls itself; two that call each other still give two thousand lines.
+    Python folds a function that calls itself, but two functions that call each other still give two thousand lines.
     """
     trace = exc.__traceback__
     while trace is not None and trace.tb_next is not None and _is_machinery(trace.tb_frame):
@@ -219,7 +219,9 @@ def format_traceback(exc: BaseException) -> str:
         left_out = len(lines) - TRACEBACK_HEAD_LINES - TRACEBACK_TAIL_LINES
         lines[TRACEBACK_HEAD_LINES:-TRACEBACK_TAIL_LINES] = [f"  ... {left_out} lines left out ..."]
     return "\n".join(
-        line if len(line) <= TRACEBACK_LINE_LIMIT else line[: TRACEBACK_LINE_LIMIT - 1] + "…"
+        line
+        if len(line) <= MAX_TRACEBACK_LINE_CHARACTERS
+        else line[: MAX_TRACEBACK_LINE_CHARACTERS - 1] + "…"
         for line in lines
     )
 
@@ -267,7 +269,7 @@ def check_step_returns(
 ) -> Problem | None:
     """The first wrong type or shape in what one step of `num_envs` envs of `cls` returned, or None.
 
-    ManiSkill 3.0.1 checks none of it. Some mistakes raise far from their cause (``success`` as a Python bool: "'bool'
+    ManiSkill 3.0.1 does not check them. Some mistakes raise far from their cause (``success`` as a Python bool: "'bool'
     object has no attribute 'clone'", inside `BaseEnv.step`). Others are silent with several envs: ``success`` of shape
     ``()`` gives a ``terminated`` of shape ``()``; a reward of shape ``(N, 1)`` or ``()``, or a Python float, is returned
     and broadcasts against ``(N,)`` into ``(N, N)`` in a trainer. With one env all of them look right.
@@ -278,9 +280,9 @@ def check_step_returns(
         reward: (N,) real numbers, or bools, which the rule `reward-rows` reports; None if no reward was computed.
 
     With one env shape () is allowed too. Tensors may be on any device. The problem's stage is ``returns``; its place is in
-    `source_files`, or None if the hook is inherited. NaN has the right shape: `envs.outliers` tells of it.
+    `source_files`, or None if the hook is inherited. NaN has the right shape: `envs.outliers` reports it.
     """
-    from workbench.envs.evaluate_entries import (  # torch, which the server does without
+    from workbench.envs.evaluate_entries import (  # imports torch, which the server must not
         no_reward,
         wrong_evaluate,
     )
@@ -329,12 +331,12 @@ def _message(exc: BaseException) -> str:
     except Exception as failure:  # the author's own __str__ may raise
         text = f"<its __str__ raised {type(failure).__qualname__}>"
     if isinstance(exc, BdbQuit) and not text:
-        text = "a debugger's prompt was left, or had no terminal; it was called just before this line: remove the call"
+        text = "a debugger's prompt was quit, or had no terminal; it was called just before this line: remove the call"
     return shorten(f"{name}: {text}{_suggestion(exc)}" if text.strip() else name)
 
 
 def _suggestion(exc: BaseException) -> str:
-    """A name that is nearly the missing one, as Python's interactive prompt would say it; empty if there is none."""
+    """Text that suggests a similar name, as Python's interactive prompt does; empty if there is none."""
     wanted = getattr(exc, "name", None)
     if not isinstance(wanted, str) or not isinstance(exc, (NameError, AttributeError)):
         return ""
@@ -355,7 +357,7 @@ _Line = tuple[str, int]
 
 
 def _place_in(exc: BaseException, own: Collection[str]) -> _Line | None:
-    """The author's innermost line; None if there is none, or it only hands on to the constructor of a base class."""
+    """The author's innermost line; None if there is none, or it only calls the constructor of a base class."""
     if _is_authors_syntax(exc, own):
         return str(exc.filename), exc.lineno or 1
     if isinstance(exc, CoreRefusal) and exc.place is not None and _is_authors(exc.place[0], own):
@@ -370,7 +372,7 @@ def _place_in(exc: BaseException, own: Collection[str]) -> _Line | None:
 
 
 def _override_of_other_arguments(exc: BaseException, cls: type, own: Collection[str]) -> _Line | None:
-    """The author's method that does not take what the method takes that it overrides, if `exc` was raised by a call of it:
+    """The author's method whose parameters differ from those of the method that it overrides, if a call of it raised `exc`:
     Python raises that TypeError in the caller."""
     frames = [frame for frame, _ in tracebacks.walk_tb(exc.__traceback__)]
     if not isinstance(exc, TypeError) or not frames:
@@ -411,9 +413,9 @@ def _is_raised_at(exc: BaseException, place: _Line | None) -> bool:
 
 
 def _hands_on(frame: FrameType, below: list[FrameType]) -> bool:
-    """Whether a constructor's frame is in its ``super().__init__()``, and this called a method of the object that failed.
+    """Whether a constructor's frame is in its ``super().__init__()``, which called a method of the object that failed.
 
-    ``BaseEnv.__init__`` builds the scene and resets: its call says nothing about where they fail.
+    ``BaseEnv.__init__`` builds the scene and resets, so the line of its call does not show where they fail.
     """
     same = [
         one.f_code.co_name == "__init__"
@@ -428,7 +430,7 @@ def _is_authors(file: str, own: Collection[str]) -> bool:
 
 
 def _is_authors_syntax(exc: BaseException, own: Collection[str]) -> TypeGuard[SyntaxError]:
-    """Whether `exc` is a SyntaxError of one of the author's files, and not of a text that is parsed."""
+    """Whether `exc` is a SyntaxError of one of the author's files, not of a text that their code parses."""
     known = isinstance(exc, SyntaxError) and exc.filename and exc.lineno is not None
     return bool(known) and _is_authors(exc.filename, own)  # type: ignore[union-attr]
 

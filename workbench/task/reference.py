@@ -24,8 +24,8 @@ _REFERENCE = re.compile(rf"(?P<module>{_NAME.pattern}):(?P<cls>[^\W\d]\w*)")
 class RecordedTask:
     """A task that a recording names, as opposed to a ``str``, which a person gave.
 
-    Two types, so that a path or module name out of a recording is never opened as if a person had asked for it: only a
-    registered id, or the very texts that a person approved.
+    A separate type, so that a path or module name from a recording is never opened as if a person had given it: only a
+    registered id, or the exact texts that a person approved.
     """
 
     env_id: str
@@ -34,7 +34,7 @@ class RecordedTask:
     """The task's own file, absolute, if the recording has one."""
     class_name: str | None = None
     approved: Mapping[str, str] | None = None
-    """Path to text of `file` and of its modules, approved by a person: only these are executed. None: `file` is not
+    """Text by path of `file` and of its modules, approved by a person: only these are executed. None: `file` is not
     opened."""
 
     def __str__(self) -> str:
@@ -48,7 +48,7 @@ TaskName = str | RecordedTask
 
 
 def file_and_class(reference: str) -> tuple[str, str | None]:
-    """File and class of ``file.py`` or ``file.py:ClassName``; an empty file for another form."""
+    """File and class of ``file.py`` or ``file.py:ClassName``; an empty file for any other form."""
     match = _FILE.fullmatch(reference)
     return ("", None) if match is None else (match["file"], match["cls"])
 
@@ -65,7 +65,7 @@ def named_file(reference: TaskName) -> Path | None:
         module = find_module(named[0])
         return None if module is None else module.file
     file, _ = file_and_class(reference)
-    # Not Path.expanduser, which raises where there is no such user.
+    # Not Path.expanduser, which raises if there is no such user.
     return real_path(Path(os.path.expanduser(file))) if file else None
 
 
@@ -94,7 +94,7 @@ def followed_folder(reference: TaskName) -> Path | None:
 
 
 def why_missing(reference: str) -> str | None:
-    """Why the named file or module cannot be opened, by form and disk alone; None if it may exist."""
+    """Why the named file or module cannot be opened, judged by its form and the disk alone; None if it may exist."""
     if (named := split_reference(reference)) is not None:
         return not_found_text(named[0]) if find_module(named[0]) is None else None
     file = named_file(reference)
@@ -108,7 +108,7 @@ def why_missing(reference: str) -> str | None:
 
 
 def check_task_file(file: Path) -> None:
-    """Raise `TaskError`, with what to do, for a path that is no readable .py file."""
+    """Raise `TaskError`, with advice, for a path that is not a readable .py file."""
     try:
         if file.is_dir():
             names = sorted(path.name for path in file.glob("*.py"))[:5]
@@ -116,23 +116,23 @@ def check_task_file(file: Path) -> None:
             raise task_error(f"{file} is a folder; name a .py file in it{inside}")
         if not file.exists():
             if file.is_symlink():
-                raise task_error(f"{file} is a link to {file.readlink()}, which leads to no file")
+                raise task_error(f"{file} is a link to {file.readlink()}, which is no file")
             raise _missing(file)
         if not file.is_file():
-            # Reading a pipe may never end, and a device may have no end.
+            # Reading a pipe or a device may block forever.
             raise task_error(f"{file} is not an ordinary file")
         if file.suffix != ".py":
             raise task_error(
                 f"{file} is not a .py file; a task is one Python file with a class that inherits BaseEnv"
             )
     except OSError as exc:
-        raise task_error(f"cannot look at the file ({exc.strerror}): {file}") from exc
+        raise task_error(f"cannot access the file ({exc.strerror}): {file}") from exc
 
 
 def _missing(file: Path) -> TaskError:
     if not file.parent.is_dir():
         return task_error(f"{file} does not exist, nor does its folder {file.parent}")
-    # By stems: with the suffix, short names that share nothing else are alike.
+    # Compare stems: the common suffix makes unrelated short names similar.
     stems = [path.stem for path in file.parent.glob("*.py")]
     near = difflib.get_close_matches(file.stem, stems, n=3, cutoff=0.7)
     hint = f"; did you mean {' or '.join(f'{stem}.py' for stem in near)}?" if near else ""
@@ -140,7 +140,7 @@ def _missing(file: Path) -> TaskError:
 
 
 def reference_to_class(reference: TaskName, file: Path, class_name: str) -> TaskName:
-    """The reference of another class of the same file or package; `file` is that of the class that `reference` gave."""
+    """The reference of another class of the same file or package; `file` is the file of the class that `reference` gave."""
     if isinstance(reference, RecordedTask):
         return replace(reference, class_name=class_name)
     named = split_reference(reference)
@@ -162,10 +162,11 @@ class NamedModule:
     name: str
     file: Path
     search_folder: Path | None
-    """The folder that must be on ``sys.path``; None if the file's path does not match its name (an import hook maps it)."""
+    """The folder that must be on ``sys.path``; None if the file's path does not match the module's name (an import hook maps
+    it)."""
     own_folder: Path | None
-    """Top package of the module, or the folder of a module without a package: all in it is the author's. None for a
-    library's module, which is imported as it is and not watched."""
+    """Top package of the module, or the folder of a module without a package: everything in it is the author's. None for a
+    library's module, which is imported normally and not watched."""
 
 
 def split_reference(reference: str) -> tuple[str, str] | None:
@@ -184,7 +185,7 @@ def is_module_name(text: str) -> bool:
 def find_module(name: str) -> NamedModule | None:
     """The module `name` as Python would find it, else in the current folder; None if it has no source file.
 
-    The current folder is not on ``sys.path`` of the command, but is where a person who types a name looks.
+    The current folder is not on ``sys.path`` of the command, but a person expects names to be found there.
     """
     first, *rest = name.split(".")
     file, folders = _first(first)
@@ -220,7 +221,7 @@ def _first(name: str) -> tuple[Path | None, list[Path]]:
     folders = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
     if spec is not None and spec.origin is not None:
         return (Path(spec.origin) if spec.has_location else None), folders
-    # A folder without an __init__.py yields to a package found later, as on sys.path.
+    # A package found later takes precedence over a folder without __init__.py, as on sys.path.
     file, here = find_in([Path.cwd()], name)
     return (file, here) if file is not None else (None, [*folders, *here])
 

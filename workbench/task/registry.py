@@ -78,7 +78,7 @@ class Registrations:
             _put(name, self.placed[name])
 
     def replaced(self) -> tuple[Registration, ...]:
-        """Registrations that plain ManiSkill skips: their name was registered before, such as that of a built-in
+        """Registrations that plain ManiSkill skips: their name is registered already, such as that of a built-in
         task, and they do not override it."""
         first = {made.name: made for made in reversed(self.made)}
         taken = [
@@ -98,7 +98,7 @@ def id_of(cls: type) -> str | None:
 
 
 def gymnasium_spec_of(cls: type) -> GymnasiumSpec | None:
-    """What a class is registered as with gymnasium's own `register`, which ManiSkill's table does not know."""
+    """Spec of a class that is registered with gymnasium's own `register`, which ManiSkill's table lacks."""
     ways = (cls, f"{cls.__module__}:{cls.__qualname__}")
     return next((spec for spec in gymnasium_registry.values() if spec.entry_point in ways), None)
 
@@ -122,10 +122,10 @@ def is_robot(value: object) -> bool:
 
 @contextmanager
 def registering(is_own: Callable[[str], bool], registrations: Registrations) -> Iterator[None]:
-    """Record in `registrations` what files with `is_own(path)` register within the context.
+    """Context manager that records in `registrations` what files with `is_own(path)` register.
 
     ManiSkill's `@register_env` keeps the old class of a known id ("already registered. Skip"), so a file that is executed
-    on every save would keep its first version, and one that takes a built-in id would be ignored. So the two decorators are
+    on every save would keep its first version, and one with a built-in id would be ignored. So the two decorators are
     replaced by ones that clear the name first. The tables are not reset afterwards, whether the body raises or not: see
     `Registrations.undo`. Registrations of libraries that the file imports are left alone, since those stay imported.
 
@@ -139,7 +139,7 @@ def registering(is_own: Callable[[str], bool], registrations: Registrations) -> 
         file, line = caller
         earlier = next((made for made in registrations.made if made.name == name), None)
         if earlier is not None and not override:
-            # ManiSkill would keep the first class, with only a log line.
+            # ManiSkill would keep the first class and only log it.
             raise DuplicateName(
                 f"{name!r} is registered twice: in line {earlier.line} ({earlier.cls.__name__}) of "
                 f"{earlier.file} and in line {line} ({getattr(cls, '__name__', cls)})"

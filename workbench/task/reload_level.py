@@ -20,8 +20,8 @@ from workbench.task.kept_state import (
 from workbench.task.problem import hooks_of
 
 Level = Literal["same", "patched", "cameras", "rebuilt"]
-"""same: only comments, docstrings or layout changed. patched: only code that runs at steps and resets: the new class is
-put on the live env. cameras: configs of cameras too: the scene stays. rebuilt: everything else."""
+"""same: only comments, docstrings or layout changed. patched: only code that runs at steps and resets changed; the new class
+is put on the live env. cameras: camera configs changed too; the scene stays. rebuilt: everything else."""
 
 RESET_HOOKS = frozenset(hooks_of("reset"))
 STEP_HOOKS = frozenset(hooks_of("step"))
@@ -59,7 +59,7 @@ class Inherited:
 
     names: frozenset[str]
     used_at_build: frozenset[str] = frozenset()
-    """Names that the code of such classes (except BaseEnv) uses: they may call them while they build."""
+    """Names that the code of these classes (except BaseEnv) uses: they may call them while building."""
 
 
 @dataclass(frozen=True)
@@ -85,16 +85,16 @@ class _NeedsRebuild(Exception):
 def find_change(
     old: Mapping[str, str], new: Mapping[str, str], file: str, class_name: str, inherited: Inherited
 ) -> Change:
-    """The cheapest level that leaves no mixture of two versions of a task, given as texts by path.
+    """The cheapest reload level that does not mix two versions of a task, given as texts by path.
 
     Building a scene takes a second and loses the current moment, and most saves change a line of the reward. So the two
     versions are compared symbol by symbol. The new file is executed as a whole at every level; what remains of the old
     version on a live env is what *building* made: `_load_scene` and the other build hooks, robots and other classes,
-    statements at the top, and everything that those mention, transitively. A change in there means rebuilt. The rest can be
-    exchanged unless something may outlive the exchange (`workbench.task.kept_state`): values that hooks keep
-    between calls, dicts and lists at the top that are filled while the task runs, attributes that only the old version
-    writes, objects of the author's classes. If code may reach further than its names (``exec``), nothing is exchanged. In
-    doubt it is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" shows numbers of mixed code.
+    module-level statements, and everything that those mention, transitively. A change in these means rebuilt. The rest can
+    be replaced unless state may outlive the replacement (`workbench.task.kept_state`): values that hooks keep between
+    calls, module-level dicts and lists that are filled while the task runs, attributes that only the old version writes,
+    objects of the author's classes. If code may reach further than its names (``exec``), nothing is replaced. In doubt the
+    level is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" shows numbers of mixed code.
 
     Pure: nothing is imported or executed, and no content of the texts raises.
     """
@@ -123,7 +123,7 @@ class _Comparison:
         if self._versions.changed:
             self._refuse_unusual_classes(family)
             self._refuse_if_built_of_it(family)
-        # Also for the smallest edit: at every level the names of the file are created again.
+        # Checked for every edit: at every level the module's names are created again.
         self._refuse_kept_between_calls(family)
         if not self._versions.changed:
             return Change("same", "only comments, docstrings or layout changed")
@@ -176,7 +176,7 @@ class _Comparison:
                 continue
             foreign_member = symbol.owner is not None and (symbol.path, symbol.owner) not in family
             if symbol.kind in ("statements", "class") or foreign_member:
-                # Used without being named: a robot by its uid, an enum's members by their position.
+                # These may be used without being named: a robot by its uid, an enum's members by their position.
                 runs = True
             elif symbol.owner is None:
                 runs = any(getattr(node, "decorator_list", ()) for node in symbol.nodes)
@@ -215,7 +215,7 @@ class _Comparison:
     # --- code that cannot be analysed ----------------------------------------------------------------
 
     def _refuse_another_order(self, family: set[Key]) -> None:
-        """Refuse another order of members: it numbers an enum's members and a dataclass's arguments."""
+        """Refuse a changed order of members: it numbers an enum's members and a dataclass's arguments."""
         for key, versions in self._versions.by_key.items():
             if versions[0].kind != "class" or key in family or key in self._versions.changed:
                 continue
@@ -242,14 +242,14 @@ class _Comparison:
                     if (symbol.path, f"{symbol.name}.{name}") in self._versions.by_key:
                         raise _NeedsRebuild(f"the class {symbol.name} has {name}")
         for symbol in self._versions.symbols:
-            # A library's names do not reach the author's code.
+            # Names of a library cannot reach the author's code.
             from_library = symbol.kind == "import" and symbol.short_names <= self._versions.libraries
             if symbol.dynamic is not None and not from_library:
                 raise _NeedsRebuild(
                     f"{self._label(symbol.key)} uses `{symbol.dynamic}`, which may reach anything"
                 )
 
-    # --- state that may outlive an exchange of the code -----------------------------------------------
+    # --- state that may outlive a replacement of the code ---------------------------------------------
 
     def _refuse_kept_between_calls(self, family: set[Key]) -> None:
         found = changed_while_running(self._versions.symbols, self._versions.libraries)
@@ -286,7 +286,7 @@ class _Comparison:
                 raise _NeedsRebuild(f"{self._label(key)} no longer writes {name}, which is still read")
 
     def _refuse_cameras_of_the_moment(self, seen: Collection[Key]) -> None:
-        """New cameras must equal those that a new env would make, so their code may not depend on the moment."""
+        """New cameras must equal those of a new env, so their code must not depend on the current moment."""
         for symbol in self._versions.symbols:
             label = self._label(symbol.key)
             if symbol.key not in seen:
@@ -343,8 +343,8 @@ def _joined(names: list[str]) -> str:
 
 
 def removed_effects(old: Mapping[str, str], new: Mapping[str, str]) -> str:
-    """A statement that the old version ran when it was imported, for what it does (a call, an assignment to something of
-    another module), and that the new version does not have: ``push.py:7 (torch.set_num_threads(8))``. Empty if there is none.
+    """A statement with an effect outside its module (a call, an assignment to another module's attribute) that the old version
+    ran at its import and that the new version lacks: ``push.py:7 (torch.set_num_threads(8))``. Empty if there is none.
     """
     changed = [path for path in old if old[path] != new.get(path)]
     ran = [(path, *effect) for path in changed for effect in _effects(path, old[path])]
@@ -380,7 +380,7 @@ def _has_effect(node: ast.AST) -> bool:
 
 def inherited_names(task: type, files: Collection[str]) -> Inherited:
     """Names that the class `task` inherits from classes of libraries; `files` are the author's."""
-    from mani_skill.envs.sapien_env import BaseEnv  # the rest of this module does without a simulator
+    from mani_skill.envs.sapien_env import BaseEnv  # the rest of this module needs no simulator
 
     libraries = [cls for cls in task.__mro__ if cls is not object and _file_of(cls) not in files]
     names = {name for cls in libraries for name in (*vars(cls), *vars(cls).get("__annotations__", ()))}

@@ -1,4 +1,4 @@
-"""Finds what a name of a task's file can set (a constant, an argument of the constructor) from the text alone, and sets it."""
+"""Finds the constants and constructor arguments of a task's file from its text alone, and sets them in the text."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from workbench.task.constructor_arguments import arguments_of
 
 
 class SettingError(ValueError):
-    """A name cannot be set, or not to this value; the text says what to do."""
+    """A name cannot be set, or not to this value; the message gives advice."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Constant:
     line: int
     value: Any
     at: Replacement
-    """Place of the value, with the text that is there."""
+    """Place of the value, with its current text."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class TaskText:
     def __init__(self, file: Path, text: str, class_name: str | None = None) -> None:
         """
         Args:
-            class_name: of the task; None for the one that the file is opened with.
+            class_name: name of the task's class; None for the class that the file opens with.
 
         Raises:
             SettingError: the text is not Python.
@@ -58,7 +58,7 @@ class TaskText:
             raise SettingError(error.reason) from error
 
     def find(self, name: str) -> Constant | Argument:
-        """What `name` sets. Raises SettingError, where it is nothing, not a literal, or several things."""
+        """The constant or argument that `name` sets. Raises SettingError if there is none, several, or it is no literal."""
         cls = self._task_class()
         arguments = None if cls is None else arguments_of(self._file, self._path, cls)
         found: dict[str, Constant | Argument | SettingError] = {}
@@ -66,19 +66,19 @@ class TaskText:
         for owner, bindings in self._scopes():
             if plain in bindings:
                 found[f"{owner}.{plain}"] = self._constant(f"{owner}.{plain}", bindings[plain])
-        # Where the bases of the class are not to be found by reading, any name may be an argument.
+        # If the bases of the class cannot be found in the text, any name may be an argument.
         if cls is not None and (plain in (arguments or ()) or (arguments is None and not found)):
             found[f"{cls.name}.__init__.{plain}"] = Argument(plain)
         if name != plain:
             found = {full: one for full, one in found.items() if full == name}
         elif self._class is not None and f"{self._class}.{plain}" in found:
-            # The person named the class: what the others have is not meant.
+            # The person named the class: ignore the names of other classes.
             found = {full: one for full, one in found.items() if full.startswith(f"{self._class}.")}
         if not found:
             raise SettingError(self._nothing(name, arguments or ()))
         if len(found) > 1:
             raise SettingError(
-                f"{name} of {self._file.name} may be {' or '.join(sorted(found))}: name one of them so"
+                f"{name} of {self._file.name} may be {' or '.join(sorted(found))}: give one of these names"
             )
         (one,) = found.values()
         if isinstance(one, SettingError):
@@ -86,7 +86,7 @@ class TaskText:
         return one
 
     def replaced(self, values: Sequence[tuple[Constant, Any]]) -> str:
-        """The text with other values of these constants. Raises SettingError for one of another type."""
+        """The text with new values of these constants. Raises SettingError for a value of another type."""
         changes = [
             Replacement(one.at.start, one.at.end, _python_text(one, value, one.value))
             for one, value in values
@@ -96,7 +96,7 @@ class TaskText:
     # --- inside ----------------------------------------------------------------------------------------
 
     def _scopes(self) -> Iterator[tuple[str, Mapping[str, list[Binding]]]]:
-        """The module and the classes of the file, each by its name, with the names that it binds."""
+        """(name, bindings) of the module and of each class of the file."""
         yield self._path.stem, self._project.bindings(self._file, self._file.module)
         for node in self._file.nodes:
             if isinstance(node, ast.ClassDef) and "<locals>" not in self._file.qualname(node):
@@ -118,7 +118,7 @@ class TaskText:
         except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
             code = self._file.one_line(one.value)
             return SettingError(
-                f"{where} is computed, `{code}`: give it a constant of its own that is a plain value, and set that"
+                f"{where} is computed, `{code}`: introduce a constant with a plain value, and set that"
             )
         start, end = self._file.span(one.value)
         return Constant(name, lines[0], value, Replacement(start, end, self._file.text[start:end]))
@@ -165,7 +165,7 @@ def _registers(decorator: ast.expr) -> bool:
 
 
 def _python_text(constant: Constant, value: Any, before: Any) -> str:
-    """The Python text of a JSON value, in the type of the present value."""
+    """The Python text of a JSON value, in the type of the current value."""
     if value is None or before is None:
         return repr(value)
     kinds = ((bool, "true or false"), (int | float, "a number"), (str, "a text"), (list | tuple, "a list"))
@@ -175,7 +175,7 @@ def _python_text(constant: Constant, value: Any, before: Any) -> str:
                 raise SettingError(f"{constant.name} is {what} (line {constant.line}); got {value!r}")
             break
     if isinstance(before, float) and isinstance(value, int):
-        # A whole number makes a tensor of integers, which no reward is.
+        # Written as a float: an integer would make an integer tensor, and a reward is a float.
         return repr(float(value))
     if isinstance(value, list) and isinstance(before, list | tuple):
         olds = [*before, *[before[-1] if before else None] * len(value)]

@@ -13,23 +13,23 @@ from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file, real_p
 from workbench.machine.processes.watched_thread import report_failure, watched_thread
 from workbench.task.modules import decode
 
-POLL_S = 0.04
-"""Seconds between two polls."""
-QUIET_S = 0.03
-"""Seconds without a change after which a burst of saves is over."""
-BURST_S = 0.2
-"""Longest wait in seconds for the end of a burst."""
-READ_S = 0.25
-"""How often the files are read even if their ``stat`` is the same: a network mount may be late with it, and two saves
+POLL_SECONDS = 0.04
+"""Interval between polls."""
+QUIET_SECONDS = 0.03
+"""Debounce: a burst of saves is over after this time without a change."""
+BURST_SECONDS = 0.2
+"""Maximum wait for the end of a burst."""
+READ_SECONDS = 0.25
+"""Interval of reading the files even if their ``stat`` is unchanged: a network mount may update it late, and two saves
 within one tick of a file system's clock have the same one."""
-GONE_S = 0.3
-"""Seconds for which a file must be missing or empty before that counts as its new content, and not as half of a save."""
-STOP_S = 1.0
-"""Longest wait in seconds for the end of the thread: reading a file on a disk that hangs cannot be ended."""
+GONE_SECONDS = 0.3
+"""Time for which a file must be missing or empty before that counts as its new content, not as half of a save."""
+STOP_SECONDS = 1.0
+"""Maximum wait for the end of the thread: a read on a disk that hangs cannot be cancelled."""
 POLL_SHARE, READ_SHARE = 0.003, 0.001
-"""Shares of one core for ``stat`` and for reading; with hundreds of files both are done less often."""
+"""Maximum fractions of one core for ``stat`` and for reading; with hundreds of files both are done less often."""
 NEWEST, TURN = 8, 32
-"""Files checked at every poll, which are those saved last; and how many of the others are checked in turn."""
+"""Number of files checked at every poll (those saved last), and number of the others checked in turn."""
 
 Content = str | bytes | None
 """Text; bytes if they are not text; None for a missing or unreadable file (a device, a pipe, too large)."""
@@ -38,13 +38,13 @@ Statuses = dict[Path, tuple[int, ...]]
 
 
 class SourceWatcher:
-    """Calls `on_change` with the followed files whose content is new, on a thread of its own.
+    """Thread that calls `on_change` with the followed files that have new content.
 
     One save is many events of the file system: truncate and write; a temporary file renamed over it; delete and create; a
     formatter that repeats all of it 20 ms later. So the paths are polled 25 times a second by ``stat``, which takes
-    microseconds. Of hundreds of files those saved last are polled every time, all of them after a rename, creation or
-    deletion in their folder (as most editors save), and the others in turns. Once ``stat`` is quiet the texts are compared:
-    a ``touch``, a ``git checkout`` of the same content or a line-end conversion is no change.
+    microseconds. Of hundreds of files the most recently saved are polled every time, the others in turn, and all of them
+    after a rename, creation or deletion in their folder (as most editors save). Once ``stat`` is stable the texts are
+    compared: a ``touch``, a ``git checkout`` of the same content or a line-end conversion is no change.
 
     `on_change` may call `follow` and `stop`. What it raises is reported, and watching continues.
     """
@@ -54,7 +54,7 @@ class SourceWatcher:
         self._lock = threading.Lock()
         self._known: dict[Path, Content] = {}
         self._seen: Statuses | None = {}
-        """``stat`` of the files when they were last read, the last saved one first; None: read them at the next poll."""
+        """``stat`` of the files when they were last read, most recently saved first; None: read them at the next poll."""
         self._folders: Statuses = {}
         self._others: Iterator[Path] = iter(())
         self._stopped = threading.Event()
@@ -66,8 +66,8 @@ class SourceWatcher:
 
         Args:
             paths: files, which need not exist.
-            texts: their known texts by path, so that a save between a load's reading and this call is noticed. Paths that
-                are not in it and not followed yet are read now.
+            texts: their known texts by path, so that a save between a load and this call is noticed. Paths that are not in
+                it and not followed yet are read now.
         """
         texts = texts or {}
         followed = [_real(Path(path).expanduser()) for path in paths]
@@ -83,10 +83,10 @@ class SourceWatcher:
             self._seen = None  # something may have been saved since `texts` was read
 
     def stop(self) -> None:
-        """Return when the thread has ended; at once, when called from `on_change`, and soon, where it reads a disk that hangs."""
+        """Stop, and wait for the thread at most `STOP_SECONDS`; does not wait if called from `on_change`."""
         self._stopped.set()
         if threading.current_thread() is not self._thread:
-            self._thread.join(timeout=STOP_S)
+            self._thread.join(timeout=STOP_SECONDS)
 
     def _run(self) -> None:
         pause = read_again = 0.0
@@ -95,14 +95,14 @@ class SourceWatcher:
             time.sleep(pause)
             began = time.thread_time()
             new = self._has_new_status()
-            pause = max(POLL_S, (time.thread_time() - began) / POLL_SHARE)
+            pause = max(POLL_SECONDS, (time.thread_time() - began) / POLL_SHARE)
             if new:
                 self._settle()
             elif time.monotonic() < read_again:
                 continue
             began = time.thread_time()
             changed = self._changes()
-            read_again = time.monotonic() + max(READ_S, (time.thread_time() - began) / READ_SHARE)
+            read_again = time.monotonic() + max(READ_SECONDS, (time.thread_time() - began) / READ_SHARE)
             if changed and not self._stopped.is_set():
                 try:
                     self._on_change(changed)
@@ -122,10 +122,10 @@ class SourceWatcher:
 
     def _settle(self) -> None:
         """Wait for the end of a burst of saves."""
-        before, deadline = None, time.monotonic() + BURST_S
+        before, deadline = None, time.monotonic() + BURST_SECONDS
         now = self._statuses()
         while now != before and time.monotonic() < deadline:
-            self._stopped.wait(QUIET_S)
+            self._stopped.wait(QUIET_SECONDS)
             before, now = now, self._statuses()
         newest = sorted(now, key=now.__getitem__, reverse=True)
         with self._lock:  # `follow` may have been called meanwhile
@@ -140,7 +140,7 @@ class SourceWatcher:
 
     def _changes(self) -> set[Path]:
         """Files whose content differs from the known one, which is updated."""
-        deadline = time.monotonic() + GONE_S
+        deadline = time.monotonic() + GONE_SECONDS
         while not self._stopped.is_set():
             with self._lock:
                 now = {path: _read(path) for path in self._known}
@@ -148,12 +148,12 @@ class SourceWatcher:
                 if all(now[path] for path in changed) or time.monotonic() > deadline:
                     self._known.update(now)
                     return changed
-            self._stopped.wait(QUIET_S)
+            self._stopped.wait(QUIET_SECONDS)
         return set()
 
 
 def _real(path: Path) -> Path:
-    """The file behind links. A link to something else (a device, by mistake) is watched itself, until it is a file again."""
+    """The file behind links. A link to anything else (a device, by mistake) is itself watched until it is a file again."""
     real = real_path(path)
     return real if os.path.isfile(real) else real_path(path.parent) / path.name
 

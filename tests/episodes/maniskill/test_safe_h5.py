@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.episodes.foreign_h5 import write
-from workbench.episodes.maniskill.safe_h5 import DEEPEST
+from workbench.episodes.maniskill.safe_h5 import MAX_DEPTH
 from workbench.episodes.reader.read_episode import read_maniskill
 from workbench.episodes.reader.read_rows import read_found
 from workbench.episodes.reader.scan import scan_folder
@@ -94,7 +94,7 @@ def words(group: h5py.Group) -> None:
         (soft_link_out, "traj_0/way in another file (an external link)"),
         (two_gigabytes, "claims 2,147,483,648 bytes of numbers for traj_0/rewards"),
         (huge_chunks, "claims chunks of 2,147,483,648 bytes for traj_0/rewards"),
-        (circle, f"groups more than {DEEPEST} deep"),
+        (circle, f"groups more than {MAX_DEPTH} deep"),
         (strange_filter, "packed by a filter that h5py does not bring along (32015)"),
         (words, "no plain number"),
     ],
@@ -156,7 +156,7 @@ def test_what_stands_in_its_own_file_is_read_also_by_soft_links_and_packed(tmp_p
 def test_one_dataset_under_many_names_is_not_read_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.episodes.maniskill.safe_h5.MOST_BYTES", 1 << 20)
+    monkeypatch.setattr("workbench.episodes.maniskill.safe_h5.MAX_BYTES", 1 << 20)
 
     def spoil(group: h5py.Group) -> None:
         group["obs/0"] = np.arange(30_000, dtype=np.float32)

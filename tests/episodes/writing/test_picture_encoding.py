@@ -105,7 +105,7 @@ def test_what_was_encoded_does_not_wait_any_more(
     """However many pictures there were: only where too many wait at once are they encoded by whoever brings them."""
     picture = np.zeros((30, 40), np.int32)
     monkeypatch.setattr(episode_writer, "_pool", None)
-    monkeypatch.setattr(episode_writer, "MOST_PENDING_BYTES", 2 * picture.nbytes)
+    monkeypatch.setattr(episode_writer, "MAX_PENDING_BYTES", 2 * picture.nbytes)
     encode, by = episode_writer.encode, []
 
     def noted(*args: Any) -> bytes:

@@ -12,11 +12,11 @@ from workbench.planning.planned_episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
 from workbench.planning.rollouts import NotAlike, NothingToPlan, control_mode_to_plan, require_plannable
 from workbench.planning.seeds_report import few_seeds_text
-from workbench.planning.verdicts import ENOUGH_SEEDS, MOST_OF, PlannedEpisodes
+from workbench.planning.verdicts import MIN_EPISODES, MIN_SEEDS, PlannedEpisodes
 from workbench.planning.verdicts import RULES as VERDICTS
 from workbench.task.blame import blamed
 
-SEEDS = ENOUGH_SEEDS
+SEEDS = MIN_SEEDS
 """Most seeds that are solved: each takes seconds."""
 STEPS = 200
 """Of an episode whose task has no time limit."""
@@ -24,7 +24,12 @@ AFTER_SUCCESS = 5
 """Control steps that an episode goes on after its success."""
 HOOK = {"success-lost": "evaluate"}
 """At which a rule is told; the others at the dense reward."""
-_OF_SUCCESS = {"reward-exploited": 1, "reward-stuck": 0, "reward-against": MOST_OF, "success-lost": MOST_OF}
+_OF_SUCCESS = {
+    "reward-exploited": 1,
+    "reward-stuck": 0,
+    "reward-against": MIN_EPISODES,
+    "success-lost": MIN_EPISODES,
+}
 """Rules that speak of success, with the fewest solved seeds from which on it says something that they are not broken."""
 
 
@@ -85,8 +90,8 @@ def _require_tried(rule: str, episodes: PlannedEpisodes) -> None:
         raise NotApplicable("evaluate() has no entry success")
     if rule == "failing-pays" and "fail" not in entries:
         raise NotApplicable("evaluate() has no entry fail")
-    if len(episodes.all) < ENOUGH_SEEDS:
-        raise NotKnown(f"fewer than {ENOUGH_SEEDS} seeds were planned")
+    if len(episodes.all) < MIN_SEEDS:
+        raise NotKnown(f"fewer than {MIN_SEEDS} seeds were planned")
     if len(episodes.solved) < _OF_SUCCESS.get(rule, 0):
         raise NotKnown(f"planning solved {len(episodes.solved)} of {len(episodes.all)} seeds")
 
@@ -99,7 +104,7 @@ def _check_of(rule: str) -> Check:
             solved = [one.solved_at for one in episodes.solved]
             steps = f", in {np.median(solved):g} control steps (median)" if solved else ""
             yield Note(f"planning solved {len(solved)} of {len(episodes.all)} seeds{steps}")
-            if len(episodes.all) < ENOUGH_SEEDS:
+            if len(episodes.all) < MIN_SEEDS:
                 yield Note(few_seeds_text(len(episodes.all)))
         if verdict is not None:
             hook = HOOK.get(rule, "compute_dense_reward")

@@ -40,7 +40,7 @@ OF_EVERY_FRAME = {
     for name in ("timestamp", "frame_index", "episode_index", "index", "task_index")
 }
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-MOST_SAMPLED = 100
+MAX_SAMPLED_PICTURES = 100
 """Pictures of an episode that its statistics use."""
 
 Stats = dict[str, NDArray[Any]]
@@ -81,7 +81,7 @@ def picture_stats(pictures: list[NDArray[np.uint8]]) -> Stats:
 
 def sampled(count: int) -> NDArray[np.int64]:
     """Indices of the pictures among `count` that statistics use."""
-    return np.unique(np.linspace(0, count - 1, min(count, MOST_SAMPLED)).round().astype(np.int64))
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_SAMPLED_PICTURES)).round().astype(np.int64))
 
 
 def combined_stats(parts: list[Stats]) -> Stats:

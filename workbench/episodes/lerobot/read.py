@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from workbench.envs.camera_data import CameraInfo
 from workbench.episodes.document import read_json
-from workbench.episodes.encoded_pictures import MOST_PIXELS, EncodedPictures, LazyPictures
+from workbench.episodes.encoded_pictures import MAX_PIXELS, EncodedPictures, LazyPictures
 from workbench.episodes.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
 from workbench.episodes.films import FilmPart
 from workbench.episodes.lerobot import format as form
@@ -24,12 +24,12 @@ from workbench.episodes.row import Facts, UnreadableRecording, clean_text, integ
 from workbench.machine.files import open_regular_file
 from workbench.pictures.camera_conventions import intrinsic_from_fov
 
-DEFAULT_FOVY = math.radians(60)
+DEFAULT_FOVY_RADIANS = math.radians(60)
 """Datasets have no camera parameters; nothing is computed from this."""
-MOST_EPISODES = 100_000
-MOST_FRAMES = 20_000_000
+MAX_EPISODES = 100_000
+MAX_FRAMES = 20_000_000
 """Frames of a dataset."""
-MOST_LENGTH = 1_000_000
+MAX_EPISODE_FRAMES = 1_000_000
 """Frames of an episode."""
 _PLACE = re.compile(r"\{(?P<name>chunk_index|file_index|video_key)(:0?(?P<width>\d)d)?\}")
 _NUMBER = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
@@ -73,7 +73,7 @@ def _of_episodes(
     if not features:
         return None, None
     data = ds.dataset(_tables(folder / "data"), format="parquet")
-    if (frames := data.count_rows()) > MOST_FRAMES:
+    if (frames := data.count_rows()) > MAX_FRAMES:
         raise ValueError(f"it claims {frames:,} frames")
     table = data.to_table(["episode_index", *features])
     indices, episode = np.unique(table["episode_index"].to_numpy(), return_inverse=True)
@@ -122,7 +122,7 @@ def _episode(folder: Path, info: dict[str, Any], entry: dict[str, Any], index: i
     open_regular_file(file).close()
     table = pq.read_table(file, filters=[("episode_index", "=", index)])
     length, features = table.num_rows, info["features"]
-    if length > MOST_LENGTH:
+    if length > MAX_EPISODE_FRAMES:
         raise ValueError(f"episode {index} claims {length:,} frames")
     columns = {
         key: np.array(table[key].to_pylist(), dtype=feature["dtype"]).reshape(length, -1)
@@ -177,7 +177,7 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
     height, width = info["features"][key]["shape"][:2]
     if info["features"][key]["names"][0] == "channels":  # (3, H, W) in some datasets
         height, width = info["features"][key]["shape"][1:]
-    if not 0 < width * height <= MOST_PIXELS:
+    if not 0 < width * height <= MAX_PIXELS:
         raise ValueError(f"{key} claims pictures of {width} x {height}")
     where = {
         "chunk_index": entry[f"videos/{key}/chunk_index"],
@@ -193,10 +193,10 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
             kind="sensor",
             width=width,
             height=height,
-            fovy=DEFAULT_FOVY,
+            fovy=DEFAULT_FOVY_RADIANS,
             near=0.01,
             far=100.0,
-            intrinsic=intrinsic_from_fov(DEFAULT_FOVY, width, height).astype(np.float32),
+            intrinsic=intrinsic_from_fov(DEFAULT_FOVY_RADIANS, width, height).astype(np.float32),
             mount=None,
             modalities=("rgb",),
         ),
@@ -224,8 +224,8 @@ def _info(folder: Path) -> dict[str, Any]:
 
 def _entries(folder: Path) -> list[dict[str, Any]]:
     data = ds.dataset(_tables(Path(folder) / "meta" / "episodes"), format="parquet")
-    if (episodes := data.count_rows()) > MOST_EPISODES:
-        raise ValueError(f"it claims {episodes:,} episodes, and {MOST_EPISODES:,} can be listed")
+    if (episodes := data.count_rows()) > MAX_EPISODES:
+        raise ValueError(f"it claims {episodes:,} episodes, and {MAX_EPISODES:,} can be listed")
     return data.to_table([name for name in data.schema.names if not name.startswith("stats/")]).to_pylist()
 
 

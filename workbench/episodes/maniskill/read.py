@@ -15,9 +15,9 @@ from workbench.envs.camera_data import CameraInfo
 from workbench.envs.keywords import one_mode
 from workbench.episodes.document import Document, EpisodeJson, WrongDocument, read_document
 from workbench.episodes.encoded_pictures import (
+    MAX_PIXELS,
     MILLIMETRES_PER_METRE,
     MODALITIES,
-    MOST_PIXELS,
     EncodedPictures,
     LazyPictures,
     Modality,
@@ -28,7 +28,7 @@ from workbench.episodes.maniskill.safe_h5 import H5Dataset, H5Group, RefusedH5, 
 from workbench.episodes.row import UnreadableRecording
 
 _PICTURES = ("sensor_data", "sensor_param")
-_UNKNOWN_DT = 0.05
+_DEFAULT_DT_SECONDS = 0.05
 """ManiSkill's default control period (20 Hz), if the file has none."""
 
 
@@ -104,7 +104,7 @@ def _episode(group: H5Group, document: Document, entry: EpisodeJson, path: Path,
         source_file=None,
         source_hash="",
         source={},
-        control_dt=1 / frequency if frequency else _UNKNOWN_DT,
+        control_dt=1 / frequency if frequency else _DEFAULT_DT_SECONDS,
         control_mode=one_mode(entry.control_mode),
         backend=str(kwargs.get("sim_backend") or "physx_cpu"),
         env_kwargs=kwargs,
@@ -188,7 +188,7 @@ def _cameras(obs: H5Group | H5Dataset | None, path: Path) -> list[CameraTrack]:
                     f"has pictures of shape {dataset.shape} and type {dataset.dtype} (at {dataset.name})"
                 )
             count, size = len(dataset), (dataset.shape[1], dataset.shape[2])
-            if dataset.shape[1] * dataset.shape[2] > MOST_PIXELS:
+            if dataset.shape[1] * dataset.shape[2] > MAX_PIXELS:
                 raise RefusedH5(
                     f"claims pictures of {dataset.shape[2]} x {dataset.shape[1]} pixels (at {dataset.name})"
                 )

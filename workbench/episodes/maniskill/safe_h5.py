@@ -20,17 +20,17 @@ with unchanged_environment():
     os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")
     h5py.h5pl.size()
 
-MOST_BYTES = 1 << 30
+MAX_BYTES = 1 << 30
 """Numbers that are read from one open file."""
-MOST_NODES = 200_000
+MAX_NODES = 200_000
 """Groups and datasets that are looked up in one open file."""
-DEEPEST = 32
+MAX_DEPTH = 32
 """Nesting of groups; hard links can form a cycle."""
-SMALL = 1 << 20
+ALLOWED_BYTES = 1 << 20
 """Bytes that every dataset may claim: an unwritten one has no storage and reads as zeros."""
-MOST_PACKED = 1100
+MAX_COMPRESSION_RATIO = 1100
 """Largest compression ratio; deflate's limit is 1032."""
-LARGEST_CHUNK = 16 << 20
+MAX_CHUNK_BYTES = 16 << 20
 """Bytes that a chunk may have independent of its dataset's storage."""
 
 _FILTERS = {
@@ -75,17 +75,17 @@ class _Budget:
 
     def __init__(self, file_size: int) -> None:
         self.file_size = file_size
-        self._bytes, self._nodes = MOST_BYTES, MOST_NODES
+        self._bytes, self._nodes = MAX_BYTES, MAX_NODES
 
     def take_node(self) -> None:
         self._nodes -= 1
         if self._nodes < 0:
-            raise RefusedH5(f"holds more than {MOST_NODES:,} groups and datasets")
+            raise RefusedH5(f"holds more than {MAX_NODES:,} groups and datasets")
 
     def take_bytes(self, name: str, count: int) -> None:
         self._bytes -= count
         if self._bytes < 0:
-            raise RefusedH5(f"holds more than {MOST_BYTES >> 30} GB of numbers (at {name})")
+            raise RefusedH5(f"holds more than {MAX_BYTES >> 30} GB of numbers (at {name})")
 
 
 class H5Group:
@@ -95,7 +95,7 @@ class H5Group:
         self._group, self._budget, self._depth = group, budget, depth
 
     def __iter__(self) -> Iterator[str]:
-        if len(self._group) > MOST_NODES:
+        if len(self._group) > MAX_NODES:
             raise RefusedH5(f"holds a group of {len(self._group):,} entries")
         return (str(name) for name in self._group)
 
@@ -141,14 +141,14 @@ class H5Group:
                 f"has {self._where(name)} in another file (an external link), and other files are not read for it"
             )
         if isinstance(link, h5py.SoftLink):
-            if links >= DEEPEST:
+            if links >= MAX_DEPTH:
                 raise RefusedH5(f"has links that lead round in a circle (at {self._where(name)})")
             begin = H5Group(self._group.file, self._budget) if link.path.startswith("/") else self
             return begin._follow(link.path, links + 1)
         if link is None:
             return None
-        if self._depth >= DEEPEST:
-            raise RefusedH5(f"has groups more than {DEEPEST} deep (at {self._where(name)})")
+        if self._depth >= MAX_DEPTH:
+            raise RefusedH5(f"has groups more than {MAX_DEPTH} deep (at {self._where(name)})")
         found = self._group[name]
         if isinstance(found, h5py.Group):
             return H5Group(found, self._budget, self._depth + 1)
@@ -224,11 +224,11 @@ class H5Dataset:
             )
         claimed = self._size(self.shape)
         chunk = self._dataset.chunks
-        if claimed > SMALL + storage * (1 if chunk is None else MOST_PACKED):
+        if claimed > ALLOWED_BYTES + storage * (1 if chunk is None else MAX_COMPRESSION_RATIO):
             raise RefusedH5(
                 f"claims {claimed:,} bytes of numbers for {self._short}, and holds {storage:,} bytes of it"
             )
-        if chunk is not None and self._size(chunk) > LARGEST_CHUNK + storage * MOST_PACKED:
+        if chunk is not None and self._size(chunk) > MAX_CHUNK_BYTES + storage * MAX_COMPRESSION_RATIO:
             raise RefusedH5(f"claims chunks of {self._size(chunk):,} bytes for {self._short}")
 
     def _size(self, shape: tuple[int, ...]) -> int:

@@ -18,7 +18,7 @@ _FROM_OPENGL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 """Axes of ManiSkill's camera frame (x forward, y left, z up) in OpenGL's (x right, y up, z backward)."""
 _FROM_OPENCV = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Axes of ManiSkill's camera frame (x forward, y left, z up) in OpenCV's (x right, y down, z forward)."""
-_LEVEL = 1
+_ZLIB_LEVEL = 1
 """Compression level of zlib."""
 
 
@@ -105,7 +105,7 @@ def _put(track: CameraTrack, modality: Modality, group: h5py.Group) -> None:
         dtype,
         chunks=(1, *shape),
         compression="gzip",
-        compression_opts=_LEVEL,
+        compression_opts=_ZLIB_LEVEL,
         shuffle=dtype == np.int16,
     )
     for number in range(len(pictures)):

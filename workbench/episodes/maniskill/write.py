@@ -18,9 +18,9 @@ from workbench.episodes.document import json_text, with_checksum
 from workbench.episodes.episode import Episode
 
 TRAJECTORY = "traj_0"
-_WORTH_PACKING = 8 << 10
+_MIN_COMPRESSED_BYTES = 8 << 10
 _CHUNK_BYTES = 256 << 10
-_LEVEL = 1
+_ZLIB_LEVEL = 1
 """Compression level of zlib. On numbers of a simulation level 4 saves 1 % more, in a third more time."""
 _MAKES_UTF8 = h5py.h5p.create(h5py.h5p.LINK_CREATE)
 _MAKES_UTF8.set_char_encoding(h5py.h5t.CSET_UTF8)
@@ -89,7 +89,7 @@ def _put(parent: h5py.h5g.GroupID, name: str, values: NDArray) -> None:
     """Write a dataset by HDF5's low-level calls: h5py's high-level ones take longer than writing the numbers."""
     kind, space = _kind(values.dtype), h5py.h5s.create_simple(values.shape)
     row = math.prod(values.shape[1:]) * values.dtype.itemsize
-    packing = _packed(values.shape, row) if row * values.shape[0] >= _WORTH_PACKING else _PLAIN
+    packing = _packed(values.shape, row) if row * values.shape[0] >= _MIN_COMPRESSED_BYTES else _PLAIN
     dataset = h5py.h5d.create(parent, name.encode(), kind, space, packing, _MAKES_UTF8)
     if values.size:
         # With its type: h5py makes it anew otherwise, which takes longer than writing.
@@ -119,7 +119,7 @@ def _packed(shape: tuple[int, ...], row: int) -> h5py.h5p.PropDCID:
     packing = _plain()
     packing.set_chunk((min(max(_CHUNK_BYTES // row, 1), shape[0]), *shape[1:]))
     packing.set_shuffle()
-    packing.set_deflate(_LEVEL)
+    packing.set_deflate(_ZLIB_LEVEL)
     return packing
 
 

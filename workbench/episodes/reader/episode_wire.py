@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
-from workbench.episodes.columns import MOST_LINES
+from workbench.episodes.columns import MAX_TEXT_LINES
 from workbench.episodes.document import CameraJson
-from workbench.episodes.encoded_pictures import MOST_PIXELS, EncodedPictures, LazyPictures, Modality
+from workbench.episodes.encoded_pictures import MAX_PIXELS, EncodedPictures, LazyPictures, Modality
 from workbench.episodes.episode import BrokenFile, CameraTrack, Episode
 from workbench.episodes.reader.requests import CameraRead, EpisodeRead, PictureRead, ShapeRead, VisualRead
 
@@ -99,7 +99,7 @@ def _pictures(modality: Modality, camera: int, count: int, fetch: FetchPicture) 
         dtype, ndim = {"rgb": ("u1", 3), "depth": ("f4", 2), "segmentation": ("i4", 2)}[modality]
         if picture is None or picture.dtype != dtype or picture.ndim != ndim or not picture.size:
             raise OSError("the reader gave no picture")
-        if picture.shape[0] * picture.shape[1] > MOST_PIXELS or (ndim == 3 and picture.shape[2] != 3):
+        if picture.shape[0] * picture.shape[1] > MAX_PIXELS or (ndim == 3 and picture.shape[2] != 3):
             raise OSError(f"the reader gave a picture of shape {picture.shape}")
         return picture
 
@@ -148,7 +148,7 @@ def unpack_episode(
         for name, flags in (("terminated", episode.terminated), ("truncated", episode.truncated))
     }
     action = _checked(episode.action, "actions", length, len(episode.action_names))
-    _require(sum(map(len, episode.texts.values())) <= MOST_LINES, "too many entries that are no numbers")
+    _require(sum(map(len, episode.texts.values())) <= MAX_TEXT_LINES, "too many entries that are no numbers")
     return replace(
         episode,
         geometry=geometry,
@@ -227,7 +227,7 @@ def _mesh(mesh: Mesh) -> Mesh:
 def _material(material: Material) -> Material:
     if (texture := material.texture) is not None:
         _checked(texture, "a texture", None, None, 4)
-        fits = texture.dtype == np.uint8 and 0 < texture.size <= 4 * MOST_PIXELS
+        fits = texture.dtype == np.uint8 and 0 < texture.size <= 4 * MAX_PIXELS
         _require(fits, f"a texture of shape {texture.shape} and type {texture.dtype}")
     return material
 
@@ -237,7 +237,7 @@ def _track(read: CameraRead, number: int, fetch: FetchPicture) -> CameraTrack:
     frame = _checked(read.frame, f"{info.name}: frames", None, kinds="iu").astype(np.int64, copy=False)
     pose = _checked(read.pose, f"{info.name}: poses", len(frame), 7).astype(np.float32, copy=False)
     _require(
-        info.width > 0 and info.height > 0 and info.width * info.height <= MOST_PIXELS,
+        info.width > 0 and info.height > 0 and info.width * info.height <= MAX_PIXELS,
         f"{info.name}: pictures of {info.width} x {info.height}",
     )
     for count in read.pictures.values():

@@ -41,14 +41,14 @@ from workbench.machine.processes.confinement import confine
 from workbench.machine.processes.family import end_with_parent
 from workbench.machine.processes.wire import MessageSocket, Unpacker, pack, pack_message
 
-MOST_MEMORY = 3 << 30
+MAX_MEMORY_BYTES = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
-LONGEST = 1 << 20
-MOST_RECOVERY_MEMORY = 4 << 30
+MAX_REQUEST_BYTES = 1 << 20
+MAX_RECOVERY_MEMORY_BYTES = 4 << 30
 """Bytes that a reader may allocate while it recovers recordings."""
-MOST_SHARED = 4
+MAX_SHARED_GROUPS = 4
 """Groups of episodes (`OpenEpisode.sharing`) whose shapes are kept."""
-LONGEST_MESSAGE = 600
+MAX_MESSAGE_CHARACTERS = 600
 
 
 def main() -> None:
@@ -62,7 +62,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()
     while True:
-        message, fds, _, _ = socket.recv_fds(control, LONGEST, 1)
+        message, fds, _, _ = socket.recv_fds(control, MAX_REQUEST_BYTES, 1)
         if not message:
             return
         request = Unpacker().unpack(message, NewReader | GetExitCode)
@@ -88,9 +88,9 @@ def _run_reader(end: socket.socket, request: NewReader, fork_server: int) -> Non
         end_with_parent(fork_server)
         os.setpgid(0, 0)
         if request.writes is None:
-            confine(request.paths, MOST_MEMORY)
+            confine(request.paths, MAX_MEMORY_BYTES)
         else:
-            confine(request.paths, MOST_RECOVERY_MEMORY, [request.writes])
+            confine(request.paths, MAX_RECOVERY_MEMORY_BYTES, [request.writes])
         serve(MessageSocket(end, get_args(Request)))
     finally:
         os._exit(0)
@@ -167,7 +167,7 @@ class _Reader:
 
         shapes = self._shapes.setdefault(request.sharing, SentShapes())
         self._shapes.move_to_end(request.sharing)
-        while len(self._shapes) > MOST_SHARED:
+        while len(self._shapes) > MAX_SHARED_GROUPS:
             self._shapes.popitem(last=False)
         source_path = None
         if request.kind == "lerobot":
@@ -208,7 +208,7 @@ def _sweep(request: ReadSweep) -> SweepRead:
 
 
 def _failed(why: Literal["unreadable", "system", "gone"], message: str) -> ReadFailed:
-    return ReadFailed(why, clean_text(message, LONGEST_MESSAGE))
+    return ReadFailed(why, clean_text(message, MAX_MESSAGE_CHARACTERS))
 
 
 if __name__ == "__main__":

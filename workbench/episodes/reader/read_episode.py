@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.envs.scene.shapes import SceneGeometry, SharedShapes
-from workbench.episodes.columns import MOST_LINES
+from workbench.episodes.columns import MAX_TEXT_LINES
 from workbench.episodes.document import (
     CameraJson,
     ColumnType,
@@ -44,8 +44,8 @@ from workbench.episodes.rerun.read import RerunTable, rows_at
 from workbench.episodes.row import UnreadableRecording
 from workbench.machine.files import NotARegularFile
 
-MOST_STATES = 10_000_000
-MOST_COLUMN_BYTES = 1 << 29
+MAX_STATES = 10_000_000
+MAX_COLUMN_BYTES = 1 << 29
 """Size of one column as described: the file leaves out repeated rows, so its own size is no bound."""
 
 
@@ -182,10 +182,10 @@ def _list(value: Any) -> list[Any]:
 
 def _episode(description: Description, table: RerunTable | None) -> Episode:
     states = description.length + 1
-    if not 0 < states <= MOST_STATES:
+    if not 0 < states <= MAX_STATES:
         raise ValueError(f"it says that it has {description.length} steps")
-    if sum(map(len, description.texts.values())) > MOST_LINES:
-        raise ValueError(f"it has more than {MOST_LINES} lines of entries that are no numbers")
+    if sum(map(len, description.texts.values())) > MAX_TEXT_LINES:
+        raise ValueError(f"it has more than {MAX_TEXT_LINES} lines of entries that are no numbers")
     geometry = poses = None
     cameras: list[CameraTrack] = []
     if table is not None:
@@ -247,7 +247,7 @@ def _check_room(what: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
     """Check a described size before allocating it. Raises ValueError."""
     if dtype.kind not in "biuf":
         raise ValueError(f"{what} claims the type {dtype}, which is not a plain number")
-    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize > MOST_COLUMN_BYTES:
+    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize > MAX_COLUMN_BYTES:
         raise ValueError(f"{what} claims {shape} numbers")
 
 

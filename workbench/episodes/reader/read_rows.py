@@ -20,7 +20,7 @@ from workbench.episodes.document import (
 )
 from workbench.episodes.encoded_pictures import open_picture, small_jpeg
 from workbench.episodes.episode import acted_by_text, parse_acted_by
-from workbench.episodes.maniskill.safe_h5 import MOST_NODES, H5Dataset, H5Group, RefusedH5, open_h5
+from workbench.episodes.maniskill.safe_h5 import MAX_NODES, H5Dataset, H5Group, RefusedH5, open_h5
 from workbench.episodes.reader.scan import DATASET_KEY, NOTES, RecordingFiles, broken
 from workbench.episodes.row import (
     Facts,
@@ -42,10 +42,10 @@ from workbench.machine.text import listed
 THUMBNAIL_PIXELS = 96
 THUMBNAIL_BYTES = 8192
 """Recorded thumbnails up to this size are used unchanged."""
-MOST_EPISODES = 20_000
+MAX_EPISODES = 20_000
 """Episodes of one file that are listed."""
 
-_LARGEST_PICTURE = 4096
+_MAX_PICTURE_PIXELS = 4096
 """Pixels of the longer side of a picture that a thumbnail is made of."""
 
 
@@ -190,7 +190,7 @@ def _maniskill_entries(
             return []  # another program's .json with "episodes"
         lost = f"{name}.h5, which {name}.json describes, is missing."
         return [(Facts("maniskill", task=task, written=written, problem=lost), None)]
-    most = MOST_NODES if only_names else MOST_EPISODES
+    most = MAX_NODES if only_names else MAX_EPISODES
     data = [_episode_or_problem(document, number) for number in range(min(count, most))]
     names = [f"traj_{one.episode_id}" for one in data if isinstance(one, EpisodeJson)]
     totals, pictures, broken, others = _read_h5(found.path(folder, ".h5"), names, only_names)
@@ -292,7 +292,7 @@ def _last_picture(group: H5Group) -> bytes | None:
         camera = None if cameras is None else cameras.group(name)
         rgb = None if camera is None else camera.get("rgb")
         if isinstance(rgb, H5Dataset) and rgb.dtype == np.uint8 and rgb.ndim == 4 and len(rgb):
-            if rgb.shape[3] == 3 and max(rgb.shape[1:3]) <= _LARGEST_PICTURE:
+            if rgb.shape[3] == 3 and max(rgb.shape[1:3]) <= _MAX_PICTURE_PIXELS:
                 return small_jpeg(Image.fromarray(rgb.row(len(rgb) - 1)), THUMBNAIL_PIXELS)
     return None
 

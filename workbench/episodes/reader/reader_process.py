@@ -23,7 +23,7 @@ from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable
 
 START_SECONDS = 60.0
 """Timeout of the fork server's start, which imports for half a second."""
-STOP_SECONDS = 0.2
+POLL_SECONDS = 0.2
 """Seconds between two looks whether an answer is still needed."""
 
 
@@ -278,7 +278,7 @@ def _receive(line: MessageSocket, seconds: float, stopped: Callable[[], bool]) -
     """The next answer. Raises TimeoutError, also when it is `stopped`."""
     until = time.monotonic() + seconds
     while (left := until - time.monotonic()) > 0 and not stopped():
-        if (answer := line.receive(min(left, STOP_SECONDS))) is not None:
+        if (answer := line.receive(min(left, POLL_SECONDS))) is not None:
             return answer
     raise TimeoutError
 

@@ -43,11 +43,11 @@ PICTURE_SECONDS = 70.0
 """A film is decoded when its first frame is read."""
 RECOVERY_SECONDS = 1800.0
 """An hour with four cameras takes some minutes."""
-PICTURE_PATIENCE = 0.2
+PICTURE_WAIT_SECONDS = 0.2
 """Seconds that a picture waits while another recording is being opened."""
-MOST_READERS = 4
-LARGEST_THUMBNAIL = 64 << 10
-_AT_ONCE = 8
+MAX_READERS = 4
+MAX_THUMBNAIL_BYTES = 64 << 10
+_BATCH_ROWS = 8
 """Rows per batch of requests: the reader works on while the last batch goes into the table."""
 _JPEG = b"\xff\xd8\xff"
 T = TypeVar("T")
@@ -86,8 +86,8 @@ def read_rows(
     found_files = list(found_files)
     reader = _reader(folder, episodes=False)
     reader.allow(_link_targets(path for found in found_files for path in found.paths(folder)))
-    for begin in range(0, len(found_files), _AT_ONCE):
-        some = found_files[begin : begin + _AT_ONCE]
+    for begin in range(0, len(found_files), _BATCH_ROWS):
+        some = found_files[begin : begin + _BATCH_ROWS]
         requests = [
             ReadRows(Path(folder), os.fsencode(found.key), found.sizes, found.times, only_names)
             for found in some
@@ -217,7 +217,7 @@ def _reader(folder: Path, episodes: bool) -> Reader:
         if key not in _readers:
             _readers[key] = Reader(key[0])
         _readers.move_to_end(key)
-        if len(_readers) > MOST_READERS:
+        if len(_readers) > MAX_READERS:
             _, gone = _readers.popitem(last=False)
         reader = _readers[key]
     if gone is not None:
@@ -246,7 +246,7 @@ def _entries(found: RecordingFiles, answered: Answered | ReaderEnded) -> list[Li
 
 def _thumbnail(jpeg: bytes | None) -> bytes | None:
     """`jpeg` if it may be sent to the browser."""
-    return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= LARGEST_THUMBNAIL else None
+    return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= MAX_THUMBNAIL_BYTES else None
 
 
 def _request(
@@ -301,7 +301,7 @@ class _OpenEpisode:
         for _ in range(2):
             request = ReadPicture(self._number, camera, modality, index, encoded)
             try:
-                return self._reader.ask(request, PICTURE_SECONDS, PICTURE_PATIENCE, self._process)
+                return self._reader.ask(request, PICTURE_SECONDS, PICTURE_WAIT_SECONDS, self._process)
             except WrongProcess:
                 # Another request has ended the process.
                 read, process = _request(self._reader, self._request, EpisodeRead, self._name)

@@ -18,7 +18,7 @@ DATASET_KEY = ["meta", "info"]
 """How the key of a LeRobot dataset ends."""
 SETTLE_SECONDS = 3.0
 """Seconds in which a folder may change again within one tick of its time, or a recording get its other files."""
-MOST_ENTRIES = 500_000
+MAX_ENTRIES = 500_000
 """Names that are listed: the folder may be a home folder."""
 
 
@@ -127,8 +127,8 @@ def scan_folder(folder: Path) -> Scan:
                 )
         except OSError as error:
             problem = f"{_printable(path)} cannot be looked into: {error.strerror or error}."
-        if entries > MOST_ENTRIES:
-            problem = f"{_printable(folder)} holds more than {MOST_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
+        if entries > MAX_ENTRIES:
+            problem = f"{_printable(folder)} holds more than {MAX_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
             break
     found, unsettled = {}, {}
     for key, stats in names.items():

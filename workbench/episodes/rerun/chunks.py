@@ -17,7 +17,7 @@ STEP = "step"
 SIM_TIME = "sim_time"
 LOOK = "look"
 """Component of a visual, JSON: its name, its colour as red, green, blue and alpha, how metallic and how rough it is."""
-_MOST_KEPT_STEPS = 2000
+_MAX_CACHED_STEPS = 2000
 """Most steps whose times are cached: those of hours would be a hundred megabytes, for as long as the process lives."""
 SERIES_COLORS = (
     (86, 180, 233),
@@ -181,7 +181,7 @@ class TimedChunks:
 
 
 def _times_of(steps: NDArray[np.int64], control_dt: float) -> tuple[rr.TimeColumn, ...]:
-    if len(steps) > _MOST_KEPT_STEPS:
+    if len(steps) > _MAX_CACHED_STEPS:
         return _times(steps, control_dt)
     return _kept_times(np.asarray(steps, np.int64).tobytes(), control_dt)
 

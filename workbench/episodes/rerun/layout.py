@@ -37,7 +37,7 @@ OBSERVATION = "/observation/state"
 REWARD_TERMS = "reward_terms/"
 """Prefix of the entries of ``evaluate()`` that are terms of the reward."""
 
-_MOST_PIXELS, _MOST_PICTURES = 1 << 20, 1024
+_MAX_PIXELS, _MAX_PICTURES = 1 << 20, 1024
 """Limits of one chunk, whose pictures are in memory together."""
 _PNG_RGBA = 6
 """Colour type of a PNG, its byte 25 (PNG specification, section 11.2.1)."""
@@ -127,7 +127,7 @@ def _pieces(cameras: Sequence[CameraTrack]) -> list[tuple[int, slice]]:
     """Camera and slice of pictures of each chunk, in order of time."""
     found = []
     for number, camera in enumerate(cameras):
-        many = min(max(_MOST_PIXELS // (camera.info.width * camera.info.height), 1), _MOST_PICTURES)
+        many = min(max(_MAX_PIXELS // (camera.info.width * camera.info.height), 1), _MAX_PICTURES)
         for begin in range(0, len(camera.frame), many):
             found.append((camera.frame[begin], number, slice(begin, begin + many)))
     return [(number, some) for _, number, some in sorted(found, key=lambda piece: piece[:2])]
@@ -201,10 +201,10 @@ it as WebP."""
 _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 """Results of `_mesh_chunk` by the visual's id, while the visual lives: the next episode of the scene reuses them, since
 textures are megabytes to convert."""
-_MOST_MADE = 64
+_MAX_ENTITIES = 64
 """Entities per visual. A scene that names bodies by env has one, and a copy, for each env."""
 _encoded: dict[bytes, bytes] = {}
-_MOST_ENCODED = 256
+_MAX_ENCODED_TEXTURES = 256
 _making = threading.Lock()
 """Several threads may write episodes of one scene."""
 
@@ -219,7 +219,7 @@ def _mesh_chunk(visual: Visual, entity: str) -> Chunk | None:
         made = held[1]
         if entity not in made:
             chunk = next((chunk for chunk in made.values() if chunk is not None), None)
-            if len(made) >= _MOST_MADE:
+            if len(made) >= _MAX_ENTITIES:
                 made.clear()
             made[entity] = _visual_chunk(visual, entity) if chunk is None else chunk.with_entity_path(entity)
         return made[entity]
@@ -250,7 +250,7 @@ def _webp(texture: NDArray[np.uint8]) -> bytes:
     if digest not in _encoded:
         content = io.BytesIO()
         Image.fromarray(pixels).save(content, "WEBP", quality=_TEXTURE_QUALITY, method=6)
-        if len(_encoded) >= _MOST_ENCODED:
+        if len(_encoded) >= _MAX_ENCODED_TEXTURES:
             _encoded.clear()
         _encoded[digest] = content.getvalue()
     return _encoded[digest]

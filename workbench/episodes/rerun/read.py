@@ -316,7 +316,7 @@ def _data_of(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.Array]]:
 
 # --- pictures --------------------------------------------------------------------------------------
 
-KEPT_BYTES = 64 << 20
+CACHE_BYTES = 64 << 20
 """Decompressed chunks kept in the process; the newest is kept at any size."""
 PICTURE_COMPONENTS: dict[Modality, str] = {
     "rgb": "EncodedImage:blob",
@@ -402,7 +402,7 @@ class _ChunkCache:
             if key not in self._chunks:
                 self._chunks[key] = (file, rows)
                 self._bytes += rows.nbytes
-            while self._bytes > KEPT_BYTES and len(self._chunks) > 1:
+            while self._bytes > CACHE_BYTES and len(self._chunks) > 1:
                 _, (_, gone) = self._chunks.popitem(last=False)
                 self._bytes -= gone.nbytes
         return rows

@@ -291,7 +291,7 @@ def _arrays_of(picture: Picture) -> dict[Modality, NDArray]:
 # --- pictures encoded on threads ---------------------------------------------------------------
 
 
-MOST_PENDING_BYTES = 8 << 20
+MAX_PENDING_BYTES = 8 << 20
 """Limit of pictures that wait for a thread: a few hundredths of a second of work, which a killed process loses."""
 _BATCH_BYTES = 1 << 20
 """Pictures that are submitted together. Waking a thread at every step for one small picture costs the step as much as
@@ -345,7 +345,7 @@ class _EncoderPool:
     def take(self, pictures: _Pictures) -> PendingEntries:
         pending = PendingEntries(self, pictures)
         with self._lock:
-            full = self._bytes > 0 and self._bytes + pending.size > MOST_PENDING_BYTES
+            full = self._bytes > 0 and self._bytes + pending.size > MAX_PENDING_BYTES
             if not full:
                 self._bytes += pending.size
                 self._gathered.append(pending)

@@ -18,7 +18,7 @@ from workbench.episodes.writing.journal import SCENE_SUFFIX, Journal, JournalRea
 from workbench.machine.processes.child_python import child_environment, start_with_socket
 from workbench.machine.processes.wire import Unpacker, Unreadable, has_come, pack, pack_message
 
-_LONGEST = 1 << 16
+_MAX_MESSAGE_BYTES = 1 << 16
 """Limit of a message, in bytes."""
 
 
@@ -101,7 +101,7 @@ class FilesProcess:
     def _receive(self) -> _Ready | _Made | _NotMade | None:
         """None if it has ended."""
         try:
-            said = self._end.recv(_LONGEST)
+            said = self._end.recv(_MAX_MESSAGE_BYTES)
             return self._unpacker.message(said) if said else None
         except (OSError, Unreadable):
             return None
@@ -119,7 +119,7 @@ def main() -> None:
     with contextlib.suppress(ConnectionError):
         end.send(pack_message(_Ready()))
         while True:
-            message, fds, _, _ = socket.recv_fds(end, _LONGEST, 1)
+            message, fds, _, _ = socket.recv_fds(end, _MAX_MESSAGE_BYTES, 1)
             if not message:
                 return
             try:

@@ -33,7 +33,7 @@ SYNC_SECONDS = 0.4
 """Interval of writing."""
 _BATCH_BYTES = 2 << 20
 """Beyond this `append` writes by itself: memory stays bounded when the disk is slower than the episode."""
-_MOST_BATCHES = 4
+_MAX_CACHED_BATCHES = 4
 """Batches cached while reading: pictures of the same states are read camera by camera."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 _BEGIN = _SCHEMA.serialize().size
@@ -342,7 +342,7 @@ class JournalReader:
         """Raises OSError."""
         self.path = path
         self._file = _BoundedFile(open_regular_file(path))
-        self._batch = lru_cache(maxsize=_MOST_BATCHES)(self._read)
+        self._batch = lru_cache(maxsize=_MAX_CACHED_BATCHES)(self._read)
         self._end = _BEGIN
         """Offset of the end of the last complete batch that was read."""
 
