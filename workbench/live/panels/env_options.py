@@ -13,7 +13,7 @@ import viser
 from workbench.envs.keywords import MODES, HowMade, Keyword, as_json, read_value, shown
 from workbench.envs.recorded_run import HOW_IT_IS_RUN
 from workbench.live.commands import (
-    LONGEST_VALUE,
+    MAX_VALUE_CHARACTERS,
     ApplyEnvOptions,
     DiscardEnvOptions,
     ResetEnvOptions,
@@ -225,7 +225,9 @@ def _field_for(server: viser.ViserServer, keyword: Keyword) -> Field:
         return Field(server, label, SetKeyword, "value", value, given=[given], step=_step(value))
     hint = "Text" if keyword.kind == "str" else 'A value in JSON: 0.5, true, [1, 2], "text"'
     hint += "; null for none" if keyword.optional else ""
-    return Field(server, label, SetKeyword, "value", value, given=[given], hint=hint, longest=LONGEST_VALUE)
+    return Field(
+        server, label, SetKeyword, "value", value, given=[given], hint=hint, longest=MAX_VALUE_CHARACTERS
+    )
 
 
 def _options(keyword: Keyword) -> dict[str, Plain]:
