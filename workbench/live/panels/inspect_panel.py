@@ -16,7 +16,7 @@ from workbench.envs.inspection import SECTIONS, Inspection, JointReadings, Leaf,
 from workbench.live.commands import ChooseInspected, ShowForces
 from workbench.live.events import ReadingChosen
 from workbench.live.live_session import LiveSession
-from workbench.live.reading import READ_EVERY
+from workbench.live.reading import READ_PERIOD_SECONDS
 from workbench.live.view import SessionView
 from workbench.machine.text import number_text
 from workbench.page.command import Command
@@ -182,7 +182,7 @@ class InspectPanel(PagePart[SessionView]):
         server.gui.add_html(render("tell", command=TellUnfolded(panel=TAB)))
         self._now: Inspection | None = None
         self._before: Inspection | None = None
-        self._due = DrawThrottle(READ_EVERY, clock)
+        self._due = DrawThrottle(READ_PERIOD_SECONDS, clock)
 
     def draw(self, view: SessionView) -> None:
         chosen = self._chosen

@@ -195,8 +195,8 @@ class Background(QuestionClient):
         self._turn = None
         if self._unanswered is not None and self._process is not None:
             self._process.send(Cancel())
-            patience = _LOAD_CANCEL_TIMEOUT_SECONDS if _is_load(self._question) else _CANCEL_TIMEOUT_SECONDS
-            self._overdue = loop.later(patience, self.end)
+            timeout = _LOAD_CANCEL_TIMEOUT_SECONDS if _is_load(self._question) else _CANCEL_TIMEOUT_SECONDS
+            self._overdue = loop.later(timeout, self.end)
         self._grant()
 
     def _is_waited_for(self) -> bool:
@@ -365,7 +365,7 @@ class _Process:
         except OSError as error:
             why = f"no process could be started in the background: {error}"
         except Exception as error:
-            report_failure("The process in the background could not be heard", error)
+            report_failure("Reading from the process in the background failed", error)
         finally:
             loop.do(partial(self._background._ended, self, why))
 
