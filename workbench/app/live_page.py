@@ -62,7 +62,7 @@ from workbench.page.commands import (
 )
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
-from workbench.page.scene.viewpoint import FOV, View3D, Viewpoint, frame_all, frame_one
+from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.hotkeys import add_hints, key_rows, register
@@ -444,7 +444,7 @@ class Page:
         assert self._layout is not None and view.task is not None, "asked only where a scene is drawn"
         if self._view_panel.only_selected or view.task.num_envs == 1:
             human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
-            fovy = next((c.fovy for c in view.task.cameras if human and c.name == human.camera), FOV)
+            fovy = next((c.fovy for c in view.task.cameras if human and c.name == human.camera), FOV_RADIANS)
             acting = None
             if human is None and view.step is not None:
                 acting = acting_box(view.task.geometry, view.step.poses, self._layout)
