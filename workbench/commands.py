@@ -1,4 +1,4 @@
-"""All that can be asked for on a page, by a script or by an agent: `COMMANDS`.
+"""All commands that a page, a script or an agent can use: `COMMANDS`.
 
 >>> from workbench.commands import COMMANDS
 >>> for command in COMMANDS:

@@ -141,7 +141,7 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
 ) -> None:
     # A browser applies a batch with anything of the view in it at its next frame of the view, which may take long.
     opened.load()
-    monkeypatch.setattr("workbench.app.pages.SENT_WITHIN", 10.0)
+    monkeypatch.setattr("workbench.app.pages.PANELS_TIMEOUT_SECONDS", 10.0)
     opened.session.change(selected_env=0)
     opened.draw()
     address, options = handshake(f"http://127.0.0.1:{opened.panels.server.get_port()}")

@@ -93,7 +93,7 @@ def test_the_session_knows_whether_any_tab_is_open(house: House) -> None:
 def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
     house: House, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(strangers, "READ_WITHIN", 3.0)
+    monkeypatch.setattr(strangers, "READ_TIMEOUT_SECONDS", 3.0)
     reads = house.tabs.open()
     until(lambda: reads.open, "the tab that reads")
     deaf = open_deaf_tab(house.gated_server.url)

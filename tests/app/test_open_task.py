@@ -200,7 +200,7 @@ def test_the_recordings_are_a_row_and_a_task_is_opened_from_there_too(
 def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shared, "ENOUGH_MEMORY", 0)
+    monkeypatch.setattr(shared, "MIN_FREE_BYTES", 0)
     assert desk.app.shared.is_idle()
     desk.choose("push.py")
     session = desk.session_of("push.py")
@@ -209,7 +209,7 @@ def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
     until(lambda: not desk.app.shared.is_idle(), "a task that plays")
     session.do(PauseRun())
     until(desk.app.shared.is_idle, "a paused task")
-    monkeypatch.setattr(shared, "ENOUGH_MEMORY", 1 << 60)
+    monkeypatch.setattr(shared, "MIN_FREE_BYTES", 1 << 60)
     assert not desk.app.shared.is_idle()
 
 

@@ -44,7 +44,7 @@ from workbench.app.pages import Pages
 from workbench.app.session import Session
 from workbench.commands import COMMANDS
 from workbench.page.door.gated_server import ServerOptions, open_server
-from workbench.page.scene.viewpoint import FOV, View3D
+from workbench.page.scene.viewpoint import FOV_RADIANS, View3D
 from workbench.page.widgets.visitors import Visitors
 from workbench.task.description import TaskOptions
 
@@ -140,7 +140,9 @@ def measure(played: Played, options: Options) -> str:
         with line_to(gated.url, BITS, DELAY) as line:
             address, how = handshake(line.address(gated.url))
             how["compression"] = "deflate"
-            greeting = camera_message(tuple(gated.server.initial_camera.position), width=1280, fov=FOV)
+            greeting = camera_message(
+                tuple(gated.server.initial_camera.position), width=1280, fov=FOV_RADIANS
+            )
             coming = client.read(address, how, greeting)
             thread = threading.Thread(target=lambda: asyncio.run(coming), daemon=True)
             thread.start()

@@ -42,7 +42,7 @@ from workbench.envs import action_vector as actions
 from workbench.envs.step_result import StepResult
 from workbench.live.messages import Status
 from workbench.page.door.gated_server import ServerOptions, open_server
-from workbench.page.scene.viewpoint import FOV, View3D
+from workbench.page.scene.viewpoint import FOV_RADIANS, View3D
 from workbench.page.widgets.visitors import Visitors
 from workbench.task.description import Stepped, TaskDescription, TaskOptions
 from workbench.task.open import open_task
@@ -171,7 +171,7 @@ def measure(played: Played, options: Options, exact: bool) -> Update:
             address, how = handshake(line.address(gated.url))
             how["compression"] = None if exact else "deflate"
             eye = gated.server.initial_camera.position
-            greeting = camera_message(tuple(eye), width=1280, fov=1e-6 if exact else FOV)
+            greeting = camera_message(tuple(eye), width=1280, fov=1e-6 if exact else FOV_RADIANS)
             thread = threading.Thread(target=_run, args=(client, address, how, greeting), daemon=True)
             thread.start()
             while not gated.server.get_clients():

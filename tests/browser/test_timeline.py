@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, Locator, expect
 from tests.browser.conftest import At
 from tests.drive.desk import Desk
 from tests.drive.waiting import until
-from workbench.live.panels.timeline_panel import RANGE_EVERY
+from workbench.live.panels.timeline_panel import RANGE_PERIOD_SECONDS
 
 pytestmark = pytest.mark.browser
 STEPS = 8
@@ -43,7 +43,7 @@ def desk(opened: Desk) -> Desk:
 
 def wait_for_the_range() -> None:
     """The slider's range follows a moment later, and would go over a hand that is there already."""
-    time.sleep(RANGE_EVERY)
+    time.sleep(RANGE_PERIOD_SECONDS)
 
 
 @pytest.mark.slow

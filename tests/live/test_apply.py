@@ -46,7 +46,7 @@ from workbench.live.events import (
     VersionLoaded,
     WorkerDied,
 )
-from workbench.live.inspect_polling import READ_EVERY
+from workbench.live.inspect_polling import READ_PERIOD_SECONDS
 from workbench.live.messages import Load, Loaded, Loading, ReloadReport, Settings, Status, TaskFailed
 from workbench.live.process.supervisor import End
 from workbench.live.run import first_run
@@ -206,4 +206,4 @@ def test_a_reading_comes_at_once_and_the_next_after_a_while() -> None:
     state, _ = apply(state, ReadingDue(), Now(100.0, 0.0))
     state, _ = apply(state, stepped(1, ()), Now(100.05, 0.0))
     state, (soon,) = apply(state, Inspection(0, 0), Now(100.1, 0.0))
-    assert isinstance(soon, Later) and soon.seconds == pytest.approx(READ_EVERY - 0.1)
+    assert isinstance(soon, Later) and soon.seconds == pytest.approx(READ_PERIOD_SECONDS - 0.1)

@@ -21,7 +21,7 @@ from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection
 from workbench.live.commands import ChooseClass, PauseRun, PlayRun, ReloadFile, SetSeed
 from workbench.live.events import MomentShown, OptionsApplied, PagesCounted, ReadingChosen
-from workbench.live.inspect_polling import READ_EVERY
+from workbench.live.inspect_polling import READ_PERIOD_SECONDS
 from workbench.live.messages import (
     CameraFailed,
     CameraRequest,
@@ -374,12 +374,12 @@ def test_what_is_looked_at_is_read_once_for_each_step_and_again_when_the_answer_
     (asked,) = until(lambda: told.asked(Inspect), "a reading")
     assert (asked.env, asked.sections) == (0, ("joints",))
     told.step(5)
-    time.sleep(2 * READ_EVERY)
+    time.sleep(2 * READ_PERIOD_SECONDS)
     assert told.asked(Inspect) == [], "a busy worker gets no queue of questions"
     told.tell(Inspection(0, 3))
     assert len(until(lambda: told.asked(Inspect), "the reading of the newest step")) == 1
     told.tell(Inspection(0, 8))
-    time.sleep(2 * READ_EVERY)
+    time.sleep(2 * READ_PERIOD_SECONDS)
     assert told.asked(Inspect) == [], "nothing is new"
     told.session.change(selected_env=1)
     (asked,) = until(lambda: told.asked(Inspect), "another env")
@@ -388,7 +388,7 @@ def test_what_is_looked_at_is_read_once_for_each_step_and_again_when_the_answer_
     told.session.happen(ReadingChosen(()))
     told.tell(Inspection(1, 0))
     told.step()
-    time.sleep(2 * READ_EVERY)
+    time.sleep(2 * READ_PERIOD_SECONDS)
     assert told.asked(Inspect) == []
 
 

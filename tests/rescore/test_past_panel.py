@@ -21,7 +21,7 @@ from workbench.live.timeline_commands import (
     StopRescoring,
     TurnRescored,
 )
-from workbench.page.widgets.line_chart import LONGEST
+from workbench.page.widgets.line_chart import MAX_POINTS
 from workbench.rescore import verdict_text
 from workbench.rescore.past_panel import chart_data
 from workbench.rescore.past_scores import PastRun, RescoredCurve
@@ -148,12 +148,12 @@ def test_the_key_goes_round(rescored: Rescored) -> None:
 
 
 def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
-    count = 3 * LONGEST
+    count = 3 * MAX_POINTS
     tick = np.arange(count)
     curve = RescoredCurve(tick, tick + 7, np.zeros(count, np.float32), np.ones(count, np.float32))
     assert chart_data(curve, None)[0][-1] == count - 1
-    x, _, _, cursor = chart_data(curve, 7 + LONGEST)
-    assert len(x) == LONGEST and x[np.flatnonzero(np.isfinite(cursor))].tolist() == [LONGEST]
+    x, _, _, cursor = chart_data(curve, 7 + MAX_POINTS)
+    assert len(x) == MAX_POINTS and x[np.flatnonzero(np.isfinite(cursor))].tolist() == [MAX_POINTS]
     assert len(chart_data(curve, 10**6)) == 3
 
 

@@ -45,15 +45,15 @@ NEW_ENVS = 4
 """Envs of a session that is opened for "all envs"."""
 
 
-_LOOK = 0.05
-"""Seconds between two checks whether a live env exists."""
-_OPENED_WITHIN = 2.0
-"""Seconds that the end of the program waits for a session that is being opened."""
+_POLL_SECONDS = 0.05
+"""Interval at which the transition checks whether a live env exists."""
+_OPEN_TIMEOUT_SECONDS = 2.0
+"""Timeout, at the end of the program, for a session that is being opened."""
 MakeSession = Callable[[TaskName, TaskOptions], Session]
 
 
 @dataclass
-class _Way:
+class _Transition:
     """One transition from a recording to a live env."""
 
     info: EpisodeInfo
@@ -61,7 +61,7 @@ class _Way:
     state: int
     given_up: bool = False
     asks: bool = False
-    """Whether a person may have to say that the code may run."""
+    """Whether a user may have to allow the code to run."""
     number: int = 0
     """Value of `TimelineView.entered` once the env has the recorded state."""
     problems: int = 0
@@ -69,7 +69,7 @@ class _Way:
     """Session that gets the recorded state; None until the consent is given. Set last."""
 
     def is_over(self) -> bool:
-        """Whether to show the live page now: the state is there, the task failed, or it may have to be interrupted."""
+        """Whether to show the live page now: the state is restored, the task failed, or it may have to be interrupted."""
         if self.session is None:
             return False
         view = self.session.view()
@@ -93,9 +93,9 @@ class _Way:
 class GoLive:
     """Continues recordings in a live env.
 
-    If the recording's task is open already, its env (or all) gets the recorded state; else another session is opened
-    for it, and closed here, with the folder of a recorded text. The review stays until the live page has something to
-    show. Used on the loop, but for `close`.
+    If the recording's task is already open, its env (or all envs) gets the recorded state. If not, `GoLive` opens another
+    session, and later closes it and removes the folder of a recorded text. The review stays until the live page has
+    something to show. Used on the loop, except `close`.
 
     Args:
         shared: The pages, and the open session, if any.
@@ -114,14 +114,14 @@ class GoLive:
         self._shared, self._make, self._clearances, self._base = shared, make_session, clearances, base
         self._own: tuple[Session, Path | None] | None = None
         self.recorded_source, self.everywhere = False, False
-        self._way: _Way | None = None
+        self._transition: _Transition | None = None
         self._opening = BlockingPool("go-live")
         """Asks for consent, and opens sessions."""
         self._ending = BlockingPool("end-session")
 
     def go(self, id: str, state: int) -> None:
         """Continue live from a state of an opened recording; if that is in progress, cancel it."""
-        if self._way is not None:
+        if self._transition is not None:
             self._give_up()
             return
         review = self._shared.recordings.review.view()
@@ -135,29 +135,29 @@ class GoLive:
             return
         if self.recorded_source:
             run = replace(run, name=f"{run.name} as it was recorded")
-        self._way = way = _Way(one.episode.info, run, state)
-        begin(self._go(way))
+        self._transition = transition = _Transition(one.episode.info, run, state)
+        begin(self._go(transition))
 
-    async def _go(self, way: _Way) -> None:
-        info, recorded_source = way.info, self.recorded_source
+    async def _go(self, transition: _Transition) -> None:
+        info, recorded_source = transition.info, self.recorded_source
         try:
             why = await self._opening.run(lambda: self._clearances.refused_arguments(info))
             if why is not None:
                 raise NotCleared(why)
             session = None if recorded_source else self._open_already(info)
             if session is None:
-                session = await self._open(way, recorded_source)
+                session = await self._open(transition, recorded_source)
             if session is not None:
-                await self._enter(session, way)
+                await self._enter(session, transition)
         except (CannotEnterRecording, NotCleared) as error:
-            if not way.given_up:
+            if not transition.given_up:
                 self._say(sentence(str(error)))
         finally:
-            if self._way is way:
-                self._way = None
+            if self._transition is transition:
+                self._transition = None
 
     def _open_already(self, info: EpisodeInfo) -> Session | None:
-        """An open session with this task in today's code."""
+        """An open session with this task in its current code."""
         session = self._shared.session
         if session is not None and (self._own is None or self._own[1] is None):
             task = session.view().task
@@ -167,21 +167,21 @@ class GoLive:
         task = None if known is None else known.view().task
         return known if task is not None and not why_not_enter(task, info) else None
 
-    async def _open(self, way: _Way, recorded_source: bool) -> Session | None:
-        """Another session for the recording's task; None if the transition is given up meanwhile.
+    async def _open(self, transition: _Transition, recorded_source: bool) -> Session | None:
+        """Another session for the recording's task; None if the transition is cancelled meanwhile.
 
         Raises:
-            CannotEnterRecording, NotCleared: it may not be opened.
+            CannotEnterRecording, NotCleared: the task must not be opened.
         """
-        info, num_envs = way.info, NEW_ENVS if self.everywhere else 1
+        info, num_envs = transition.info, NEW_ENVS if self.everywhere else 1
 
         def open_cleared() -> tuple[Session, Path | None] | None:
             wanted = CodeToRun(reference_of(info), info, recorded_source, followed=not recorded_source)
             options = options_of(info, num_envs, self._base)
-            folder, reference = None, self._clearances.clear(wanted, lambda: way.given_up)
+            folder, reference = None, self._clearances.clear(wanted, lambda: transition.given_up)
             if recorded_source:
                 folder, reference = write_source(info)
-            if not way.given_up:
+            if not transition.given_up:
                 if self._shared.home is not None:
                     self._shared.home.do(PauseRun())
                 return self._make(reference, options), folder
@@ -189,9 +189,9 @@ class GoLive:
                 shutil.rmtree(folder, ignore_errors=True)
             return None
 
-        way.asks = True
+        transition.asks = True
         opened = await self._opening.run(open_cleared)
-        if opened is None or way.given_up:
+        if opened is None or transition.given_up:
             if opened is not None:
                 self._ending.begin(lambda: _end(*opened))
             return None
@@ -199,32 +199,34 @@ class GoLive:
         self._own = opened
         return opened[0]
 
-    async def _enter(self, session: Session, way: _Way) -> None:
+    async def _enter(self, session: Session, transition: _Transition) -> None:
         """Put the recorded state into the env, and show the live page once it is there."""
         self._shared.session = session
-        way.problems = session.view().problem_serial
-        way.number = session.enter_recording(way.run, self.everywhere, way.info.source_file, way.info.source)
-        way.session = session
-        while self._way is way:
-            if way.is_over():
+        transition.problems = session.view().problem_serial
+        transition.number = session.enter_recording(
+            transition.run, self.everywhere, transition.info.source_file, transition.info.source
+        )
+        transition.session = session
+        while self._transition is transition:
+            if transition.is_over():
                 self._shared.pages.show("live")
                 return
-            await asyncio.sleep(_LOOK)
+            await asyncio.sleep(_POLL_SECONDS)
 
     def _give_up(self) -> None:
-        way, self._way = self._way, None
-        if way is not None:
-            way.given_up = True
+        transition, self._transition = self._transition, None
+        if transition is not None:
+            transition.given_up = True
 
     def going(self) -> str:
         """Text: what the transition waits for; empty without a transition."""
-        way = self._way
-        return "" if way is None else way.words()
+        transition = self._transition
+        return "" if transition is None else transition.words()
 
     def review_is_back(self) -> None:
-        """Forget a transition that waits for no consent, because the review page is shown again."""
-        if self._way is not None and self._way.session is not None:
-            self._way = None
+        """Cancel a transition unless it waits for consent, because the review page is shown again."""
+        if self._transition is not None and self._transition.session is not None:
+            self._transition = None
 
     def can_go_home(self) -> bool:
         """Whether the live session was opened here."""
@@ -232,7 +234,7 @@ class GoLive:
         return home is not None and self._shared.session is not home
 
     def go_home(self) -> None:
-        """Return to the session that a person opened; the other session ends."""
+        """Return to the session that the user opened; the other session ends."""
         if self._shared.home is None:
             return
         self._shared.session = self._shared.home
@@ -240,19 +242,19 @@ class GoLive:
         self._let_go()
 
     def let_go(self) -> None:
-        """Give up a transition, and end a session that was opened here, because a person opens another task."""
+        """Cancel a transition and end a session that was opened here, because the user opens another task."""
         self._give_up()
         self._let_go()
 
     def close(self) -> None:
         """End the session opened here; the pages must be stopped. Called on another thread than the loop."""
         do(self.let_go)
-        self._opening.close(_OPENED_WITHIN)
-        do(lambda: None)  # what was opened meanwhile is given up by now
+        self._opening.close(_OPEN_TIMEOUT_SECONDS)
+        do(lambda: None)  # a session that was opened meanwhile has ended by now
         self._ending.close()
 
     def _let_go(self) -> None:
-        """End the session that was opened here; the caller shows another page meanwhile."""
+        """End the session that was opened here; the caller shows another page."""
         own, self._own = self._own, None
         if own is not None:
             self._ending.begin(lambda: _end(*own))
@@ -262,7 +264,7 @@ class GoLive:
 
 
 class GoLivePart(PagePart[ReviewView]):
-    """Options of going live: which code, and into which envs."""
+    """Options of continuing live: which code, and which envs."""
 
     does = (ChooseLiveCode, ChooseLiveEnvs, ReturnToFirstTask)
 

@@ -1,4 +1,4 @@
-"""The documents as topics: which there are, their text, and the pages that *Help* opens in the browser."""
+"""The documents as topics: a list, their text, and the pages that *Help* opens in the browser."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ HEADERS = {
     "frame-ancestors 'self'",
     "Cache-Control": "no-cache",
 }
-_BEGINNING = 1000
-"""Number of characters of a page that say what the page is about."""
+_INTRODUCTION_CHARACTERS = 1000
+"""Length of the start of a page that is searched for its subject."""
 _LITTLE_WORDS = frozenset("a an and for how i in is it my of on or the to with your".split())
 OVERVIEW = "overview"
-"""The topic that is README."""
+"""The topic made of the README."""
 GROUPS = (
     ("", "Use it"),
     ("jobs", "Let it run for long"),
     ("reference", "Look something up"),
     ("developers", "Change the workbench"),
 )
-"""Folders of the documents, and what a reader who opens the folder wants."""
+"""Folders of the documents, with a heading that states the reader's goal."""
 RULE_PAGES = "rules"
-"""Folder with a page for each rule of `checks`. They are no list to read: the topic ``rules`` has them in a table."""
+"""Folder with a page for each rule of `checks`. The list of topics omits them; the topic ``rules`` has a table."""
 FIRST = (
     OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "solve",
     "sweep", "cluster", "batched_env", "safety", "limits", "gallery", "rules", "keys", "cli",
@@ -112,8 +112,8 @@ def _as_named(name: str) -> str:
 
 
 def topics_about(words: str) -> list[Topic]:
-    """Topics whose text holds each of these words, whatever their case and order; first those that begin with them. Pages of
-    rules only where no other does."""
+    """Topics whose text contains each of these words, in any case and order; topics that begin with them come first. Pages
+    of rules only if no other topic matches."""
     wanted = [word for word in re.findall(r"[\w-]+", words.lower()) if word not in _LITTLE_WORDS]
     if not wanted:
         return []
@@ -123,7 +123,7 @@ def topics_about(words: str) -> list[Topic]:
 
     found = [topic for topic in topics() if holds(topic.text)]
     found = [topic for topic in found if topic.group != RULE_PAGES] or found
-    return sorted(found, key=lambda topic: not holds(topic.text[:_BEGINNING]))
+    return sorted(found, key=lambda topic: not holds(topic.text[:_INTRODUCTION_CHARACTERS]))
 
 
 def by_path(path: str) -> Topic | None:
@@ -144,8 +144,8 @@ def reply(path: str) -> tuple[int, str, bytes]:
 
 
 def html_of(topic: Topic) -> str:
-    """The text as HTML, with links to other topics and pictures as this server has them."""
-    from markdown_it import MarkdownIt  # late: a page that nobody opens needs none
+    """The text as HTML, with links and pictures resolved to addresses on this server."""
+    from markdown_it import MarkdownIt  # imported late: only an opened help page needs it
 
     # HTML in the text is our own: README's <picture>.
     markdown = MarkdownIt("commonmark", {"html": True, "highlight": _coloured}).enable("table")
@@ -156,7 +156,7 @@ def html_of(topic: Topic) -> str:
         elif token.type == "image":
             token.attrSet("src", _address(topic, str(token.attrGet("src"))))
         elif token.attrGet("style") == "text-align:right":
-            # A style in a tag is refused by the policy.
+            # The Content-Security-Policy forbids inline styles.
             token.attrs = {"class": "number"}
         elif token.type == "html_block":
             token.content = re.sub(
@@ -172,14 +172,14 @@ def html_of(topic: Topic) -> str:
                 if part.type == "text":
                     part.type, part.content = "html_inline", _breakable(part.content)
     made = markdown.renderer.render(tokens, markdown.options, {})
-    # In a frame of its own, so that a wide table scrolls and not the page.
+    # In its own container, so that a wide table scrolls instead of the page.
     made = made.replace("<table>", '<div class="wide"><table>').replace("</table>", "</table></div>")
-    # Each picture of the page was taken dark and light.
+    # Each screenshot exists in a dark and a light version.
     return re.sub(r'<img src="(/workbench/screenshots/)dark/([\w.]+)" alt="([^"]*)" />', _PICTURE, made)
 
 
 def _coloured(code: str, language: str, attributes: str) -> str:
-    """The lines of a diff as HTML with their signs as classes; empty for other code, which is then only escaped."""
+    """The lines of a diff as HTML with their signs as classes; empty for other code, which markdown-it then only escapes."""
     if language != "diff":
         return ""
     kinds = {"-": "gone", "+": "come"}
@@ -198,7 +198,7 @@ _PICTURE = (
 
 
 def _breakable(text: str) -> str:
-    """The text as HTML in which a path or a long name may go on in another line: a table is as wide as its longest word."""
+    """The text as HTML with line-break opportunities in paths and long names: a table is as wide as its longest word."""
     path = re.sub(r"(?<=\w)([/_])(?=\w)", r"\1<wbr>", html.escape(text, quote=False))
     return re.sub(r"[A-Za-z0-9]{20,}", lambda name: re.sub(r"(?<=[a-z])(?=[A-Z])", "<wbr>", name[0]), path)
 

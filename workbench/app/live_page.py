@@ -39,7 +39,7 @@ from workbench.live.panels.inspect_panel import ForceArrows, InspectPanel
 from workbench.live.panels.log_panel import LogPanel
 from workbench.live.panels.reward_panel import CurvesPanel, NumbersPanel
 from workbench.live.panels.run_panel import RunPanel
-from workbench.live.panels.timeline_panel import HEIGHT as TIMELINE_HEIGHT
+from workbench.live.panels.timeline_panel import HEIGHT_PIXELS as TIMELINE_HEIGHT
 from workbench.live.panels.timeline_panel import TimelinePanel
 from workbench.live.panels.version_panel import VersionPanel
 from workbench.live.panels.view_panel import ViewPanel
@@ -62,7 +62,7 @@ from workbench.page.commands import (
 )
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
-from workbench.page.scene.viewpoint import FOV, View3D, Viewpoint, frame_all, frame_one
+from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.hotkeys import add_hints, key_rows, register
@@ -94,16 +94,16 @@ DOES: frozenset[type[Command]] = frozenset(
         *CamerasPanel.does,
     }
 )
-"""Commands that the page itself carries out; the session has its own, and the parts of the page have the others."""
-PANELS_EVERY = 0.06
-"""Seconds between two drawings of the panels while the envs play, every second frame; numbers cannot be read faster."""
+"""Commands that the page itself carries out; the session and the parts of the page carry out the others."""
+PANELS_PERIOD_SECONDS = 0.06
+"""Interval at which the panels are drawn while the envs play, every second frame; numbers cannot be read faster."""
 PICTURES_HINT = (
     "Exact ones are SAPIEN's own; fast ones take a fraction of the time without a graphics card, of simplified meshes. "
     "Auto: fast while something moves, exact when it stands still. What this page records is exact."
 )
-PANEL_WIDTH = 372
-ENVS_WIDTHS = 220, 640
-"""Minimum and maximum width in pixels of the table of envs; the view keeps half of the page."""
+PANEL_WIDTH_PIXELS = 372
+ENVS_WIDTHS_PIXELS = 220, 640
+"""Minimum and maximum width of the table of envs; the view keeps half of the page."""
 
 
 class Page:
@@ -114,15 +114,15 @@ class Page:
     drawn or rendered.
 
     Args:
-        server: Of viser.
+        server: The viser server.
         visitors: The open pages.
         session: The session.
-        dark: The first theme.
-        on_review: Called when a person wants to see the recordings.
-        on_look: Called with the recording that a person wants to look at.
+        dark: Whether the first theme is dark.
+        on_review: Called when the user opens the recordings.
+        on_look: Called with the recording that the user opens.
         stage: The 3-D view; None makes one.
-        also: Further commands for the palette, which somebody else does.
-        clock: Of all parts of the page.
+        also: Further commands for the palette, which the caller carries out.
+        clock: Clock of all parts of the page.
         editor: Address of a line in the author's editor, as `parse_editor` gives it.
         chooser: Opens another task; None for a page that keeps its own.
     """
@@ -148,10 +148,10 @@ class Page:
         self._on_review, self._on_look = on_review, on_look
         self._visitors_counted = -1
         self._watched: tuple[CameraRequest, ...] = ()
-        """Pictures that the session was asked for."""
+        """Pictures requested from the session."""
         self._choices = BlockingPool("choices")
-        """Keeps what a person chose for later runs."""
-        self._panels_due = DrawThrottle(PANELS_EVERY, clock)
+        """Saves the user's choices for later runs."""
+        self._panels_due = DrawThrottle(PANELS_PERIOD_SECONDS, clock)
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
         self._built: tuple[bool, DrawStyle] | None = None
@@ -160,13 +160,13 @@ class Page:
         self._scene, self._framing, self._view_choice = stage.scene, stage.framing, stage.choice
 
         server.gui.main_panel.dock_right()
-        server.gui.main_panel.set_width(PANEL_WIDTH)
-        # Until it has loaded, and for good where it fails.
+        server.gui.main_panel.set_width(PANEL_WIDTH_PIXELS)
+        # Used until the task has loaded, and permanently if it fails to load.
         file = named_file(session.reference)
         server.gui.set_panel_label(str(session.reference) if file is None else file.name)
 
         status = StatusLine(server, clock)
-        # Not the path itself, which may be long.
+        # A hash, since the path may be long.
         which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
         self._open_tabs = OpenTabs(visitors)
         server.gui.add_html(render("which", which=which, anew=False, says=True))
@@ -272,7 +272,7 @@ class Page:
 
     @property
     def dark(self) -> bool:
-        """Its theme."""
+        """Whether the theme is dark."""
         return self._view_panel.dark
 
     def wait(self, seen: int, timeout: float) -> int:
@@ -280,26 +280,25 @@ class Page:
         return self._session.wait(seen, timeout)
 
     def counted(self, visitors: int) -> None:
-        """So many browsers show it: for none, nothing is rendered."""
+        """Take the number of browsers that show the page; without any, nothing is rendered."""
         if visitors != self._visitors_counted:
             self._visitors_counted = visitors
             self._session.happen(PagesCounted(visitors))
 
     def close(self) -> None:
-        """It is shown no more. The session may live on under another page, and must not render for this one."""
+        """Release the page. The session may continue under another page, and must not render for this one."""
         self.counted(0)
         self._choices.end()
 
     def redraw(self) -> None:
-        """Draw the present state of the session; where only steps advance, the panels are drawn less often than
-        the view."""
+        """Draw the present state of the session. If only steps advance, the panels are drawn less often than the view."""
         view = self._session.view()
         panels = (lambda: self._draw_panels(view)) if self._panels_due.is_due(*_shown_of(view)) else None
         draw_apart(self._server, panels, lambda: self._draw_scene(view))
         self._watch(view)
 
     def _watch(self, view: SessionView) -> None:
-        """Ask the session for the pictures that the page shows."""
+        """Request from the session the pictures that the page shows."""
         wanted = self._cameras.wanted(shown_cameras(view))
         if wanted != self._watched:
             self._watched = wanted
@@ -310,7 +309,7 @@ class Page:
         self._degree.show(view.settings.pictures)
         self._cameras.draw(shown_cameras(view))
 
-    # --- what a person does ----------------------------------------------------------------------
+    # --- commands --------------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> Done:
         """Carry out a command of a page. Raises `Refused`."""
@@ -363,13 +362,13 @@ class Page:
             self._inspect.unfold()
 
     def _fit_envs(self) -> None:
-        """Set the table's width to that of its columns, once for each page width: a person may have dragged its edge."""
+        """Set the table's width to that of its columns, once for each page width: the user may have dragged its edge."""
         wanted = self._envs.wanted_width()
         page = min((visitor.page_width for visitor in self._visitors.all() if visitor.page_width), default=0)
         if page in (0, self._envs_fitted) or not wanted:
             return
-        least, most = ENVS_WIDTHS
-        self._env_window.set_width(max(least, min(wanted, most, page / 2 - PANEL_WIDTH)))
+        least, most = ENVS_WIDTHS_PIXELS
+        self._env_window.set_width(max(least, min(wanted, most, page / 2 - PANEL_WIDTH_PIXELS)))
         self._envs_fitted = page
 
     def _toggle_envs(self) -> None:
@@ -387,7 +386,7 @@ class Page:
     def _draw_scene(self, view: SessionView) -> None:
         task, step, seen = view.task, view.step, shown_cameras(view)
         if task is None:
-            # The bodies are those of the page before.
+            # The bodies are those of the previous page.
             self._scene.hide()
             return
         if (
@@ -399,7 +398,7 @@ class Page:
                 len(task.geometry.body_names),
             )
         ):
-            # Between two versions a step of the old one may come with the new task.
+            # Between two versions a step of the old one may arrive with the new task.
             return
         one = self._view_panel.only_selected and task.num_envs > 1
         env = min(view.selected_env, task.num_envs - 1)
@@ -431,13 +430,13 @@ class Page:
             self._waits_for_human = alone
             self._framing.frame_new(lambda aspect, height: self._viewpoint(view, aspect, height))
         if self._waits_for_human and any(kind == "human" for kind, _ in view.pictures):
-            # The human camera's place comes with its first picture, after the scene.
+            # The human camera's pose arrives with its first picture, after the scene.
             self._waits_for_human = False
             self.frame(view, untouched_only=True)
         self._framing.frame_untouched(lambda aspect, height: self._viewpoint(view, aspect, height))
 
     def frame(self, view: SessionView, untouched_only: bool = False) -> None:
-        """Point every open page (or only untouched ones), and those to come, at the scene."""
+        """Frame the scene in every open page (or only untouched ones) and in pages opened later."""
         if self._layout is not None and view.task is not None:
             self._framing.frame(lambda aspect, height: self._viewpoint(view, aspect, height), untouched_only)
 
@@ -445,7 +444,7 @@ class Page:
         assert self._layout is not None and view.task is not None, "asked only where a scene is drawn"
         if self._view_panel.only_selected or view.task.num_envs == 1:
             human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
-            fovy = next((c.fovy for c in view.task.cameras if human and c.name == human.camera), FOV)
+            fovy = next((c.fovy for c in view.task.cameras if human and c.name == human.camera), FOV_RADIANS)
             acting = None
             if human is None and view.step is not None:
                 acting = acting_box(view.task.geometry, view.step.poses, self._layout)
@@ -471,7 +470,7 @@ class Page:
 
 
 def _shown_of(view: SessionView) -> tuple[object, object]:
-    """Keys of what the panels show and of what a person waits for in it, as `DrawThrottle` takes them."""
+    """Keys of the panels' content and of the part that must be drawn at once, as `DrawThrottle` takes them."""
     steps_go_on = view.playing and view.state == "running" and view.timeline.shown is None
     waited_for = (
         view.settings,
@@ -482,5 +481,5 @@ def _shown_of(view: SessionView) -> tuple[object, object]:
         view.activity,
         view.pictures_serial,
     )
-    # Every view is new; where no steps go on, a person waits for each.
+    # Every view is new; while no steps are made, each must be drawn at once.
     return object(), (waited_for if steps_go_on else object())

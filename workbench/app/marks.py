@@ -1,5 +1,4 @@
-"""The marks that stay in sight on every tab: recording, saving of the past, a camera moved by hand, findings,
-flagged envs."""
+"""Marks that are visible on every tab: recording, saving of the past, a camera moved by hand, findings, flagged envs."""
 
 from __future__ import annotations
 
@@ -34,8 +33,8 @@ EPISODES, STUDIO = "Episodes", "Studio"
 
 
 class Marks(PagePart[SessionView]):
-    """One row between the status line and the tabs, of an element of its own: the line is written four times a second, and
-    a press on it would be lost.
+    """One row between the status line and the tabs, in its own element: the status line is redrawn four times a second,
+    and a press on it would be lost.
 
     Args:
         server: The page.
@@ -84,7 +83,7 @@ class Marks(PagePart[SessionView]):
         )
 
     def _show_change(self, visitor: Visitor) -> None:
-        """Show how the file would change; nothing is written before that was read."""
+        """Show how the file would change; nothing is written until the user confirms."""
         moved = moved_cameras(self._session.view())
         if not moved:
             return
@@ -94,7 +93,7 @@ class Marks(PagePart[SessionView]):
 
 
 def moved_cameras(view: SessionView) -> tuple[CameraKey, ...]:
-    """The cameras that are not where the file has them."""
+    """The cameras whose pose differs from the file's."""
     return tuple(camera.key for camera in view.of(StudioView).cameras if camera.moved)
 
 
@@ -123,7 +122,7 @@ def recording_mark(view: SessionView) -> dict[str, object] | None:
     if not recording.active:
         return None
     count = 1 if view.task is None else view.task.num_envs
-    # Nothing that changes with each step: the mark would be another element whenever somebody presses it.
+    # Nothing here may change with each step: a redraw would replace the element during a press.
     hint = f"Recording {envs_in_words(recording.env_idx)}."
     if recording.waiting:
         hint += f" {counted(recording.waiting, 'env')} of them {'begins' if recording.waiting == 1 else 'begin'} with the next reset: no step of {'it' if recording.waiting == 1 else 'them'} is recorded before."

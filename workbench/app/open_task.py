@@ -1,4 +1,4 @@
-"""Opens a listed task in place of the open one: asks for consent, changes the session, and keeps what was done in the old."""
+"""Opens a listed task in place of the open one: asks for consent, replaces the session, and keeps the old one's work."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from workbench.task.reference import TaskName, file_and_class, lasting
 from workbench.trust.clearance import Clearances, NotCleared
 
 OpenSession = Callable[[TaskName, TaskOptions, KeptWork | None], Session]
-"""Opens a task, with what was kept of an earlier session of it."""
+"""Opens a task, with the work kept from its last session."""
 
 
 @dataclass(frozen=True)
 class Choices:
-    """Content of the list of tasks in addition to the tasks that are found, and how a chosen task is opened."""
+    """Entries of the list of tasks in addition to the tasks that are found, and how a chosen task is opened."""
 
     recents: RecentTasks
     open_session: OpenSession
@@ -38,22 +38,22 @@ class Choices:
     """Options of tasks without options of their own."""
 
 
-_SHOWN_WITHIN = 10.0
-"""Seconds that the old session waits for the page of the new one."""
+_SHOW_TIMEOUT_SECONDS = 10.0
+"""Timeout of the old session for the page of the new one."""
 
 
 class OpenTask:
-    """Opens what a person chooses from the list.
+    """Opens the task that the user chooses from the list.
 
-    One at a time, since a question may wait for minutes and a session that ends writes its recordings. Of several
-    wishes the last counts: a question for an earlier one is withdrawn. The page of the new session is shown first, then
-    the old session is closed as at the end of the program. Used on the loop, but for `close`.
+    It opens one task at a time, since a question may wait for minutes and a session that ends writes its recordings. The
+    last request counts: the question for an earlier one is withdrawn. The page of the new session is shown first, then the
+    old session is closed as at the end of the program. Used on the loop, except `close`.
 
     Args:
         shared: The pages and the open session.
-        go_live: Gives up a session that it opened.
+        go_live: Ends a session that it opened.
         open_session: Opens a task.
-        catalogue: What may be chosen.
+        catalogue: The tasks that may be chosen.
         clearances: Decide whether a file may run.
     """
 
@@ -69,19 +69,19 @@ class OpenTask:
         self.catalogue, self._clearances = catalogue, clearances
         home = shared.home
         self._open_reference = "" if home is None else lasting(str(home.reference))
-        """Reference of the task that a person opened, as `Entry.lasting` has it."""
+        """Reference of the task that the user opened, in the form of `Entry.lasting`."""
         self._wish: Entry | None = None
         self._opening: asyncio.Task[None] | None = None
         self._aside = BlockingPool("open-task")
         self._doing = ""
         self._closing = False
         self._ran: set[str] = set()
-        """References of tasks that were open in this run; opening one again asks for no consent."""
+        """References of tasks that were open in this run; these open again without a question."""
         self._kept: dict[str, KeptWork] = {}
-        """Work kept of sessions of this run, by `lasting` reference."""
+        """Work kept from sessions of this run, by `lasting` reference."""
 
     def choose(self, number: int) -> None:
-        """Open the row of this number; returns at once. What is not listed is refused."""
+        """Open the row with this number; returns at once. Raises `Refused` for a number that is not listed."""
         entry = self.catalogue.entry(number)
         if entry is not None:
             self._want(entry)
@@ -94,11 +94,11 @@ class OpenTask:
     async def create(self, name: str, template: TemplateName) -> None:
         """Write a new task into the folder of the list, and open it; see `Chooser.create`."""
         made = await self._aside.run(lambda: write_new_task(name, template, self.catalogue.folder))
-        # Not by its number: a search that began before it was written may end now, and list it not.
+        # Not by its number: a search that began before the file was written may end now without it.
         self._want(self.catalogue.add_file(made.file, made.env_id))
 
     def doing(self) -> str:
-        """Text for the page: what is being done; empty if nothing."""
+        """Text for the page: the work in progress; empty if there is none."""
         return self._doing
 
     def is_open(self, entry: Entry) -> bool:
@@ -106,7 +106,7 @@ class OpenTask:
         return self._shared.home is not None and self._open_reference == entry.lasting
 
     def close(self) -> None:
-        """Withdraw a question and end the thread; a session that is being closed is waited for."""
+        """Withdraw a question and end the thread; waits for a session that is being closed."""
         self._closing = True
         if self._opening is not None:
             result_of(asyncio.wait([self._opening]))
@@ -153,11 +153,11 @@ class OpenTask:
             await self._change(reference, entry)
 
     def _cleared(self, entry: Entry) -> TaskName:
-        """What to open; asks a person if need be, and waits for the answer. A file is opened unasked where the workbench was
-        started, if it is one of the examples, and if it was open before in this run.
+        """The task to open; asks the user if necessary, and waits for the answer. It does not ask for a file in the folder in
+        which the workbench was started, for an example, or for a task that was open in this run.
 
         Raises:
-            NotCleared: it may not run.
+            NotCleared: the task must not run.
         """
         file = entry.file
         known = entry.lasting in self._ran or file in example_tasks()
@@ -171,7 +171,7 @@ class OpenTask:
         if old is not None:
             old.do(PauseRun())
             self._kept[self._open_reference] = old.kept_work()
-            # Not the texts of a recording, which name a path and are other code.
+            # Not a recording's texts: they name a path, but are other code.
             if isinstance(old.reference, str):
                 self._ran.add(self._open_reference)
         kept = self._kept.get(entry.lasting)
@@ -179,9 +179,9 @@ class OpenTask:
         session = await self._aside.run(lambda: self._open_session(reference, options, kept))
         shared.session = shared.home = session
         self._open_reference = entry.lasting
-        # Until then the old page draws the old session.
+        # Until the new page is shown, the old page draws the old session.
         shown = asyncio.wrap_future(shared.pages.show("live", anew=True))
-        await asyncio.wait([shown], timeout=_SHOWN_WITHIN)
+        await asyncio.wait([shown], timeout=_SHOW_TIMEOUT_SECONDS)
         if old is not None:
             self._doing = "Closing the task before: its recordings are written …"
             await self._aside.run(old.close)

@@ -23,44 +23,44 @@ from workbench.page.widgets.visitors import Done, Visitor
 
 log = logging.getLogger(__name__)
 
-FRAME = 1 / 30
-"""Seconds of a frame. More pushes make a browser slower (measured: 350 a second leave it 13 to 30 frames a second)."""
-SENT_WITHIN = 0.01
-"""Seconds of a frame that the 3-D view may wait for the panels to be sent."""
-AGAIN_AFTER = 1.0
-"""Seconds until a page that could not be drawn is tried again."""
-_REST = 0.1
-"""Seconds after which a page is drawn again although nothing has changed."""
-_LOOK = 0.02
-"""Seconds between two checks whether another page is wanted."""
-_BUILT_WITHIN = 10.0
-"""Seconds that the end of the program waits for a page that is being drawn."""
+FRAME_SECONDS = 1 / 30
+"""Period of a frame. More pushes slow a browser down (measured: with 350 a second it draws 13 to 30 frames a second)."""
+PANELS_TIMEOUT_SECONDS = 0.01
+"""Longest time in each frame that the 3-D view waits for the panels to be sent."""
+RETRY_SECONDS = 1.0
+"""Time until a page that could not be drawn is tried again."""
+_IDLE_SECONDS = 0.1
+"""Time after which a page is drawn again although nothing has changed."""
+_POLL_SECONDS = 0.02
+"""Interval at which the thread checks whether another page is wanted."""
+_BUILD_TIMEOUT_SECONDS = 10.0
+"""Timeout, at the end of the program, for a page that is being drawn."""
 
 Which = Literal["start", "live", "review"]
 
 
 class ShownPage(Protocol):
-    """A page, built on a server that has no other."""
+    """A page, built on a server that has no other page."""
 
     @property
     def dark(self) -> bool:
-        """Its theme."""
+        """Whether the theme is dark."""
         ...
 
     def wait(self, seen: int, timeout: float) -> int:
-        """Sleep until there is something newer than this serial, at most so many seconds; returns the newest serial."""
+        """Sleep until there is something newer than this serial, at most `timeout` seconds; returns the newest serial."""
         ...
 
     def counted(self, visitors: int) -> None:
-        """So many browsers show it."""
+        """Take the number of browsers that show the page."""
         ...
 
     def redraw(self) -> None:
-        """Draw it."""
+        """Draw the present state."""
         ...
 
     def close(self) -> None:
-        """It is shown no more."""
+        """Release the page: it will not be shown again."""
         ...
 
     def do(self, command: Command, visitor: Visitor) -> Done:
@@ -69,33 +69,33 @@ class ShownPage(Protocol):
 
 
 @dataclass(frozen=True)
-class _Wish:
+class _PageRequest:
     which: Which
     anew: bool
     shown: Future[None] = field(default_factory=Future)
 
 
 class Pages:
-    """Shows one page of several on the same server, and draws it again whenever there is something new to show.
+    """Shows one of several pages on the same server, and redraws it whenever there is something new to show.
 
-    viser has one page a server, so a page is removed whole and the other is built in its place; every open browser
-    follows. The session and the review live on meanwhile, the bodies in the 3-D view stay (`View3D`), and nothing is
-    sent before the new page was drawn once, so that no empty control is ever seen.
+    viser has one page per server, so a page is removed whole and the other is built in its place; every open browser
+    follows. The session and the review continue, the bodies in the 3-D view stay (`View3D`), and nothing is sent before
+    the new page was drawn once, so that no empty control is ever visible.
 
-    A page that cannot be drawn says so in every open browser and is tried again: a page that looks alive and stands
-    still is worse.
+    If a page cannot be drawn, every open browser shows a notice and the page is tried again: a page that looks alive but
+    is frozen is worse.
 
     Args:
-        server: Of viser.
+        server: The viser server.
         stage: The 3-D view that the pages share.
-        make: Builds a page on the empty server, given which one and whether it is dark.
+        make: Builds a page on the empty server, given its name and whether it is dark.
     """
 
     def __init__(
         self, server: viser.ViserServer, stage: View3D, make: Callable[[Which, bool], ShownPage]
     ) -> None:
         self._server, self._stage, self._make = server, stage, make
-        self._wishes: queue.SimpleQueue[_Wish] = queue.SimpleQueue()
+        self._wishes: queue.SimpleQueue[_PageRequest] = queue.SimpleQueue()
         self._ending = False
         self.shown: Which | None = None
         """The page that is shown."""
@@ -105,18 +105,18 @@ class Pages:
         self._thread = watched_thread("pages", self._run)
 
     def start(self, which: Which) -> None:
-        """Show the first page; returns when it is shown, and raises what was raised as it was built."""
+        """Show the first page; returns when it is shown, and raises any exception of its construction."""
         shown = self.show(which)
         self._thread.start()
         shown.result()
 
     def show(self, which: Which, anew: bool = False) -> Future[None]:
-        """Request a page; it is done when this one, or one that was requested after it, is shown.
+        """Request a page. The future is done when this page, or one that was requested later, is shown.
 
         Args:
-            anew: build it also if it is shown: it has another session.
+            anew: rebuild the page even if it is shown, because its session was replaced.
         """
-        wish = _Wish(which, anew)
+        wish = _PageRequest(which, anew)
         self._wishes.put(wish)
         return wish.shown
 
@@ -131,7 +131,7 @@ class Pages:
         """Stop drawing the present page; it stays as it is until the server closes."""
         self._ending = True
         if self._thread.ident is not None:
-            self._thread.join(_BUILT_WITHIN)
+            self._thread.join(_BUILD_TIMEOUT_SECONDS)
         if self._page is not None:
             self._page.close()
 
@@ -144,18 +144,18 @@ class Pages:
                 self._show_newest()
                 seen = -1
             if self._page is None:
-                time.sleep(_LOOK)
+                time.sleep(_POLL_SECONDS)
                 continue
             seen = self._newer(self._page, seen)
             began = time.monotonic()
-            pause = 0.0 if self._draw_or_say(self._page) else AGAIN_AFTER
+            pause = 0.0 if self._draw_or_say(self._page) else RETRY_SECONDS
             due = next_frame(due, began)
             self._sleep(max(pause, due - time.monotonic()))
 
     def _newer(self, page: ShownPage, seen: int) -> int:
         """The newest serial of the page, as soon as there is something to draw or another page is wanted."""
-        until = time.monotonic() + _REST
-        while (newest := page.wait(seen, _LOOK)) == seen and time.monotonic() < until:
+        until = time.monotonic() + _IDLE_SECONDS
+        while (newest := page.wait(seen, _POLL_SECONDS)) == seen and time.monotonic() < until:
             if not self._wishes.empty() or self._ending:
                 break
         return newest
@@ -163,7 +163,7 @@ class Pages:
     def _sleep(self, seconds: float) -> None:
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0 and self._wishes.empty() and not self._ending:
-            time.sleep(min(left, _LOOK))
+            time.sleep(min(left, _POLL_SECONDS))
 
     def _show_newest(self) -> None:
         wishes = [self._wishes.get()]
@@ -187,7 +187,7 @@ class Pages:
         with self._server.atomic():
             if before is not None:
                 self._dark = before.dark
-                # On the loop: a command must not meet a page of which half is gone.
+                # On the loop: a command must not reach a page that is half removed.
                 do(lambda: self._take_down(before))
             page = self._make(which, self._dark)
             self._draw_or_say(page)
@@ -209,7 +209,7 @@ class Pages:
             if visitors:
                 page.redraw()
         except Exception as error:
-            # A second later the next one comes: not each has a traceback.
+            # Drawing is retried every second: not every failure prints a traceback.
             self._told.happened(type(error), "The page could not be drawn; trying again.", error)
             tell_all(
                 self._server,
@@ -223,13 +223,13 @@ class Pages:
 
 
 def next_frame(due: float, began: float) -> float:
-    """When to draw next: a frame that came late makes the next wait less, or its delay would be lost for good.
+    """Time of the next frame: after a late frame the next wait is shorter, or the delay would accumulate.
 
     Args:
-        due: When the last frame was to be drawn, in seconds.
-        began: When it was drawn.
+        due: Scheduled time of the last frame, in seconds.
+        began: Time at which it was drawn.
     """
-    return max(due + FRAME, began + FRAME / 2)
+    return max(due + FRAME_SECONDS, began + FRAME_SECONDS / 2)
 
 
 def draw_apart(
@@ -237,14 +237,14 @@ def draw_apart(
 ) -> None:
     """Send the panels first, unless they are None, then the 3-D view in a batch of its own.
 
-    A browser takes a batch as a whole, and one with anything of the 3-D view waits for the next frame of that view,
-    which may take long; numbers and buttons need not.
+    A browser handles a batch as a whole, and a batch with anything of the 3-D view waits for the next frame of that view,
+    which may take long; numbers and buttons need not wait.
     """
     if panels is not None:
         with server.atomic():
             panels()
         server.flush()
-        wait_until_taken(server, SENT_WITHIN)
+        wait_until_taken(server, PANELS_TIMEOUT_SECONDS)
     with server.atomic():
         scene()
     server.flush()

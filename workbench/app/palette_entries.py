@@ -1,4 +1,4 @@
-"""Entries of the palette that the open task has: its envs, cameras and control modes by name."""
+"""Palette entries of the open task: its envs, cameras and control modes by name."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.visitors import Visitors
 
 MAX_ENVS = 256
-"""Maximum number of envs with an entry; more entries would make every page wait for them."""
+"""Maximum number of envs with an entry; more entries would delay every page."""
 STUDIO = "Studio"
 
 
 class TaskCommands(PagePart[SessionView]):
-    """Make it in no container, after the commands of the page: the palette lists them in the order of making."""
+    """Palette entries of the open task. Construct it outside any container and after the commands of the page: the palette
+    lists entries in the order of creation."""
 
     def __init__(self, server: viser.ViserServer, visitors: Visitors) -> None:
         self._server, self._visitors = server, visitors
@@ -47,7 +48,7 @@ class TaskCommands(PagePart[SessionView]):
 
 
 def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
-    """Label, command, and what is below the label."""
+    """Label, command, and the text below the label."""
     task = view.task
     if task is None:
         return []

@@ -1,4 +1,4 @@
-"""Tells every open browser, whichever page and tab it shows, and the terminal why something was not recorded."""
+"""Reports to every open browser, on any page and tab, and to the terminal why something was not recorded."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from workbench.machine.loop import begin, do
 from workbench.page.widgets.notices import tell_all
 from workbench.record.state import RecordingStatus
 
-_LOOK = 0.2
-"""Seconds between two looks."""
+_POLL_SECONDS = 0.2
 REFUSED_SECONDS = 8.0
 
 
 class RecordingProblems:
-    """Follows the live session, also while another page is shown: it goes on recording.
+    """Watches the live session for problems, also while another page is shown, since it continues to record.
 
     Args:
-        session: The live session now, if there is one.
+        session: Returns the live session, if there is one.
         on_notice: Called with a message for the terminal.
     """
 
@@ -44,11 +43,11 @@ class RecordingProblems:
             session = self._session()
             if session is not None:
                 self._tell(session.view().of(RecordingStatus))
-            await asyncio.sleep(_LOOK)
+            await asyncio.sleep(_POLL_SECONDS)
 
     def _tell(self, now: RecordingStatus) -> None:
         before, self._before = self._before, now
-        # By identity: the same may happen again between two looks.
+        # By identity: the same problem may occur again between two polls.
         if now.problem is not None and now.problem is not before.problem:
             self._on_notice(now.problem)
             tell_all(self._server, "Not recorded", now.problem, "red")

@@ -1,4 +1,4 @@
-"""The review page: recordings in place of a live env, with the same timeline and keys."""
+"""The review page: shows recordings in place of a live env, with the same timeline and keys."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from workbench.library.panel import LibraryPanel
 from workbench.library.rows import OpenVersion
 from workbench.live.commands import TogglePlay
 from workbench.live.messages import CameraRequest
-from workbench.live.panels.timeline_panel import MOST_MARKS, TimeBar, strip_values, walk_tools
+from workbench.live.panels.timeline_panel import MAX_MARKS, TimeBar, strip_values, walk_tools
 from workbench.live.panels.view_panel import ViewPanel
 from workbench.live.timeline_commands import (
     GoToFirst,
@@ -65,19 +65,18 @@ from workbench.share.panel import Sharing
 from workbench.start.panel import OpenDialog
 from workbench.sweep.panel import SweepPanel
 
-TOLD_EVERY = 0.1
-"""Seconds between two drawings of the panels while a recording plays; numbers cannot be read faster."""
-PANEL_WIDTH = 340
-LIBRARY_WIDTH = 520
-LEAST_VIEW = 240
-"""Minimum width in pixels of the view between the library and another panel."""
-LEAST_BESIDE_SWEEP = 400
-"""Minimum width in pixels of the view in which an episode of a sweep is watched next to its table; the timeline
-needs most of it."""
-NARROW = 700
-"""Pixels of the view next to the library; below this there is no room for both."""
-TOLD_WIDTH = 20.0
-"""Seconds within which a page reports the new width of its view."""
+PANELS_PERIOD_SECONDS = 0.1
+"""Interval at which the panels are drawn while a recording plays; numbers cannot be read faster."""
+PANEL_WIDTH_PIXELS = 340
+LIBRARY_WIDTH_PIXELS = 520
+MIN_VIEW_PIXELS = 240
+"""Minimum width of the view between the library and another panel."""
+MIN_VIEW_BY_SWEEP_PIXELS = 400
+"""Minimum width of the view for watching an episode of a sweep next to its table; the timeline needs most of it."""
+NARROW_VIEW_PIXELS = 700
+"""Width of the view next to the library below which there is no room for both."""
+WIDTH_TIMEOUT_SECONDS = 20.0
+"""Time within which a page reports the new width of its view."""
 BACK = "Back to the live env"
 LIBRARY = "library"
 """Name of the panel in the page's report that the panel was unfolded."""
@@ -100,7 +99,7 @@ DOES: frozenset[type[Command]] = frozenset(
 
 @dataclass(frozen=True)
 class ReviewTools:
-    """What outlives a review page."""
+    """Objects that outlive a review page."""
 
     go_live: GoLive
     rescorer: Rescorer
@@ -109,16 +108,16 @@ class ReviewTools:
 
 
 class ReviewPage:
-    """The review's page, built and redrawn like the live page, without a worker or a task file.
+    """The review page, built and redrawn like the live page, without a worker or a task file.
 
     Args:
-        shared: The recordings, and what else all pages share.
+        shared: The recordings and the other objects that all pages share.
         open_task: The list of tasks.
-        tools: What can be done with recordings.
+        tools: Objects that outlive the page.
         also: Further commands that all pages have.
-        dark: The first theme.
-        anew: Show the first tab also to a browser that left the page at another one.
-        clock: Of all parts of the page.
+        dark: Whether the first theme is dark.
+        anew: Show the first tab, even in a browser that left the page on another tab.
+        clock: Clock of all parts of the page.
     """
 
     def __init__(
@@ -143,10 +142,10 @@ class ReviewPage:
         self._other_folded = False
         self._unfolded = "", 0.0
         """Name of the panel (library or rerun) that was unfolded last, and when, until the width was checked."""
-        self._told = DrawThrottle(TOLD_EVERY, clock)
+        self._told = DrawThrottle(PANELS_PERIOD_SECONDS, clock)
 
         server.gui.main_panel.dock_right()
-        server.gui.main_panel.set_width(PANEL_WIDTH)
+        server.gui.main_panel.set_width(PANEL_WIDTH_PIXELS)
         server.gui.set_panel_label("Recordings")
         self._status = server.gui.add_html("")
         self._opening = OpenDialog(server, open_task)
@@ -224,7 +223,7 @@ class ReviewPage:
         return None if task is None else OpenVersion(task.env_id, task.source_hash)
 
     def _add_library(self, library: Library) -> None:
-        """The table of recordings, in a panel of its own."""
+        """Add the table of recordings in its own panel."""
         self._library_window = self._server.gui.add_panel(order=5.0)
         self._sweep = self._sweep_of(library)
         with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
@@ -248,33 +247,33 @@ class ReviewPage:
             )
         )
         self._library_window.dock_left()
-        self._library_window.set_width(LIBRARY_WIDTH)
+        self._library_window.set_width(LIBRARY_WIDTH_PIXELS)
         self._library_open = True
         if self._had_opened and not self._review.view().library_stays:
             self._show_library(False)
 
     def _sweep_of(self, library: Library) -> SweepPanel | None:
-        """The tab with the results of a sweep, if the folder has some."""
+        """The tab with the results of a sweep, if the folder has results."""
         if library.view().sweep is None:
             return None
         with self._library_window.add_tab("Sweep", viser.Icon.ADJUSTMENTS_HORIZONTAL):
             return SweepPanel(self._server, library, self._open_of_sweep)
 
     def _add_late_sweep(self) -> None:
-        """Add the tab of a sweep whose results came after the page."""
+        """Add the tab of a sweep whose results arrived after the page was built."""
         if self._sweep is None and (sweep := self._sweep_of(self._shared.recordings.library)) is not None:
             self._sweep = sweep
             self._parts.add(sweep)
 
     def _open_of_sweep(self, ids: tuple[str, ...]) -> None:
-        # The panel stays: a person goes from the best episode to the worst.
-        self._review.open(ids, library_stays=self._smallest_view() >= LEAST_BESIDE_SWEEP)
+        # The panel stays open: the user compares several episodes of the sweep.
+        self._review.open(ids, library_stays=self._smallest_view() >= MIN_VIEW_BY_SWEEP_PIXELS)
 
     # --- drawing ---------------------------------------------------------------------------------
 
     @property
     def dark(self) -> bool:
-        """Its theme."""
+        """Whether the theme is dark."""
         return self._view_panel.dark
 
     def wait(self, seen: int, timeout: float) -> int:
@@ -282,10 +281,10 @@ class ReviewPage:
         return self._review.wait(seen, timeout)
 
     def counted(self, visitors: int) -> None:
-        """A review plays whoever looks."""
+        """Ignored: a review plays with or without viewers."""
 
     def close(self) -> None:
-        """It is shown no more."""
+        """Release the page: it will not be shown again."""
         self._library.end()
         self._share.close()
         if self._sweep is not None:
@@ -298,7 +297,7 @@ class ReviewPage:
         draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
 
     def _draw_panels(self, view: ReviewView) -> None:
-        """Draw the panels, all from one view; while it plays, less often than the 3-D view."""
+        """Draw all panels from one view; while a recording plays, less often than the 3-D view."""
         if not self._told.is_due(object(), urgent=None if view.playing else object()):
             return
         self._add_late_sweep()
@@ -327,12 +326,12 @@ class ReviewPage:
             return
         if ids != self._had_opened:
             self._had_opened = ids
-            if not ids or self._smallest_view() < NARROW:
+            if not ids or self._smallest_view() < NARROW_VIEW_PIXELS:
                 self._show_library(not ids)
 
     def _make_way(self, fold: Callable[[bool], None]) -> int:
         self._fold_other = fold
-        width = self._smallest_view() + (LIBRARY_WIDTH if self._library_open else 0)
+        width = self._smallest_view() + (LIBRARY_WIDTH_PIXELS if self._library_open else 0)
         self._show_library(False)
         return width
 
@@ -346,7 +345,7 @@ class ReviewPage:
         self._unfolded = "", 0.0
         if shown:
             # While it is folded, the other panel and the view share the width.
-            self._other_folded = 0 < self._smallest_view() < LIBRARY_WIDTH + LEAST_VIEW
+            self._other_folded = 0 < self._smallest_view() < LIBRARY_WIDTH_PIXELS + MIN_VIEW_PIXELS
             if self._other_folded:
                 self._fold_other(True)
             self._library_window.expand()
@@ -363,15 +362,15 @@ class ReviewPage:
         self._unfolded = panel, self._clock()
 
     def _fold_what_crowds(self) -> None:
-        """Fold the panel that was unfolded first, where library and rerun leave no room for the view.
+        """Fold the panel that was unfolded first if library and rerun leave no room for the view.
 
         A page reports its new width some time later; while rerun loads, that takes seconds.
         """
         last, since = self._unfolded
-        if not last or not 0 < self._smallest_view() < LEAST_VIEW:
+        if not last or not 0 < self._smallest_view() < MIN_VIEW_PIXELS:
             return
         self._unfolded = "", 0.0
-        if self._clock() - since > TOLD_WIDTH or not self._library_open:
+        if self._clock() - since > WIDTH_TIMEOUT_SECONDS or not self._library_open:
             return
         if last == LIBRARY:
             self._other_folded = True
@@ -461,9 +460,9 @@ FIRST, LAST = "first", "last"
 
 
 class ReviewTimeline(TimeBar[ReviewView]):
-    """The live page's slider, strip and keys, but counting forwards: a recording has a beginning and an end.
+    """The timeline of the live page, but counting forwards: a recording has a start and an end.
 
-    Each of several recordings has its own line on the strip, placed as they are aligned.
+    Each of several recordings has its own line on the strip, shifted by its alignment.
     """
 
     does = (StepBack, StepForward, PreviousEvent, NextEvent, Seek, GoToFirst, GoToLast)
@@ -501,13 +500,13 @@ class ReviewTimeline(TimeBar[ReviewView]):
 def fixed_values(view: ReviewView) -> dict[str, object]:
     """The values of the strip that do not depend on the position."""
     rows = [
-        (index, [h for h in view.opened[index].events if h.style != "reset"][:MOST_MARKS])
+        (index, [h for h in view.opened[index].events if h.style != "reset"][:MAX_MARKS])
         for index in shown_together(view)
     ]
     episode = view.opened[view.selected].episode
     reward = np.asarray(episode.reward, np.float64)
     if not episode.info.has_reward:
-        reward = np.full_like(reward, np.nan)  # ManiSkill's is 0 then
+        reward = np.full_like(reward, np.nan)  # ManiSkill reports 0 without a reward
     after, anchor = np.arange(1, len(reward) + 1), view.anchors[view.selected]
     over = column_at(after, reward, anchor, np.arange(view.first, view.last + 1)).astype(np.float32)
     styles = {h.style for _, marks in rows for h in marks}

@@ -1,4 +1,4 @@
-"""The application: all pages of one server, and what they share."""
+"""The application: all pages of one server, and the objects that they share."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from workbench.trust.consent_dialog import TrustDialog
 
 
 class App:
-    """All pages on one server, and what outlives them. Used by ``workbench``, ``open`` and ``review``.
+    """All pages on one server, and the objects that outlive them. Used by ``workbench``, ``open`` and ``review``.
 
     Args:
         gated_server: The server of the pages.
@@ -43,7 +43,7 @@ class App:
         trust: Run code named by recordings without asking.
         on_notice: Called, on any thread, with a message for the terminal.
         editor: Address of a line in the author's editor, as `parse_editor` gives it.
-        choices: What the list of tasks offers, and how a chosen one is opened; None for no recent ones and `make_session`.
+        choices: Further entries of the list of tasks, and how a chosen task is opened; None: no recent tasks, `make_session`.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class App:
         )
         self._editor = editor
         self.renew_token: Callable[[], None] | None = None
-        """Set before the first page is shown, where there is a token."""
+        """Set before the first page is shown, if there is a token."""
         shared.visitors.do = self._do
         self._dialog = TrustDialog(shared.server)
         clearances = Clearances(shared.task_files, self._dialog.ask, all_trusted=trust)
@@ -84,7 +84,7 @@ class App:
 
     @property
     def does(self) -> frozenset[type[Command]]:
-        """Commands that are carried out whichever page is shown."""
+        """Commands that work on every page."""
         return frozenset({OpenHelp} if self.renew_token is None else {OpenHelp, RenewToken})
 
     def _do(self, command: Command, visitor: Visitor) -> Done:

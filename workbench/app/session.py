@@ -1,4 +1,4 @@
-"""The live session: takes requests of the page and events of the worker."""
+"""The live session: handles requests of the page and events of the worker."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ HISTORY_BYTES = 256 * 1024**2
 
 @dataclass(frozen=True)
 class KeptWork:
-    """What a person did in a session, for a later session of the same task."""
+    """The user's work in a session, for a later session of the same task."""
 
     options: TaskOptions
     settings: Settings
@@ -85,9 +85,9 @@ class KeptWork:
 class Session:
     """One task, one worker, any number of pages. All methods may be called on any thread, and return at once.
 
-    Its state is one value, which changes on the loop (`machine.loop`): `happen` takes an event, `apply` says what the state is
-    after it and what has to be done, and `_perform` begins that. Nothing waits for the env. When the
-    worker dies, `Supervisor` starts another, which loads the last good version; pages stay open.
+    Its state is one value, which changes on the loop (`machine.loop`): `happen` takes an event, `apply` returns the next
+    state and the effects, and `_perform` starts each effect. Nothing waits for the env. When the worker dies, `Supervisor`
+    starts another, which loads the last good version; pages stay open.
     """
 
     def __init__(
@@ -107,15 +107,15 @@ class Session:
     ) -> None:
         """
         Args:
-            task: a file, ``file.py:ClassName``, or a registered env id; or what a recording names, cleared.
-            recordings: folder for recorded episodes; made when the first is written.
+            task: a file, ``file.py:ClassName``, or a registered env id; or a cleared task of a recording.
+            recordings: folder for recorded episodes; created when the first is written.
             history_bytes: memory limit of the history.
             worker: limits of the worker process, and whether there is a spare one.
-            kept: of an earlier session of this task; its options are used in place of `options`.
+            kept: work of the previous session of this task; its options replace `options`.
             check: whether the rules are checked after each load, until a `CheckAfterSave`.
-            make_worker: makes the supervisor; tests without a worker process give another.
+            make_worker: makes the supervisor; tests without a worker process replace it.
             on_event: called with every event of the worker, and with its death as `TaskFailed`, on the supervisor's thread.
-            on_line: called with the lines that the worker printed, from other threads; drops some of a flood.
+            on_line: called with the lines that the worker printed, on other threads; lines of a flood are dropped.
             on_notice: called, on any thread, with a message for the terminal.
         """
         self.reference = task
@@ -136,7 +136,7 @@ class Session:
         self._enter_numbers = itertools.count(1)
         self._printed = PrintedLog(self._on_lines)
         self._aside = BlockingPool("follow")
-        """Begins to watch files, for which they are read."""
+        """Starts to watch files, which reads them first."""
         self._watcher = SourceWatcher(self._on_files_changed)
         self._policy_file = PolicyFile(self._on_policy_saved)
         self._worker = make_worker(
@@ -158,7 +158,7 @@ class Session:
         self._policies = PolicySearch(self._happen)
         self._asker = QuestionClient(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
-        # Last: what it recovers happens at once.
+        # Last: it reports recovered episodes at once.
         self._recorder = LiveRecorder(recordings, self._happen, on_notice)
         self._past_saver = PastSaver(recordings, self._recorder.finisher, self._background, self._happen)
         self._past_rescorer = PastRescorer(self._background, self._happen)
@@ -166,30 +166,31 @@ class Session:
         self._watcher.follow(watched_files(self._run))
         self._worker.start()
 
-    # --- what happens ------------------------------------------------------------------------------
+    # --- events ------------------------------------------------------------------------------------
 
     def do(self, command: Command, page: str = "") -> None:
         """Carry out a command of `state.DOES`.
 
         Args:
-            page: name of the page that asks.
+            page: name of the page that sends it.
 
         Raises:
-            Refused: it makes no sense now; nothing has changed.
+            Refused: the command makes no sense now; nothing has changed.
         """
         self.happen(Asked(command, page))
 
     def happen(self, event: SessionEvent) -> None:
-        """Take an event: what a page asks for, what the worker says, a saved file.
+        """Handle an event: a command of a page, a message of the worker, a saved file.
 
         Raises:
             Refused: a command makes no sense now; nothing has changed.
         """
         for begun in do(lambda: self._happen(event)):
-            wait_for_disk(begun)  # then a save is noticed
+            wait_for_disk(begun)  # when this returns, saves are noticed
 
     def _happen(self, event: SessionEvent) -> list[Future[None]]:
-        """Returns what was begun beside the loop. An effect that fails costs no other one: it is reported, or raised to who asked."""
+        """Handle an event; returns the work started off the loop. If an effect fails, the others are still performed: the failure
+        is reported, or raised to the caller."""
         before, begun, failure = self._state, list[Future[None]](), None
         self._state, effects = apply(before, event, Now(time.monotonic(), time.time()))
         for effect in effects:
@@ -211,7 +212,7 @@ class Session:
         return self._state.run
 
     def _perform(self, effect: Effect) -> Future[None] | None:
-        """Begin it. Returns what is done beside the loop."""
+        """Start an effect. Returns the work that runs off the loop, if any."""
         match effect:
             case Send(request=request):
                 self._send(request)
@@ -258,12 +259,12 @@ class Session:
 
     @on_loop
     def look(self, read: Callable[[Run], Value]) -> Value:
-        """What `read` gives of the present run. It runs on the loop, since the history is written into there."""
+        """The result of `read` for the present run. `read` runs on the loop, since the history is written there."""
         return read(self._run)
 
     @property
     def present_reference(self) -> TaskName:
-        """The task as it is named now: another class of the file, or a copy of the file, may have been chosen since."""
+        """The present name of the task: another class of the file, or a copy of the file, may have been chosen since."""
         return self._run.reference
 
     @on_loop
@@ -302,7 +303,7 @@ class Session:
 
     @on_loop
     def kept_work(self) -> KeptWork:
-        """What a person did in this session, for a later session of the same task."""
+        """The user's work in this session, for a later session of the same task."""
         run = self._run
         return KeptWork(run.options, run.settings, run.seed, kept_placements(self._state.studio))
 
@@ -317,8 +318,8 @@ class Session:
         return self._recorder.finisher.finished.count
 
     def knows_file(self, path: str) -> bool:
-        """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder. Looks at the disk
-        for the last two."""
+        """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder. Reads the disk for
+        the last two."""
         run, file = self._run, Path(path)
         if file in [Path(one).absolute() for one in run.own_files]:
             return True
@@ -356,7 +357,7 @@ class Session:
         return number
 
     def close(self) -> None:
-        """End all processes and threads; waits for episodes that are being written. Called on another thread than the loop."""
+        """End all processes and threads; waits for episodes that are being written. Must not be called on the loop."""
         stop_listening(self._log)
         self._changes.close()
         self._worker.stop()
@@ -385,15 +386,15 @@ class Session:
         return requests
 
     def _take(self, event: Event) -> None:
-        """Take an event of the worker. Called on the supervisor's thread, which continues when the event was taken."""
-        # Files are read here: a disk that hangs must not keep the loop.
+        """Handle an event of the worker. Called on the supervisor's thread, which continues after the event was handled."""
+        # Files are read here: a disk that hangs must not block the loop.
         if isinstance(event, TaskFailed):
-            # Before a person sees the problem and mends the file.
+            # Before the user sees the problem and fixes the file.
             files = self.look(lambda run: files_at_fault(run, event))
             wait_for_disk(do(lambda: self._perform(Follow(files))) if files else None)
         on_disk = True
         if isinstance(event, Loaded):
-            # The watcher finds later what has changed by then.
+            # The watcher finds changes made after this.
             looked = do(lambda: self._aside.begin(partial(_is_on_disk, event.task.source)))
             wait_for_disk(looked)
             on_disk = not looked.done() or looked.cancelled() or looked.result()
@@ -401,23 +402,23 @@ class Session:
             self._on_event(event)
 
     def _on_death(self, death: Death) -> None:
-        """Take the death of a worker. Called on the supervisor's thread."""
+        """Handle the death of a worker. Called on the supervisor's thread."""
         problem, kept = do(lambda: self._died(death))
         if problem is not None:
             self._on_event(TaskFailed(problem, kept))
 
     def _died(self, death: Death) -> tuple[Problem | None, bool]:
-        """Returns the problem to show, if any, and whether there is a version to bring back."""
+        """Returns the problem to show, if any, and whether there is a version to restore."""
         before = self._run.problem_serial
         self._happen(WorkerDied(death, self._printed.tail(20)))
         run = self._run
         return run.problem if run.problem_serial != before else None, run.task is not None
 
     def _handle(self, event: Event, on_disk: bool) -> bool:
-        """Take an event; returns whether anybody needs to hear of it.
+        """Handle an event; returns whether `on_event` needs it.
 
         Args:
-            on_disk: of a version that was loaded: whether the files still have its texts.
+            on_disk: for a loaded version, whether the files still have its texts.
         """
         match event:
             case TaskFailed() if self._worker.load_pending and event.problem.interrupted:
@@ -447,7 +448,7 @@ class Session:
         self._happen(FileSaved())
 
     def _on_policy_saved(self) -> None:
-        """Read the policy again. Called on the watcher's thread."""
+        """Reload the policy. Called on the watcher's thread."""
         # A policy in the task's folder is also watched as a module of the task, for which a save reports "nothing changed".
         self._log("the policy's file was saved: it is read again")
         self.happen(PolicySaved())

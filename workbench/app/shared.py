@@ -1,4 +1,4 @@
-"""What the pages of one server share."""
+"""The objects that the pages of one server share."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from workbench.page.widgets.visitors import PATH, Visitors
 from workbench.review.playback import Review
 from workbench.review.recorded_scene import SceneProcess
 
-ENOUGH_MEMORY = 4 << 30
-"""Minimum free memory in bytes for drawing pictures of tasks while a task is open."""
-_RECOVERED_WITHIN = 10.0
-"""Timeout in seconds, at the end of the program, for the recovery of episodes."""
+MIN_FREE_BYTES = 4 << 30
+"""Minimum free RAM for rendering catalogue thumbnails while a task is open."""
+_RECOVERY_TIMEOUT_SECONDS = 10.0
+"""Timeout, at the end of the program, for the recovery of episodes."""
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """The recordings of a folder, and the review of those that are open."""
+    """The recordings of a folder, and the review of the open ones."""
 
     library: Library
     review: Review
 
 
 class Shared:
-    """The sessions, the recordings, the 3-D view, and which page is shown.
+    """The sessions, the recordings, the 3-D view, and the shown page.
 
     Args:
         gated_server: The server of the pages.
         folder: The folder that is recorded to and reviewed.
-        make_page: Builds a page, as `Pages` asks for it.
+        make_page: Builds a page; see `Pages`.
         session: The live env, if there is one.
         tasks: Task files that may define the envs of foreign recordings.
         imports: Modules that register tasks, as in `TaskOptions.imports`.
@@ -64,21 +64,21 @@ class Shared:
         self._first: Path | Literal["newest"] = "newest"
         """Recording that the first review opens."""
         self.looks_at = False
-        """Whether the next review page is for a recording that a person chose on another page."""
+        """Whether the next review page opens a recording that the user chose on another page."""
         self._recovering = BlockingPool("recover")
         self.visitors = Visitors(self.server, COMMANDS)
         gated_server.add_channel(PATH, self.visitors.serve)
         self.session = session
         """Session that the live page shows when it is next built."""
         self.home = session
-        """The session that a person opened, by command or from the list. `session` is another one while a recording of
-        another task is continued."""
+        """The session that the user opened, by command or from the list. `session` differs while a recording of another task
+        is continued."""
         self.stage = View3D(self.server)
         self.pages = Pages(self.server, self.stage, make_page)
 
     @property
     def recordings(self) -> Recordings:
-        """The folder is read at the first access, by the first review page; it stays open until the program ends."""
+        """The recordings. The first access, by the first review page, reads the folder; it stays open until the program ends."""
         self._recordings = self._recordings or self._open_recordings()
         return self._recordings
 
@@ -90,12 +90,12 @@ class Shared:
         library.watch()
         opened = Recordings(library, review)
         if self.session is None:
-            # With a live env its recorder has recovered them already, and is writing.
+            # With a live env, its recorder has already recovered them, and is writing.
             self._recovering.begin(lambda: self._recover(opened))
         return opened
 
     def _recover(self, opened: Recordings) -> None:
-        """Recover episodes of a writer that was killed."""
+        """Recover episodes that a killed program left half written."""
         try:
             recovered = [str(file) for file in recover_confined(self._folder)]
         except OSError as error:
@@ -122,17 +122,17 @@ class Shared:
         return tuple(file.absolute() for file in (*live, *self._tasks))
 
     def is_idle(self) -> bool:
-        """Whether the machine is free for other work than an open task."""
+        """Whether the machine has capacity for work besides an open task."""
         session = self.session
         if session is None:
             return True
         view = session.view()
         free = psutil.virtual_memory().available
-        return view.state in ("paused", "error", "stopped") and view.busy is None and free > ENOUGH_MEMORY
+        return view.state in ("paused", "error", "stopped") and view.busy is None and free > MIN_FREE_BYTES
 
     def close(self) -> None:
-        """End the recovery of episodes, and close the recordings. The sessions stay."""
-        self._recovering.close(_RECOVERED_WITHIN)
+        """End the recovery of episodes, and close the recordings. Sessions are not closed."""
+        self._recovering.close(_RECOVERY_TIMEOUT_SECONDS)
         if self._recordings is not None:
             self._recordings.review.close()
             self._recordings.library.close()

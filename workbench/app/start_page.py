@@ -1,4 +1,4 @@
-"""The start page: the list of tasks, while none is open."""
+"""The start page: the list of tasks, shown while none is open."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from workbench.start.panel import TaskList
 
 
 class StartPage:
-    """The list in a panel over the whole window (``.wb-start`` in page.css): there is no scene to look at.
+    """The list of tasks in a panel over the whole window (``.wb-start`` in page.css), since there is no scene.
 
     Args:
-        shared: What all pages share.
+        shared: The objects that all pages share.
         open_task: The list of tasks.
         also: Further commands that all pages have.
-        dark: The first theme.
-        clock: Of all parts of the page.
+        dark: Whether the first theme is dark.
+        clock: Clock of all parts of the page.
     """
 
     def __init__(
@@ -65,15 +65,15 @@ class StartPage:
         return None
 
     def wait(self, seen: int, timeout: float) -> int:
-        """It is drawn at its own pace; see `Pages`."""
+        """See `ShownPage`; this page is redrawn at a fixed interval."""
         time.sleep(timeout)
         return seen
 
     def counted(self, visitors: int) -> None:
-        """It has no pictures that somebody would have to draw."""
+        """Ignored: the page has no pictures to render."""
 
     def close(self) -> None:
-        """Nothing of it lasts."""
+        """Does nothing: the page holds no resources."""
 
     def redraw(self) -> None:
         """Draw what has changed."""

@@ -1,4 +1,4 @@
-"""All that a session knows, as one value, and how each event changes it."""
+"""The state of a session as one value, and how each event changes it."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ DOES: frozenset[type[Command]] = (
     | of_solver.DOES
     | of_studio.DOES
 )
-"""Commands that `apply` takes."""
+"""Commands that `apply` handles."""
 
 
 @dataclass(frozen=True)
 class State:
-    """One moment of a session. Parts that an event did not change are the same objects."""
+    """State of a session. Parts that an event did not change are the same objects."""
 
     run: Run
     recording: of_recording.LiveRecording
@@ -75,18 +75,18 @@ class State:
     profile: of_profile.ProfileView = of_profile.ProfileView()
     """Where the time of a step of the running version goes."""
     seeds: of_seeds.SeedsView = of_seeds.SeedsView()
-    """The task solved from many seeds."""
+    """The job that solves the task from many seeds."""
     solving: of_solver.Solving = of_solver.Solving()
-    """Plans of the source of actions *solve*."""
+    """Plans for the action source *solve*."""
     policies: of_policies.KnownPolicies = of_policies.KnownPolicies()
-    """Policies to choose from, for the source of actions *policy*."""
+    """Policies to choose from, for the action source *policy*."""
 
 
 def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
-    """The state after an event, and what has to be done.
+    """The state after an event, and the effects to perform.
 
     Raises:
-        Refused: a command makes no sense now; nothing has changed.
+        Refused: the command makes no sense now; nothing has changed.
     """
     before, solved = state.run, state.solving.solved
     run, for_run = of_run.apply(before, event, now)
@@ -100,7 +100,7 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
     new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
-    # Rescoring begins before checks: the later of two jobs of one priority comes first. What the run has to do comes after
-    # them: when a load is done a recording continues before a recorded run is entered.
+    # Rescoring starts before checks: of two jobs of one priority the later one runs first. Effects of the run come after
+    # them: when a load is done, a recording continues before a recorded run is entered.
     for_jobs = [*for_recording, *for_rescoring, *for_checks, *for_profile, *for_seeds, *for_solver]
     return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio]

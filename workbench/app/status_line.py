@@ -20,8 +20,8 @@ from workbench.record.state import RecordingStatus
 from workbench.solve.state import SolveView
 from workbench.task.description import TaskDescription
 
-NEWS = 6.0
-"""Seconds for which a new version is announced."""
+NEW_VERSION_SECONDS = 6.0
+"""Time for which a new version is announced."""
 
 STATE_WORDS = {
     "starting": "starting",
@@ -58,12 +58,12 @@ class StatusLine(MomentPart):
         )
 
     def _is_fresh(self, view: SessionView) -> bool:
-        """Whether a new version came less than `NEWS` seconds ago."""
+        """Whether a new version was loaded less than `NEW_VERSION_SECONDS` ago."""
         if view.task_serial != self._task_serial:
             # The first version is not announced.
             self._loaded_at = self._clock() if self._task_serial else -math.inf
             self._task_serial = view.task_serial
-        return self._clock() - self._loaded_at < NEWS
+        return self._clock() - self._loaded_at < NEW_VERSION_SECONDS
 
     def draw(self, view: SessionView) -> None:
         self._handle.content = render("status_line", **status_values(view, self._is_fresh(view)))
@@ -73,13 +73,13 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
     """The values of the template.
 
     Args:
-        fresh: a new version has just come.
+        fresh: whether a new version has just been loaded.
     """
     task = view.task
-    # While the renderer works, the session's activity says more than "busy".
+    # While the renderer works, the session's activity is more specific than "busy".
     busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
     moving = view.playing and view.state == "running" and task is not None and busy is None
-    # A plan takes what it takes: rates of single steps would only say that it is slow.
+    # Planning dominates the time: rates of single steps would mean nothing.
     planning = moving and view.settings.action_source == "solve"
     starting = planning and view.of(SolveView).state == "starting"
     known = view.steps_per_second > 0  # from the second step on
@@ -107,7 +107,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
 
 
 def _recording(recording: RecordingStatus) -> Literal["", "waits", "on"]:
-    """Whether a step would be recorded, of any env."""
+    """Whether a step of any env would be recorded."""
     if not recording.active:
         return ""
     return "waits" if recording.waiting == len(recording.env_idx) else "on"
@@ -124,15 +124,15 @@ def robot_text(task: TaskDescription) -> str:
     return " · ".join(part for part in parts if part)
 
 
-SLOWS = 0.3
-"""Minimum share of the time that is named as what slows down playing."""
+MIN_SLOWING_SHARE = 0.3
+"""Minimum share of the time at which recording or rendering is named as the cause of slow playing."""
 
 
 def slowed_by(view: SessionView) -> tuple[str, str] | None:
     """The part of recording and watching that takes most of the measured time while playing, as a short and a full
     text; None for neither."""
     task, recorded, watched = view.task, view.recorded_share, view.watched_share
-    if task is None or max(recorded, watched) < SLOWS:
+    if task is None or max(recorded, watched) < MIN_SLOWING_SHARE:
         return None
     rate = f"{rate_text(view.steps_per_second)} steps a second"
     if recorded >= watched:

@@ -1,4 +1,4 @@
-"""The camera that is chosen in the Studio: its place, its picture, what it sees."""
+"""Commands of the camera that is chosen in the Studio: placement, lens, pictures, reports, changes of the file."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import msgspec
 
 from workbench.page.command import Command
 
-FARTHEST = 1000.0
-"""Most metres from the origin."""
+MAX_COORDINATE_METRES = 1000.0
+"""Maximum absolute value of a coordinate."""
 Axis = Literal["x", "y", "z"]
 Angle = Literal["roll", "pitch", "yaw"]
 RotationForm = Literal["roll, pitch, yaw", "quaternion wxyz", "forward and up"]
 LensForm = Literal["field of view", "intrinsic matrix"]
-Number = Annotated[float, msgspec.Meta(ge=-FARTHEST, le=FARTHEST)]
+Number = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE_METRES, le=MAX_COORDINATE_METRES)]
 
 
 class SelectCamera(Command, frozen=True):
@@ -119,7 +119,7 @@ class TurnCameraDown(Command, frozen=True):
 
 
 class ToggleLookThrough(Command, frozen=True):
-    """Look through the chosen camera, or go back to my view."""
+    """Look through the chosen camera, or return to my view."""
 
 
 class MoveCameraToView(Command, frozen=True):
@@ -127,15 +127,15 @@ class MoveCameraToView(Command, frozen=True):
 
 
 class ResetCamera(Command, frozen=True):
-    """Put the chosen camera back to the placement in the file."""
+    """Return the chosen camera to its placement in the file."""
 
 
 class PutMovedCamerasBack(Command, frozen=True):
-    """Put all cameras back that were moved by hand."""
+    """Return all moved cameras to their placement in the file."""
 
 
 class ShowCameraChange(Command, frozen=True):
-    """Show the change of the file for the camera that was moved."""
+    """Show the change of the file for the moved camera."""
 
 
 class ChooseHandles(Command, frozen=True):
@@ -145,19 +145,19 @@ class ChooseHandles(Command, frozen=True):
 
 
 class ChooseAxes(Command, frozen=True):
-    """Move the camera along the world's axes, or along its own."""
+    """Move the camera along the world's axes or along its own."""
 
     own: bool
 
 
 class ChooseSnap(Command, frozen=True):
-    """Move and turn the camera in steps of this size."""
+    """Move and rotate the camera in steps of this size."""
 
     snap: str
 
 
 class ShowOneEnv(Command, frozen=True):
-    """Show the selected env alone, or all."""
+    """Show only the selected env, or all."""
 
     one: bool
 
@@ -169,22 +169,22 @@ class ShowModality(Command, frozen=True):
 
 
 class ScalePreview(Command, frozen=True):
-    """Draw the preview in another size."""
+    """Render the preview at this scale."""
 
     scale: float
 
 
 class PickPixel(Command, frozen=True):
-    """Say what the camera sees at a place of its picture."""
+    """Show what the camera sees at a pixel of its picture."""
 
     x: float
-    """0 at the left border, 1 at the right."""
+    """0 at the left edge, 1 at the right."""
     y: float
-    """0 at the upper border, 1 at the lower."""
+    """0 at the top edge, 1 at the bottom."""
 
 
 class ShowMeasuredMoment(Command, frozen=True):
-    """Show a moment that the camera was measured at."""
+    """Show a state that the camera was measured in."""
 
     number: int
 
@@ -196,134 +196,134 @@ class UseSuggestedPlane(Command, frozen=True):
 
 
 class ToggleWantedObject(Command, frozen=True):
-    """Ask that an object be visible from a suggested placement, or no longer."""
+    """Add an object to, or remove it from, those that a suggested placement must see."""
 
     name: str
 
 
 class ToggleAllLinks(Command, frozen=True):
-    """List all links of the robot, or a few."""
+    """List all links of the robot, or only a few."""
 
 
 class UsePlacement(Command, frozen=True):
-    """Put the camera where a suggestion has it."""
+    """Move the camera to a suggested placement."""
 
     number: int
 
 
 class ChooseCamera(Command, frozen=True):
-    """Choose a camera in the Studio by its name in the list there, or none."""
+    """Choose a camera in the Studio by its name in the list, or none."""
 
     name: str
 
 
 class SetCameraPosition(Command, frozen=True):
-    """Place the chosen camera at this coordinate, in metres."""
+    """Set this coordinate of the chosen camera's position, in metres."""
 
     of: Axis
     to: Number
 
 
 class SetCameraTarget(Command, frozen=True):
-    """Turn the chosen camera to a target with this coordinate, in metres."""
+    """Set this coordinate of the target that the chosen camera looks at, in metres."""
 
     of: Axis
     to: Number
 
 
 class ChooseRotationForm(Command, frozen=True):
-    """Write the rotation of the chosen camera as angles, as a quaternion, or as two axes."""
+    """Show the rotation of the chosen camera as angles, as a quaternion, or as two axes."""
 
     form: RotationForm
 
 
 class SetCameraAngle(Command, frozen=True):
-    """Turn the chosen camera to this angle, in degrees."""
+    """Set this angle of the chosen camera's rotation, in degrees."""
 
     of: Angle
     to: Number
 
 
 class SetCameraQuaternion(Command, frozen=True):
-    """Turn the chosen camera as this quaternion says: four numbers, w first."""
+    """Set the rotation of the chosen camera as a quaternion: four numbers, w first."""
 
     wxyz: Annotated[str, msgspec.Meta(max_length=200)]
 
 
 class SetCameraForward(Command, frozen=True):
-    """Turn the chosen camera so that its line of sight has this component."""
+    """Set this component of the chosen camera's forward direction."""
 
     of: Axis
     to: Number
 
 
 class SetCameraUp(Command, frozen=True):
-    """Turn the chosen camera so that the top of its picture has this component."""
+    """Set this component of the chosen camera's up direction."""
 
     of: Axis
     to: Number
 
 
 class ChooseLensForm(Command, frozen=True):
-    """Say the lens of the chosen camera by a field of view, or by an intrinsic matrix of the same picture."""
+    """Give the lens of the chosen camera as a field of view, or as an intrinsic matrix of the same picture."""
 
     form: LensForm
 
 
 class SetFieldOfView(Command, frozen=True):
-    """Give the chosen camera this vertical field of view, in degrees."""
+    """Set the vertical field of view of the chosen camera, in degrees."""
 
     degrees: Annotated[float, msgspec.Meta(ge=1.0, le=175.0)]
 
 
 class SetFieldOfViewInRadians(Command, frozen=True):
-    """Give the chosen camera this vertical field of view, in radians."""
+    """Set the vertical field of view of the chosen camera, in radians."""
 
     radians: Annotated[float, msgspec.Meta(ge=0.02, le=3.05)]
 
 
 class SetFocalLength(Command, frozen=True):
-    """Give the chosen camera this focal length, in pixels."""
+    """Set a focal length of the chosen camera, in pixels."""
 
     of: Literal["fx", "fy"]
     to: Annotated[float, msgspec.Meta(ge=1.0, le=1e5)]
 
 
 class SetOpticalCentre(Command, frozen=True):
-    """Put the optical axis of the chosen camera at this place of its picture, in pixels."""
+    """Set the optical centre (principal point) of the chosen camera, in pixels."""
 
     of: Literal["cx", "cy"]
     to: Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
 
 
 class SetPictureSize(Command, frozen=True):
-    """Give the chosen camera's picture this width or height, in pixels."""
+    """Set the width or height of the chosen camera's picture, in pixels."""
 
     of: Literal["width", "height"]
     to: Annotated[int, msgspec.Meta(ge=8, le=4096)]
 
 
 class SetNearOrFar(Command, frozen=True):
-    """Draw nothing that is nearer or farther from the chosen camera than this, in metres."""
+    """Set the near or far plane of the chosen camera, in metres."""
 
     of: Literal["near", "far"]
     to: Annotated[float, msgspec.Meta(ge=1e-4, le=1e4)]
 
 
 class ChooseShader(Command, frozen=True):
-    """Draw the chosen camera's picture with this shader pack."""
+    """Render the chosen camera's picture with this shader pack."""
 
     shader: str
 
 
 class ShowFrustums(Command, frozen=True):
-    """Draw the cameras, with their pictures, in the 3D view, or not."""
+    """Show or hide the camera frustums with their pictures in the 3D view."""
 
     on: bool
 
 
 class ShowPictures(Command, frozen=True):
-    """Show a camera's colours, depth, segmentation or another of its modalities, or not."""
+    """Show or hide a camera's colours, depth, segmentation or another modality."""
 
     kind: Literal["sensor", "human"]
     name: str
@@ -331,8 +331,8 @@ class ShowPictures(Command, frozen=True):
     on: bool
 
 
-MOST_MEASURED = 1000
-"""Steps, or resets, that a camera is measured over."""
+MAX_MEASURED = 1000
+"""Maximum number of steps or resets that a camera is measured over."""
 
 Measured = Literal["envs", "steps", "resets"]
 
@@ -344,15 +344,15 @@ class ChooseMeasured(Command, frozen=True):
 
 
 class ChooseMeasuredSteps(Command, frozen=True):
-    """Choose how many steps of the episode a camera is measured over at most."""
+    """Choose the maximum number of steps of the episode that a camera is measured over."""
 
-    steps: Annotated[int, msgspec.Meta(ge=1, le=MOST_MEASURED)]
+    steps: Annotated[int, msgspec.Meta(ge=1, le=MAX_MEASURED)]
 
 
 class ChooseMeasuredResets(Command, frozen=True):
     """Choose how many fresh resets a camera is measured over."""
 
-    resets: Annotated[int, msgspec.Meta(ge=1, le=MOST_MEASURED)]
+    resets: Annotated[int, msgspec.Meta(ge=1, le=MAX_MEASURED)]
 
 
 class MeasureChosenCamera(Command, frozen=True):
@@ -364,11 +364,11 @@ class DrawSheet(Command, frozen=True):
 
 
 class StopMeasuring(Command, frozen=True):
-    """Stop what measures, compares or searches for a camera."""
+    """Stop measuring, comparing or searching for a camera."""
 
 
 class ChooseCompared(Command, frozen=True):
-    """Choose the placement that the chosen camera's present one is compared with."""
+    """Choose the placement to compare with the current one of the chosen camera."""
 
     other: Literal["file", "before", "kept"]
 
@@ -382,11 +382,11 @@ class ComparePlacements(Command, frozen=True):
 
 
 class ReturnToKept(Command, frozen=True):
-    """Put the chosen camera back to the placement that was kept as A."""
+    """Return the chosen camera to the placement kept as A."""
 
 
 class SetSearchBox(Command, frozen=True):
-    """Bound the box in which a placement is searched, and draw it."""
+    """Set a bound of the box in which placements are searched, and draw the box."""
 
     corner: Literal["from", "to"]
     axis: Literal[0, 1, 2]
@@ -394,33 +394,33 @@ class SetSearchBox(Command, frozen=True):
 
 
 class ShowSearchBox(Command, frozen=True):
-    """Draw the box in which a placement is searched, or not."""
+    """Show or hide the box in which placements are searched."""
 
     on: bool
 
 
-MOST_SEARCHED = 256
-"""Resets that a placement is searched over."""
+MAX_SEARCH_RESETS = 256
+"""Maximum number of resets that a placement is searched over."""
 
 
 class ChooseSearchResets(Command, frozen=True):
-    """Choose how many fresh resets a placement is searched over."""
+    """Choose how many fresh resets a search for placements covers."""
 
-    resets: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEARCHED)]
+    resets: Annotated[int, msgspec.Meta(ge=1, le=MAX_SEARCH_RESETS)]
 
 
 class SearchPlacements(Command, frozen=True):
-    """Search placements of the chosen camera that see the wanted objects."""
+    """Search for placements of the chosen camera that see the wanted objects."""
 
 
 class ChooseConvention(Command, frozen=True):
-    """Choose the convention of the camera's own axes, for what is shown and what is pasted."""
+    """Choose the axis convention of shown and pasted camera poses."""
 
     convention: Literal["opencv", "opengl", "maniskill"]
 
 
 class ChooseDirection(Command, frozen=True):
-    """Choose the direction of a camera's matrix, for what is shown and what is pasted."""
+    """Choose the direction of shown and pasted camera matrices."""
 
     direction: Literal["world_to_camera", "camera_to_world"]
 
@@ -435,7 +435,7 @@ class ChooseCameraFile(Command, frozen=True):
 
 
 class ChooseDownloaded(Command, frozen=True):
-    """Choose whether all cameras are downloaded, or the chosen one."""
+    """Choose whether all cameras or only the chosen one are downloaded."""
 
     every: bool
 
@@ -445,7 +445,7 @@ class DownloadCamera(Command, frozen=True):
 
 
 class PasteCalibration(Command, frozen=True):
-    """Paste the calibration that the chosen camera will be placed by."""
+    """Paste the calibration by which to place the chosen camera."""
 
     text: Annotated[str, msgspec.Meta(max_length=20_000)]
 
@@ -469,25 +469,24 @@ class SaveCameraChange(Command, frozen=True):
 
 
 class RevertCameraChange(Command, frozen=True):
-    """Take the last saved change of a camera out of the file."""
+    """Revert the last saved change of a camera in the file."""
 
 
 class CopyTask(Command, frozen=True):
-    """Copy the task to a file of my own, and open it."""
+    """Copy the task to a file of my own and open it."""
 
 
 class DropCameraChange(Command, frozen=True):
-    """Discard the shown change of a camera, or close what is said of it."""
+    """Discard the shown change of a camera, or close the notice about it."""
 
 
-LONGEST_CAMERA_NAME = 64
-"""Characters."""
+MAX_CAMERA_NAME_CHARACTERS = 64
 
 
 class NameCamera(Command, frozen=True):
     """Name the camera that is added, copied or renamed next."""
 
-    name: Annotated[str, msgspec.Meta(max_length=LONGEST_CAMERA_NAME)]
+    name: Annotated[str, msgspec.Meta(max_length=MAX_CAMERA_NAME_CHARACTERS)]
 
 
 class AddCamera(Command, frozen=True):

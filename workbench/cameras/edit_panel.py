@@ -14,7 +14,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.cameras.commands import (
-    LONGEST_CAMERA_NAME,
+    MAX_CAMERA_NAME_CHARACTERS,
     AddCamera,
     CopyTask,
     DropCameraChange,
@@ -206,7 +206,7 @@ class WriteToFile(PagePart[SessionView]):
             self._change = CameraChange(server, folder)
         with gui.add_folder("Add, copy, rename, remove", expand_by_default=False):
             self._typed = Field(
-                server, "New name", NameCamera, "name", hint=NAME_HINT, longest=LONGEST_CAMERA_NAME
+                server, "New name", NameCamera, "name", hint=NAME_HINT, longest=MAX_CAMERA_NAME_CHARACTERS
             )
             self._members = gui.add_html("")
             gui.add_html(render("aside", text=WHERE))

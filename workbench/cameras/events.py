@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.cameras.commands import MOST_MEASURED, Measured
+from workbench.cameras.commands import MAX_MEASURED, Measured
 from workbench.cameras.questions import DrawCamera, MeasureCamera
 from workbench.cameras.view import EditRequest, EditState, MeasuredMoment, PickedPixel
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraSettings, Picture
@@ -62,7 +62,7 @@ class MeasureWanted:
     evenly spread; or over freshly reset envs, in the background."""
 
     over: Measured
-    most: int = MOST_MEASURED
+    most: int = MAX_MEASURED
     """Steps or resets at most."""
 
 

@@ -28,7 +28,7 @@ from workbench.cameras.view import StudioCamera
 from workbench.envs.camera_data import CameraKey, CameraSettings
 from workbench.machine.loop import post
 from workbench.page.scene.env_grid import line_set
-from workbench.page.scene.viewpoint import USUAL_ASPECT
+from workbench.page.scene.viewpoint import DEFAULT_ASPECT
 from workbench.page.widgets.notices import refusals_told
 from workbench.pictures.camera_conventions import axes_of, intrinsic_of, target_of, vertical_fov
 
@@ -302,7 +302,9 @@ class LookThrough:
         # The page orbits about its up axis: with the camera's own, a drag would tilt a level horizon.
         level = abs(left[2]) < 1e-3 and up[2] > 0.05
         eye = client.camera
-        aspect = eye.image_width / eye.image_height if eye.image_height and eye.image_width else USUAL_ASPECT
+        aspect = (
+            eye.image_width / eye.image_height if eye.image_height and eye.image_width else DEFAULT_ASPECT
+        )
         fov = vertical_fov(intrinsic_of(now), now.height)
         target = self._placing.frame(camera).point_to_view(target_of(now))
         fov = fov_that_shows_all(fov, now.width / now.height, aspect)

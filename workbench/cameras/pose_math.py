@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from viser.transforms import SO3
 
-from workbench.cameras.commands import FARTHEST
+from workbench.cameras.commands import MAX_COORDINATE_METRES
 from workbench.cameras.events import CameraPlaced
 from workbench.cameras.view import StudioCamera, StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings
@@ -221,8 +221,8 @@ class Placing:
         Raises:
             Refused: it is too far away for any task.
         """
-        if not all(abs(x) <= FARTHEST for x in settings.position):
-            raise Refused(f"A camera must be within {FARTHEST:g} m of the origin.")
+        if not all(abs(x) <= MAX_COORDINATE_METRES for x in settings.position):
+            raise Refused(f"A camera must be within {MAX_COORDINATE_METRES:g} m of the origin.")
         self._session.happen(CameraPlaced(key, settings, control, pause))
 
     def change(self, control: object, change: Callable[[CameraSettings, Frame], CameraSettings]) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.cameras.commands import MOST_MEASURED, PickPixel, StopMeasuring
+from workbench.cameras.commands import MAX_MEASURED, PickPixel, StopMeasuring
 from workbench.cameras.events import (
     Case,
     Compare,
@@ -122,7 +122,7 @@ def _measure(studio: Studio, wanted: MeasureWanted, run: Run) -> Change:
     camera, load = selected_camera(studio, run), run.running_load()
     if camera is None or load is None:
         return studio, []
-    most = min(max(1, wanted.most), MOST_MEASURED)
+    most = min(max(1, wanted.most), MAX_MEASURED)
     what, question = f"measuring {camera.key[1]}", MeasureCamera(camera.key, None, 0)
     if wanted.over == "resets":
         question = replace(question, settings=camera.now if camera.moved else None)

@@ -17,13 +17,13 @@ class ShowChecks(Command, frozen=True):
 
 
 class ToggleRule(Command, frozen=True):
-    """Fold out what a rule says, or fold it in."""
+    """Unfold or fold the text of a rule."""
 
     rule: str
 
 
 class ToggleVerdict(Command, frozen=True):
-    """Fold out what a verdict on the reward says, or fold it in."""
+    """Unfold or fold the text of a verdict on the reward."""
 
     rule: str
 
@@ -43,13 +43,13 @@ class StopChecks(Command, frozen=True):
 
 
 class CheckAfterSave(Command, frozen=True):
-    """Check each version that loads, or none."""
+    """Check each version that loads, or only on request."""
 
     on: bool
 
 
 class TimeStep(Command, frozen=True):
-    """Time each hook and line over some hundred control steps, in a process of its own."""
+    """Time each hook and line over some hundred control steps, in a separate process."""
 
 
 class StopProfile(Command, frozen=True):
@@ -60,14 +60,14 @@ MOST_SEEDS = 256
 
 
 class ChooseSeeds(Command, frozen=True):
-    """How many seeds to solve, from 0 on."""
+    """Choose how many seeds to solve, from 0 on."""
 
     seeds: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEEDS)]
 
 
 class SolveSeeds(Command, frozen=True):
-    """Solve the file as it is saved from each seed, as workbench solve does, with the sliders of the Run tab."""
+    """Solve the saved file from each seed, like workbench solve, with the settings of the Run tab."""
 
 
 class StopSolving(Command, frozen=True):
-    """Stop solving from many seeds."""
+    """Stop solving seeds."""

@@ -195,7 +195,7 @@ def print_finding(finding: Finding) -> None:
 
 def print_event(event: Event) -> None:
     """Print loads and failures; the page shows them too."""
-    from workbench.live.messages import Loaded, TaskFailed, RulesBroken
+    from workbench.live.messages import Loaded, RulesBroken, TaskFailed
 
     if isinstance(event, Loaded):
         parts = ", ".join(f"{plain_text(name)} {ms:.0f}" for name, ms in event.milliseconds.items())

@@ -1,4 +1,4 @@
-"""The table of recordings."""
+"""Commands of the table of recordings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from workbench.page.command import Command
 
 
 class PressRow(Command, frozen=True):
-    """Select a recording; with ctrl it is added or taken away, with shift all up to it are selected."""
+    """Select a recording; ctrl adds it to the selection or removes it, shift selects all up to it."""
 
     id: str
     held: Literal["", "ctrl", "shift", "ctrl+shift"] = ""
@@ -137,13 +137,13 @@ class EmptyTrash(Command, frozen=True):
 
 
 class SortRows(Command, frozen=True):
-    """Sort the table of recordings by a column; by the same again in reverse order."""
+    """Sort the table of recordings by a column; the same column again reverses the order."""
 
     column: Literal["task", "date", "seed", "steps", "return", "success", "version", "tags", "note", "name"]
 
 
 class FilterRows(Command, frozen=True):
-    """List these recordings only."""
+    """List only these recordings."""
 
     outcome: Literal["all", "success", "no success", "broken"]
 
@@ -156,12 +156,12 @@ class ClearRowFilter(Command, frozen=True):
 
 
 class LookForRows(Command, frozen=True):
-    """List the recordings that have these words."""
+    """List the recordings that contain these words."""
 
     words: str
 
 
 class FilterTask(Command, frozen=True):
-    """List the recordings of this task only, or of all tasks."""
+    """List only the recordings of this task, or those of all tasks."""
 
     task: str | None

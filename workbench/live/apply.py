@@ -139,15 +139,15 @@ DOES: frozenset[type[Command]] = frozenset(
         ContinueFromHere,
     }
 )
-"""Commands that `apply` takes."""
-STANDS_STILL = 0.35
-"""Seconds at one moment of the past before its pictures are drawn; with less, every drag would draw some."""
+"""Commands that `apply` handles."""
+PICTURES_DELAY_SECONDS = 0.35
+"""Debounce time at one moment of the past before its pictures are drawn; with less, every drag would draw some."""
 
 
 def apply(run: Run, event: object, now: Now) -> Change:
-    """The run after an event, and what has to be done.
+    """The run after an event, and the effects to perform.
 
-    Only the history is written into in place (see `Past.history`): all else is in the value.
+    The history is the only part that is changed in place (see `Past.history`).
 
     Raises:
         Refused: the command makes no sense now; nothing has changed.
@@ -155,7 +155,7 @@ def apply(run: Run, event: object, now: Now) -> Change:
     new, effects = _apply(run, event, now)
     stands_at = new.stands_at
     if new.pages and stands_at is not None and (stands_at != run.stands_at or isinstance(event, Placed)):
-        effects = [*effects, Later(STANDS_STILL, PastPicturesWanted(stands_at))]
+        effects = [*effects, Later(PICTURES_DELAY_SECONDS, PastPicturesWanted(stands_at))]
     new, for_reading = schedule(new, event, now)
     return new, [*effects, *for_reading]
 
@@ -240,7 +240,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
     return run, []
 
 
-# --- what a person asks ------------------------------------------------------------------------------
+# --- commands ----------------------------------------------------------------------------------------
 
 
 def _do_command(run: Run, command: Command) -> Change:
@@ -272,7 +272,7 @@ def _do_command(run: Run, command: Command) -> Change:
         case ChooseEpisodeEnd(rule=rule):
             return _change_settings(run, episode_end=rule)
         case ChooseActions(source=source):
-            # Without a name a policy is a source too: the next step reports what is missing.
+            # The source may be a policy without a name: the next step reports what is missing.
             policy = run.named_policy if source == "policy" else None
             return _change_settings(run, action_source=source, policy=policy)
         case SetPolicy(policy=policy):
@@ -306,7 +306,7 @@ def _do_command(run: Run, command: Command) -> Change:
 
 
 def _travel(run: Run, command: Command) -> Change:
-    """Commands of the timeline."""
+    """Carry out a command of the timeline."""
     past, env = run.kept, run.env
     if past is None:
         raise Refused("There is no step yet.")
@@ -350,12 +350,12 @@ def _reset(run: Run, env_idx: tuple[int, ...] | None) -> Change:
 
 
 def _show_live(run: Run) -> Run:
-    """The newest moment is shown."""
+    """Show the newest moment."""
     return _show(run, None if run.past is None else run.past.seek(None))
 
 
 def _show(run: Run, past: Past | None) -> Run:
-    """`past` shows another moment, or the same."""
+    """Take the shown moment from `past`."""
     if past is None or run.past is None or past.shown is run.past.shown:
         return run
     return new_pictures(replace(run, past=past))
@@ -381,7 +381,7 @@ def _change_settings(run: Run, **values: Any) -> Change:
     policy = run.policy
     run = replace(run, settings=new)
     if new.cameras != before.cameras:
-        # One that is asked for again is tried again.
+        # A camera that failed is tried again when it is requested again.
         kept = {camera.key for camera in before.cameras} & {camera.key for camera in new.cameras}
         run = replace(
             run, failed_cameras={key: why for key, why in run.failed_cameras.items() if key in kept}
@@ -412,7 +412,7 @@ def _enter(run: Run, wanted: RunToEnter) -> Change:
     return run, [*effects, Send(request)]
 
 
-# --- what the worker says ----------------------------------------------------------------------------
+# --- events of the worker ----------------------------------------------------------------------------
 
 
 def _stepped(run: Run, event: Stepped) -> Run:
@@ -424,7 +424,7 @@ def _stepped(run: Run, event: Stepped) -> Run:
     first = run.first_step_due
     run = replace(run, recovery=recovery, past=past, step=step, step_serial=serial, first_step_due=False)
     if run.problem is not None and run.problem_at_run and not first:
-        # It runs again after a problem at run time: the task was reset, or the policy changed.
+        # The task runs again after a problem at run time: it was reset, or the policy changed.
         run = at_rest(with_problem(run, None))
     return run
 

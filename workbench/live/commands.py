@@ -1,4 +1,4 @@
-"""The task that runs: play, step, reset, which code."""
+"""Commands of the running task: play, step, reset, actions, log, reload, env options."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import msgspec
 from workbench.actions.sources import ActionSource
 from workbench.page.command import Command
 
-LARGEST_SEED = 2**31 - 1
+MAX_SEED = 2**31 - 1
 
 
 class TogglePlay(Command, frozen=True):
@@ -74,17 +74,17 @@ class RestartWorker(Command, frozen=True):
 
 
 class UseControlMode(Command, frozen=True):
-    """Make the envs anew with this control mode."""
+    """Rebuild the envs with this control mode."""
 
     mode: str
 
 
 class ResetEnvOptions(Command, frozen=True):
-    """Make the envs as the task does."""
+    """Rebuild the envs with the task's own options."""
 
 
 class ToggleCurve(Command, frozen=True):
-    """Draw the curve of an entry, or leave it out."""
+    """Show or hide the curve of an entry."""
 
     group: Literal["reward", "reward term", "evaluate", "joint"]
     name: str
@@ -93,49 +93,49 @@ class ToggleCurve(Command, frozen=True):
 class SetSeed(Command, frozen=True):
     """Reset all envs with this seed."""
 
-    seed: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_SEED)]
+    seed: Annotated[int, msgspec.Meta(ge=0, le=MAX_SEED)]
 
 
 class SetPolicy(Command, frozen=True):
-    """Let this policy act: ``module:function`` or ``file.py:function``."""
+    """Take the actions from this policy: ``module:function`` or ``file.py:function``."""
 
     policy: str
 
 
 class FilterLog(Command, frozen=True):
-    """Show the lines of the log that have this text."""
+    """Show only the lines of the log that contain this text."""
 
     text: str
 
 
 class SetSpeed(Command, frozen=True):
-    """Play at this speed: simulated seconds in one second."""
+    """Play at this speed: simulated seconds per real second."""
 
     speed: Annotated[float, msgspec.Meta(gt=0)] | None
-    """None is as fast as it goes."""
+    """None: as fast as possible."""
 
 
 class ChooseEpisodeEnd(Command, frozen=True):
-    """What to do when an episode ends."""
+    """Choose what happens when an episode ends."""
 
     rule: Literal["reset", "continue", "pause"]
 
 
 class ChooseActions(Command, frozen=True):
-    """Where the actions come from."""
+    """Choose the source of the actions."""
 
     source: ActionSource
 
 
 class MoveSlider(Command, frozen=True):
-    """Tell the robot this value of one dimension of its action."""
+    """Set one dimension of the robot's action to this value."""
 
     dimension: Annotated[int, msgspec.Meta(ge=0)]
     value: float
 
 
 class ChooseMoved(Command, frozen=True):
-    """Whose robot the sliders of the action move."""
+    """Choose the envs whose robots the action sliders move."""
 
     envs: Literal["selected", "all"]
 
@@ -145,41 +145,41 @@ class HoldStill(Command, frozen=True):
 
 
 class PauseLog(Command, frozen=True):
-    """Let new lines of the log wait, or show them."""
+    """Hold back new lines of the log, or show them."""
 
     on: bool
 
 
 class ClearLog(Command, frozen=True):
-    """Forget what was printed."""
+    """Clear the log."""
 
 
 class ChooseInspected(Command, frozen=True):
-    """Read this of the selected env, or nothing."""
+    """Choose what to inspect in the selected env."""
 
     what: Literal["nothing", "joints", "contacts", "poses", "observation", "state"]
 
 
 class ShowForces(Command, frozen=True):
-    """Draw the contact forces of the selected env as arrows in the 3D view, or not."""
+    """Show or hide the contact forces of the selected env, as arrows in the 3D view."""
 
     on: bool
 
 
 class RebuildScene(Command, frozen=True):
-    """Reload the file and rebuild the scene, with the moment restored."""
+    """Reload the file, rebuild the scene and restore the current state."""
 
 
 class ReloadCode(Command, frozen=True):
-    """Only reload code, also where that was not found safe: old and new code may then be mixed."""
+    """Only reload code, even if that was not found safe: old and new code may then be mixed."""
 
 
 class ReloadCameras(Command, frozen=True):
-    """Only reload cameras and code, also where that was not found safe: old and new code may then be mixed."""
+    """Only reload cameras and code, even if that was not found safe: old and new code may then be mixed."""
 
 
 class ChooseClass(Command, frozen=True):
-    """Load this one of the file's tasks."""
+    """Load this task of the file."""
 
     name: str
 
@@ -188,30 +188,29 @@ class FillEmptyFile(Command, frozen=True):
     """Write the minimal task into the empty file."""
 
 
-MOST_ENVS = 4096
-LONGEST_VALUE = 2000
-"""Characters."""
+MAX_NUM_ENVS = 4096
+MAX_VALUE_CHARACTERS = 2000
 
 
 class SetNumEnvs(Command, frozen=True):
-    """Write this number of envs into the form of how the envs are made."""
+    """Enter this number of envs in the form of env options."""
 
-    num_envs: Annotated[int, msgspec.Meta(ge=1, le=MOST_ENVS)]
+    num_envs: Annotated[int, msgspec.Meta(ge=1, le=MAX_NUM_ENVS)]
 
 
 class SetKeyword(Command, frozen=True):
-    """Write this value of a keyword argument into the form of how the envs are made."""
+    """Enter this value of a keyword argument in the form of env options."""
 
     name: str
-    value: Annotated[str, msgspec.Meta(max_length=LONGEST_VALUE)] | int | float | bool
+    value: Annotated[str, msgspec.Meta(max_length=MAX_VALUE_CHARACTERS)] | int | float | bool
 
 
 class ApplyEnvOptions(Command, frozen=True):
-    """Make the envs anew with what the form says."""
+    """Rebuild the envs with the options in the form."""
 
 
 class DiscardEnvOptions(Command, frozen=True):
-    """Show again in the form how the envs are made now."""
+    """Revert the form to the current env options."""
 
 
 class ChoosePictures(Command, frozen=True):

@@ -1,4 +1,4 @@
-"""What can happen to a session or a review, apart from what a worker says (`protocol.messages.Event`), and what follows."""
+"""Events of a session or a review that do not come from a worker, and effects that schedule an event."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from workbench.page.command import Command
 
 @dataclass(frozen=True)
 class Asked:
-    """A page, a script or an agent asks for a command."""
+    """Event: a page, a script or an agent sends a command."""
 
     command: Command
     page: str = ""
-    """Name of the page that asks; empty for none."""
+    """Name of the page that sends it; empty for none."""
 
 
 @dataclass(frozen=True)
 class Then:
-    """Effect: let this event happen next."""
+    """Effect: handle this event next."""
 
     event: Any
 
 
 @dataclass(frozen=True)
 class Later:
-    """Effect: let this event happen after some seconds. `apply` ignores it if it has lost its sense by then."""
+    """Effect: handle this event after some seconds. `apply` ignores the event if it no longer applies by then."""
 
     seconds: float
     event: Any

@@ -1,4 +1,4 @@
-"""Which env is selected, and the table of envs."""
+"""Commands that select an env, and commands of the table of envs."""
 
 from __future__ import annotations
 
@@ -55,31 +55,31 @@ class ShowFirstFlagged(Command, frozen=True):
 
 
 class ShowEnvAtEvent(Command, frozen=True):
-    """Select this env, at the moment that its row is about."""
+    """Select this env, at the event that its row shows."""
 
     env: int
 
 
 class SortEnvs(Command, frozen=True):
-    """Sort the table of envs by a column; by the same again in reverse order."""
+    """Sort the table of envs by a column; the same column again reverses the order."""
 
     column: str
 
 
 class FilterEnvs(Command, frozen=True):
-    """List these envs only."""
+    """List only these envs."""
 
     which: Literal["all", "failed", "running", "flagged"]
 
 
 class ToggleEnvEntry(Command, frozen=True):
-    """Show an entry in the table of envs, or leave it out."""
+    """Show or hide an entry in the table of envs."""
 
     name: str
 
 
 class ToggleEnvEntries(Command, frozen=True):
-    """Open or close the list of entries of the table of envs."""
+    """Open or close the list of entries for the table of envs."""
 
 
 class TurnEnvs(Command, frozen=True):
@@ -89,6 +89,6 @@ class TurnEnvs(Command, frozen=True):
 
 
 class ShowEnvs(Command, frozen=True):
-    """Show all envs, or the selected one alone."""
+    """Show all envs or only the selected one."""
 
     which: Literal["all envs", "the selected env"]

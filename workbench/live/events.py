@@ -1,4 +1,4 @@
-"""What can happen to the run, and what is done about it."""
+"""Events of the run, and the effects that follow from them."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ class Now(NamedTuple):
     """When an event happens."""
 
     monotonic: float
-    """Seconds of `time.monotonic`."""
+    """`time.monotonic()` in seconds."""
     wall: float
     """Seconds since the epoch."""
 
 
 @dataclass(frozen=True)
 class RunToEnter:
-    """Put the selected env, or all, into the last state of a recorded run, and pause. Waits for a task to be loaded."""
+    """Put the selected env, or all, into the last state of a recorded run, and pause; once a task is loaded."""
 
     run: RecordedRun
     number: int
-    """The value of `TimelineView.entered` when it is done."""
+    """Value of `TimelineView.entered` when this is done."""
     everywhere: bool = False
     source_file: str | None = None
     source: Mapping[str, str] = field(default_factory=dict)
     """The task's source when it was recorded; changes since are reported with the result."""
 
 
-# --- events that only the session knows, beside those of `protocol.messages` and `Asked` ----------
+# --- events of the session; the others are in `live.messages`, and `Asked` ------------------------
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class VersionLoaded:
 
 @dataclass(frozen=True)
 class LoadDone:
-    """All that follows from a load has been asked of the worker."""
+    """All requests that follow from a load were sent to the worker."""
 
 
 @dataclass(frozen=True)
@@ -64,16 +64,16 @@ class LoadPreempted:
 
 @dataclass(frozen=True)
 class WorkerDied:
-    """The worker is gone."""
+    """The worker has ended."""
 
     death: Death
     printed: str
-    """Its last lines."""
+    """The last lines of its output."""
 
 
 @dataclass(frozen=True)
 class WorkerBusy:
-    """The worker has been at one piece of work for long; None when it is done."""
+    """The worker is busy with one piece of work for long; None when that is done."""
 
     busy: Busy | None
 
@@ -90,7 +90,7 @@ class PolicySaved:
 
 @dataclass(frozen=True)
 class PagesCounted:
-    """So many pages are open. With none, no picture is rendered."""
+    """The number of open pages changed. Without any, no picture is rendered."""
 
     count: int
 
@@ -104,7 +104,7 @@ class SettingsChanged:
 
 @dataclass(frozen=True)
 class OptionsApplied:
-    """Make the envs with other options. If the task fails with them, the present envs and options stay."""
+    """Rebuild the envs with other options. If the task fails with them, the present envs and options stay."""
 
     options: TaskOptions
 
@@ -135,15 +135,15 @@ class EpisodeStepShown:
 
 @dataclass(frozen=True)
 class PastPicturesWanted:
-    """Draw the pictures that the shown moment lacks, if it is still the same."""
+    """Draw the missing pictures of the shown moment, if it is still the same."""
 
     at: object
-    """`Run.stands_at` when this was asked for."""
+    """`Run.stands_at` when this was requested."""
 
 
 @dataclass(frozen=True)
 class ActionTold:
-    """Tell envs (all if None) these numbers of their action, while its source is ``sliders``; without any, to hold still."""
+    """Set these numbers of the action of envs (all if None), while its source is ``sliders``; without any, hold still."""
 
     dimensions: tuple[int, ...]
     values: tuple[float, ...]
@@ -152,14 +152,14 @@ class ActionTold:
 
 @dataclass(frozen=True)
 class ReadingChosen:
-    """Read these sections of the selected env from now on, while pages are open; without any, nothing."""
+    """Read these sections of the selected env from now on, while pages are open; without any, stop reading."""
 
     sections: tuple[Section, ...]
 
 
 @dataclass(frozen=True)
 class ReadingDue:
-    """The time of a reading that was scheduled has come."""
+    """A scheduled reading is due."""
 
 
 @dataclass(frozen=True)
@@ -199,14 +199,14 @@ RunEvent = (
 
 @dataclass(frozen=True)
 class Send:
-    """Send this to the worker."""
+    """Send this request to the worker."""
 
     request: Request
 
 
 @dataclass(frozen=True)
 class ReplaceWorker:
-    """End the worker, and start another."""
+    """End the worker and start another."""
 
 
 @dataclass(frozen=True)
@@ -220,12 +220,12 @@ class Follow:
 
     files: frozenset[Path]
     texts: Mapping[str, str] = field(default_factory=dict)
-    """Texts by path as they were loaded; a file that differs was saved since."""
+    """The loaded texts by path; a file that differs was saved since."""
 
 
 @dataclass(frozen=True)
 class FollowPolicy:
-    """Watch the file of this policy, or none, from now on."""
+    """Watch the file of this policy, or no file, from now on."""
 
     policy: str | None
     folder: Path | None

@@ -1,4 +1,4 @@
-"""Which version is loaded when: after a save, on request, after a crash, and what a load changes."""
+"""Decides which version to load after a save, on request or after a crash, and applies the result of a load."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from workbench.machine.processes.wire import pack
 from workbench.task.description import TaskDescription, TaskOptions, changed_options
 from workbench.task.reference import RecordedTask, reference_to_class
 
-_MOST_LOADS = 20
+_MAX_PAST_LOADS = 20
 
 
 def first_requests(run: Run) -> tuple[Run, list[Request]]:
@@ -43,15 +43,15 @@ def first_requests(run: Run) -> tuple[Run, list[Request]]:
     elif run.state == "starting":
         # There is no version to load: the problem stays.
         run = replace(run, state="error", activity="")
-    # A version that failed while it ran would fail again: it comes back paused.
+    # A version that failed while it ran would fail again: it is restored paused.
     if run.wants_play and not (recovery.restoring and run.problem_at_run):
         requests.append(Play(True))
     return run, requests
 
 
 def watched_files(run: Run, paths: Iterable[str] = (), at_fault: str | None = None) -> frozenset[Path]:
-    """The task's own file, those of `paths` in its folder, and the one that `at_fault` names, wherever it is; none if
-    nothing is watched."""
+    """The task's own file, those of `paths` in its folder, and the file `at_fault` in any folder; empty if nothing is
+    watched."""
     if run.own_file is None or run.own_folder is None:
         return frozenset()
     modules = (Path(p) for p in paths if Path(p).is_relative_to(run.own_folder))
@@ -59,8 +59,8 @@ def watched_files(run: Run, paths: Iterable[str] = (), at_fault: str | None = No
 
 
 def files_at_fault(run: Run, failed: TaskFailed) -> frozenset[Path]:
-    """Files to watch where a problem is: a module that the task has never imported without an error is in no
-    `source_files`, and it may be in another folder, where a person mends it."""
+    """Files with the problem, to be watched: a module that the task has never imported without an error is not in
+    `source_files`, and it may be in another folder, where the user fixes it."""
     if failed.problem.file is None:
         return frozenset()
     return watched_files(run, () if run.task is None else run.task.source_files, failed.problem.file)
@@ -74,13 +74,13 @@ def follow(
 
 
 def reload_file(run: Run, level: LoadLevel = "auto", effects: Iterable[RunEffect] = ()) -> Change:
-    """Load the file again. A level other than ``auto`` is forced, even if it keeps parts of the old version.
+    """Reload the file. A level other than ``auto`` is forced, even if it keeps parts of the old version.
 
-    A worker that does not take the request (an endless loop) is interrupted or replaced.
+    A worker that does not handle the request (an endless loop) is interrupted or replaced.
     """
     recovery, inputs = run.recovery.file_requested(run.newest_moment)
     run = replace(run, recovery=recovery)
-    # A stopped one is replaced, and the new one loads the file, see `first_requests`.
+    # A stopped worker is replaced, and the new one loads the file, see `first_requests`.
     load = ReplaceWorker() if run.state == "stopped" else Send(load_of(run, inputs, level))
     return run, [*effects, load]
 
@@ -88,7 +88,7 @@ def reload_file(run: Run, level: LoadLevel = "auto", effects: Iterable[RunEffect
 def file_saved(run: Run) -> Change:
     run = replace(run, stale=True)
     if isinstance(run.reference, RecordedTask) and run.reference.approved is not None:
-        # It was opened with a recording's approved text: from now on the file on disk is used.
+        # The task was opened with a recording's approved text: from now on the file on disk is used.
         run = replace(run, reference=str(run.reference))
     return reload_file(run)
 
@@ -99,11 +99,11 @@ def apply_options(run: Run, options: TaskOptions) -> Change:
 
 
 def _past_after(before: TaskDescription | None, event: Loaded, restored: bool) -> PastAfterLoad:
-    """What a load means for the history.
+    """What happens to the history after a load.
 
     Args:
-        before: the version that ran before.
-        restored: it was brought back.
+        before: the previous version.
+        restored: whether the load restored an earlier version.
     """
     if before is None:
         return "gone"
@@ -119,7 +119,7 @@ def _past_after(before: TaskDescription | None, event: Loaded, restored: bool) -
 
 
 def loaded(run: Run, event: Loaded, on_disk: bool, now: Now) -> Change:
-    """A version runs."""
+    """Handle a successful load."""
     restored = run.recovery.restoring
     stale = restored and not on_disk
     task, report, before = event.task, event.reload, run.task
@@ -129,7 +129,7 @@ def loaded(run: Run, event: Loaded, on_disk: bool, now: Now) -> Change:
     past = _past_after(before, event, restored)
     drawn = kept or (past != "gone" and before is not None and pack(before.geometry) == pack(task.geometry))
     if drawn and before is not None:
-        # The same object, so that the page sees that it need not build the scene again.
+        # The same object tells the page that it need not rebuild the scene.
         task = replace(task, geometry=before.geometry)
     level, reason = (None, "the first version") if report is None else (report.level, report.reason)
     milliseconds = sum(event.milliseconds.values())
@@ -157,16 +157,16 @@ def loaded(run: Run, event: Loaded, on_disk: bool, now: Now) -> Change:
     if report is None or report.level not in ("same", "patched"):
         run = replace(run, cameras_serial=run.cameras_serial + 1, pictures=run.pictures if kept else {})
         run = new_pictures(run)
-    if not (restored and run.choices):  # else another class may have been chosen since
+    if not (restored and run.choices):  # with choices, another class may have been chosen since
         run = replace(run, choices=(task.chosen, *task.others) if task.others else ())
     if task.others and task.source_files and task.file is not None:
         running = reference_to_class(run.reference, Path(task.file), task.chosen)
-        # Another class may run in place of the one that fails: saves reload that one.
+        # Another class may run in place of the failing one: saves then reload the running class.
         reference = run.reference if task.in_place_of is None else running
         run = replace(run, running_reference=running, reference=reference)
     else:
         run = replace(run, running_reference=run.reference)
-    if not restored:  # else the problem that killed the worker stays
+    if not restored:  # after a restore the problem that killed the worker stays visible
         run = with_problem(run, None)
     run = at_rest(run)
     effects = [*follow(run, task.source_files, {} if stale else task.source), Send(run.for_worker())]
@@ -214,7 +214,7 @@ def task_failed(run: Run, event: TaskFailed, now: Now) -> Change:
 
 
 def try_next(run: Run, failed: TaskFailed) -> Change:
-    """A worker without a version gets the next attempt of `Recovery`, unless it is spoiled and ends."""
+    """Send the next attempt of `Recovery` to a worker without a version, unless it is spoiled and ends."""
     if failed.spoiled:
         return replace(run, needed=NewProcessNeeded(failed.spoiled, failed.at_run)), []
     recovery, goes_on = run.recovery.failed(failed.kept, run.newest_moment)
@@ -237,7 +237,8 @@ def _take_options(run: Run, loaded: TaskOptions | None) -> Run:
 
 
 def _refuse_options(run: Run, failed: TaskOptions | None) -> tuple[Run, bool]:
-    """Drop options with which the task failed, so that the next save does not fail for them. False if it was not them."""
+    """Drop options with which the task failed, so that the next save does not fail with them. Returns False if the options
+    were not the cause."""
     tried = run.tried_options
     if tried is None or failed is None or changed_options(tried, failed):
         return run, False
@@ -277,17 +278,17 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
 
 
 def _texts(run: Run) -> Mapping[str, str]:
-    """Source by path of the version that is being loaded, as far as it is known, or of the running one."""
+    """Source by path of the version that is being loaded, if known, or of the running one."""
     recovery = run.recovery
     if not recovery.loading:
         return {} if run.task is None else run.task.source
     if recovery.restoring:
         return recovery.good_source or {}
     if recovery.file_waits:
-        # It was saved again since: its lines on disk are not those that ran.
+        # The file was saved again since: its lines on disk are not those that ran.
         return dict.fromkeys(run.own_files, "")
     return {}
 
 
 def _remembered(run: Run, load: PastLoad) -> tuple[PastLoad, ...]:
-    return load, *run.loads[: _MOST_LOADS - 1]
+    return load, *run.loads[: _MAX_PAST_LOADS - 1]

@@ -1,4 +1,4 @@
-"""Requests to the worker and events from it: plain dataclasses with NumPy arrays."""
+"""Requests to the worker and events from the worker: plain dataclasses with NumPy arrays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from workbench.task.problem import Problem
 from workbench.task.reference import TaskName
 
 LoadLevel = Literal["auto", "patched", "cameras", "rebuilt"]
-"""How to load a new version; ``auto`` takes the least that is safe. See `workbench.task.reload_level`."""
+"""How to load a new version; ``auto`` takes the smallest level that is safe. See `workbench.task.reload_level`."""
 ReloadLevel = Literal["same", "patched", "cameras", "rebuilt", "restarted"]
 SCENE_KEPT: frozenset[ReloadLevel] = frozenset({"same", "patched", "cameras"})
 """Levels that keep the env, its episodes and its history."""
@@ -38,10 +38,10 @@ class Load(Question["Loaded"]):
     """Import and build the task; it replaces the running one only if all of it succeeds."""
 
     task: TaskName
-    """A path, ``path:ClassName`` or a registered env id, as a person named it, or a task that a recording names."""
+    """A path, ``path:ClassName`` or a registered env id, as the user named it, or a task named by a recording."""
     options: TaskOptions
     source: dict[str, str] | None = None
-    """Text to use in place of the files on disk, to bring back the last good version."""
+    """Text to use in place of the files on disk, to restore the last good version."""
     level: LoadLevel = "auto"
     """How to replace a running version of the same task."""
     snapshot: bytes | None = None
@@ -49,11 +49,11 @@ class Load(Question["Loaded"]):
     any_task: bool = False
     """If no class is named and the first one fails, open another task of the file."""
     number: int = 0
-    """Number of the load of the file on disk, counting up; 0 for a version that is brought back."""
+    """Number of the load of the file on disk, counting up; 0 for a restored version."""
     because: str = ""
     """Why a new process loads it, for the `ReloadReport`."""
     same_scene: bool = False
-    """Whether a new process loads the version, and the same code as before builds the scene."""
+    """Whether a new process loads the version and its scene-building code is unchanged."""
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,14 @@ class Settings:
     plan: PlanOptions = PlanOptions()
     """How actions are planned while `action_source` is ``solve``."""
     solve_all: bool = False
-    """Plan for every env in turn; else for the selected one only, and the other envs hold still."""
+    """Plan for every env in turn. If False, plan for the selected env only; the others keep their last action."""
     traced: str = ""
     """Name of the body whose path in the rollouts is shown; empty for the robot's tool."""
     selected_env: int = 0
     cameras: tuple[CameraRequest, ...] = ()
     """Cameras to draw in the selected env; none while no page is open."""
     pictures: ShownPictures = "auto"
-    """Degree of the pictures of these cameras."""
+    """Quality of the pictures of these cameras."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class SetSliderAction:
 
 @dataclass(frozen=True)
 class ReadPolicyAgain:
-    """Import the policy again: its file was saved."""
+    """Reload the policy, because its file was saved."""
 
     play: bool
     """Start playing if the import succeeds."""
@@ -137,20 +137,20 @@ class ReadPolicyAgain:
 
 @dataclass(frozen=True)
 class FollowPlan:
-    """The answer to a `PlanWanted`: actions to take from that moment on. Dropped if anything else moved the envs since."""
+    """The answer to a `PlanWanted`: actions to take from that moment on. Dropped if the envs moved in any other way since."""
 
     number: int
     """Number of the `PlanWanted` that this answers."""
     env_idx: tuple[int, ...]
     actions: NDArray[np.float32]
-    """(S, n, A) actions for S control steps of these n envs; the other envs hold still."""
+    """(S, n, A) actions for S control steps of these n envs; the other envs keep their last action."""
 
 
 @dataclass(frozen=True)
 class PlaceCamera(Question["Placed"]):
     """Change a camera's pose, lens, size or shader in all envs; followed by a `Placed`.
 
-    Of several waiting requests for one camera only the last is carried out.
+    If several requests for one camera wait, only the last is carried out.
     """
 
     key: CameraKey
@@ -170,7 +170,7 @@ class SetCapture:
 
 @dataclass(frozen=True)
 class ReplayPath:
-    """How an env came to a moment: actions from the state at an exact point."""
+    """How an env reached a moment: actions from the state at an exact point."""
 
     start: int
     """The server's number of the exact point's moment; the snapshot of it is in `Restore.starts`."""
@@ -236,7 +236,7 @@ class WarmUp(Question[None]):
 
 @dataclass(frozen=True)
 class ListenForDebugger:
-    """Let debugpy listen on this machine; the log tells the result."""
+    """Let debugpy listen on this machine; the log shows the result."""
 
     port: int
     wait: bool = False
@@ -253,8 +253,8 @@ class Inspect:
 
 @dataclass(frozen=True)
 class Cancel:
-    """Cancel the previous question: its answer is not needed. Wakes the worker: long work stops as soon as a request
-    comes."""
+    """Cancel the previous question, because its answer is no longer needed. Wakes the worker: long work stops as soon as a
+    request arrives."""
 
 
 @dataclass(frozen=True)
@@ -285,7 +285,7 @@ Request = (
 
 
 def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
-    """Waiting requests after an interrupt: without control steps, but with the pause that a `SingleStep` begins with."""
+    """Waiting requests after an interrupt, without control steps; a `SingleStep` becomes the pause that it starts with."""
     for request in requests:
         if isinstance(request, SingleStep):
             yield Play(False)
@@ -303,7 +303,7 @@ def hands_over(event: object) -> bool:
 
 @dataclass(frozen=True)
 class Loading:
-    """What a load is doing, for the status line."""
+    """Current phase of a load, for the status line."""
 
     activity: str
     number: int = 0
@@ -312,12 +312,12 @@ class Loading:
 
 @dataclass(frozen=True)
 class NewProcessNeeded:
-    """The worker's answer to a `Load` that it must not do: the version that runs left something in this process that no
-    reload takes back. The worker ends; the next one loads the file at the newest moment."""
+    """The worker's answer to a `Load` that it must not do: the running version left something in this process that no
+    reload undoes. The worker ends; the next one loads the file at the newest moment."""
 
     reason: str
     same_scene: bool
-    """Whether only code that runs at resets and steps differs, if any does."""
+    """Whether all changed code, if any, runs only at resets and steps."""
 
 
 @dataclass(frozen=True)
@@ -330,9 +330,9 @@ class ReloadReport:
     carried: tuple[str, ...] = ()
     """After a build: names of actors, articulations and attributes that kept their state."""
     not_carried: dict[str, str] = field(default_factory=dict)
-    """Names of what did not keep its state, each with the reason."""
+    """Names of things that did not keep their state, each with the reason."""
     same_scene: bool = False
-    """Whether the same code as before built the scene, see `Load.same_scene`."""
+    """Whether the scene-building code is unchanged, see `Load.same_scene`."""
 
 
 @dataclass(frozen=True)
@@ -359,19 +359,19 @@ class TaskFailed:
     kept: bool
     """Whether the previous version still runs."""
     classes: tuple[str, ...] = ()
-    """Tasks of the file, the one that was tried first; empty where the file has only one or none was tried."""
+    """Tasks of the file, the tried one first; empty if the file has only one or none was tried."""
     options: TaskOptions | None = None
     """Options of the `Load` that failed; None if the problem came later."""
     at_run: bool = False
-    """Whether the running version or its policy failed; no load did."""
+    """Whether the running version or its policy failed, not a load."""
     spoiled: str = ""
-    """What the failed code left in this process, or may have: the worker ends, and the next one brings the version that ran
-    back. Empty if the worker goes on."""
+    """What the failed code left, or may have left, in this process: the worker ends, and the next one restores the version
+    that ran. Empty if the worker continues."""
 
 
 @dataclass(frozen=True)
 class PlanWanted:
-    """The worker waits for actions to take; followed by a `FollowPlan`, or by nothing where there is no plan."""
+    """The worker waits for actions; answered by a `FollowPlan`, or not at all if there is no plan."""
 
     number: int
     """`Stepped.number` of the moment to plan from."""
@@ -380,7 +380,7 @@ class PlanWanted:
     snapshot: bytes = b""
     """A pickled `envs.snapshots.snapshot.Snapshot` of these envs at that moment."""
     bodies: tuple[dict[str, bytes], ...] = ()
-    """What each of these envs is built of, from `planning.rollouts.bodies_of`."""
+    """Bodies of each of these envs, from `planning.rollouts.bodies_of`."""
     why_not: str = ""
     """Why there is no snapshot; empty if there is one."""
 
@@ -396,14 +396,14 @@ class Pictures:
 
     pictures: tuple[Picture, ...]
     milliseconds: float | None
-    """Render time; None where steps were made meanwhile, which took part of the time."""
+    """Render time; None if steps were made meanwhile, which took part of the time."""
     number: int
     """`Stepped.number` of the moment that the pictures show."""
 
 
 @dataclass(frozen=True)
 class CameraFailed:
-    """A camera that cannot be drawn, and is left out until other cameras are watched or another version is loaded."""
+    """A camera cannot be drawn. It is left out until other cameras are watched or another version is loaded."""
 
     key: CameraKey
     why: str
@@ -417,9 +417,9 @@ class Placed:
     settings: CameraSettings | None
     """Settings of the request."""
     info: CameraInfo | None
-    """The camera as it is now; `CameraInfo.settings` stays what the task's config has."""
+    """The camera after the change; `CameraInfo.settings` still has the values of the task's config."""
     reshaped: bool = False
-    """Whether the camera's pictures have another size or other modalities now."""
+    """Whether the size or modalities of the camera's pictures changed."""
     why_not: str = ""
     """Why the camera was not placed; nothing has changed then."""
 
@@ -451,13 +451,13 @@ class Answer:
     value: bytes = b""
     """The answer, packed: only the caller knows its type."""
     why: str = ""
-    """Why there is no value, for the page; empty if there is one."""
+    """Why there is no answer, for the page; empty if there is one."""
     problem: Problem | None = None
-    """What the author's code raised, if that is the reason."""
+    """Problem of the author's code, if that is the reason."""
 
 
 class CannotAnswer(Exception):
-    """Raised in a worker that has no answer; the text is a sentence for the page."""
+    """The worker has no answer; the text is a sentence for the page."""
 
 
 @dataclass(frozen=True)
@@ -473,13 +473,12 @@ class Status:
     """Long work that delays requests, if any."""
     recorded_share: float = 0.0
     watched_share: float = 0.0
-    """Share (0 to 1) of the time while playing that went into what is recorded with every step, and into pictures for
-    the page."""
+    """Shares (0 to 1) of the playing time spent on recording every step, and on pictures for the page."""
 
 
 @dataclass(frozen=True)
 class SliderAction:
-    """The action that sliders send next, while they are the source of actions; sent whenever it may have changed."""
+    """The next action of the sliders, while they are the source of actions; sent whenever it may have changed."""
 
     action: NDArray[np.float32]
     """(N, A) the action."""
@@ -487,7 +486,7 @@ class SliderAction:
 
 @dataclass(frozen=True)
 class RulesBroken:
-    """Rules that the running version breaks without being stopped; sent when the findings change."""
+    """Rules that the running version breaks without stopping; sent when the findings change."""
 
     rows: tuple[Finding, ...]
     more: int = 0

@@ -1,4 +1,4 @@
-"""The past of the run: which moment of the history is shown, and going back to it."""
+"""The past of the run: the shown moment of the history, and requests to go back to it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ from workbench.task.description import ShownPictures, Stepped
 
 Scope = Literal["this", "all", "into all"]
 """Which envs go back: the selected one; all, each to its own state; or all to the selected env's state."""
-MOST_STEPS = 400
-"""Most control steps that are replayed to go back to a moment."""
+MAX_REPLAYED_STEPS = 400
+"""Maximum number of control steps that are replayed to go back to a moment."""
 
 
 @dataclass(frozen=True)
 class TimelineView:
-    """State of the time slider. Moments are named by serials, which count up and are never reused; resets are moments
-    too. A person sees control steps: a tick is the number of control steps since the envs were built, as on the
-    curves."""
+    """State of the time slider. Moments have serials, which count up and are never reused; resets are moments too. The page
+    shows ticks: a tick is the number of control steps since the envs were built, as on the curves."""
 
     first: int = 0
     last: int = -1
@@ -42,15 +41,15 @@ class TimelineView:
     can_continue: bool = False
     """Whether envs can go back to the shown moment."""
     undo: str | None = None
-    """What `UndoReset` would undo, as text."""
+    """Text: the change that `UndoReset` would undo."""
     not_carried: tuple[str, ...] = ()
     """State that the last jump could not restore, each with its reason."""
     arrived: str = ""
     """How the last jump entered a recording; empty if the jump entered none."""
     entered: int = 0
-    """Number of the last finished `EnterRun`; 0 for none."""
+    """Number of the last finished `EnterRecording`; 0 for none."""
     wants_pictures: bool = False
-    """The shown moment lacks pictures of the watched cameras."""
+    """Whether the shown moment lacks pictures of the watched cameras."""
 
     @property
     def steps(self) -> int:
@@ -71,26 +70,26 @@ class Strip:
     high: int
     """Lowest and highest tick, both included."""
     events: tuple[tuple[int, int], ...]
-    """Tick and event flags (`history.RESET` ... added up); what happened at one tick is one event."""
+    """Tick and event flags (`history.RESET` ... combined); everything at one tick is one event."""
     reward: NDArray[np.float32]
     """(high - low + 1,) reward after each control step; NaN where there is none."""
     branches: tuple[tuple[int, int], ...]
     """Ticks at which the env went back, each with the tick that it went back to."""
     segments: tuple[tuple[int, int, bool], ...]
-    """First and last tick of each segment (see `History`), and whether it begins with going back."""
+    """First and last tick of each segment (see `History`), and whether it starts with a jump back."""
 
 
 @dataclass(frozen=True)
 class Past:
-    """The history of the present task, and which of its moments is shown. Methods that change something return another value.
+    """The history of the present task and its shown moment. Methods that change something return a new value.
 
-    Live is the newest moment. The slider pins another one, and then all that the page draws of the batch (poses, numbers,
-    pictures) comes from the server's memory, while the worker continues. The worker gets requests only to continue from a
-    moment, to undo a jump, and to draw a moment that has no pictures.
+    Live is the newest moment. The slider pins another one; then everything that the page draws of the batch (poses,
+    numbers, pictures) comes from the server's memory, while the worker continues. The worker gets requests only to
+    continue from a moment, to undo a jump, and to draw a moment that has no pictures.
     """
 
     history: History
-    """Append-only store: `added` and its kind write into it, and equal values of a past share it."""
+    """Append-only store, changed in place by `added` and similar methods, and shared by all `Past` values of a task."""
     pinned: int | None = None
     """Serial of the shown moment; None while live."""
     entered: int = 0
@@ -101,7 +100,7 @@ class Past:
     # --- events --------------------------------------------------------------------------------------
 
     def added(self, stepped: Stepped) -> tuple[Past, Moment]:
-        """The past with one moment more."""
+        """The past with one more moment."""
         moment = self.history.add(stepped)
         past = self
         if stepped.restored is not None and stepped.restored.number:
@@ -134,8 +133,8 @@ class Past:
         return replace(self, pinned=max(serial, self.history.first))
 
     def seek_by(self, env: int, steps: int) -> Past:
-        """Go some moments of this env forward (or back, if negative) from the shown one: its control steps, resets and
-        jumps back. Those of other envs are passed by."""
+        """Go some moments of this env (control steps, resets and jumps back) forward, or back if negative, from the shown
+        one. Moments of other envs are skipped."""
         history, at = self.history, self.at
         for _ in range(abs(steps)):
             at += 1 if steps > 0 else -1
@@ -144,7 +143,7 @@ class Past:
         return self.seek(at)
 
     def seek_step(self, env: int, step: int) -> Past:
-        """Go to a control step of the shown episode of this env, through its jumps back; or the nearest kept."""
+        """Go to a control step of this env's shown episode, through its jumps back; or to the nearest kept one."""
         episode_backwards = self.history.episode_backwards(env, self.history.segment_at(env, self.at)[1])
         serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in episode_backwards}
         if not serials:
@@ -155,14 +154,14 @@ class Past:
         """Go to the moment after a control step (`Curves.serial`), or to the nearest kept one.
 
         Args:
-            episode_of: within the shown episode of this env: at the tick at which it begins there is the last step of the
-                one before, too.
+            episode_of: stay within the shown episode of this env. The last step of the previous episode has the same tick as
+                the start of this one.
         """
         first = self.history.first if episode_of is None else self.episode(episode_of)[0]
         return self.seek(max(self.history.serial_of_tick(tick), first))
 
     def seek_event(self, env: int, direction: int) -> Past:
-        """Go to the next (1) or previous (-1) event of this env; forward from the last one is live."""
+        """Go to the next (1) or previous (-1) event of this env; after the last event comes live."""
         here = self.at
         if direction > 0:
             after = self.history.events(env, here + 1, self.history.last)
@@ -184,7 +183,7 @@ class Past:
         at = moment if moment is not None else history.at(history.last)
         jump = history.last_jump(env)
         begin = history.at(history.segment_at(env, self.at)[0]) if at is not None else None
-        # For the shown env and moment: another env, or a reset since, lacks nothing.
+        # Only for the shown env and moment: another env, or a later reset, lacks nothing.
         came = begin.restored if begin is not None and begin.jumped[env] else None
         missed, how = ({}, "") if came is None else (came.not_carried, came.how)
         return TimelineView(
@@ -215,7 +214,7 @@ class Past:
         if jump.restored is None and before is not None:
             ended = before.step.terminated | before.step.truncated
             if ended[jump.jumped].all():
-                return "reset at the end"  # only the task asked for it
+                return "reset at the end"  # the reset was automatic
         what = "reset" if jump.restored is None else "jump"
         if jump.restored is not None and jump.restored.recording:
             what = "going live"
@@ -231,12 +230,12 @@ class Past:
         return 0 if moment is None else moment.tick
 
     def strip(self, env: int, low: int, high: int) -> Strip:
-        """The history of one env between two ticks, both included."""
+        """The history of one env between two ticks, inclusive."""
         history = self.history
         ticks = history.ticks(history.first, history.last)
         low = min(max(low, int(ticks[0])), int(ticks[-1]))
         high = min(max(high, low), int(ticks[-1]))
-        # The first moment at a tick is the control step that led there; the others are resets and jumps after it.
+        # The first moment at a tick is its control step; the others are resets and jumps after it.
         first, end = int(np.searchsorted(ticks, low)), int(np.searchsorted(ticks, high, side="right"))
         here = slice(first, end)
         serials, base = (history.first + first, history.first + end - 1), history.first
@@ -269,8 +268,8 @@ class Past:
         )
 
     def episode(self, env: int) -> tuple[int, int]:
-        """Serials of the first and the last moment of this env's episode that contains the shown moment. What lies between,
-        where it went back, is part of the way."""
+        """Serials of the first and the last moment of this env's episode that contains the shown moment. Moments in between
+        that the env later went back over are included."""
         end = self.history.segment_at(env, self.at)[1]
         begin = min((moment.serial for moment, _ in self.history.episode_backwards(env, end)), default=end)
         return begin, end
@@ -307,7 +306,9 @@ class Past:
         undoes: int | None = None,
     ) -> Restore:
         history = self.history
-        found = {i: history.replay_path(of, origin, MOST_STEPS) for i, of in zip(envs, source, strict=True)}
+        found = {
+            i: history.replay_path(of, origin, MAX_REPLAYED_STEPS) for i, of in zip(envs, source, strict=True)
+        }
         ways = {i: way for i, way in found.items() if way is not None}
         beginnings = {way.start for way in ways.values()}
         starts = {at: taken for at in beginnings if (taken := history.snapshot_at(at)) is not None}
@@ -316,9 +317,9 @@ class Past:
     def draw(
         self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "auto"
     ) -> tuple[Past, DrawPast | None]:
-        """Request the missing pictures of the shown moment; only once for each moment, env and set of cameras.
+        """Request the missing pictures of the shown moment, only once for each moment, env and set of cameras.
 
-        Fast ones are missing too, as exact ones, unless fast ones are asked for: they were drawn while something moved.
+        A fast picture, drawn while something moved, counts as missing unless fast ones are requested.
         """
         moment = self.shown
         if moment is None:

@@ -1,4 +1,4 @@
-"""Policies to choose from, listed while the source of actions is *policy* and a page is open."""
+"""Lists policies to choose from, while the source of actions is *policy* and a page is open."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from workbench.machine.kept_choices import keep_policy, used_policies
 from workbench.machine.loop import BlockingPool, do
 
 LIST_SECONDS = 5.0
-"""Seconds between two searches for policies, which read many files."""
+"""Interval of searches for policies, which read many files."""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is listed."""
+    """Arguments of the search for policies."""
 
     task_folder: Path | None
     acting: str | None
-    """The policy that is chosen; kept for the next run if there is such a file or module."""
+    """The chosen policy; saved for the next run if its file or module exists."""
 
 
 @dataclass(frozen=True)
@@ -39,20 +39,20 @@ class KnownPolicies:
 
 @dataclass(frozen=True)
 class PoliciesListed:
-    """A search has ended."""
+    """Event: a search has ended."""
 
     found: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class ListPolicies:
-    """Effect: list these in place of those before, again and again; nothing if None."""
+    """Effect: search repeatedly with these arguments in place of the previous ones; stop if None."""
 
     wanted: Wanted | None
 
 
 def apply(known: KnownPolicies, event: object, run: Run) -> tuple[KnownPolicies, list[ListPolicies]]:
-    """What is known after an event, and what has to be done.
+    """The known policies after an event, and the effects to perform.
 
     Args:
         run: the run after the event.
@@ -67,7 +67,7 @@ def apply(known: KnownPolicies, event: object, run: Run) -> tuple[KnownPolicies,
 
 
 class PolicySearch:
-    """Performs the effect. Used on the loop, but for `close`."""
+    """Performs `ListPolicies`. Used on the loop, except `close`."""
 
     def __init__(self, happen: Callable[[PoliciesListed], object]) -> None:
         self._happen = happen

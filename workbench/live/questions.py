@@ -1,4 +1,4 @@
-"""Questions to a worker without a task: scenes of recordings, and the list of tasks with their pictures."""
+"""Questions for a worker without a task: scenes of recordings, and the list of tasks with their pictures."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ class SceneMade:
     poses: NDArray[np.float32]
     """(T + 1, B, 7) poses."""
     missed: tuple[str, ...]
-    """States that could not be written into the env, each with its reason."""
+    """States that could not be set in the env, each with its reason."""
 
 
 @dataclass(frozen=True)
 class MakeScene(Question[SceneMade]):
-    """Make a recording's env in a worker without a task, and put it into each recorded state."""
+    """Build a recording's env in a worker without a task, and read the poses at each recorded state."""
 
     part: ClassVar[Any] = str
     task: str
     """Registered id of the task."""
     files: tuple[str, ...]
-    """Task files to search before ManiSkill's registry."""
+    """Task files in which to look for the task before ManiSkill's registry."""
     env_kwargs: dict[str, Any]
     seed: int
     reset_options: dict[str, Any]
@@ -41,12 +41,12 @@ class MakeScene(Question[SceneMade]):
 
 @dataclass(frozen=True)
 class ListTasks(Question[tuple[str, ...]]):
-    """The ids that ManiSkill registers."""
+    """List the ids that ManiSkill registers."""
 
 
 @dataclass(frozen=True)
 class TaskPicture:
-    """A picture of a task, or why there is none."""
+    """A picture of a task, or the reason why there is none."""
 
     pixels: NDArray[np.uint8] | None = None
     """(H, W, 3) pixels."""
@@ -57,6 +57,6 @@ class TaskPicture:
 
 @dataclass(frozen=True)
 class DrawTask(Question[TaskPicture]):
-    """Draw a picture of a registered task after a reset, by its human camera, or else by its first sensor."""
+    """Render a registered task after a reset with its human camera, or with its first sensor if it has none."""
 
     env_id: str

@@ -14,14 +14,14 @@ Newest = Callable[[], bytes | None]
 since assembling one takes longer than a step."""
 _GOOD_VERSIONS = 2
 _PROVEN_SECONDS = 30.0
-"""Seconds after a load: a version whose process crashes later than this counts as one that worked."""
+"""Time after a load: a version whose process crashes later than this counts as one that works."""
 
 
 class LoadInputs(NamedTuple):
     """Source and moment of a load."""
 
     source: dict[str, str] | None
-    """Texts to use in place of the files; None for those on disk."""
+    """Texts to use in place of the files; None to read the files on disk."""
     snapshot: bytes | None
     """The moment to restore."""
     number: int
@@ -35,51 +35,52 @@ class GoodVersion:
     file: str | None
     source: dict[str, str]
     since: float
-    """When the version was last loaded, in seconds of the session's clock."""
+    """Time of the version's last load, in seconds of the session's clock."""
     crashes: int = 0
-    """Crashes of its process in a row, each soon after the version was loaded."""
+    """Number of crashes of its process in a row, each soon after a load of the version."""
     idle_crashes: int = 0
-    """How many of `crashes` came since its last step, while nothing was asked of the worker."""
+    """How many of `crashes` happened since its last step, in an idle worker."""
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """Chooses what the next worker loads after one has ended. Methods that change something return another value.
+    """Chooses what the next worker loads after one has ended. Methods that change something return a new value.
 
-    Loading may end the worker again: the version is refused, the moment cannot be restored, importing the file crashes,
-    memory runs out. So the attempts are, in order: the file on disk if no worker has tried it yet, the last good version at
-    its newest moment, the same from its start, and at last nothing, until the file changes. None is tried twice, so that
-    no file can end workers one after the other. A version that crashes twice, each time soon after it was loaded, is no good
-    one: the version before it comes back. Without one it comes back itself, unless it crashed twice without making a step.
+    Loading may end the worker again: the version is refused, the moment cannot be restored, the import crashes, memory runs
+    out. So the attempts are, in order: the file on disk if no worker has tried it yet, the last good version at its newest
+    moment, the same version from its start, and finally nothing, until the file changes. No attempt is repeated, so that a
+    file cannot kill one worker after another. A version that crashes twice, each time soon after its load, is not good: the
+    previous good version is restored. If there is none, the version itself is restored, unless it crashed twice without
+    making a step.
     """
 
     good: tuple[GoodVersion, ...] = ()
-    """The newest last; at most `_GOOD_VERSIONS`."""
+    """Good versions, newest last; at most `_GOOD_VERSIONS`."""
     attempt: Attempt = "file"
     asked: int = 1
     begun: int = 1
-    """Numbers of the newest load of the file that was asked for, and of the newest that a worker has begun."""
+    """Numbers of the newest requested load of the file, and of the newest that a worker has begun."""
     loading: bool = True
-    """A load is running."""
+    """Whether a load is running."""
     has_env: bool = False
 
     @property
     def restoring(self) -> bool:
-        """Whether the running load brings back the last good version."""
+        """Whether the running load restores the last good version."""
         return self.loading and self.attempt in ("moment", "version")
 
     @property
     def good_source(self) -> dict[str, str] | None:
-        """Source of the version that is brought back; None if there is none."""
+        """Source of the version to restore; None if there is none."""
         return self.good[-1].source if self.good else None
 
     @property
     def file_waits(self) -> bool:
-        """Whether no worker has begun to load the file as it was saved last."""
+        """Whether no worker has begun to load the last saved text of the file."""
         return self.asked > self.begun
 
     def next_load(self, newest: Newest) -> tuple[Recovery, LoadInputs | None]:
-        """What a new worker has to load; None for nothing."""
+        """The load for a new worker; None for nothing."""
         if self.attempt == "nothing":
             return self, None
         good = self.good_source if self.attempt != "file" else None
@@ -88,20 +89,20 @@ class Recovery:
         return replace(self, loading=True), LoadInputs(good or None, snapshot, number)
 
     def file_requested(self, newest: Newest) -> tuple[Recovery, LoadInputs]:
-        """The present worker is to load the file on disk."""
+        """The load of the file on disk for the present worker."""
         asked = self.asked + 1
         inputs = LoadInputs(None, None if self.has_env else newest(), asked)
         return replace(self, attempt="file", loading=True, asked=asked), inputs
 
     def began(self, number: int) -> Recovery:
-        """A worker has begun the load of this number."""
+        """Record that a worker has begun the load of this number."""
         return replace(self, begun=max(self.begun, number))
 
     def loaded(self, task: TaskDescription, now: float) -> Recovery:
-        """`task` runs: it is the last good version from now on."""
+        """Record that `task` runs: it is the last good version from now on."""
         good = self.good
         if good and good[-1].file != task.file:
-            good = ()  # no version of another file comes back
+            good = ()  # no version of another file is restored
         if good and good[-1].source == task.source:
             good = (*good[:-1], replace(good[-1], since=now))
         else:
@@ -109,14 +110,14 @@ class Recovery:
         return replace(self, good=good, has_env=True, attempt="file", loading=self.file_waits)
 
     def stepped(self) -> Recovery:
-        """A step was made, which somebody had asked for."""
+        """Record that a requested step was made."""
         if not self.good or not self.good[-1].idle_crashes:
             return self
         return replace(self, good=(*self.good[:-1], replace(self.good[-1], idle_crashes=0)))
 
     def failed(self, kept: bool, newest: Newest) -> tuple[Recovery, bool]:
-        """A load failed in a worker that continues. True if the worker has no version now, and `next_load` has one to
-        try."""
+        """Record that a load failed in a worker that continues. Returns True if the worker has no version now and
+        `next_load` has another attempt."""
         after = replace(self, loading=self.file_waits)
         if kept or not self.loading or self.file_waits:
             return after, False
@@ -124,11 +125,11 @@ class Recovery:
         return after, after.attempt != "nothing"
 
     def died(self, crashed: bool, idle: bool, now: float, newest: Newest) -> Recovery:
-        """The worker is gone.
+        """Record that the worker has ended.
 
         Args:
-            crashed: by itself, and not because it was ended or handed over.
-            idle: nothing was asked of it at the time.
+            crashed: it ended by itself; it was not ended and did not hand over.
+            idle: it had no request at the time.
         """
         after = self
         if self.file_waits:
@@ -140,11 +141,11 @@ class Recovery:
         return replace(after, loading=False, has_env=False)
 
     def restart_requested(self) -> Recovery:
-        """A person restarts the worker, to load the file as it is now; if that is just being loaded (it may loop there), to
-        have the last good version back."""
+        """Record that the user restarts the worker, to load the file as it is now; if that is being loaded (and may hang), to
+        restore the last good version."""
         good = tuple(replace(version, crashes=0, idle_crashes=0) for version in self.good)
         if self.loading and not self.restoring and not self.file_waits and good:
-            return replace(self, good=good)  # `died` goes on from there
+            return replace(self, good=good)  # `died` continues from there
         return replace(self, good=good, attempt="file", loading=False, has_env=False, asked=self.asked + 1)
 
     def _after_running(self, crashed: bool, idle: bool, now: float) -> Recovery:

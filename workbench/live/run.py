@@ -1,4 +1,4 @@
-"""The run of the open task as one value: what is loaded, how it goes, what a person chose."""
+"""The run of the open task as one value: the loaded version, its state, and the user's choices."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ see `Run.problem`; ``stopped``: there is no worker."""
 
 
 PastAfterLoad = Literal["same", "patched", "gone"]
-"""What a load means for the history: it continues unchanged, it continues with other code, or another history begins."""
+"""Effect of a load on the history: it continues unchanged, it continues with other code, or a new history begins."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PastLoad:
     at: float
     """Seconds since the epoch."""
     level: ReloadLevel | None
-    """Level of the reload; None for the first version, and for one that was refused."""
+    """Level of the reload; None for the first version and for a refused one."""
     reason: str
     milliseconds: float = 0.0
     problem: Problem | None = None
@@ -58,10 +58,10 @@ class PastLoad:
 
 @dataclass(frozen=True)
 class Run:
-    """One value for all that is known of the run. Its serials tell a page cheaply which parts are new."""
+    """State of the run. Its serials tell a page cheaply which parts are new."""
 
     reference: TaskName
-    """The requested task: a file, ``file.py:ClassName`` or a registered env id, or a task that a recording names."""
+    """The requested task: a file, ``file.py:ClassName``, a registered env id, or a task named by a recording."""
     options: TaskOptions
     """Build options in effect; the seed is `seed`."""
     history_bytes: int
@@ -74,43 +74,43 @@ class Run:
     """The running task."""
     recovery: Recovery = Recovery()
     past: Past | None = None
-    """None before a task is loaded."""
+    """The history; None before a task is loaded."""
     versions: tuple[tuple[int, TaskDescription], ...] = ()
     """The versions that made the moments of `past`, oldest first, each with the serial of its first one."""
     needed: NewProcessNeeded = NewProcessNeeded("", False)
-    """Why the next worker is a new process, where the last one said so."""
+    """Why the next worker must be a new process, as reported by the last one."""
     to_enter: RunToEnter | None = None
-    """To be entered as soon as a task is loaded."""
+    """Recorded run to enter as soon as a task is loaded."""
     first_step_due: bool = False
-    """The next step is the first of a new scene: it does not prove that the task runs."""
+    """Whether the next step is the first of a new scene, which does not prove that the task runs."""
     pages: int = 0
-    """Pages that are open."""
+    """Number of open pages."""
     tried_options: TaskOptions | None = None
-    """Options that a person applied and that no load has taken or refused yet."""
+    """Options that the user applied and that no load has accepted or refused yet."""
     wants_play: bool = False
     policy_failed: bool = False
-    """Whether a failure of the policy stopped playing, and playing has not begun since. `problem` may be gone: a save
-    that a load follows clears it."""
+    """Whether a failure of the policy stopped playing, and playing has not resumed since. `problem` may be None already: a
+    save that leads to a load clears it."""
     named_policy: str | None = None
-    """The policy that was named last, for when policies act again."""
+    """The policy that was named last, to use when the source of actions is a policy again."""
 
     state: RunState = "starting"
     activity: str = "a worker process"
-    """Current step of starting or loading, else empty."""
+    """Current phase of starting or loading, else empty."""
     stale: bool = False
-    """The file on disk is newer than the running version, or does not load."""
+    """Whether the file on disk is newer than the running version, or does not load."""
     task: TaskDescription | None = None
     task_serial: int = 0
-    """Grows with every successful load."""
+    """Increases with every successful load."""
     scene_serial: int = 0
-    """Grows with every new scene: not with a version that is patched into the present one."""
+    """Increases with every new scene, not with a version that is patched into the present one."""
     cameras_serial: int = 0
-    """Grows with every new set of cameras."""
+    """Increases with every new set of cameras."""
     load_milliseconds: float = 0.0
     reload: ReloadReport | None = None
-    """How the running version came in; None for the first."""
+    """How the running version was loaded; None for the first."""
     after_load: PastAfterLoad = "same"
-    """What the last load meant for the history."""
+    """Effect of the last load on the history."""
     loads: tuple[PastLoad, ...] = ()
     """The last loads, newest first."""
     choices: tuple[str, ...] = ()
@@ -123,17 +123,17 @@ class Run:
     pictures_serial: int = 0
     picture_milliseconds: float | None = None
     failed_cameras: Mapping[CameraKey, str] = field(default_factory=dict)
-    """Why cameras cannot be drawn, as sentences; they are left out."""
+    """Cameras that cannot be drawn and are left out, with the reason as a sentence."""
     problem: Problem | None = None
     problem_serial: int = 0
     problem_at_run: bool = False
-    """Whether `problem` came while the task ran, not while a version was loaded."""
+    """Whether `problem` occurred while the task ran, not during a load."""
     spoiled: str = ""
-    """Why another process brought the version back that ran when `problem` came, as `TaskFailed` has it."""
+    """Why another process restored the version that ran when `problem` occurred; see `TaskFailed.spoiled`."""
     settings: Settings = Settings()
     """Settings chosen on the page."""
     told: NDArray[np.float32] | None = None
-    """(N, A) action that sliders send next; None if unknown."""
+    """(N, A) next action of the sliders; None if unknown."""
     options_refused: TaskOptions | None = None
     """Options that were applied last and with which the task failed."""
     seed: int = 0
@@ -151,12 +151,12 @@ class Run:
     inspection: Inspection | None = None
     """The newest reading, of the env that was selected then."""
     read_sections: tuple[Section, ...] = ()
-    """What is read of the selected env while steps go on."""
+    """Sections of the selected env that are read while steps are made."""
     reading: Literal["none", "soon", "asked"] = "none"
     read_at: object = None
-    """What was shown when the last reading was asked for."""
+    """What was shown when the last reading was requested."""
     read_when: float = -math.inf
-    """When that was, in seconds of `Now.monotonic`."""
+    """When it was requested, in seconds of `Now.monotonic`."""
 
     # --- reading -----------------------------------------------------------------------------------
 
@@ -172,7 +172,7 @@ class Run:
 
     @property
     def folder(self) -> Path | None:
-        """Folder of the task's own file, where policies are looked for too."""
+        """Folder of the task's own file, where policies are searched too."""
         return None if self.own_file is None else self.own_file.parent
 
     @property
@@ -190,7 +190,7 @@ class Run:
         return None if self.past is None else self.past.history.snapshot_at(self.past.history.last)
 
     def running_load(self) -> Load | None:
-        """The load of the running version, for another worker; None if no task runs."""
+        """A load of the running version for another worker; None if no task runs."""
         return None if self.task is None else load_of(self, LoadInputs(dict(self.task.source), None, 0))
 
     def for_worker(self) -> Settings:
@@ -203,8 +203,8 @@ class Run:
         )
 
     def env_rows(self) -> EnvRows | None:
-        """The table of envs at the shown moment; None before a task is loaded. Copies some 100 kB for 256 envs: not for
-        every frame."""
+        """The table of envs at the shown moment; None before a task is loaded. Copies some 100 kB for 256 envs: do not call
+        it every frame."""
         return None if self.past is None else self.past.env_rows()
 
     def strip(self, low: int, high: int) -> Strip | None:
@@ -212,7 +212,7 @@ class Run:
         return None if self.kept is None else self.kept.strip(self.env, low, high)
 
     def episode_ticks(self) -> tuple[int, int] | None:
-        """First and last tick of the selected env's episode that contains the shown moment, also where it went back."""
+        """First and last tick of the selected env's episode that contains the shown moment, through its jumps back."""
         if self.kept is None:
             return None
         begin, end = self.kept.episode(self.env)
@@ -224,7 +224,7 @@ class Run:
 
     @property
     def stands_at(self) -> object:
-        """What pictures are needed of while a moment of the past is shown; None while live."""
+        """Key of the shown past moment for which pictures are needed; None while live."""
         if self.past is None or self.past.pinned is None:
             return None
         return self.past.pinned, self.env, self.settings.cameras, self.settings.pictures
@@ -241,7 +241,7 @@ class Run:
         return ShownMoment(self.env, count, None if shown is None else shown.step.poses)
 
     def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
-        """At most so many moments of the selected env's episode that contains the shown moment."""
+        """At most `most` moments of the selected env's episode that contains the shown moment."""
         if self.past is None or not len(self.past.history):
             return ()
         return self.past.history.episode(self.env, self.past.at, most)
@@ -252,11 +252,11 @@ class Run:
 
 
 Change = tuple[Run, list[RunEffect]]
-"""The run after an event, and what has to be done."""
+"""The run after an event, and the effects to perform."""
 
 
 def first_run(task: TaskName, options: TaskOptions, history_bytes: int, settings: Settings) -> Run:
-    """The run before a worker has said anything. Looks at the disk."""
+    """The run before the first event of a worker. Reads the disk."""
     return Run(
         task,
         options,
@@ -275,7 +275,7 @@ def load_of(
 ) -> Load:
     tried = run.tried_options if inputs.source is None else None
     options = replace(tried or run.options, seed=run.seed)
-    # The version that ran is brought back even if another class of the file was chosen since.
+    # The version that ran is restored even if another class of the file was chosen since.
     reference = run.reference if inputs.source is None else run.running_reference
     any_task = run.task is None and isinstance(reference, str)
     return Load(
@@ -312,5 +312,5 @@ def at_rest(run: Run) -> Run:
 
 
 def new_pictures(run: Run) -> Run:
-    """Other pictures are shown."""
+    """The run with a new `pictures_serial`."""
     return replace(run, pictures_serial=run.pictures_serial + 1)

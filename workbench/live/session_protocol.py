@@ -1,4 +1,4 @@
-"""What panels may ask of the session of the open task."""
+"""Interface of the session of the open task for panels."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Value = TypeVar("Value")
 
 
 class LiveSession(Protocol):
-    """The session of the open task, which the app puts together from all features. Any thread may call it."""
+    """The session of the open task, which the app assembles from all features. Thread-safe."""
 
     @property
     def present_reference(self) -> TaskName:
-        """The task as it is named now."""
+        """The present name of the task."""
         ...
 
     def do(self, command: Command, page: str = "") -> None:
@@ -27,7 +27,7 @@ class LiveSession(Protocol):
         ...
 
     def happen(self, event: Any) -> None:
-        """Take an event of `live.events` or of a feature. Raises `Refused` for a command that makes no sense now."""
+        """Handle an event of `live.events` or of a feature. Raises `Refused` for a command that makes no sense now."""
         ...
 
     def change(self, **settings: Any) -> None:

@@ -1,4 +1,4 @@
-"""The past of the run, and the steps of a recording."""
+"""Commands that move through the history of the run and the steps of recordings, and commands of rescored runs."""
 
 from __future__ import annotations
 
@@ -50,21 +50,22 @@ class GoToLast(Command, frozen=True):
 
 
 class Seek(Command, frozen=True):
-    """Show the moment after this control step: of the run, or of the aligned recordings."""
+    """Show the state after this control step of the run or of the aligned recordings."""
 
     step: int
     episode_only: bool = False
-    """Within the shown episode of the selected env: where it begins there is the last step of the one before, too."""
+    """Look for the step only in the shown episode of the selected env. The step at which an episode begins is also the
+    last one of the previous episode."""
 
 
 class SeekBack(Command, frozen=True):
-    """Show the moment this many steps before the newest: -37; 0 is live."""
+    """Show the state this many steps before the newest: -37; 0 is live."""
 
     steps: Annotated[int, msgspec.Meta(le=0)]
 
 
 class SeekOnCurve(Command, frozen=True):
-    """Show the moment after this control step, which was pressed on a curve."""
+    """Show the state after this control step, which was clicked on a curve."""
 
     step: int
 
@@ -82,11 +83,12 @@ class ContinueFromHere(Command, frozen=True):
     key = "shift+g"
     context = "live"
     scope: Literal["this", "all", "into all"] = "this"
-    """The selected env from its moment; all envs, each from its own; or all from the selected one's."""
+    """``this``: the selected env from its shown state; ``all``: each env from its own; ``into all``: all envs from the
+    selected one's."""
 
 
 class ZoomTimeline(Command, frozen=True):
-    """Show this episode on the timeline, or all that is kept."""
+    """Show only this episode on the timeline, or the whole history."""
 
     episode_only: bool
 
@@ -106,7 +108,7 @@ class PreviousDifference(Command, frozen=True):
 
 
 class ShowRescored(Command, frozen=True):
-    """Go to a run of the list of rescored ones."""
+    """Go to a run in the list of rescored runs."""
 
     run: str
 
@@ -122,6 +124,6 @@ class StopRescoring(Command, frozen=True):
 
 
 class ChooseRescoredCurve(Command, frozen=True):
-    """Plot this number of the history, as recorded and with the new code."""
+    """Plot this quantity of the history, as recorded and with the new code."""
 
     curve: str

@@ -1,4 +1,4 @@
-"""Snapshot of the session that the page draws."""
+"""The snapshot of the session that the page draws."""
 
 from __future__ import annotations
 
@@ -28,25 +28,26 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class SessionView:
-    """Immutable; its serials tell the redraw loop cheaply which parts are new, so that nothing is drawn twice."""
+    """Immutable snapshot of the session. Its serials tell the redraw loop cheaply which parts are new, so that nothing is
+    drawn twice."""
 
     state: RunState = "starting"
     activity: str = ""
-    """Current step of starting or loading, else empty."""
+    """Current phase of starting or loading, else empty."""
     stale: bool = False
-    """The file on disk is newer than the running version, or does not load."""
+    """Whether the file on disk is newer than the running version, or does not load."""
     task: TaskDescription | None = None
     task_serial: int = 0
-    """Grows with every successful load."""
+    """Increases with every successful load."""
     scene_serial: int = 0
-    """Grows with every new scene: not with a version that is patched into the present one."""
+    """Increases with every new scene, not with a version that is patched into the present one."""
     cameras_serial: int = 0
-    """Grows with every new set of cameras."""
+    """Increases with every new set of cameras."""
     load_milliseconds: float = 0.0
     reload: ReloadReport | None = None
-    """How the running version came in; None for the first."""
+    """How the running version was loaded; None for the first."""
     timeline_cleared: bool = False
-    """Whether the running version began another history."""
+    """Whether the load of the running version started a new history."""
     loads: tuple[PastLoad, ...] = ()
     """The last loads, newest first."""
     choices: tuple[str, ...] = ()
@@ -59,20 +60,20 @@ class SessionView:
     pictures_serial: int = 0
     picture_milliseconds: float | None = None
     failed_cameras: Mapping[CameraKey, str] = field(default_factory=dict)
-    """Why cameras cannot be drawn, as sentences; they are left out."""
+    """Cameras that cannot be drawn and are left out, with the reason as a sentence."""
     problem: Problem | None = None
     problem_serial: int = 0
     problem_at_run: bool = False
-    """Whether `problem` came while the task ran, not while a version was loaded."""
+    """Whether `problem` occurred while the task ran, not during a load."""
     spoiled: str = ""
-    """Why another process brought the version back that ran when `problem` came, as `TaskFailed` has it."""
+    """Why another process restored the version that ran when `problem` occurred; see `TaskFailed.spoiled`."""
     refused: Problem | None = None
     """Why the present version of the file does not run."""
     curves: Curves | None = None
     settings: Settings = Settings()
     """Settings chosen on the page."""
     told: NDArray[np.float32] | None = None
-    """(N, A) action that sliders send next; of a past moment, the action that led there. None if unknown."""
+    """(N, A) next action of the sliders; for a past moment, the action that led there. None if unknown."""
     options: TaskOptions = TaskOptions()
     """How the envs are made; the seed is `seed`."""
     options_refused: TaskOptions | None = None
@@ -85,27 +86,27 @@ class SessionView:
     watched_share: float = 0.0
     """Speeds and shares of time, as in `Status`."""
     timeline: TimelineView = TimelineView()
-    """The history. While one of its moments is shown, `step` and `pictures` are of that moment."""
+    """The history. While a past moment is shown, `step` and `pictures` are those of that moment."""
     busy: Busy | None = None
     """A long-running call in the worker."""
     rules: RulesBroken | None = None
     """Rules of GPU simulation that the running version has broken; None for none."""
     rules_serial: int = 0
     odd: tuple[Finding, ...] = ()
-    """Rules that the running version broke by outliers, one a rule."""
+    """Rules that the running version broke by outliers, one finding per rule."""
     inspection: Inspection | None = None
-    """As `Run.inspection`."""
+    """See `Run.inspection`."""
     printed: Printed = NOTHING_PRINTED
     """The last lines that the author's code printed."""
     vitals: ProcessMemory = ProcessMemory()
     """Memory of the processes."""
     known_policies: tuple[str, ...] = ()
-    """Policies to choose from, as they were listed last."""
+    """Policies to choose from, from the last search."""
     features: Mapping[type[Any], Any] = field(default_factory=dict)
     """The view of each feature, by its class."""
 
     def of(self, kind: type[Part]) -> Part:
-        """The view of a feature, such as ``of(StudioView)``; one with default values where the session has none."""
+        """The view of a feature, such as ``of(StudioView)``; one with default values if the session has none."""
         return self.features[kind] if kind in self.features else kind()
 
     @property
@@ -120,11 +121,11 @@ class SessionView:
 
 
 _OF_RUN = {one.name for one in fields(SessionView)} & {one.name for one in fields(Run)}
-"""Fields that a view has from the run as they are."""
+"""Fields that a view copies unchanged from the run."""
 
 
 def view_of(run: Run, **known: Any) -> SessionView:
-    """What a page shows of the run, at the shown moment.
+    """The view of the run at the shown moment.
 
     Args:
         known: further fields of the view.

@@ -25,11 +25,11 @@ KEY_NAMES = {
     "delete": "Delete",
 }
 MODIFIERS = "ctrl", "alt", "shift"
-"""In the order in which a key names them. ``ctrl`` is Cmd on a Mac too."""
+"""In the order in which a key lists them. On a Mac ``ctrl`` is also Cmd."""
 
 
 class Refused(ValueError):
-    """A command is not possible now, or not with these values; the message tells the person why."""
+    """A command is not possible now, or not with these values; the message gives the user the reason."""
 
 
 def name_of(kind: type[Command]) -> str:
@@ -38,26 +38,26 @@ def name_of(kind: type[Command]) -> str:
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Something that a person, a script or an agent can ask for.
+    """A request that a user, a script or an agent can make.
 
-    The first line of its docstring is its help. A value that its fields do not take is refused when it is read.
+    The first line of the docstring is the help text. `CommandList.decode` refuses values that do not fit the fields.
     """
 
     key: ClassVar[str] = ""
-    """The key that asks for it with its default values: ``s``, ``shift+arrowleft``, ``ctrl+z``."""
+    """Key that triggers it with its default values: ``s``, ``shift+arrowleft``, ``ctrl+z``."""
     context: ClassVar[str] = "page"
-    """Where the key counts: ``page``, or an element with this ``data-context`` that is visible."""
+    """Where the key works: ``page``, or while an element with this ``data-context`` is visible."""
     repeats: ClassVar[bool] = False
-    """A key that is held down asks again and again."""
+    """Whether a key that is held down repeats the command."""
 
     @classmethod
     def help(cls) -> str:
-        """One sentence without its full stop."""
+        """The help text: one sentence without its full stop."""
         return (cls.__doc__ or "").strip().split("\n")[0].removesuffix(".")
 
     @classmethod
     def is_in_palette(cls) -> bool:
-        """A person can ask for it by its name alone."""
+        """Whether the palette lists it: its name alone is enough, without field values."""
         alone = not any(field.required for field in msgspec.structs.fields(cls))
         return alone and cls.context != "dialog" and not cls.__name__.startswith("Tell")
 
@@ -68,7 +68,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 @dataclass(frozen=True)
 class Key:
-    """A key and the command that it asks for."""
+    """A key and the command that it triggers."""
 
     key: str
     context: str
@@ -85,7 +85,7 @@ class CommandList:
         assert len(self._by_name) == len(self.kinds), "two commands have one name"
         taken = [(kind.context, kind.key) for kind in self.kinds if kind.key]
         assert len(taken) == len(set(taken)), "two commands have one key"
-        assert all(is_key(kind.key) for kind in self.kinds if kind.key), "a key is written otherwise"
+        assert all(is_key(kind.key) for kind in self.kinds if kind.key), "a key is not in the normal form"
 
     def __iter__(self) -> Iterator[type[Command]]:
         return iter(self.kinds)
@@ -97,8 +97,8 @@ class CommandList:
         """Read a command.
 
         Raises:
-            KeyError: there is no command of this name.
-            Refused: its fields do not take these values.
+            KeyError: no command has this name.
+            Refused: the values do not fit the fields.
         """
         kind = self._by_name[name]
         try:
@@ -119,7 +119,7 @@ def is_key(key: str) -> bool:
 
 
 def key_in_words(key: str) -> str:
-    """As the page and the docs show it: ``Space``, ``Shift+R``; empty for no key."""
+    """The key as the page and the docs show it: ``Space``, ``Shift+R``; empty for no key."""
     if not key:
         return ""
     *held, last = key.split("+")

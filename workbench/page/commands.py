@@ -1,4 +1,4 @@
-"""What the pages themselves do: which one is shown, tabs, folds, the view."""
+"""Commands of the pages themselves: which page is shown, tabs, folds, dialogs, the view."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ class ShowTab(Command, frozen=True):
 
 
 class TellOpenTab(Command, frozen=True):
-    """The page says which tab it has open."""
+    """Report from the page: the open tab."""
 
     tab: str
 
 
 class TellUnfolded(Command, frozen=True):
-    """The page says that a panel was unfolded."""
+    """Report from the page: a panel was unfolded."""
 
     panel: str
 
 
 class TellDrawnInSoftware(Command, frozen=True):
-    """The page says that it draws its view in software."""
+    """Report from the page: the browser renders the view in software."""
 
 
 class ToggleTable(Command, frozen=True):
@@ -75,34 +75,34 @@ class RenewToken(Command, frozen=True):
 
 
 class CloseDialog(Command, frozen=True):
-    """Close what is open over the page."""
+    """Close the open dialog."""
 
     key = "escape"
     context = "dialog"
 
 
 class TypeAnswer(Command, frozen=True):
-    """Type into the question that is open over the page."""
+    """Type into the open dialog."""
 
     text: str
 
 
 class AnswerDialog(Command, frozen=True):
-    """Accept what was typed into the question that is open over the page."""
+    """Accept the text typed into the open dialog."""
 
     context = "dialog"
 
 
 class AnswerTrust(Command, frozen=True):
-    """Answer the question whether code may run."""
+    """Answer whether code may run."""
 
     question: str
-    """Which one: another may be open by the time of the answer."""
+    """Id of the question: another one may be open when the answer arrives."""
     answer: Literal["no", "none", "once", "always"]
 
 
 class ChooseDetail(Command, frozen=True):
-    """Choose how finely shapes are drawn."""
+    """Choose the level of detail of shapes."""
 
     detail: Literal["fine", "normal", "coarse"]
 

@@ -1,4 +1,4 @@
-"""Recording what runs, or what has been seen."""
+"""Commands of the recorder: record the running envs, or save steps of the history."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class SavePreviousEpisode(Command, frozen=True):
 
 
 class ChooseRecordedEnvs(Command, frozen=True):
-    """Which envs are recorded and saved."""
+    """Choose which envs are recorded and saved."""
 
     envs: Literal["selected", "all"]
 
 
 class SaveSolved(Command, frozen=True):
-    """Save the solved episode into the recordings, like any other: from there it can be exported as a demonstration."""
+    """Save the solved episode to the recordings, from where it can be exported as a demonstration."""

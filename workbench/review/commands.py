@@ -1,4 +1,4 @@
-"""Recordings that are open in the review."""
+"""Commands of the recordings that are open in the review."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ class PreviousRecording(Command, frozen=True):
 
 
 class SelectRecording(Command, frozen=True):
-    """Select this one of the open recordings."""
+    """Select this open recording."""
 
     id: str
 
 
 class CloseRecording(Command, frozen=True):
-    """Close this one of the open recordings."""
+    """Close this open recording."""
 
     id: str
 
 
 class ToggleOverlaid(Command, frozen=True):
-    """Overlaid or side by side."""
+    """Switch between overlaid and side by side."""
 
     key = "o"
     context = "review"
@@ -65,13 +65,13 @@ class ShowSweepPoint(Command, frozen=True):
 
 
 class SortSweep(Command, frozen=True):
-    """Sort the points of a sweep by a column; by the same again in reverse order."""
+    """Sort the points of a sweep by a column; the same column again reverses the order."""
 
     column: str
 
 
 class FilterSweep(Command, frozen=True):
-    """List the points of a sweep with this value of a setting, or no longer."""
+    """Add or remove a filter: list only the points of a sweep with this value of a setting."""
 
     name: str
     value: str
@@ -100,23 +100,23 @@ class ChoosePlaybackSpeed(Command, frozen=True):
 
 
 class LoopPlayback(Command, frozen=True):
-    """Play the recordings round and round, or once."""
+    """Play the recordings in a loop, or once."""
 
     on: bool
 
 
 class OpenAgain(Command, frozen=True):
-    """Read once more what could not be opened: it may only have taken too long."""
+    """Retry the recordings that could not be opened: the first try may have timed out."""
 
 
 class ArrangeRecordings(Command, frozen=True):
-    """Draw the open recordings over each other, or side by side."""
+    """Draw the open recordings overlaid or side by side."""
 
     layout: Literal["overlaid", "side by side"]
 
 
 class AlignRecordings(Command, frozen=True):
-    """Align the open recordings at their starts, or at the first event of a name."""
+    """Align the open recordings at their starts, or at the first event of this name."""
 
     at: str
 
@@ -134,13 +134,13 @@ class SwapWithFirst(Command, frozen=True):
 
 
 class ChooseTolerance(Command, frozen=True):
-    """Count a body of two recordings as different where it is further apart than this."""
+    """Set the distance, in metres, from which a body counts as different between two recordings."""
 
     metres: Annotated[float, msgspec.Meta(gt=0)]
 
 
 class ChooseReviewCurve(Command, frozen=True):
-    """Draw this entry of the recordings below their reward."""
+    """Plot this entry of the recordings below their reward."""
 
     curve: str
 
@@ -150,7 +150,7 @@ class RescoreOpen(Command, frozen=True):
 
 
 class ChooseRescoreCode(Command, frozen=True):
-    """Rescore recordings with this one of the listed codes."""
+    """Choose the code that recordings are rescored with."""
 
     code: str
 

@@ -14,7 +14,7 @@ from workbench.cameras.frustums import SMALL, CameraFrustums, without_the_viewpo
 from workbench.envs.camera_data import CameraInfo, CameraKey, Picture
 from workbench.envs.scene.shapes import BodyKind, Material, SceneGeometry, Visual, fingerprint
 from workbench.episodes.episode import CameraTrack
-from workbench.live.panels.timeline_panel import HEIGHT as TIMELINE_HEIGHT
+from workbench.live.panels.timeline_panel import HEIGHT_PIXELS as TIMELINE_HEIGHT
 from workbench.machine.loop import post
 from workbench.page.command import Refused
 from workbench.page.scene.bodies import DrawStyle

@@ -1,4 +1,4 @@
-"""What is made of recordings to be shared, and rerun's viewer."""
+"""Commands that export recordings and open them in rerun's viewer."""
 
 from __future__ import annotations
 
@@ -9,53 +9,52 @@ import msgspec
 from workbench.page.command import Command
 
 What = Literal["film", "scene", "page", "sheet", "zip", "lerobot", "maniskill"]
-LONGEST_INSTRUCTION = 400
-"""Characters."""
+MAX_INSTRUCTION_CHARACTERS = 400
 
 
 class ChooseShared(Command, frozen=True):
-    """Choose whether the open recordings are shared, or the selected ones."""
+    """Choose whether the open or the selected recordings are shared."""
 
     opened: bool
 
 
 class ChooseMade(Command, frozen=True):
-    """Choose what is made of recordings."""
+    """Choose what to make of recordings."""
 
     what: What
 
 
 class ChooseFilmed(Command, frozen=True):
-    """Choose the camera that a video is made of."""
+    """Choose the camera of a video."""
 
     camera: str
-    """Empty for every camera."""
+    """Empty for all cameras."""
 
 
 class TakeOnlySuccesses(Command, frozen=True):
-    """Leave recordings that reach success at no step out of a dataset, or not."""
+    """Leave recordings that never reach success out of a dataset, or keep them."""
 
     on: bool
 
 
 class TakeOnlyCompatible(Command, frozen=True):
-    """Leave recordings that cannot be read, or lack what the first one has, out of a dataset, or not."""
+    """Leave recordings that cannot be read, or lack data of the first one, out of a dataset, or keep them."""
 
     on: bool
 
 
 class TypeInstruction(Command, frozen=True):
-    """Type the task of a dataset in words."""
+    """Type the task of a dataset as an instruction in words."""
 
-    words: Annotated[str, msgspec.Meta(max_length=LONGEST_INSTRUCTION)]
+    words: Annotated[str, msgspec.Meta(max_length=MAX_INSTRUCTION_CHARACTERS)]
 
 
 class MakeShared(Command, frozen=True):
-    """Make something of the selected or open recordings."""
+    """Make the chosen thing of the selected or open recordings."""
 
 
 class StopMaking(Command, frozen=True):
-    """Stop making something of recordings."""
+    """Stop the export of recordings."""
 
 
 class OpenInRerun(Command, frozen=True):

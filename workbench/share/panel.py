@@ -27,7 +27,7 @@ from workbench.page.widgets.visitors import Visitor
 from workbench.pictures.camera_conventions import triple
 from workbench.review.view import ReviewView
 from workbench.share.commands import (
-    LONGEST_INSTRUCTION,
+    MAX_INSTRUCTION_CHARACTERS,
     ChooseFilmed,
     ChooseMade,
     ChooseShared,
@@ -133,7 +133,7 @@ class SharePanel:
             server, "Only compatible ones", TakeOnlyCompatible, "on", first.only_fitting, hint=FITTING_HINT
         )
         self._task = Field(
-            server, "Task", TypeInstruction, "words", hint=TASK_HINT, longest=LONGEST_INSTRUCTION
+            server, "Task", TypeInstruction, "words", hint=TASK_HINT, longest=MAX_INSTRUCTION_CHARACTERS
         )
         self._will = gui.add_html("")
         self._tools = gui.add_html("")

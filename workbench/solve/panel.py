@@ -28,7 +28,7 @@ from workbench.planning.options import PlanOptions
 from workbench.record.commands import SaveSolved
 from workbench.record.state import RecordingStatus
 from workbench.solve.commands import (
-    LONGEST_HORIZON,
+    MAX_HORIZON_SECONDS,
     ChooseMethod,
     ChoosePlannedEnvs,
     FollowBody,
@@ -212,7 +212,7 @@ class SolvePanel(PagePart[SessionView]):
         self._rollouts.show(plan.rollouts)
         has_success = view.step is None or "success" in view.step.evaluate
         seconds = horizon_seconds(plan, task.control_dt, has_success)
-        self._horizon.show(round(min(seconds, LONGEST_HORIZON), 2))
+        self._horizon.show(round(min(seconds, MAX_HORIZON_SECONDS), 2))
         self._noise.show(plan.noise)
         self._temperature.show(plan.temperature)
         self._temperature.visible = plan.method == "mppi"

@@ -13,7 +13,7 @@ from enum import Enum
 from functools import cache
 from pathlib import Path
 
-from workbench.live.commands import MOST_ENVS
+from workbench.live.commands import MAX_NUM_ENVS
 from workbench.machine.folders import example_tasks
 from workbench.machine.loop import BlockingPool, begin, do, on_loop
 from workbench.machine.parse_python import parse_python
@@ -253,7 +253,7 @@ class Catalogue:
 
     def _recent(self, task: RecentTask) -> Entry:
         file = task.file
-        num_envs = min(task.num_envs, MOST_ENVS)
+        num_envs = min(task.num_envs, MAX_NUM_ENVS)
         options = replace(self.options, num_envs=num_envs, env_kwargs=dict(task.env_kwargs))
         kwargs = "".join(f", {name}={value}" for name, value in task.env_kwargs.items())
         how = f"{num_envs} {'env' if num_envs == 1 else 'envs'}{kwargs}"

@@ -1,4 +1,4 @@
-"""The list of tasks."""
+"""Commands of the list of tasks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class OpenTaskList(Command, frozen=True):
 
 
 class OpenListedTask(Command, frozen=True):
-    """Open this task of the list."""
+    """Open this listed task."""
 
     number: int
 
@@ -33,26 +33,25 @@ class ClearTaskSearch(Command, frozen=True):
 
 
 class LookForTasks(Command, frozen=True):
-    """List the tasks that have these words, or the file with this path."""
+    """List the tasks that contain these words, or the file with this path."""
 
     words: str
 
 
-LONGEST_NAME = 200
-"""Characters."""
+MAX_NAME_CHARACTERS = 200
 
 
 class NameTask(Command, frozen=True):
-    """Name the task that is to be created."""
+    """Type the name of the new task."""
 
-    name: Annotated[str, msgspec.Meta(max_length=LONGEST_NAME)]
+    name: Annotated[str, msgspec.Meta(max_length=MAX_NAME_CHARACTERS)]
 
 
 class ChooseTemplate(Command, frozen=True):
-    """Choose what the task that is to be created begins as."""
+    """Choose the template of the new task."""
 
     template: TemplateName
 
 
 class CreateTask(Command, frozen=True):
-    """Create the named task from the chosen template, and open it."""
+    """Create the task with the typed name from the chosen template, and open it."""

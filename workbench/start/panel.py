@@ -18,7 +18,7 @@ from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Done, Visitor
 from workbench.start.catalogue import Catalogue, CatalogueView, Entry, Section
 from workbench.start.commands import (
-    LONGEST_NAME,
+    MAX_NAME_CHARACTERS,
     ChooseTemplate,
     ClearTaskSearch,
     CreateTask,
@@ -128,7 +128,7 @@ class TaskList:
                 NameTask,
                 "name",
                 hint="Such as stack_two, which is written to stack_two.py",
-                longest=LONGEST_NAME,
+                longest=MAX_NAME_CHARACTERS,
             )
             about = {f"{template.name}: {template.about}": template.name for template in TEMPLATES}
             self._template_choice = choice(

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from workbench.live.commands import MOST_ENVS
+from workbench.live.commands import MAX_NUM_ENVS
 from workbench.machine.folders import locked, read_private, state_folder, write_private
 from workbench.task.description import TaskOptions
 from workbench.task.reference import lasting, named_file, split_reference
@@ -124,7 +124,7 @@ def _decoded(row: msgspec.Raw) -> RecentTask | None:
 def _checked(task: RecentTask) -> RecentTask | None:
     """The task, unless its values cannot be those of one: the file may have been written by anybody."""
     text = task.reference
-    if not 0 < len(text) <= LONGEST or not text.isprintable() or not 1 <= task.num_envs <= MOST_ENVS:
+    if not 0 < len(text) <= LONGEST or not text.isprintable() or not 1 <= task.num_envs <= MAX_NUM_ENVS:
         return None
     try:
         # A module's name would find another file in another folder.

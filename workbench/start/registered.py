@@ -34,8 +34,8 @@ log = logging.getLogger(__name__)
 LIST_FILE = "tasks.json"
 MOST_TASKS = 2000
 MOST_TRIES = 2
-"""Attempts to draw a task before `AGAIN_AFTER` has to pass."""
-AGAIN_AFTER = 7 * 24 * 3600.0
+"""Attempts to draw a task before `RETRY_SECONDS` has to pass."""
+RETRY_SECONDS = 7 * 24 * 3600.0
 """Seconds after which a task that failed so often is tried again: what it lacks may have been downloaded."""
 ANSWER_SECONDS = 120.0
 """Timeout of the list and of each picture; on two cores with a software renderer most tasks are drawn in 5 s."""
@@ -231,7 +231,7 @@ class RegisteredTasks:
 
 
 def _may_try(before: NotDrawn | None) -> bool:
-    return before is None or before.tries < MOST_TRIES or abs(time.time() - before.last) > AGAIN_AFTER
+    return before is None or before.tries < MOST_TRIES or abs(time.time() - before.last) > RETRY_SECONDS
 
 
 def _version_folder() -> Path:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tests.drive.session import moment
 from workbench.envs.step_result import OtherEntry, StepResult
 from workbench.live.history.curves import (
-    MOST,
+    MAX_COLUMNS,
     REWARD,
     SUCCESS,
     Column,
@@ -146,9 +146,9 @@ def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
 
 def test_columns_are_bounded_and_those_that_a_version_has_dropped_make_room() -> None:
     steps = StepCurves(N)
-    steps.add(step(1, **{f"term{i}": [0] * N for i in range(MOST + 5)}))
+    steps.add(step(1, **{f"term{i}": [0] * N for i in range(MAX_COLUMNS + 5)}))
     kept = steps.curves(0).columns
-    assert len(kept) == MOST and kept[:2] == (REWARD, SUCCESS)
+    assert len(kept) == MAX_COLUMNS and kept[:2] == (REWARD, SUCCESS)
     steps.add(step(2, other=[1] * N))
     assert [column.name for column in steps.curves(0).columns] == ["reward", "success", "other", "fail"]
     assert line(steps.curves(0), REWARD) == ([1, 2], [1, 2])

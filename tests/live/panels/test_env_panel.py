@@ -21,13 +21,13 @@ from workbench.live.env_commands import (
 )
 from workbench.live.events import EpisodeStepShown, SettingsChanged
 from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
-from workbench.live.panels.env_panel import MOST_ROWS, TABLE
+from workbench.live.panels.env_panel import ROWS_PER_PAGE, TABLE
 from workbench.page.command import Command
 from workbench.page.commands import TellUnfolded, ToggleTable
 
 pytestmark = pytest.mark.thorough
 
-MANY = MOST_ROWS + 6
+MANY = ROWS_PER_PAGE + 6
 
 
 def many(**changes: Any) -> EnvRows:
@@ -85,29 +85,29 @@ def table(live_page: Live) -> Table:
 
 
 def test_pages_filters_and_rows_are_pressed(table: Table) -> None:
-    assert table.envs() == list(range(MOST_ROWS))
-    assert table.ask(TurnEnvs(by=1)) == list(range(MOST_ROWS, MANY))
+    assert table.envs() == list(range(ROWS_PER_PAGE))
+    assert table.ask(TurnEnvs(by=1)) == list(range(ROWS_PER_PAGE, MANY))
     table.ask(ShowEnvAtEvent(env=MANY - 3))
     assert table.live.asked == [SettingsChanged({"selected_env": MANY - 3})], "there is no moment to go to"
     table.ask(ShowEnvAtEvent(env=MANY - 1))
     assert table.live.asked[1:] == [EpisodeStepShown(MANY - 1, 12)]
     table.live.do(TurnEnvs(by=1))  # it is pressed on a page that was drawn before the last one was shown
     table.live.again()
-    assert table.envs() == list(range(MOST_ROWS, MANY))
+    assert table.envs() == list(range(ROWS_PER_PAGE, MANY))
     assert table.ask(FilterEnvs(which="flagged")) == [MANY - 2, MANY - 1]
     assert "&lt;b&gt;odd" in table.html and "<b>odd" not in table.html
 
 
 def test_another_filter_and_another_order_begin_on_the_first_page(table: Table) -> None:
     table.ask(TurnEnvs(by=1))
-    assert table.ask(FilterEnvs(which="running")) == list(range(MOST_ROWS))
+    assert table.ask(FilterEnvs(which="running")) == list(range(ROWS_PER_PAGE))
     assert table.ask(FilterEnvs(which="failed")) == list(range(1, MANY, 2))
-    assert table.ask(FilterEnvs(which="all")) == list(range(MOST_ROWS))
+    assert table.ask(FilterEnvs(which="all")) == list(range(ROWS_PER_PAGE))
     table.ask(TurnEnvs(by=1))
-    assert table.ask(SortEnvs(column="return")) == list(range(MOST_ROWS))
+    assert table.ask(SortEnvs(column="return")) == list(range(ROWS_PER_PAGE))
     table.ask(TurnEnvs(by=1))
-    assert table.ask(SortEnvs(column="return")) == list(range(MANY - 1, MANY - 1 - MOST_ROWS, -1))
-    assert table.ask(SortEnvs(column="env")) == list(range(MOST_ROWS)), (
+    assert table.ask(SortEnvs(column="return")) == list(range(MANY - 1, MANY - 1 - ROWS_PER_PAGE, -1))
+    assert table.ask(SortEnvs(column="env")) == list(range(ROWS_PER_PAGE)), (
         "another column begins with its smallest"
     )
 

@@ -11,7 +11,7 @@ from tests.drive.scenes import running
 from workbench.envs.inspection import Inspection, JointReadings, Leaf, Touching
 from workbench.live.panels.inspect_panel import (
     CHOICES,
-    LONGEST,
+    MAX_ARROW_METRES,
     METRES_AT_ONE_NEWTON,
     arrows_of,
     inspect_html,
@@ -79,7 +79,7 @@ def test_arrows_start_at_the_points_and_are_bounded() -> None:
     # The point without a force has no arrow.
     four_newtons = 4 ** (1 / 3) * METRES_AT_ONE_NEWTON
     np.testing.assert_allclose(
-        arrows, [[[0, 0, 0], [0, 0, four_newtons]], [[1, 1, 1], [1 + LONGEST, 1, 1]]], rtol=1e-6
+        arrows, [[[0, 0, 0], [0, 0, four_newtons]], [[1, 1, 1], [1 + MAX_ARROW_METRES, 1, 1]]], rtol=1e-6
     )
     assert arrows_of(Inspection(0, 0)).shape == (0, 2, 3)
 

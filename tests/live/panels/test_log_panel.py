@@ -15,7 +15,7 @@ from workbench.live.panels.log_panel import (
     DARK_PAGE,
     LIGHT_PAGE,
     LINES_SHOWN,
-    READABLE,
+    MIN_CONTRAST,
     contrast,
     log_html,
     readable_on,
@@ -104,7 +104,7 @@ def test_colours_become_spans_and_all_else_is_shown() -> None:
 @given(st.tuples(BYTE, BYTE, BYTE))
 def test_every_colour_can_be_read_on_both_pages(colour: tuple[int, int, int]) -> None:
     for page in (LIGHT_PAGE, DARK_PAGE):
-        assert contrast(readable_on(colour, page), page) >= READABLE
+        assert contrast(readable_on(colour, page), page) >= MIN_CONTRAST
     assert readable_on((0, 0, 0), LIGHT_PAGE) == (0, 0, 0)
 
 
@@ -116,11 +116,11 @@ def test_the_sixteen_colours_of_the_page_can_be_read(scheme: str, page: tuple[in
         found = re.search(rf"(?:^|\s){re.escape(scheme)}\.wb-ansi-{number} {{ color: #(\w{{6}}); }}", CSS)
         assert found is not None, number
         red, green, blue = bytes.fromhex(found[1])
-        assert contrast((red, green, blue), page) >= READABLE, (number, found[1])
+        assert contrast((red, green, blue), page) >= MIN_CONTRAST, (number, found[1])
     stderr = re.search(rf"(?:^|\n){re.escape(scheme)}\.wb-log \.wb-stderr {{ color: #(\w{{6}}); }}", CSS)
     assert stderr is not None
     red, green, blue = bytes.fromhex(stderr[1])
-    assert contrast((red, green, blue), page) >= READABLE
+    assert contrast((red, green, blue), page) >= MIN_CONTRAST
 
 
 @given(
@@ -135,4 +135,4 @@ def test_text_can_be_seen_on_any_background(style: Style) -> None:
     colours = re.fullmatch(r"color:#(\w{6});background:#(\w{6})", span.css)
     assert colours is not None
     text, behind = (tuple(bytes.fromhex(colour)) for colour in colours.groups())
-    assert contrast(text, behind) >= READABLE / 2  # type: ignore[arg-type]
+    assert contrast(text, behind) >= MIN_CONTRAST / 2  # type: ignore[arg-type]

@@ -23,8 +23,16 @@ from workbench.live.commands import (
     RestartWorker,
 )
 from workbench.live.messages import ReloadReport
-from workbench.live.panels.banners import FILL, INTERRUPT, NEW_WORKER, REBUILD, RELOAD, RESTART, SHOWN_AFTER
-from workbench.live.panels.version_panel import MOST_SHOWN
+from workbench.live.panels.banners import (
+    FILL,
+    INTERRUPT,
+    NEW_WORKER,
+    REBUILD,
+    RELOAD,
+    RESTART,
+    SHOWN_AFTER_SECONDS,
+)
+from workbench.live.panels.version_panel import MAX_NAMED
 from workbench.live.process.heartbeat import Busy, busy_at
 from workbench.live.run import PastLoad
 from workbench.live.view import SessionView
@@ -141,7 +149,7 @@ def test_an_empty_file_is_filled_by_a_press_and_only_while_it_is_empty(live: Liv
 
 
 def test_what_takes_long_can_be_ended_and_stands_instead_of_a_problem(live: Live) -> None:
-    live.show(running(2, busy=replace(LOOP, seconds=SHOWN_AFTER - 1)))
+    live.show(running(2, busy=replace(LOOP, seconds=SHOWN_AFTER_SECONDS - 1)))
     assert not live.part("Busy").seen
     live.show(failed(busy=LOOP))
     busy = live.part("Busy")
@@ -255,10 +263,10 @@ def test_a_load_is_told_with_level_time_reason_and_what_it_could_not_carry(live:
         live, running(2, reload=ReloadReport("patched", "only evaluate changed"), load_milliseconds=43.2)
     )
     assert all(word in said for word in ("patched", "43 ms", "only evaluate changed"))
-    missing = {f"actor cube_{i}": "<script>why</script>" for i in range(MOST_SHOWN + 3)}
+    missing = {f"actor cube_{i}": "<script>why</script>" for i in range(MAX_NAMED + 3)}
     report = ReloadReport("rebuilt", "_load_scene changed", ("actor goal",), missing)
     said = version(live, running(2, reload=report, load_milliseconds=1500.0))
-    assert "1.5 s" in said and "actor cube_0" in said and f"actor cube_{MOST_SHOWN}" not in said
+    assert "1.5 s" in said and "actor cube_0" in said and f"actor cube_{MAX_NAMED}" not in said
     assert "and 3 more" in said and "<script" not in said
 
 

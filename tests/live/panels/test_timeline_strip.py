@@ -9,7 +9,7 @@ import pytest
 from tests.drive.scenes import running
 from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.live.panels.timeline_panel import LINE_HEIGHT as HEIGHT
-from workbench.live.panels.timeline_panel import MOST_MARKS, POINTS, reward_lines, strip_html
+from workbench.live.panels.timeline_panel import MAX_MARKS, REWARD_POINTS, reward_lines, strip_html
 from workbench.live.past import Strip, TimelineView
 
 
@@ -75,13 +75,13 @@ def test_what_came_from_a_recording_or_from_before_the_strip_is_said_so() -> Non
     assert re.findall(r'<path d="([^"]*)"', html) == ["M 0.0 0 Q 30.0 -26 60.0 0"]
 
 
-@pytest.mark.parametrize("count", [2, POINTS, POINTS + 1, 15_000])
+@pytest.mark.parametrize("count", [2, REWARD_POINTS, REWARD_POINTS + 1, 15_000])
 def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
     reward = np.zeros(count, np.float32)
     reward[count // 3] = 5.0
     (line,) = reward_lines(reward)
     points = [tuple(map(float, point.split(","))) for point in line.split()]
-    assert len(points) <= POINTS
+    assert len(points) <= REWARD_POINTS
     assert min(y for _, y in points) == 0.0 and max(y for _, y in points) == HEIGHT == 30.0
     assert all(0 <= x <= 100 for x, _ in points)
 
@@ -111,7 +111,7 @@ def test_of_very_many_events_each_part_of_the_strip_shows_the_worst() -> None:
         strip(low=0, high=100_000, events=tuple(ends), branches=()), running(4, timeline=past())
     )
     drawn = marks(html)
-    assert len(drawn) == MOST_MARKS and min(drawn)[0] == 0.0 and max(drawn)[0] > 99
+    assert len(drawn) == MAX_MARKS and min(drawn)[0] == 0.0 and max(drawn)[0] > 99
     assert sum(style == "fail" for _, style, _ in drawn) == 100
     both = strip_html(strip(events=((190, REWARD_NONFINITE | RESET),)), running(4, timeline=past()))
     assert marks(both) == [(90.0, "odd", "reward is NaN or infinite, 10 steps ago")]

@@ -144,7 +144,7 @@ def in_turns(background: Background, job: Job, work: Work, priority: Priority = 
 def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another(
     background: Background, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    monkeypatch.setattr(askers, "_LOAD_PATIENCE", 1.0)
+    monkeypatch.setattr(askers, "_LOAD_CANCEL_TIMEOUT_SECONDS", 1.0)
     job, load = Job("rescoring"), load_of(tmp_path)
     file = Path(str(load.task))
     provoke(file, "import", what)
@@ -203,7 +203,7 @@ def test_what_is_loaded_is_loaded_once_and_what_dies_or_fails_is_loaded_anew(
 def test_the_job_that_was_begun_last_comes_first_and_what_gave_way_is_done_again(
     background: Background, tmp_path: Path, aside: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(askers, "_PATIENCE", PATIENCE)  # also of a machine that is busy
+    monkeypatch.setattr(askers, "_CANCEL_TIMEOUT_SECONDS", PATIENCE)  # also of a machine that is busy
     load = load_of(tmp_path)
     done, under_way, seen = list[str](), threading.Event(), threading.Event()
     pids = set[int | None]()

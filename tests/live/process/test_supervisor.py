@@ -110,9 +110,18 @@ def small_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_start, "python_command", command)
     monkeypatch.setattr(worker_process, "worker_forks", SimpleNamespace(start=worker_start.start_anew))
     # What takes seconds for the sake of slow machines takes tenths here.
-    for name, seconds in (("_BUSY", 0.8), ("_STACK_EVERY", 0.3), ("_IGNORED_AFTER", 0.3), ("_HEADLESS", 0.8)):
+    for name, seconds in (
+        ("_BUSY_SECONDS", 0.8),
+        ("_STACK_PERIOD_SECONDS", 0.3),
+        ("_INTERRUPT_TIMEOUT_SECONDS", 0.3),
+        ("_HEADLESS_SECONDS", 0.8),
+    ):
         monkeypatch.setattr(supervisor, name, seconds)
-    for name, seconds in (("_LOAD_WAITS", 0.3), ("_LONGEST_SILENCE", 1.2), ("_AFTER_A_FAILURE", 0.05)):
+    for name, seconds in (
+        ("_LOAD_WAIT_SECONDS", 0.3),
+        ("_SILENCE_TIMEOUT_SECONDS", 1.2),
+        ("_RESTART_DELAY_SECONDS", 0.05),
+    ):
         monkeypatch.setattr(supervisor, name, seconds)
 
 
@@ -190,7 +199,11 @@ def test_long_work_is_told_again_and_again_and_that_it_is_over() -> None:
         one.worker.send(do("work 2.0"))
         one.until(lambda: None in one.busy, "its end")
         told = [busy for busy in one.busy if busy is not None]
-        assert len(told) >= 2 and told[0].seconds >= supervisor._BUSY and told[-1].seconds > told[0].seconds
+        assert (
+            len(told) >= 2
+            and told[0].seconds >= supervisor._BUSY_SECONDS
+            and told[-1].seconds > told[0].seconds
+        )
         assert told[-1].file == str(SMALL_WORKER) and not told[-1].ignores_interrupt and not told[-1].held
         assert one.deaths == [] and one.busy.count(None) == 1
 
@@ -297,7 +310,7 @@ def test_what_cannot_go_on_is_ended_with_a_reason_and_another_comes(does: str, f
 def test_one_that_is_about_to_end_without_its_main_thread_is_left_to_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervisor, "_HEADLESS", 600.0)
+    monkeypatch.setattr(supervisor, "_HEADLESS_SECONDS", 600.0)
     with minded() as one:
         one.worker.send(do("ends_soon_without_a_main_thread 0.5"))
         assert "exit code 7" in one.until_dead().why
@@ -370,14 +383,14 @@ def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
 
 @pytest.mark.slow
 def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "_SPARE_DELAY", 0.0)
+    monkeypatch.setattr(supervisor, "_SPARE_DELAY_SECONDS", 0.0)
     with minded(WorkerOptions(spare=True)) as one:
         assert one.worker.vitals.spare_memory is None
         one.worker.send(do("loaded"))
         one.until(lambda: one.worker.vitals.spare_ready, "the spare")
         assert (one.worker.vitals.spare_memory or 0) > 0
         # The next one would be ready before the assertion.
-        monkeypatch.setattr(supervisor, "_SPARE_DELAY", 600.0)
+        monkeypatch.setattr(supervisor, "_SPARE_DELAY_SECONDS", 600.0)
         first = one.worker.pid
         os.kill(first or 0, signal.SIGKILL)
         one.until_greeted(2)
@@ -389,7 +402,7 @@ def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatc
 def test_a_spare_that_dies_of_its_warming_up_is_tried_once_more_and_no_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervisor, "_SPARE_DELAY", 0.0)
+    monkeypatch.setattr(supervisor, "_SPARE_DELAY_SECONDS", 0.0)
     spare = SpareWorker(WarmUp(OPTIONS))
 
     def lives() -> bool:

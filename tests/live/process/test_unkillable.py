@@ -43,9 +43,13 @@ LIMIT = 2 * 2**30
 def soon() -> Iterator[None]:
     """What takes seconds for the sake of slow machines takes about one here."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, seconds in (("_BUSY", 1.0), ("_STACK_EVERY", 0.3), ("_IGNORED_AFTER", 0.5)):
+        for name, seconds in (
+            ("_BUSY_SECONDS", 1.0),
+            ("_STACK_PERIOD_SECONDS", 0.3),
+            ("_INTERRUPT_TIMEOUT_SECONDS", 0.5),
+        ):
             patch.setattr(supervisor, name, seconds)
-        for name, seconds in (("_LOAD_WAITS", 0.7), ("_LONGEST_SILENCE", 2.0)):
+        for name, seconds in (("_LOAD_WAIT_SECONDS", 0.7), ("_SILENCE_TIMEOUT_SECONDS", 2.0)):
             patch.setattr(supervisor, name, seconds)
         yield
 
@@ -96,7 +100,7 @@ def test_a_loop_in_a_step_is_told_and_can_be_left_with_its_traceback(
     provoke(file, place, "loop")
     session.do(Step())
     busy = wait_until(session, lambda v: v.busy is not None, "busy").busy
-    assert place in busy.doing and busy.seconds >= supervisor._BUSY and not busy.ignores_interrupt
+    assert place in busy.doing and busy.seconds >= supervisor._BUSY_SECONDS and not busy.ignores_interrupt
     assert busy.file == str(file) and busy.code in ("while True:", "pass")
     session.do(Step())
     session.do(Step())
@@ -200,7 +204,7 @@ def test_what_is_only_slow_is_told_and_left_alone(session: Session, file: Path) 
     provoke(file, "build", "slow")
     edit(file)
     # For longer than a load waits for what cannot be interrupted.
-    long = supervisor._LOAD_WAITS + supervisor._LONGEST_SILENCE + 0.5
+    long = supervisor._LOAD_WAIT_SECONDS + supervisor._SILENCE_TIMEOUT_SECONDS + 0.5
     busy = wait_until(session, lambda v: v.busy is not None and v.busy.seconds > long, "busy").busy
     assert "build" in busy.doing and busy.code == "_time.sleep(0.1)"
     calm(file)

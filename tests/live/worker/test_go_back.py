@@ -168,7 +168,7 @@ def test_an_interrupt_in_the_middle_of_a_replay_ends_it_and_another_failure_on_t
 
 
 def test_a_way_that_takes_too_long_is_given_up(lived: EnvMoment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(go_back, "MOST_SECONDS", 0.0)
+    monkeypatch.setattr(go_back, "MAX_REPLAY_SECONDS", 0.0)
     did = lived.back(T, dict.fromkeys(range(N), 0))
     assert did.replayed == () and did.how == "" and len(lived.told) == 1
     np.testing.assert_allclose(

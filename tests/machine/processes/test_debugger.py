@@ -52,9 +52,9 @@ def session(
     child_process: None, task_file: Path, tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Session]:
     """Its worker waits for a debugger before it loads the task."""
-    monkeypatch.setattr(supervisor, "_BUSY", HANGS)
-    monkeypatch.setattr(supervisor, "_LOAD_WAITS", HANGS)
-    monkeypatch.setattr(supervisor, "_LONGEST_SILENCE", HANGS)
+    monkeypatch.setattr(supervisor, "_BUSY_SECONDS", HANGS)
+    monkeypatch.setattr(supervisor, "_LOAD_WAIT_SECONDS", HANGS)
+    monkeypatch.setattr(supervisor, "_SILENCE_TIMEOUT_SECONDS", HANGS)
     session = Session(
         str(task_file),
         TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"}),

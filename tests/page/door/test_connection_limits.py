@@ -40,7 +40,7 @@ def is_closed(sock: socket.socket) -> bool:
     "said", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nX: ", b"\x16\x03"]
 )
 def test_a_connection_that_asks_nothing_is_closed_after_a_while(gated_server, monkeypatch, said):
-    monkeypatch.setattr(strangers, "PATIENCE", 0.3)
+    monkeypatch.setattr(strangers, "TOKEN_TIMEOUT_SECONDS", 0.3)
     with connected(gated_server) as quiet:
         quiet.sendall(said)
         assert is_closed(quiet)
@@ -49,7 +49,7 @@ def test_a_connection_that_asks_nothing_is_closed_after_a_while(gated_server, mo
 
 @pytest.mark.thorough
 def test_a_head_that_comes_a_byte_at_a_time_gains_no_time(gated_server, monkeypatch):
-    monkeypatch.setattr(strangers, "PATIENCE", 0.5)
+    monkeypatch.setattr(strangers, "TOKEN_TIMEOUT_SECONDS", 0.5)
     with connected(gated_server) as slow, pytest.raises(OSError):
         for byte in b"GET / HTTP/1.1\r\nX: " + b"y" * 10_000:
             slow.sendall(bytes([byte]))
@@ -57,7 +57,7 @@ def test_a_head_that_comes_a_byte_at_a_time_gains_no_time(gated_server, monkeypa
 
 
 def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(gated_server, monkeypatch):
-    monkeypatch.setattr(strangers, "PATIENCE", 0.5)
+    monkeypatch.setattr(strangers, "TOKEN_TIMEOUT_SECONDS", 0.5)
     with connected(gated_server) as refused:
         refused.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         answer = b""
@@ -68,7 +68,7 @@ def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(gated_server
 
 @pytest.mark.thorough
 def test_a_page_that_has_shown_the_token_is_not_hurried(gated_server, monkeypatch):
-    monkeypatch.setattr(strangers, "PATIENCE", 0.3)
+    monkeypatch.setattr(strangers, "TOKEN_TIMEOUT_SECONDS", 0.3)
     slow = (200, "application/octet-stream", b"x" * 1000)
     # Both take longer than a stranger is given.
     gated_server.add_route("/slow/", lambda path: time.sleep(0.8) or slow)
@@ -79,7 +79,7 @@ def test_a_page_that_has_shown_the_token_is_not_hurried(gated_server, monkeypatc
 
 
 def test_too_many_that_say_nothing_lock_nobody_out(gated_server, monkeypatch, caplog):
-    monkeypatch.setattr(strangers, "MOST", 10)
+    monkeypatch.setattr(strangers, "MAX_WITHOUT_TOKEN", 10)
     with contextlib.ExitStack() as stack, caplog.at_level(logging.WARNING):
         idle = [stack.enter_context(connected(gated_server)) for _ in range(30)]
         for _ in range(5):

@@ -51,7 +51,7 @@ def talk(client: Callable[[ClientConnection], Awaitable[None]]) -> int | None:
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(strangers, "READ_WITHIN", 1.0)
+    monkeypatch.setattr(strangers, "READ_TIMEOUT_SECONDS", 1.0)
 
 
 @pytest.mark.slow

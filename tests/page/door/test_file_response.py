@@ -13,7 +13,7 @@ import pytest
 
 from tests.drive.knocking import ask, cookie_of
 from tests.drive.waiting import until
-from workbench.page.door.file_response import BLOCK, FileReply
+from workbench.page.door.file_response import BLOCK_BYTES, FileReply
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
 LARGE = 48 * 2**20
@@ -79,7 +79,7 @@ def position(path: Path) -> int:
     return -1
 
 
-@pytest.mark.parametrize("size", [0, 1, BLOCK - 1, BLOCK, 2 * BLOCK + 1])
+@pytest.mark.parametrize("size", [0, 1, BLOCK_BYTES - 1, BLOCK_BYTES, 2 * BLOCK_BYTES + 1])
 def test_a_file_comes_whole_and_under_its_name(
     gated_server: GatedServer, file: tuple[str, Path], size: int
 ) -> None:
@@ -102,7 +102,7 @@ def test_of_a_file_that_grows_no_more_comes_than_was_announced(
     path.touch()
     os.truncate(path, LARGE + 100)
     raw, got = begun(gated_server, address)
-    os.truncate(path, LARGE + 10 * BLOCK)
+    os.truncate(path, LARGE + 10 * BLOCK_BYTES)
     assert rest(raw, got) == (LARGE + 100, LARGE + 100)
 
 
@@ -162,7 +162,7 @@ def test_a_file_that_is_gone_is_not_found(
 def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(
     gated_server: GatedServer, tmp_path: Path
 ) -> None:
-    plain = b"wasm " * BLOCK
+    plain = b"wasm " * BLOCK_BYTES
     path = tmp_path / "viewer.wasm.gz"
     path.write_bytes(gzip.compress(plain))
     gated_server.add_route("/packed/", lambda _: FileReply(path, "application/wasm", gzipped=True))
@@ -179,19 +179,19 @@ def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(
 def test_a_packed_file_that_is_damaged_is_cut_off_and_the_terminal_stays_quiet(
     gated_server: GatedServer, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
-    packed = bytearray(gzip.compress(os.urandom(6 * BLOCK)))
+    packed = bytearray(gzip.compress(os.urandom(6 * BLOCK_BYTES)))
     if damage == "not packed at all":
         packed[:2] = b"no"
     elif damage == "torn off":
-        packed[3 * BLOCK : -4] = b""
+        packed[3 * BLOCK_BYTES : -4] = b""
     else:
-        packed[3 * BLOCK : 3 * BLOCK + 4096] = b"\xff" * 4096
+        packed[3 * BLOCK_BYTES : 3 * BLOCK_BYTES + 4096] = b"\xff" * 4096
     path = tmp_path / "viewer.wasm.gz"
     path.write_bytes(packed)
     prefix = f"/damaged-{damage.replace(' ', '-')}/"
     gated_server.add_route(prefix, lambda _: FileReply(path, "application/wasm", gzipped=True))
     raw, got = begun(gated_server, f"{prefix}x")
     announced, count = rest(raw, got)
-    assert announced == 6 * BLOCK and count < announced
+    assert announced == 6 * BLOCK_BYTES and count < announced
     until(lambda: open_files(path) == 0, "the end of the reading")
     assert caplog.records == []

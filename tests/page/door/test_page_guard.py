@@ -114,7 +114,7 @@ def test_a_large_message_of_tiny_objects_is_not_taken_apart(gated_server, bystan
 
 
 def test_a_page_that_floods_is_slowed_then_let_go_and_the_others_go_on(gated_server, bystander, monkeypatch):
-    monkeypatch.setattr(page_guard, "PATIENCE", 0.5)
+    monkeypatch.setattr(page_guard, "MAX_SLOWED_SECONDS", 0.5)
     flooded = Bell(gated_server)
     gone = threading.Event()
 

@@ -18,8 +18,8 @@ from workbench.page.door.connection_limits import RateLimitedLog
 from workbench.page.door.file_response import Handler
 from workbench.page.door.responses import (
     EVERY_REPLY,
-    LONGEST_NAME,
-    LONGEST_PATH,
+    MAX_NAME_BYTES,
+    MAX_PATH_BYTES,
     PAGE_OF_OURS,
     SCRIPTS,
     STYLES,
@@ -150,12 +150,12 @@ def test_what_is_large_and_compresses_is_packed_for_who_takes_it(
 @pytest.mark.parametrize(
     ("path", "served"),
     [
-        ("/a/" + "x" * LONGEST_NAME, True),
-        ("/a/" + "x" * (LONGEST_NAME + 1), False),
-        ("/a/" + "é" * (LONGEST_NAME // 2), True),
-        ("/a/" + "é" * (LONGEST_NAME // 2 + 1), False),
-        ("/a" + "/" + "/".join(["x" * 100] * 29 + ["x" * (LONGEST_PATH - 2901)]), True),
-        ("/a" + "/" + "/".join(["x" * 100] * 29 + ["x" * (LONGEST_PATH - 2900)]), False),
+        ("/a/" + "x" * MAX_NAME_BYTES, True),
+        ("/a/" + "x" * (MAX_NAME_BYTES + 1), False),
+        ("/a/" + "é" * (MAX_NAME_BYTES // 2), True),
+        ("/a/" + "é" * (MAX_NAME_BYTES // 2 + 1), False),
+        ("/a" + "/" + "/".join(["x" * 100] * 29 + ["x" * (MAX_PATH_BYTES - 2901)]), True),
+        ("/a" + "/" + "/".join(["x" * 100] * 29 + ["x" * (MAX_PATH_BYTES - 2900)]), False),
         ("/a/..", False),
         ("/a/%2e%2e/x", False),
         ("/a/..%5Cx", False),
@@ -164,7 +164,7 @@ def test_what_is_large_and_compresses_is_packed_for_who_takes_it(
     ],
 )
 def test_a_path_that_no_file_can_have_is_answered_without_a_look(path: str, served: bool) -> None:
-    assert (LONGEST_NAME, LONGEST_PATH) == (255, 3000)
+    assert (MAX_NAME_BYTES, MAX_PATH_BYTES) == (255, 3000)
     made = answer(path, {"/a/": (says(b"served"), {})})
     assert (made.status_code, bytes(made.body)) == ((200, b"served") if served else (404, NO_SUCH_FILE))
 

@@ -10,7 +10,7 @@ import viser
 
 from tests.drive.scenes import table_scene
 from workbench.envs.scene.shapes import Material, Mesh
-from workbench.page.scene.bodies import LEAVES_AFTER, DrawStyle, SceneView
+from workbench.page.scene.bodies import REMOVAL_DELAY_SECONDS, DrawStyle, SceneView
 from workbench.page.scene.env_grid import lay_out
 
 
@@ -136,7 +136,7 @@ def test_simpler_shapes_take_the_place_of_the_finer_ones_a_moment_later(server: 
     # Both follow, so that nothing is seen of the change.
     np.testing.assert_array_equal(fine.batched_positions, simple.batched_positions)
     assert server.scene.get_handle_by_name(fine.name) is fine
-    now = LEAVES_AFTER
+    now = REMOVAL_DELAY_SECONDS
     view.move(poses, layout, None)
     assert server.scene.get_handle_by_name(fine.name) is None
     assert server.scene.get_handle_by_name(simple.name) is simple

@@ -9,7 +9,7 @@ import trimesh
 
 from tests.drive.scenes import box_mesh
 from workbench.envs.scene.shapes import Material
-from workbench.page.scene.glb import LAYER, as_glb, lift_painted_layers
+from workbench.page.scene.glb import LAYER_METRES, as_glb, lift_painted_layers
 
 
 def read_back(glb: bytes) -> list[Any]:
@@ -54,5 +54,5 @@ def test_painted_layers_are_pulled_apart_and_solids_are_not() -> None:
     solid = box_mesh((0.1, 0.1, 0.1))
     *lifted, same = lift_painted_layers([*discs, solid])
     tops = [float(mesh.vertices[:, 2].max()) for mesh in lifted]
-    assert np.diff(tops).min() > 0.9 * LAYER
+    assert np.diff(tops).min() > 0.9 * LAYER_METRES
     assert same is solid

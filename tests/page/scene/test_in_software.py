@@ -66,7 +66,7 @@ def test_a_page_that_does_not_tell_in_time_draws_otherwise_until_it_leaves(
 ) -> None:
     server: Any = Server()
     in_software = InSoftware(server)
-    monkeypatch.setattr("workbench.page.scene.software_rendering.PATIENCE", 0.05)
+    monkeypatch.setattr("workbench.page.scene.software_rendering.REPORT_TIMEOUT_SECONDS", 0.05)
     server.come(1)
     assert not in_software.all_pages
     in_software.told_by(server.visitor(1))

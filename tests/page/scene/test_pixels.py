@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.page.scene.visible_motion import AT_REST, Eye, SentPoses, displacements, pixel_sizes
+from workbench.page.scene.visible_motion import AT_REST_SECONDS, Eye, SentPoses, displacements, pixel_sizes
 
 EYE = Eye(np.array([0.0, 0.0, 5.0]), 0.001)
 """A pixel is 5 mm at the origin."""
@@ -58,9 +58,9 @@ def test_what_comes_to_rest_gets_its_exact_pose() -> None:
     end = poses_at(0.0123456, turn=0.1234)
     shown, _ = sent.update(end, (EYE,), 1.0)
     assert not np.array_equal(shown, end)
-    shown, _ = sent.update(end, (EYE,), 1.0 + AT_REST / 2)
+    shown, _ = sent.update(end, (EYE,), 1.0 + AT_REST_SECONDS / 2)
     assert not np.array_equal(shown, end)
-    shown, changed = sent.update(end, (EYE,), 1.01 + AT_REST)
+    shown, changed = sent.update(end, (EYE,), 1.01 + AT_REST_SECONDS)
     assert np.array_equal(shown, end) and changed.all()
     _, changed = sent.update(end, (EYE,), 2.0)
     assert not changed.any(), "once"

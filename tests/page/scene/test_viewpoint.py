@@ -14,7 +14,15 @@ from workbench.envs.camera_data import Picture
 from workbench.live.panels.view_panel import ViewPanel
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import lay_out
-from workbench.page.scene.viewpoint import FOV, ONE, Framing, ViewChoice, Viewpoint, frame_box, frame_one
+from workbench.page.scene.viewpoint import (
+    FOV_RADIANS,
+    ONE,
+    Framing,
+    ViewChoice,
+    Viewpoint,
+    frame_box,
+    frame_one,
+)
 
 
 @given(
@@ -37,9 +45,9 @@ def test_whole_box_is_in_the_picture_above_what_is_covered(
     corners = np.where(picks == 0, low, high) - viewpoint.position
     depth = corners @ forward
     assert (depth > 0).all()
-    assert (corners @ up <= np.tan(FOV / 2) * depth).all()
-    assert (corners @ up >= -(1 - 2 * covered) * np.tan(FOV / 2) * depth).all()
-    assert (np.abs(corners @ right) <= np.tan(FOV / 2) * aspect * depth).all()
+    assert (corners @ up <= np.tan(FOV_RADIANS / 2) * depth).all()
+    assert (corners @ up >= -(1 - 2 * covered) * np.tan(FOV_RADIANS / 2) * depth).all()
+    assert (np.abs(corners @ right) <= np.tan(FOV_RADIANS / 2) * aspect * depth).all()
 
 
 def test_the_human_camera_s_picture_is_above_what_is_covered() -> None:
@@ -53,7 +61,7 @@ def test_the_human_camera_s_picture_is_above_what_is_covered() -> None:
     for part, place in ((0.0, covered), (1.0, 1.0), (-1.0, -(1 - 2 * covered))):
         # A point of the middle plane at the picture's middle, top and bottom: where it is in the view, -1 to 1.
         z = 0.4 + part * depth * np.tan(fovy / 2)
-        assert abs((z - viewpoint.position[2]) / (away * np.tan(FOV / 2)) - place) < 1e-5
+        assert abs((z - viewpoint.position[2]) / (away * np.tan(FOV_RADIANS / 2)) - place) < 1e-5
 
 
 def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from workbench.page.widgets.images import (
-    LONGEST_LEGEND,
+    MAX_LEGEND_ENTRIES,
     NOTHING,
     VIRIDIS,
     DepthRange,
@@ -64,10 +64,12 @@ def test_segment_has_one_colour_everywhere_and_neighbours_differ() -> None:
 
 
 def test_legend_names_the_largest_first_and_counts_the_rest() -> None:
-    picture = np.repeat(np.arange(LONGEST_LEGEND + 4), np.arange(LONGEST_LEGEND + 4, 0, -1)).astype(np.int32)
+    picture = np.repeat(np.arange(MAX_LEGEND_ENTRIES + 4), np.arange(MAX_LEGEND_ENTRIES + 4, 0, -1)).astype(
+        np.int32
+    )
     legend, more = segments_seen(picture[None], {1: "cube"})
     assert [name for _, name in legend][:3] == ["background", "cube", "id 2"]
-    assert len(legend) == LONGEST_LEGEND
+    assert len(legend) == MAX_LEGEND_ENTRIES
     assert more == 4
 
 

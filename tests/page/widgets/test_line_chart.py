@@ -6,7 +6,7 @@ import numpy as np
 import viser
 
 from tests.drive.panels import Panels
-from workbench.page.widgets.line_chart import TAKING_TURNS, YES_OR_NO, ChartLine, LineChart, span_of
+from workbench.page.widgets.line_chart import ROTATED_CHARTS, YES_OR_NO, ChartLine, LineChart, span_of
 
 X = np.arange(3.0)
 Y = np.array([0.5, np.nan, 1.0])
@@ -55,7 +55,7 @@ def test_charts_take_turns_in_one_place_and_one_is_shown(panels: Panels) -> None
         assert upper.handle.title == f"reward of env {env}" and upper.handle.order < lower.handle.order
         seen.append(upper.handle)
         assert sorted(panels.charts(), key=lambda chart: chart.order) == [upper.handle, lower.handle]
-    assert len(panels.charts(hidden=True)) == TAKING_TURNS + 1
+    assert len(panels.charts(hidden=True)) == ROTATED_CHARTS + 1
     upper.hide()
     assert panels.charts() == [lower.handle]
 

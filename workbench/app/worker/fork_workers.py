@@ -1,4 +1,4 @@
-"""The process that has imported what a worker needs, and forks workers."""
+"""The fork server: a process that has imported a worker's modules, and forks workers."""
 
 from __future__ import annotations
 
@@ -17,35 +17,36 @@ from workbench.live.process.worker_start import Forked, ForkEnded, NewWorker
 from workbench.machine.processes.child_python import python_command, quick_imports
 from workbench.machine.processes.wire import Unpacker, pack_message
 
-_LONGEST = 1 << 12
-_STANDARD = (1, 2)
+_MAX_MESSAGE_BYTES = 1 << 12
+_STANDARD_FDS = (1, 2)
 """File descriptors of stdout and stderr."""
-_MOST_PRINTED = 1 << 15
-"""Most bytes that are kept of what the imports printed: what fits into a pipe that is not read yet."""
-_FDS = 6
-"""File descriptors of a request: the socket that reports the worker's end, the three of `start.run`, and its stdout
-and stderr."""
+_MAX_PRINTED_BYTES = 1 << 15
+"""Maximum output of the imports that is kept: it must fit into a pipe that is not read yet."""
+_NUM_FDS = 6
+"""Number of file descriptors of a request: the socket that reports the worker's end, the three of `start.run`, and its
+stdout and stderr."""
 
 
 def main() -> None:
-    """Run it: ``python -m workbench.app.worker.fork_workers SOCKET``. It ends when its socket closes, and its workers with it.
+    """Run the fork server: ``python -m workbench.app.worker.fork_workers SOCKET``. When its socket closes, it ends with its
+    workers.
 
-    A fork takes some 30 ms, where the imports take a core for five seconds. It runs nothing of the author's, and has one
-    thread of Python's: a fork copies no other, and those of OpenBLAS start again by themselves.
+    A fork takes some 30 ms; the imports take five seconds of one core. The fork server runs none of the author's code, and
+    has a single Python thread: a fork copies no other, and those of OpenBLAS restart by themselves.
     """
     control = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    printed = [os.memfd_create("workbench-imports") for _ in _STANDARD]
-    for fd, standard in zip(printed, _STANDARD):
+    printed = [os.memfd_create("workbench-imports") for _ in _STANDARD_FDS]
+    for fd, standard in zip(printed, _STANDARD_FDS):
         os.dup2(fd, standard)
     try:
         with quick_imports():
             from workbench.app.worker import main_loop as loop  # noqa: F401
     except BaseException:
-        versions = None  # each worker imports for itself, and says what is wrong
+        versions = None  # each worker imports the modules itself, and reports the error
     else:
         versions = _versions()
-    texts = [os.pread(fd, _MOST_PRINTED, 0) for fd in printed]
+    texts = [os.pread(fd, _MAX_PRINTED_BYTES, 0) for fd in printed]
     for fd in printed:
         os.close(fd)
     _ForkServer(control, versions, texts).serve()
@@ -85,10 +86,10 @@ class _ForkServer:
                 if end.fileno() in ready:
                     self._signal(pid, end)
             if self._woken.fileno() in ready:
-                self._woken.recv(_LONGEST)
+                self._woken.recv(_MAX_MESSAGE_BYTES)
                 self._reap()
             if self._control.fileno() in ready:
-                message, fds, _, _ = socket.recv_fds(self._control, _LONGEST, _FDS)
+                message, fds, _, _ = socket.recv_fds(self._control, _MAX_MESSAGE_BYTES, _NUM_FDS)
                 if not message:
                     os._exit(0)  # the kernel ends the workers
                 self._fork(Unpacker().unpack(message, NewWorker), fds)
@@ -96,10 +97,10 @@ class _ForkServer:
     def _signal(self, pid: int, end: socket.socket) -> None:
         """Handle a message on a worker's socket: a signal number to send, or the end of the connection."""
         try:
-            asked = end.recv(_LONGEST)
-        except ConnectionResetError:  # it left without having read what we told
+            asked = end.recv(_MAX_MESSAGE_BYTES)
+        except ConnectionResetError:  # the client closed the socket without reading our message
             asked = b""
-        # It is our child, and its number is free only after we have waited for it.
+        # It is our child: the kernel does not reuse its pid before we have waited for it.
         os.kill(pid, Unpacker().unpack(asked, int) if asked else signal.SIGTERM)
         if not asked:
             self._workers.pop(pid).close()
@@ -118,11 +119,11 @@ class _ForkServer:
         looker.register(end, select.POLLIN)
         pid, server = 0, os.getpid()
         if looker.poll(0):
-            _tell(end, ForkEnded(-signal.SIGTERM))  # it was ended while we imported
+            _tell(end, ForkEnded(-signal.SIGTERM))  # the worker was cancelled while we imported
         else:
             try:
                 pid = os.fork()
-            except OSError as error:  # no memory, or too many processes; those that run are to go on
+            except OSError as error:  # no memory, or too many processes; running workers must continue
                 os.write(fds[-1], f"workbench: no worker can be started: {error}\n".encode())
                 _tell(end, ForkEnded(1))
             else:
@@ -131,7 +132,7 @@ class _ForkServer:
         if pid:
             _tell(end, Forked(pid))
             with suppress(OSError):
-                os.setpgid(pid, pid)  # also here: its group may be signalled before it has made it
+                os.setpgid(pid, pid)  # also here: the group may be signalled before the child has created it
             self._workers[pid] = end
         else:
             end.close()
@@ -144,7 +145,7 @@ class _ForkServer:
         for other in (self._control, self._woken, self._wakes, end, *self._workers.values()):
             other.close()
         os.setpgid(0, 0)
-        for fd, standard in zip(fds[-2:], _STANDARD):
+        for fd, standard in zip(fds[-2:], _STANDARD_FDS):
             os.dup2(fd, standard)
             os.close(fd)
         arguments = [*fds[:-2], server, request.niceness]
@@ -153,11 +154,11 @@ class _ForkServer:
                 os.set_inheritable(fd, True)
             command = python_command("-m", start.__name__, *map(str, arguments))
             os.execv(command[0], command)
-        for standard, text in zip(_STANDARD, self._printed):
+        for standard, text in zip(_STANDARD_FDS, self._printed):
             os.write(standard, text)
         import numpy as np
 
-        # Else all workers draw the same numbers. Torch begins with the same ones in every process.
+        # Without this all workers draw the same numbers. Torch starts with the same seed in every process anyway.
         random.seed()
         np.random.seed()
         sys.argv[:] = [str(Path(start.__file__))]
@@ -166,7 +167,7 @@ class _ForkServer:
 
 
 def _tell(end: socket.socket, message: Forked | ForkEnded) -> None:
-    with suppress(OSError):  # who started it has left
+    with suppress(OSError):  # the client has closed its end
         end.send(pack_message(message))
 
 

@@ -87,18 +87,18 @@ from workbench.task.open import OpenedTask, Opening, warm_up
 from workbench.task.problem import TaskError, treat_ctrl_c_as_error
 from workbench.task.reference import named_file
 
-_STATUS_PERIOD = 0.25
-_IDLE = 0.5
-"""Longest sleep in seconds when nothing is due; a request ends the sleep at once."""
+_STATUS_PERIOD_SECONDS = 0.25
+_IDLE_SECONDS = 0.5
+"""Longest sleep when nothing is due; a request ends the sleep at once."""
 
 
 class Worker:
     """The loop and its state. Only this process steps the env.
 
-    It is a process of its own because SAPIEN holds the interpreter lock while it steps and renders, and because the
-    author's code may loop for ever or crash. One loop does everything, so that nothing touches the env during a step:
-    handle the requests that have come, step if one is due, draw watched cameras, sleep. It writes what it does into shared
-    memory (`heartbeat`), and the author's code can be interrupted (`Interrupts`).
+    It runs in a separate process because SAPIEN holds the GIL while it steps and renders, and because the author's code may
+    loop for ever or crash. A single loop does everything, so that nothing touches the env during a step: handle waiting
+    requests, step if one is due, draw watched cameras, sleep. It writes its activity into shared memory (`heartbeat`), and
+    the author's code can be interrupted (`Interrupts`).
     """
 
     def __init__(self, connection: int, heartbeat: HeartbeatWriter) -> None:
@@ -173,7 +173,7 @@ class Worker:
             self._cameras.make(may_block=not self._playing)
             self._shares.add("watched", time.monotonic() - began, time.monotonic())
             self._send_status(time.monotonic())
-            if time.monotonic() - self._rules_sent > _STATUS_PERIOD:
+            if time.monotonic() - self._rules_sent > _STATUS_PERIOD_SECONDS:
                 self._send_rules()
 
     @property
@@ -183,7 +183,7 @@ class Worker:
     # --- questions ---------------------------------------------------------------------------------
 
     def _call(self, call: Call) -> None:
-        """Answer a call. There is always an answer, or the server's thread would wait for ever."""
+        """Answer a call. It always sends an answer, or the server's thread would wait for ever."""
         answers: list[Answer] = []
         doing = _DOING.get(type(call.request))
         problem = self._task.run(doing, lambda: answers.append(self._answer(call)))
@@ -247,7 +247,7 @@ class Worker:
     # --- requests ----------------------------------------------------------------------------------
 
     def _sleep(self) -> float:
-        waits = [_IDLE]
+        waits = [_IDLE_SECONDS]
         if self._playing and not self._followed.awaited:
             waits.append(self._pacer.wait())
         picture = self._cameras.wait(time.monotonic())
@@ -286,7 +286,7 @@ class Worker:
         with self._start_folder.again():
             self._task.requested_file = named_file(request.task)
         running = self._running
-        # A load starts in the first current folder; if it fails, the previous version's comes back.
+        # A load starts in the initial working directory; if it fails, that of the previous version is restored.
         with self._start_folder.again(stay=True):
             opened, report = load_version(
                 request,
@@ -317,7 +317,7 @@ class Worker:
         if report is not None and report.level in SCENE_KEPT:
             self._cameras.update_watched()
             self._cameras.scene_changed()
-            # The server has the meshes: 9 MB for a Panda would add 0.2 s to a reload.
+            # The server already has the meshes: 9 MB for a Panda would add 0.2 s to a reload.
             unchanged = replace(opened.description.geometry, visuals=())
             description = replace(opened.description, geometry=unchanged)
             send(Loaded(description, opened.first, opened.milliseconds, report, request.options))
@@ -364,7 +364,7 @@ class Worker:
             self._task.guarded(lambda opened: self._reset_envs(opened, request.env_idx, seeds))
 
     def _seeds(self, request: Reset) -> int | list[int] | None:
-        # The random actions restart with the seed, or a reset with it would not repeat an episode.
+        # Random actions restart with the seed, or a reset with that seed would not repeat an episode.
         if request.seed is not None:
             self._chooser.seed(request.seed)
         count = 0 if request.env_idx is None else len(request.env_idx)
@@ -382,7 +382,7 @@ class Worker:
             old.selected_env,
         ):
             self._followed.forget()
-            # A pressed step that waits for its plan waits for one of the new settings.
+            # A requested step that waits for its plan now waits for a plan with the new settings.
             self._one_planned_step = self._one_planned_step and self._is_planned
             self._take_planned_step()
         if (new.action_source, new.policy, new.policy_folder) != (
@@ -396,7 +396,7 @@ class Worker:
     def _tell(self, request: SetSliderAction) -> None:
         def tell(opened: OpenedTask) -> None:
             task = opened.env
-            # The page may have asked before it knew of a version with fewer envs, or of another robot.
+            # The page may have sent this before it knew of a version with fewer envs, or of another robot.
             if max(request.env_idx, default=0) < task.num_envs and max(request.dimensions, default=0) < width(
                 task.parts
             ):
@@ -428,7 +428,7 @@ class Worker:
             self._play(Play(True))
 
     def _inspect(self, request: Inspect) -> None:
-        # The page may have asked before it knew of a version with fewer envs.
+        # The page may have sent this before it knew of a version with fewer envs.
         if self._task.opened is not None and request.env < self._task.opened.env.num_envs:
             self._line.send(inspect_env(self._task.opened.env, request.env, request.sections))
 
@@ -449,7 +449,7 @@ class Worker:
         self._take_planned_step()
 
     def _take_planned_step(self) -> None:
-        """Make the requested step, if its plan has come."""
+        """Make the requested step if its plan has arrived."""
         if self._one_planned_step and self._plan_ready():
             self._one_planned_step = False
             self._task.run("stepping", partial(self._task.guarded, self._step_once))
@@ -467,7 +467,7 @@ class Worker:
         return self._followed.ready(opened, self._steps.number, envs)
 
     def _step_due(self, now: float) -> bool:
-        # The plan first: the next one is made while the pace of the last is kept.
+        # Check the plan first: the next one is computed while the last one plays at its pace.
         ready = not self._is_planned or self._plan_ready()
         return self._pacer.due(now) and ready
 
@@ -487,7 +487,7 @@ class Worker:
         ended = np.flatnonzero(step.terminated | step.truncated)
         if self._is_planned:
             done = succeeded(step)
-            # What is solved stays, to be looked at and kept.
+            # Solved envs are not reset, so that they can be watched and saved.
             ended = ended[~done[ended]]
             if before is not None and self._all_solved(done, succeeded(before)):
                 self._pause()
@@ -517,7 +517,7 @@ class Worker:
     def _reset_with_seeds(
         self, task: TaskEnv, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> StepResult:
-        """Reset these envs; the recorded ones one by one, so that a seed gives the same start anywhere.
+        """Reset these envs; recorded ones one by one, so that a seed gives the same start in any batch.
 
         Envs that are reset together share torch's generator: their numbers depend on all of them and on the first seed.
         """
@@ -530,7 +530,7 @@ class Worker:
         )
         step = None
         if env_idx is None:
-            step = task.reset(seed)  # of all: only that can build a new scene
+            step = task.reset(seed)  # of all envs: only that can rebuild the scene
         elif rest := [env for env in every if env not in alone]:
             step = task.reset([seeds[env] for env in rest], rest)
         for env in alone:
@@ -553,8 +553,8 @@ class Worker:
         self._send_status(None)
 
     def _throttled_status(self, text: Callable[..., str]) -> Callable[..., None]:
-        """A callback for progress: sends `text` of its arguments as the status, at most every `_STATUS_PERIOD`."""
-        return throttled(lambda *done: self._send_status(None, text(*done)), _STATUS_PERIOD)
+        """A progress callback: sends `text` of its arguments as the status, at most every `_STATUS_PERIOD_SECONDS`."""
+        return throttled(lambda *done: self._send_status(None, text(*done)), _STATUS_PERIOD_SECONDS)
 
     def _send_step(
         self,
@@ -600,9 +600,9 @@ class Worker:
         self._send_status(None)
 
     def _send_status(self, now: float | None, activity: str = "") -> None:
-        """Send the status every `_STATUS_PERIOD` while playing, or at once if `now` is None."""
+        """Send the status every `_STATUS_PERIOD_SECONDS` while playing, or at once if `now` is None."""
         moment = time.monotonic()
-        if now is not None and (not self._playing or now - self._status_sent < _STATUS_PERIOD):
+        if now is not None and (not self._playing or now - self._status_sent < _STATUS_PERIOD_SECONDS):
             return
         self._status_sent = moment
         steps = self._rate.per_second(moment) if self._playing else 0.0
@@ -627,7 +627,7 @@ class Worker:
 
 
 def _led_there(request: Restore | EnterRecording) -> Mapping[int, NDArray[np.float32]]:
-    """(A,) the action that led to the state that an env is put back to, by env, as far as it is known."""
+    """(A,) last action before the state that an env is restored to, by env, where it is known."""
     if isinstance(request, Restore):
         return {env: way.actions[-1] for env, way in request.ways.items() if len(way.actions)}
     run = request.run
@@ -660,8 +660,8 @@ _DOING: dict[type, Doing] = {
 
 def work(connection: int, heartbeat: HeartbeatWriter) -> None:
     """Entry point of the worker process; `connection` is the file descriptor of its end of the socket pair."""
-    # Tensors of a few thousand numbers: threads only wait for each other (measured: 16 PickCube envs ran 2.8 times faster
-    # with one thread than with two).
+    # Tensors have a few thousand numbers: threads only wait for each other (measured: 16 PickCube envs ran 2.8 times
+    # faster with one thread than with two).
     torch.set_num_threads(1)
     mark_camera_configs()
     treat_ctrl_c_as_error()

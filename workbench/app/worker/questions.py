@@ -16,4 +16,4 @@ QUESTIONS = (
     Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), CheckGroup, ProfileStep, PlanActions, RescoreMoments, CaptureMoment,
     Rescore, MakeScene, ListTasks, DrawTask,
 )  # fmt: skip
-"""All types that a `Call` may hold."""
+"""All types that a `Call` may contain."""

@@ -24,20 +24,20 @@ def main() -> None:
 
 
 def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: int) -> None:
-    """Continue as a worker in a child of this process, and as its keeper in this one.
+    """Fork: the child becomes the worker, this process its keeper.
 
     The first three are file descriptors (see `WorkerProcess`), `server` is the process id of the parent. Heavy modules are
-    imported last: by then a crash writes its stack, the server can read the stack by a signal, the kernel ends this
+    imported last: by then a crash writes its stack, the server can request the stack by a signal, the kernel kills this
     process first when memory is short, and the process ends with its server (`family`).
     """
     begin_family(server)
     if niceness:
         os.nice(niceness)
     if niceness >= LOWEST:
-        # Only what no other process wants. Some containers forbid it.
+        # Use only idle CPU time. Some containers forbid it.
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    # A server that a script started in the background inherits an ignored SIGINT, and so would we.
+    # A server that a script started in the background ignores SIGINT, and we would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     _let_kernel_end_us_first()
     leave = os._exit
@@ -48,7 +48,7 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
     heartbeat.begin("starting")
     from workbench.machine.processes.debugger import OPEN_WITH_DEBUG, pass_breakpoints, refuse_breakpoints
 
-    if niceness:  # in the background; the worker that plays is the one that is debugged
+    if niceness:  # a background worker; only the worker that plays can be debugged
         pass_breakpoints()
     else:
         refuse_breakpoints(OPEN_WITH_DEBUG)
@@ -67,8 +67,8 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
         if isinstance(error, ImportError) and (text := untested_text()):
             print(f"workbench: {text}", file=sys.stderr)
         code = 1
-    signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)  # by default it would end the process from here on
-    # Or the interpreter would wait for the task's threads, and the page for this process.
+    signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)  # from here on the default action would end the process
+    # Without this the interpreter would wait for the task's threads, and the page for this process.
     others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
     if code or not all(thread.daemon for thread in others):
         try:
@@ -79,7 +79,7 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
 
 
 def _let_kernel_end_us_first() -> None:
-    """Give this process the highest score, so that the kernel ends it first when memory runs out, and not the server."""
+    """Set the highest OOM score: when memory runs out, the kernel kills this process, not the server."""
     try:
         Path("/proc/self/oom_score_adj").write_text("1000")
     except OSError:
@@ -91,16 +91,16 @@ def _install_stack_writers(stacks: int) -> None:
     from workbench.live.process.heartbeat import INTERRUPT_SIGNAL, STACK_SIGNAL
 
     faulthandler.enable(file=stacks, all_threads=False)
-    # At its end the interpreter takes faulthandler's handler down and puts back what was there. By default the signal would
-    # then end the process, and the page would name the signal as the cause.
+    # At exit the interpreter removes faulthandler's handler and restores the previous one. With the default action the
+    # signal would then end the process, and the page would name the signal as the cause.
     signal.signal(STACK_SIGNAL, signal.SIG_IGN)
     faulthandler.register(STACK_SIGNAL, file=stacks, all_threads=False)
-    # Until the worker installs its handler there is nothing to interrupt, and the default would end the process.
+    # Until the worker installs its handler there is nothing to interrupt, and the default action would end the process.
     signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)
     leave, us = os._exit, os.getpid()
 
     def leave_with_stack(code: int) -> NoReturn:
-        # os._exit runs no handler and raises nothing: only the exit code would be known.
+        # os._exit runs no handler and raises nothing: without this only the exit code would be known.
         if os.getpid() == us:  # not in a process that the author's code forked
             os.write(stacks, f"os._exit({code})\n".encode())
             faulthandler.dump_traceback(file=stacks, all_threads=False)

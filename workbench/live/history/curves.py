@@ -16,18 +16,18 @@ PREFIX = "reward_terms/"
 """Prefix of the entries of a `StepResult` that are terms of a dense reward.
 
 ``compute_dense_reward`` puts them into ``info["reward_terms"]``, a dict of tensors (N,). The key is the workbench's own,
-since ManiSkill has no place for them; it passes ``info`` on unchanged, nested dicts included, so such a file runs in stock
-ManiSkill too. A term that is not one number an env is shown among the numbers, without a curve.
+since ManiSkill has none for reward terms; it passes ``info`` on unchanged, nested dicts included, so such a file also runs
+in stock ManiSkill. A term that is not one number per env is listed in the table of numbers, without a curve.
 """
-MOST = 64
-"""Most columns that are kept; the first ones of `columns_of`."""
-MOST_PARTS = 8
-"""Most numbers of one entry; a longer entry has no curve."""
-_SPANS = 400
-"""Spans of a curve, two points each: more do not fit into the panel's 300 pixels."""
-_NUMBERS = 2**17
-"""Limit of spans times envs: with `MOST` columns of 17 bytes the curves take 140 MB at most, 7 MB for 16 envs."""
-_FEWEST_SPANS = 64
+MAX_COLUMNS = 64
+"""Maximum number of columns: the first ones of `columns_of` are kept."""
+MAX_PARTS = 8
+"""Maximum number of numbers in one entry; a longer entry has no curve."""
+_MAX_SPANS = 400
+"""Maximum number of spans of a curve, two points each: more do not fit into the panel's 300 pixels."""
+_MAX_SPANS_TIMES_ENVS = 2**17
+"""Limit of spans times envs: with `MAX_COLUMNS` columns of 17 bytes the curves take at most 140 MB, 7 MB for 16 envs."""
+_MIN_SPANS = 64
 _FIRST_ROWS = 1024
 
 
@@ -52,7 +52,7 @@ class Columns:
     def write(self, number: int, oldest: int, values: Mapping[str, ArrayLike]) -> None:
         """
         Args:
-            number: of the newest row, or the one after it.
+            number: the row to write: the newest one, or the one after it.
             oldest: number of the oldest row to keep.
             values: (N,) by name of the column; missing columns become NaN in this row.
         """
@@ -70,7 +70,7 @@ class Columns:
             column[number - self._base] = values.get(name, np.nan)
 
     def between(self, name: str, low: int, high: int) -> NDArray[np.float32]:
-        """(K, N) of the rows from `low` to `high`, both kept ones and included; NaN if there is no such column.
+        """(K, N) values of the rows `low` to `high` inclusive, which must be kept; NaN if there is no such column.
 
         A view, not a copy: it changes if one of these rows is written again.
         """
@@ -103,7 +103,7 @@ class Column(NamedTuple):
     group: Group
     name: str
     part: int | None = None
-    """Which number of an entry with several."""
+    """Index of the number in an entry with several."""
 
     @property
     def label(self) -> str:
@@ -115,7 +115,7 @@ SUCCESS = Column(Group.EVALUATE, "success")
 
 
 def columns_of(step: StepResult, joints: Sequence[str] = ()) -> dict[Column, NDArray]:
-    """(N,) of each column that a step has: the reward, success, the reward's terms, ``evaluate``, the joints.
+    """(N,) values of each column that a step has: the reward, success, the reward's terms, ``evaluate``, the joints.
 
     Args:
         joints: names of `StepResult.qpos`.
@@ -136,7 +136,7 @@ def columns_of(step: StepResult, joints: Sequence[str] = ()) -> dict[Column, NDA
             found[SUCCESS] = flat[:, 0]
         elif flat.shape[1] == 1:
             entries[Column(Group.EVALUATE, name)] = flat[:, 0]
-        elif flat.shape[1] <= MOST_PARTS:
+        elif flat.shape[1] <= MAX_PARTS:
             entries |= {Column(Group.EVALUATE, name, k): flat[:, k] for k in range(flat.shape[1])}
     for name, entry in step.others.items():
         if entry.numbers is not None and entry.numbers.size == 1 and not name.startswith(PREFIX):
@@ -147,7 +147,7 @@ def columns_of(step: StepResult, joints: Sequence[str] = ()) -> dict[Column, NDA
 
 
 def without_curve(step: StepResult) -> tuple[str, ...]:
-    """Names of the reward's terms that are not one number an env."""
+    """Names of the reward's terms that are not one number per env."""
     there = {column.name for column in columns_of(step) if column.group is Group.TERM}
     named = [
         name for name in [*step.evaluate, *step.others] if name.startswith(PREFIX) or name == PREFIX[:-1]
@@ -155,12 +155,13 @@ def without_curve(step: StepResult) -> tuple[str, ...]:
     return tuple(name.removeprefix(PREFIX) for name in named if name.removeprefix(PREFIX) not in there)
 
 
-# --- all steps in little memory -----------------------------------------------------------------------
+# --- all steps in bounded memory ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """L lines over steps, cut into B spans of equal width with the extremes of each: a peak of one step stays."""
+    """L lines over steps, cut into B spans of equal width. The minimum and maximum of each span are kept, so that a peak of
+    one step stays visible."""
 
     width: int
     """Steps of a span; the last one may have fewer."""
@@ -171,7 +172,7 @@ class Spans:
     """(L, B) least and greatest finite number; NaN if there is none."""
     low_at: NDArray[np.int32]
     high_at: NDArray[np.int32]
-    """(L, B) the first step with the least, the last one with the greatest."""
+    """(L, B) the first step with the least number, the last step with the greatest."""
     gap: NDArray[np.bool_]
     """(L, B) whether some number is NaN or infinite."""
     last: NDArray[np.floating]
@@ -181,8 +182,8 @@ class Spans:
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(K,) steps and (L, K) numbers to draw.
 
-        The steps are those of the first line's extremes, so that a point of it is at its own step; the others are off by
-        less than a span. NaN where a line has a gap.
+        The steps are those of the first line's extremes, so that its points are exact; points of the other lines are off
+        by less than a span. NaN where a line has a gap.
         """
         lines, count = self.low.shape
         starts = self.first + self.width * np.arange(count)
@@ -211,8 +212,8 @@ class Spans:
         return x, drawn
 
 
-def spans_of(values: NDArray[np.floating], most: int = _SPANS, first: int = 1) -> Spans:
-    """The spans of whole lines (L, T), at most `most` of them; the same as `StepCurves` makes of step after step.
+def spans_of(values: NDArray[np.floating], most: int = _MAX_SPANS, first: int = 1) -> Spans:
+    """The spans of whole lines (L, T), at most `most` of them; equal to those that `StepCurves` builds step by step.
 
     Args:
         first: the step of the first number.
@@ -245,7 +246,7 @@ def spans_of(values: NDArray[np.floating], most: int = _SPANS, first: int = 1) -
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """All control steps of one env and of the mean over the batch."""
+    """Curves of one env and of the mean over the batch, over all control steps."""
 
     serial: int
     """Control steps so far, resets left out: the step of the newest numbers. The first is 1, as in a recording."""
@@ -256,11 +257,11 @@ class Curves:
     newest: NDArray[np.float32]
     """(N,) rewards of the newest step."""
     no_curve: tuple[str, ...] = ()
-    """Names of the last step's reward terms that are not one number an env."""
+    """Names of the last step's reward terms that are not one number per env."""
 
     def lines(self, wanted: Sequence[tuple[Column, bool]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(K,) steps and (L, K) numbers of these columns, each of the env or (True) the mean; NaN for one that is not
-        there. See `Spans.points`."""
+        """(K,) steps and (L, K) numbers of these columns, each of the env or (True) the mean; NaN for a missing column.
+        See `Spans.points`."""
         places = {column: 2 * k for k, column in enumerate(self.columns)}
         rows = [places[column] + mean for column, mean in wanted]
         of = self.spans
@@ -273,8 +274,8 @@ _Parts = tuple[NDArray, NDArray, NDArray, NDArray, NDArray]
 
 
 class StepCurves:
-    """The numbers of all envs over all control steps, in memory that is bounded: where another span is needed, each two
-    become one of twice the width."""
+    """The numbers of all envs over all control steps, in bounded memory: when the spans are full, each two are joined into
+    one of twice the width."""
 
     def __init__(self, num_envs: int, joints: Sequence[str] = ()) -> None:
         """
@@ -282,7 +283,7 @@ class StepCurves:
             joints: names of `StepResult.qpos`.
         """
         self._num_envs, self._joints = num_envs, tuple(joints)
-        self._most = min(_SPANS, max(_FEWEST_SPANS, _NUMBERS // (num_envs + 1))) // 2 * 2
+        self._most = min(_MAX_SPANS, max(_MIN_SPANS, _MAX_SPANS_TIMES_ENVS // (num_envs + 1))) // 2 * 2
         self._columns: list[Column] = []
         self._width = 1
         self._parts = self._empty(0)
@@ -294,7 +295,7 @@ class StepCurves:
         """Control steps so far."""
 
     def add(self, step: StepResult) -> None:
-        """Add a control step. Resets are left out, since they have no reward."""
+        """Add a control step; do not add resets, since they have no reward."""
         found = columns_of(step, self._joints)
         self._no_curve, self._newest, self._found = without_curve(step), step.reward, None
         self._make_columns(found)
@@ -316,7 +317,7 @@ class StepCurves:
         self._last = values
 
     def curves(self, env: int) -> Curves:
-        """Curves of one env, as copies: spans change until they are full, and when they are joined."""
+        """Curves of one env, as copies, since spans change until they are full and when they are joined."""
         if self._found is None or self._found.env != env:
             rows, used = [min(env, self._num_envs - 1), self._num_envs], -(-self.count // self._width)
 
@@ -334,13 +335,13 @@ class StepCurves:
         new = [column for column in found if column not in self._columns]
         if not new:
             return
-        if len(self._columns) + len(new) > MOST:
-            # Columns that a new version of the task has dropped make room.
+        if len(self._columns) + len(new) > MAX_COLUMNS:
+            # Drop columns that a new version of the task no longer has.
             places = [k for k, column in enumerate(self._columns) if column in found]
             self._columns = [self._columns[k] for k in places]
             low, high, low_at, high_at, gap = (part[:, places] for part in self._parts)
             self._parts = low, high, low_at, high_at, gap
-        new = new[: MOST - len(self._columns)]
+        new = new[: MAX_COLUMNS - len(self._columns)]
         self._columns += new
         self._extend(self._parts, self._empty(len(new)), axis=1)
 

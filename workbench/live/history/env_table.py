@@ -1,4 +1,4 @@
-"""One row an env: state of its episode, outcome of the one before, and outliers."""
+"""One row per env: state of its episode, outcome of the previous one, and outliers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from workbench.envs.step_result import StepResult
 from workbench.task.description import Restored, Stepped
 
 KEPT_REWARDS = 100
-"""The newest steps of an episode whose rewards a row holds."""
+"""Number of the newest rewards of an episode that a row holds."""
 Outliers = Mapping[int, tuple[Outlier, ...]]
 """Outliers by env, oldest first; only envs with outliers."""
 
@@ -30,13 +30,13 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True)
 class LastEpisode:
-    """The last episode of each env that ended or had outliers, before the present one.
+    """The last episode of each env, before the present one, that ended or had outliers.
 
-    Envs are reset as soon as an episode ends, so "failed" would never be seen in the present one's row.
+    Envs are reset as soon as an episode ends, so "failed" would never be visible in the row of the present episode.
     """
 
     outcome: NDArray[np.int8]
-    """(N,) `Outcome`; RUNNING if it was cut short, or there was none (then `steps` is -1)."""
+    """(N,) `Outcome`; RUNNING if the episode was cut short, or if there was none (then `steps` is -1)."""
     steps: NDArray[np.int32]
     """(N,) control steps until the end of the episode."""
     total: NDArray[np.float64]
@@ -55,7 +55,7 @@ class LastEpisode:
 
 @dataclass(frozen=True)
 class EnvRows:
-    """The whole table at one moment. Arrays are never written to, and unchanged ones are shared with the moment before:
+    """The whole table at one moment. Arrays are never written to, and unchanged ones are shared with the previous moment:
     most steps add only an array of returns."""
 
     steps: NDArray[np.int32]
@@ -63,14 +63,14 @@ class EnvRows:
     outcome: NDArray[np.int8]
     """(N,) `Outcome` of the present episode, RUNNING until it ends."""
     end: NDArray[np.int32]
-    """(N,) the first terminated or truncated step; -1 while it runs. Later steps do not change the outcome."""
+    """(N,) the first terminated or truncated step; -1 while the episode runs. Later steps do not change the outcome."""
     total: NDArray[np.float64]
     """(N,) undiscounted return so far; NaN after a NaN reward."""
     followed: NDArray[np.bool_]
     """(N,) whether `total` is known: the task has a reward, and the episode was followed from its start."""
     first: Mapping[Hashable, NDArray[np.int32]]
-    """(N,) first step at which an entry was true; 0 is the reset, -1 is never. By bool entry of ``evaluate``, and by
-    `OutlierKind`, also of a rule that is off."""
+    """(N,) first step at which an entry was true; 0 is the reset, -1 is never. Keys are bool entries of ``evaluate`` and
+    `OutlierKind`, also of rules that are off."""
     outliers: Outliers
     last: LastEpisode
     ended: NDArray[np.int64]
@@ -91,15 +91,15 @@ class EnvRows:
 
     @staticmethod
     def bytes_a_step(num_envs: int) -> int:
-        """Bytes that one more moment's rows take, nearly always."""
+        """Bytes that one more moment's rows usually take."""
         return 8 * num_envs + 400
 
 
 class EnvTable:
-    """Follows every reset and control step of the batch, by array operations; `add` all events in order.
+    """Updates the table with every reset and control step of the batch, by array operations; `add` all events in order.
 
-    An env that goes back to a moment gets that moment's row, of the env whose moment it is. Only the counts of ended
-    episodes continue.
+    An env that goes back to a moment gets the row, at that moment, of the env whose state it gets. Only the counts of
+    ended episodes continue.
     """
 
     def __init__(
@@ -141,12 +141,12 @@ class EnvTable:
     def add(
         self, stepped: Stepped, then: EnvRows | None, rewards_then: Callable[[int], NDArray[np.float32]]
     ) -> EnvRows:
-        """Take one event: a reset of some envs, a jump back, or a control step of all.
+        """Add one event: a reset of some envs, a jump back, or a control step of all.
 
         Args:
             then: the rows at the moment that some envs went back to. None without a jump back, or if that moment is
-                unknown: the rows of its envs start without a past.
-            rewards_then: of an env, the rewards of its episode until then, oldest first.
+                unknown: then the rows of these envs start without a past.
+            rewards_then: returns the rewards of an env's episode up to that moment, oldest first.
 
         Returns:
             The rows to store in the moment.
@@ -168,7 +168,7 @@ class EnvTable:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """The rules that the running version broke by outliers, one a rule."""
+        """The rules that the running version broke by outliers, one finding per rule."""
         return tuple(self._found.values())
 
     def begin_version(self, rules: Mapping[str, Finding]) -> None:
@@ -176,7 +176,7 @@ class EnvTable:
         self._rules, self._found = rules, {}
 
     def rows(self) -> EnvRows:
-        """The table as it is now."""
+        """The present table."""
         oldest_first = np.arange(self._tick, self._tick + KEPT_REWARDS) % KEPT_REWARDS
         return replace(self._now, rewards=self._rewards[:, oldest_first])
 
@@ -215,7 +215,7 @@ class EnvTable:
             )
 
     def _break(self, rule: str, sight: OutlierSighting, step: StepResult) -> bool:
-        """Count a breach; False if the rule is off."""
+        """Count a violation; returns False if the rule is off."""
         if (whole := self._rules.get(rule)) is None:
             return False
         known, count = self._found.get(rule), int(np.count_nonzero(sight.envs))
@@ -227,7 +227,7 @@ class EnvTable:
         return True
 
     def _begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
-        """Start a new episode in these envs (N,); the one before becomes `EnvRows.last`."""
+        """Start a new episode in these envs (N,); the previous one becomes `EnvRows.last`."""
         now, from_start = self._now, step.elapsed_steps == 0
         worth_keeping = envs & ((now.end >= 0) | np.isin(np.arange(len(envs)), list(now.outliers)))
         until = np.where(now.end < 0, now.steps, now.end)

@@ -24,19 +24,19 @@ from workbench.live.messages import PastPictures, Pictures, ReplayPath
 from workbench.task.description import NO_MOMENT, Restored, Stepped
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 32
-"""Event flags of an env at a moment. Success, fail and a NaN or infinite reward: only the first in an episode."""
-_OVERHEAD = 2500
-"""Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
+"""Event flags of an env at a moment. Success, fail and a NaN or infinite reward are flagged only once per episode."""
+_OVERHEAD_BYTES = 2500
+"""Memory of the objects around a moment's arrays; with it the total is within 2 % of what tracemalloc measures."""
 _PICTURES_SHARE = 0.5
 """Share of the memory limit for pictures: they are by far the largest (a human camera's is 0.8 MB; a step of 16
 PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be rendered again."""
-_RECENT = 200
-"""Newest moments among which a picture's moment is searched: pictures come some steps late."""
+_RECENT_MOMENTS = 200
+"""Number of newest moments in which a picture's moment is searched: pictures arrive some steps late."""
 
 
 @dataclass
 class SnapshotPartSet:
-    """The parts of a snapshot, shared by all moments that have the same."""
+    """The parts of a snapshot, shared by all moments with the same parts."""
 
     keys: tuple[int, ...]
     content: tuple[bytes, ...] | None
@@ -48,8 +48,8 @@ class SnapshotPartSet:
 class SnapshotParts:
     """Reference-counted store of snapshot parts.
 
-    A snapshot comes as a body and the keys of its parts (`envs.snapshots.packing`), most of which the moment before has
-    too. So moments refer to a set of parts, sets count their moments, and parts count their sets.
+    A snapshot consists of a body and the keys of its parts (`envs.snapshots.packing`), most of which the previous moment
+    has too. So moments refer to a set of parts, sets count their moments, and parts count their sets.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class SnapshotParts:
         """Bytes in use."""
 
     def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> SnapshotPartSet:
-        """Parts of the next moment; `keys` is None if they are those of the moment before."""
+        """Parts of the next moment; `keys` is None if they are those of the previous moment."""
         self._parts.update(new_parts)
         if keys is not None and keys != self._last.keys:
             known = self._parts.keys() >= {*keys}
@@ -75,7 +75,7 @@ class SnapshotParts:
         return parts
 
     def release(self, parts: SnapshotPartSet) -> None:
-        """A moment with these parts was dropped."""
+        """Release these parts, because a moment that had them was dropped."""
         parts.moments -= 1
         if parts.moments == 0 and parts.content is not None:
             for key in parts.keys:
@@ -110,26 +110,26 @@ class Moment:
     """Snapshot of the whole batch, or None; shares its bytes with other moments."""
     parts: SnapshotPartSet
     size: int
-    """Size in bytes, without parts and pictures."""
+    """Size in bytes, without snapshot parts and pictures."""
     rows: EnvRows
     """The table of envs at that moment."""
     acted_by: str
-    """What chose the action, as in `Stepped.acted_by`."""
+    """Source of the action, as in `Stepped.acted_by`."""
     pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
     """Pictures by env, kind and name of the camera."""
     outdated: set[tuple[int, CameraKind, str]] = field(default_factory=set)
     """Keys of pictures whose camera was moved since."""
     original_step: StepResult | None = None
-    """`step` before a newer version replaced it; None if none did."""
+    """The original `step`, if a newer version replaced it; else None."""
 
     @property
     def as_recorded(self) -> StepResult:
-        """The result of the version that made this moment."""
+        """The step result of the version that made this moment."""
         return self.step if self.original_step is None else self.original_step
 
 
 EnvMoment = tuple[Moment, int]
-"""A moment of an episode, and the env's number in it, which is another one where the env continued from another env's
+"""A moment of an episode, and the env's number in it. The number differs where the env continued from another env's
 moment."""
 
 
@@ -151,13 +151,12 @@ class ShownMoment:
 class History:
     """The moments of one built task, oldest first, append-only. Not thread-safe: its owner locks.
 
-    A reset is a moment of its own, and so is going back: the envs *jump*, and new moments follow behind the jump. The
-    future that they left stays and can be returned to; undo is going back to the moment before a jump. A *segment* is
-    what an env went through without a jump: it starts from a snapshot and has all actions, so it can be replayed. An
-    *episode* goes from a reset on through the moments that the env was put back to.
+    A reset is a separate moment, and so is going back: the envs *jump*, and new moments follow the jump. The moments that
+    they left are kept and can be returned to; undo goes back to the moment before a jump. A *segment* is a run of an env's
+    moments without a jump: it starts from a snapshot and has all actions, so it can be replayed. An *episode* starts at a
+    reset and continues through jumps back.
 
-    Memory is bounded: pictures beyond half the limit are dropped first, the oldest of them first; then the oldest
-    moments.
+    Memory is bounded: pictures beyond half the limit are dropped first, oldest first; then the oldest moments.
     """
 
     def __init__(
@@ -165,8 +164,8 @@ class History:
     ) -> None:
         """
         Args:
-            table: of the envs, without events so far.
-            limit: bytes; the newest moment is always kept.
+            table: the table of envs, without events so far.
+            limit: memory limit in bytes; the newest moment is always kept.
             first_serial: the number of the first moment.
             joints: names of `StepResult.qpos`.
         """
@@ -189,8 +188,8 @@ class History:
     def add(self, stepped: Stepped) -> Moment:
         """Add a moment.
 
-        Without an action (a reset or a jump back) the worker sends reward zero, and no terms of it. The stored ones are NaN
-        after a reset, those of the origin after a jump back, and in all other envs those of the moment before.
+        Without an action (a reset or a jump back) the worker sends reward zero and no reward terms. The stored values are
+        NaN after a reset, those of the origin after a jump back, and in all other envs those of the previous moment.
         """
         restored, jumps = stepped.restored, bool(stepped.reset_mask.any())
         origin = None if restored is None else self.at(restored.origin)
@@ -206,7 +205,7 @@ class History:
         snapshot = None
         if stepped.snapshot and parts.content is not None:
             snapshot = WholeSnapshot(stepped.snapshot, parts.content)
-        size = _OVERHEAD + len(stepped.snapshot) + stepped.step.nbytes
+        size = _OVERHEAD_BYTES + len(stepped.snapshot) + stepped.step.nbytes
         size += EnvRows.bytes_a_step(self.num_envs)
         moment = Moment(
             serial=self._next_serial,
@@ -233,7 +232,7 @@ class History:
         return moment
 
     def replace_last(self, step: StepResult) -> StepResult:
-        """Replace the newest moment's result by that of a version that was patched in.
+        """Replace the newest moment's result by that of a patched version.
 
         Returns:
             The new result; a moment without an action keeps its reward.
@@ -254,7 +253,7 @@ class History:
         if isinstance(event, PastPictures):
             moment = self.at(event.origin)
         else:
-            recent = islice(reversed(self._moments), _RECENT)
+            recent = islice(reversed(self._moments), _RECENT_MOMENTS)
             moment = next((one for one in recent if one.number == event.number), None)
         if moment is None:
             return
@@ -308,7 +307,7 @@ class History:
         return serials[min(found, len(serials) - 1)] if serials else self.last
 
     def ticks(self, low: int, high: int) -> NDArray[np.int64]:
-        """(K,) `Moment.tick` of the moments of these serials, both kept ones and included."""
+        """(K,) `Moment.tick` of the moments `low` to `high` inclusive, which must be kept."""
         return self._ticks.between("tick", low, high)[:, 0].astype(np.int64)
 
     def snapshot_at(self, serial: int) -> bytes | None:
@@ -322,11 +321,11 @@ class History:
         return (self._moments[k - start] for k in range(max(low, start), min(high, self.last) + 1))
 
     def env_rows(self) -> EnvRows:
-        """The table of the envs as it is now."""
+        """The present table of envs."""
         return self._table.rows()
 
     def rows_at(self, moment: Moment) -> EnvRows:
-        """The table of the envs as it was at a moment."""
+        """The table of envs at a moment."""
         rewards = np.full((self.num_envs, KEPT_REWARDS), np.nan, np.float32)
         for env in range(self.num_envs):
             known = self._rewards_until(env, moment, KEPT_REWARDS)
@@ -373,10 +372,10 @@ class History:
         return next(segment for segment in reversed(self.segments(env)) if segment[0] <= serial)
 
     def episode(self, env: int, serial: int, most: int | None = None) -> tuple[EnvMoment, ...]:
-        """The episode of this env that contains a moment, to its end; oldest first, see `episode_backwards`.
+        """The whole episode of this env that contains a moment; oldest first, see `episode_backwards`.
 
         Args:
-            most: at most so many moments, evenly spread, including the first and the last; None for all.
+            most: maximum number of moments, evenly spread, including the first and the last; None for all.
         """
         episode_backwards = [*self.episode_backwards(env, self.segment_at(env, serial)[1])][::-1]
         count = len(episode_backwards) if most is None else min(most, len(episode_backwards))
@@ -384,9 +383,9 @@ class History:
         return tuple(episode_backwards[k] for k in chosen)
 
     def episode_backwards(self, env: int, serial: int) -> Iterator[EnvMoment]:
-        """The episode of this env up to a moment, newest first, through the moments that it was put back to.
+        """The episode of this env up to a moment, newest first, through its jumps back.
 
-        Yields each control step and at the end the first reset, as far as they are kept.
+        Yields each control step and finally the first reset, as far as they are kept.
         """
         for moment, at in self._moments_back(env, serial):
             jumped = moment.jumped.any()
@@ -396,7 +395,7 @@ class History:
                 return
 
     def replay_path(self, env: int, serial: int, most: int) -> ReplayPath | None:
-        """How to replay this env to a moment from the last exact point; None if unknown or longer than `most` steps.
+        """Replay path of this env from the last exact point to a moment; None if unknown or longer than `most` steps.
 
         Exact points are resets and restored moments: from them on the same actions give the same bits.
         """
@@ -414,8 +413,8 @@ class History:
         return None
 
     def _moments_back(self, env: int, serial: int) -> Iterator[EnvMoment]:
-        """The moments that led this env to one, newest first: its control steps and its own jumps, each followed by the
-        moments before the jump's origin; as far as they are kept."""
+        """The kept moments that led this env to `serial`, newest first: its control steps and its own jumps; after a jump
+        come the moments that led to its origin."""
         while (moment := self.at(serial)) is not None:
             jump, serial = moment.restored, moment.serial - 1
             if not moment.jumped.any():
@@ -428,8 +427,8 @@ class History:
     def last_jump(self, env: int) -> Moment | None:
         """The jump that led this env to its present state, if it can be undone.
 
-        After an undo the env is as before the undone jump, so the search continues before that one; moments of the
-        future that the undo left do not count.
+        After an undo the env is in the state before the undone jump, so the search continues before that jump and skips the
+        moments that the undo left.
         """
         until = self.last
         for moment in reversed(self._jumps):
@@ -474,7 +473,7 @@ class History:
         self._ticks.write(moment.serial, self.first, {"tick": np.array([moment.tick])})
 
     def _rewards_until(self, env: int, moment: Moment | None, most: int) -> NDArray[np.float32]:
-        """(K,) the newest rewards of this env's episode up to a moment, at most so many, oldest first."""
+        """(K,) the newest rewards of this env's episode up to a moment, at most `most`, oldest first."""
         episode_backwards = () if moment is None else self.episode_backwards(env, moment.serial)
         rewards = (one.step.reward[of] for one, of in episode_backwards if not one.jumped.any())
         return np.array(list(islice(rewards, most))[::-1], np.float32)
@@ -490,7 +489,7 @@ class History:
             """Copy rewards and reward terms of the envs `of` in `then` into the envs `to`."""
             reward[to] = then.reward[of]
             for name, values in then.evaluate.items():
-                # evaluate() has no terms: only the hook of the reward adds them, and it is not called here.
+                # evaluate() has no reward terms: only the reward's hook adds them, and it is not called here.
                 if name.startswith(PREFIX) and name not in step.evaluate:
                     terms.setdefault(name, np.full(values.shape, np.nan, np.float32))[to] = values[of]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import viser
 
 from workbench.live.commands import FillEmptyFile, Interrupt, RebuildScene, ReloadFile, RestartWorker
-from workbench.live.panels.timeline_panel import GAP, step_in_words
+from workbench.live.panels.timeline_panel import GAP_PIXELS, step_in_words
 from workbench.live.process.heartbeat import Busy
 from workbench.live.view import SessionView
 from workbench.machine.loop import BlockingPool
@@ -22,9 +22,9 @@ from workbench.page.widgets.visitors import Done, Visitor
 from workbench.task.new_task import CannotBegin, fill_blank_file, is_blank
 from workbench.task.problem import Problem
 
-WIDEST, BUSY_WIDEST = 520, 460
-"""Maximum width in pixels. The style sheet makes a banner as narrow as the view, so that it does not cover the
-controls, with which the last good version is still used."""
+MAX_WIDTH_PIXELS, BUSY_MAX_WIDTH_PIXELS = 520, 460
+"""Maximum widths. The style sheet makes a banner as narrow as the view, so that it does not cover the controls, with
+which the last good version can still be used."""
 
 FILL = "Write the minimal task into it"
 RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Restart the worker"
@@ -34,11 +34,11 @@ REBUILD_HINT = (
     "the old scene. The moment is restored."
 )
 _MAY_BE_OLD = ("reset", "step", "evaluate", "reward", "observation", "returns")
-"""Stages that use objects made while the scene was built: a patch keeps those objects, and may lack what the new
-code expects."""
-SHOWN_AFTER = 4.0
-"""Seconds after which the banner of long-running code is shown. The status line shows it earlier; a banner is for
-code that a person may want to end."""
+"""Stages that use objects made while the scene was built: a patch keeps those objects, and some that the new code
+expects may be missing."""
+SHOWN_AFTER_SECONDS = 4.0
+"""Time after which the banner of long-running code is shown. The status line shows it earlier; a banner is for code
+that the user may want to end."""
 
 DOING = {
     "syntax": "is not Python yet",
@@ -63,21 +63,21 @@ INTERRUPTED = {
 def is_busy_for_long(view: SessionView) -> bool:
     """Whether to show the busy banner; it hides that of a problem.
 
-    Not while a worker gets ready: none of the author's code runs then, and the reason why the last worker ended must
-    stay visible. Nor while a debugger holds the worker, which the status line shows.
+    It is hidden while a worker starts: none of the author's code runs then, and the reason why the last worker ended must
+    stay visible. It is also hidden while a debugger holds the worker, which the status line shows.
     """
     busy = view.busy
-    return busy is not None and busy.seconds >= SHOWN_AFTER and not (busy.getting_ready or busy.held)
+    return busy is not None and busy.seconds >= SHOWN_AFTER_SECONDS and not (busy.getting_ready or busy.held)
 
 
 class Banner(PagePart[SessionView]):
-    """A floating panel that is shown while there is a problem: what failed and where, then the line of code and the
-    message; the traceback on demand.
+    """A floating panel shown while there is a problem: what failed and where, the line of code, the message, and the
+    traceback on demand.
 
     Args:
         server: The page.
         link: Links the line in the file.
-        is_own: Whether a file may be written into: the task's, and named by a person, not by a recording.
+        is_own: Whether a file may be written: it is the task's, and the user named it, not a recording.
     """
 
     does = (FillEmptyFile,)
@@ -90,16 +90,16 @@ class Banner(PagePart[SessionView]):
     ) -> None:
         self._link, self._is_own = link, is_own
         self._blank: Path | None = None
-        """File that is offered to be filled."""
+        """The empty file that the banner offers to fill."""
         self._disk = BlockingPool("fill-file")
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
-            # An element of its own: what it says changes, and the other must not be written again.
+            # A separate element: its text changes, and the other element must not be rewritten.
             self._kept = server.gui.add_html("")
             self._tools = server.gui.add_html("")
         # At the right edge of the view: on the left are viser's own notifications.
-        self._panel.float(x=-GAP, y=GAP, width=WIDEST)
+        self._panel.float(x=-GAP_PIXELS, y=GAP_PIXELS, width=MAX_WIDTH_PIXELS)
         self._drawn: int | None = None
         """Serial of the problem that is drawn."""
 
@@ -110,7 +110,7 @@ class Banner(PagePart[SessionView]):
                 self._panel.visible = False
             self._drawn = self._blank = None
             return
-        # Written once for each problem: a new text would close an open traceback.
+        # Written once per problem: rewriting would close an open traceback.
         if view.problem_serial != self._drawn:
             self._drawn = view.problem_serial
             file = Path(problem.file) if problem.file and self._is_own(problem.file) else None
@@ -159,18 +159,18 @@ def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) ->
 
 
 def kept_html(view: SessionView) -> str:
-    """HTML under the problem: which version runs now, and what to do."""
+    """HTML below the problem: which version runs now, and what to do."""
     return render("banner_kept", kept=_kept(view))
 
 
 def _stopped(view: SessionView) -> bool:
-    """Whether no worker has a version, and none will be started unasked."""
+    """Whether no worker has a version, and none will start without a command."""
     lost = view.problem is not None and view.problem.stage == "worker"
     return view.state == "stopped" or (lost and view.state == "error")
 
 
 def _kept(view: SessionView) -> str:
-    """Which version still runs and how to go on, in sentences."""
+    """Which version still runs and how to continue, in sentences."""
     if _stopped(view):
         return "No process runs the task. Restart the worker to load the file as it is now."
     if view.task is None and not (view.problem is not None and view.problem.file):
@@ -197,9 +197,9 @@ def _kept(view: SessionView) -> str:
 class BusyBanner(PagePart[SessionView]):
     """A floating panel that is shown while the worker is busy for long: hook, line and seconds.
 
-    The code may only be slow, so nothing is done unasked. *Interrupt* raises in the author's code and keeps process and
-    envs. Where that does not help (native code, a loop that catches everything), *Restart* ends the process, and the
-    last good version comes back where it was in another.
+    The code may only be slow, so nothing is done automatically. *Interrupt* raises in the author's code and keeps process
+    and envs. If that does not help (native code, a loop that catches everything), *Restart* ends the process, and a new
+    one restores the last good version where it was.
 
     Args:
         server: The page.
@@ -213,7 +213,7 @@ class BusyBanner(PagePart[SessionView]):
             self._html = server.gui.add_html("")
             self._traceback = server.gui.add_html("", visible=False)
             self._tools = server.gui.add_html("")
-        self._panel.float(x=-GAP, y=GAP, width=BUSY_WIDEST)
+        self._panel.float(x=-GAP_PIXELS, y=GAP_PIXELS, width=BUSY_MAX_WIDTH_PIXELS)
 
     def draw(self, view: SessionView) -> None:
         busy = view.busy
@@ -221,7 +221,7 @@ class BusyBanner(PagePart[SessionView]):
             self._panel.visible = False
             return
         self._html.content = busy_html(busy, view, self._link)
-        # An element of its own: the changing seconds would close an open traceback.
+        # A separate element: rewriting it for the changing seconds would close an open traceback.
         trace = (
             render("traceback", traceback=busy.traceback) if busy.ignores_interrupt and busy.traceback else ""
         )

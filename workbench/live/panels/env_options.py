@@ -13,7 +13,7 @@ import viser
 from workbench.envs.keywords import MODES, HowMade, Keyword, as_json, read_value, shown
 from workbench.envs.recorded_run import HOW_IT_IS_RUN
 from workbench.live.commands import (
-    LONGEST_VALUE,
+    MAX_VALUE_CHARACTERS,
     ApplyEnvOptions,
     DiscardEnvOptions,
     ResetEnvOptions,
@@ -39,15 +39,15 @@ LABELS = {
     "reward_mode": "Reward",
 }
 NONE = "none (null)"
-_FEWEST_DIGITS, _MOST_DIGITS = 4, 9
+_MIN_DECIMALS, _MAX_DECIMALS = 4, 9
 """Minimum and maximum number of decimals of the step of a number."""
 
 
 class EnvOptionsPanel(PagePart[SessionView]):
     """A form that is applied as a whole: every change rebuilds the envs.
 
-    What is typed stays in the form until it is applied or discarded, also if the task fails with it; then the envs that
-    run stay as they are. The form is written anew when the envs were made in another way.
+    Entered values stay in the form until they are applied or discarded, also if the task fails with them; the running
+    envs stay unchanged then. The form is rewritten when the envs were made with other options.
     """
 
     does = (SetNumEnvs, SetKeyword, ApplyEnvOptions, DiscardEnvOptions, ResetEnvOptions)
@@ -70,7 +70,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
             self._html = gui.add_html("")
 
     def key(self, view: SessionView) -> object:
-        # The command names the file by its place on the disk, which is not asked for with every step.
+        # The shown command contains the file's path on disk, which must not be looked up at every step.
         task = None if view.task is None else (view.task.made, view.task.device)
         form = self._num_envs, tuple(self._values.items())
         options = view.options, view.seed, view.options_refused
@@ -82,7 +82,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
         if made != before:
             self._made = made
             self._build(made[0])
-            # What was typed while the first version was loading stays.
+            # Values that were entered while the first version was loading stay.
             if before is None or before[1] != made[1]:
                 self._num_envs = made[1].num_envs
         self._envs.show(self._num_envs)
@@ -134,7 +134,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
         self._num_envs = view.options.num_envs
         self._values = {keyword.name: _in_effect(keyword) for keyword in self._keywords}
         if view.options_refused is not None:
-            # The task works with what is in effect: loading it takes the problem off the page.
+            # The task works with the options in effect: loading it removes the problem from the page.
             self._session.happen(OptionsApplied(view.options))
 
     def _apply(self) -> None:
@@ -151,17 +151,17 @@ class EnvOptionsPanel(PagePart[SessionView]):
             self._session.happen(OptionsApplied(wanted))
 
     def _as_the_task_does(self) -> None:
-        """Drop the keyword arguments that a person gave."""
+        """Drop the user's keyword arguments."""
         options = self._session.view().options
         kept = _of_the_machine(options.env_kwargs)
         self._session.happen(OptionsApplied(replace(options, env_kwargs=kept)))
 
 
 def merged(given: Mapping[str, Any], values: Mapping[Keyword, Any]) -> dict[str, Any]:
-    """The keyword arguments of a form over those that were given.
+    """The keyword arguments of a form merged over the given ones.
 
-    What stands as it was is left as it was, and what is the class's own value is not given. A new robot has other control
-    modes, so the old one is dropped unless it was chosen with it.
+    Unchanged arguments are kept, and arguments equal to the class's default are omitted. A new robot has other control
+    modes, so the old mode is dropped unless it was chosen together with the robot.
     """
     result = dict(given)
     changed = {keyword.name for keyword, value in values.items() if not _same(as_json(value), keyword.value)}
@@ -178,7 +178,7 @@ def merged(given: Mapping[str, Any], values: Mapping[Keyword, Any]) -> dict[str,
 
 
 def _same(a: str | None, b: str) -> bool:
-    """Whether two texts are the same value: 1 and 1.0 are, 1 and true are not."""
+    """Whether two texts are the same JSON value: 1 and 1.0 are, 1 and true are not."""
     if a is None or a == b:
         return a == b
     left, right = json.loads(a), json.loads(b)
@@ -193,12 +193,12 @@ def _of_the_machine(kwargs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _input_of(keyword: Keyword) -> object:
-    """Key of the input of a keyword: everything that the input depends on, except its value."""
+    """Key of a keyword's input field: everything that the field depends on, except its value."""
     return keyword.name, keyword.kind, keyword.choices, keyword.optional, keyword.fixed
 
 
 def _in_effect(keyword: Keyword) -> Plain:
-    """Value in the input of a keyword when it shows the value in effect."""
+    """Content of a keyword's input field for the value in effect."""
     if keyword.fixed:
         return keyword.value
     if keyword.kind == "str":
@@ -225,11 +225,13 @@ def _field_for(server: viser.ViserServer, keyword: Keyword) -> Field:
         return Field(server, label, SetKeyword, "value", value, given=[given], step=_step(value))
     hint = "Text" if keyword.kind == "str" else 'A value in JSON: 0.5, true, [1, 2], "text"'
     hint += "; null for none" if keyword.optional else ""
-    return Field(server, label, SetKeyword, "value", value, given=[given], hint=hint, longest=LONGEST_VALUE)
+    return Field(
+        server, label, SetKeyword, "value", value, given=[given], hint=hint, longest=MAX_VALUE_CHARACTERS
+    )
 
 
 def _options(keyword: Keyword) -> dict[str, Plain]:
-    """Values in JSON, by their label."""
+    """Values in JSON by label."""
     texts = keyword.choices or ("true", "false")
     names = [shown(text) for text in texts]
     # 1 and "1" look the same.
@@ -244,7 +246,7 @@ def _step(value: float) -> float:
     if isinstance(value, int):
         return 1.0
     size = math.floor(math.log10(abs(value))) if value else 0
-    return 10.0 ** -min(max(_FEWEST_DIGITS, 3 - size), _MOST_DIGITS)
+    return 10.0 ** -min(max(_MIN_DECIMALS, 3 - size), _MAX_DECIMALS)
 
 
 def _is_number(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""The table of envs: one row an env, sorted and filtered; a press selects the env and goes to its moment."""
+"""The table of envs: one row per env, sorted and filtered; a press selects the env and goes to its event."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from workbench.live.env_commands import (
 )
 from workbench.live.events import EpisodeStepShown, SettingsChanged
 from workbench.live.history.env_table import EnvRows, Outcome
-from workbench.live.panels.env_columns import DOT, EnvColumn, levels, wanted_width
+from workbench.live.panels.env_columns import DOT_PIXELS, EnvColumn, levels, wanted_width
 from workbench.live.panels.moment import MomentPart
 from workbench.live.panels.timeline_panel import polylines
 from workbench.live.session_protocol import LiveSession
@@ -57,13 +57,12 @@ FILTERS: dict[Filter, tuple[str, str, str]] = {
 before, and "failed 16" next to "running 16" confuses."""
 TABLE = "envs"
 """Name of the panel in the page's report that the panel was unfolded."""
-MOST_ENTRIES = 6
-"""Maximum number of columns of bool entries at first; with more a row is wider than the view. The others can be
-chosen."""
-POINTS = 40
+MAX_DEFAULT_ENTRIES = 6
+"""Number of bool entries with a column by default; with more a row is wider than the view. The others can be chosen."""
+CURVE_POINTS = 40
 """Number of points of a row's small curve."""
 STEP_CHARACTERS = 3
-"""Minimum width of a step number in characters: step numbers are soon that long."""
+"""Minimum width of a step number in characters, so that the columns do not widen in the first steps."""
 REWARD_CURVE = "reward curve"
 """Name of the column that cannot be sorted by."""
 CURVE_WIDTH, CURVE_HEIGHT = 60, 14
@@ -77,10 +76,10 @@ def bool_entries(rows: EnvRows) -> tuple[str, ...]:
 
 
 def entry_names(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[str, ...]:
-    """Bool entries that get a column: the chosen ones, and the first of those that a person did not set."""
+    """Bool entries that get a column: the chosen ones, and the first of those that the user did not switch."""
     chosen = chosen or {}
     every = bool_entries(rows)
-    return tuple(name for place, name in enumerate(every) if chosen.get(name, place < MOST_ENTRIES))
+    return tuple(name for place, name in enumerate(every) if chosen.get(name, place < MAX_DEFAULT_ENTRIES))
 
 
 def columns(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[str, ...]:
@@ -97,18 +96,18 @@ def columns(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[st
 
 
 def gives_way(entries: tuple[str, ...], chosen: Mapping[str, bool], sorted_by: str) -> dict[str, int]:
-    """Rank of the columns that are left out where the panel is narrow, 0 first; those without a rank always stay.
+    """Order in which columns are left out if the panel is narrow, 0 first; columns without a rank always stay.
 
     Args:
         entries: The bool entries of `evaluate` that have a column.
-        chosen: Those that a person switched on stay longer than the others.
-        sorted_by: This column stays.
+        chosen: Entries that the user switched on stay longer than the others.
+        sorted_by: This column always stays.
     """
     added = [name for name in reversed(entries) if chosen.get(name)]
     others = [name for name in reversed(entries) if name not in added]
     more = [f"first {name}" for name in others if name not in ("success", "fail")]
     fail, success = ([f"first {name}"] if name in others else [] for name in ("fail", "success"))
-    # What is flagged has a row of its own, too.
+    # Flags go first: flagged envs also have a mark above the tabs.
     in_turn = ["flags", *more, "last", *fail, REWARD_CURVE, "steps", *(f"first {name}" for name in added)]
     ranked = [column for column in (*in_turn, *success, "return") if column != sorted_by]
     return {column: rank for rank, column in enumerate(ranked)}
@@ -118,7 +117,7 @@ def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
     """(N,) whether each env passes a filter.
 
     ``failed``: the present episode ended without success or, while it runs, the previous one did.
-    ``flagged``: outliers in the present or the previous episode.
+    ``flagged``: there are outliers in the present or the previous episode.
     """
     everyone = np.ones(rows.num_envs, bool)
     if wanted == "failed":
@@ -133,15 +132,15 @@ def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
 
 
 def first_flagged(rows: EnvRows) -> int | None:
-    """The first env with an outlier in the present episode, or else in the previous one; None for none."""
+    """The first env with an outlier in the present episode; if there is none, in the previous one; else None."""
     return min(rows.outliers, default=None) if rows.outliers else min(rows.last.outliers, default=None)
 
 
 def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") -> NDArray[np.int64]:
     """The envs that pass a filter, sorted by a column.
 
-    Envs without a value come last in both directions. Ties keep the order of the envs, or rows would jump while nothing
-    changes.
+    Envs without a value come last in both directions. Ties keep the order of the envs, or rows would jump although
+    nothing changes.
     """
     envs = np.flatnonzero(mask(rows, wanted))
     keys = _keys(rows, column)[envs]
@@ -150,7 +149,7 @@ def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") 
 
 
 def moment_of(rows: EnvRows, env: int) -> int | None:
-    """The step of the present episode that a press on an env's row shows: its first outlier, else its end, else None."""
+    """The step of the present episode that a press on an env's row shows: its first outlier, if none its end, if none None."""
     if env in rows.outliers:
         return rows.outliers[env][0].step
     return int(rows.end[env]) if rows.end[env] >= 0 else None
@@ -190,7 +189,7 @@ def make_rows(
 
 
 def _keys(rows: EnvRows, column: str) -> NDArray[np.float64]:
-    """(N,) NaN for no value."""
+    """(N,) sort keys; NaN for no value."""
     if column == "state":
         return _GRAVITY[rows.outcome].astype(np.float64)
     if column == "steps":
@@ -219,8 +218,8 @@ def _curves(rewards: NDArray[np.float32], envs: NDArray[np.int64]) -> list[list[
         return [[] for _ in envs]
     # The longest shown episode sets the width.
     chosen = chosen[:, int(finite.any(axis=0).argmax()) :]
-    every = np.arange(0, chosen.shape[1], -(-chosen.shape[1] // POINTS))
-    # A single step without a number makes a gap, too.
+    every = np.arange(0, chosen.shape[1], -(-chosen.shape[1] // CURVE_POINTS))
+    # A single non-finite step makes a gap too.
     finite = np.logical_and.reduceat(np.isfinite(chosen), every, axis=1)
     chosen = chosen[:, every]
     if not finite.any():
@@ -239,8 +238,7 @@ def _step(step: int) -> str:
     return "" if step < 0 else str(step)
 
 
-MOST_ROWS = 64
-"""Number of rows of one page of the table."""
+ROWS_PER_PAGE = 64
 HINTS = {
     "env": "Click a column to sort by it, again to reverse the order",
     "state": "Of the current episode: running until it first ends",
@@ -254,7 +252,8 @@ HINTS = {
 class EnvPanel(MomentPart):
     """The table of envs in the present container. Sorting and filter are the same for all open pages.
 
-    While it is folded in every page only a new task is drawn: 64 rows were half of what the panels took while a task played.
+    While every page has it folded, it is redrawn only for a new task: drawing 64 rows takes half of the panels' time while a
+    task plays.
     """
 
     does = (
@@ -274,11 +273,11 @@ class EnvPanel(MomentPart):
         self._handle = server.gui.add_html("")
         server.gui.add_html(render("tell", command=TellUnfolded(panel=TABLE)))
         self._sort = "env", False
-        """Column that a person chose, and whether the order is descending."""
+        """Chosen sort column, and whether the order is descending."""
         self._filter: Filter = "all"
-        self._pages = Paged(MOST_ROWS)
+        self._pages = Paged(ROWS_PER_PAGE)
         self._chosen: dict[str, bool] = {}
-        """Whether a person switched each bool entry on or off."""
+        """Bool entries that the user switched on or off."""
         self._choosing = False
         """Whether the list of entries is open."""
         self._pressed = 0
@@ -315,8 +314,8 @@ class EnvPanel(MomentPart):
         self._pressed += 1
 
     def unfold(self) -> None:
-        """Draw the table from now on, because a page shows it. Lasts until `fold`, since no page reports that it
-        folds it by itself."""
+        """Draw the table from now on, because a page shows it. Lasts until `fold`, since pages do not report that the user
+        folded the panel."""
         self._is_unfolded = True
 
     def fold(self) -> None:
@@ -338,12 +337,12 @@ class EnvPanel(MomentPart):
         self._handle.content = content
 
     def wanted_width(self) -> float:
-        """Width in pixels of a panel in which every column is seen."""
+        """Width in pixels of a panel in which every column is visible."""
         rows = self._session.env_rows()
         if rows is None:
             return 0.0
         return wanted_width(
-            self._measure(rows, make_rows(rows, np.arange(min(rows.num_envs, MOST_ROWS)), self._chosen))
+            self._measure(rows, make_rows(rows, np.arange(min(rows.num_envs, ROWS_PER_PAGE)), self._chosen))
         )
 
     def _html(self, rows: EnvRows, selected: int) -> str:
@@ -406,7 +405,7 @@ class EnvPanel(MomentPart):
         return [*start, plain, *entries, *end]
 
     def _sorted_by(self, rows: EnvRows) -> tuple[str, bool]:
-        """The chosen order; by number, while the table lacks the column."""
+        """The chosen order; by env number while the table lacks the column."""
         return self._sort if self._sort[0] in columns(rows, self._chosen) else ("env", False)
 
     def _measure(self, rows: EnvRows, shown: list[dict[str, Any]]) -> list[EnvColumn]:
@@ -429,12 +428,12 @@ class EnvPanel(MomentPart):
         ]
         return [
             EnvColumn("env", longest(str(row["env"]) for row in shown)),
-            EnvColumn("state", states, states, DOT),
+            EnvColumn("state", states, states, DOT_PIXELS),
             EnvColumn("steps", longest(row["steps"] for row in shown), rank=ranks.get("steps")),
             EnvColumn("return", longest(row["total"] for row in shown), rank=ranks.get("return")),
             EnvColumn("reward", 0, fixed=CURVE_WIDTH, rank=ranks.get(REWARD_CURVE)),
             *firsts,
-            EnvColumn("last", last + STEP_CHARACTERS, last, DOT if last else 0.0, ranks.get("last")),
+            EnvColumn("last", last + STEP_CHARACTERS, last, DOT_PIXELS if last else 0.0, ranks.get("last")),
             EnvColumn("flags", 3, rank=ranks.get("flags")),
         ]
 
@@ -449,7 +448,7 @@ class EnvPanel(MomentPart):
             for name in bool_entries(rows)
         ]
 
-    # --- what a person does ------------------------------------------------------------------------
+    # --- commands ----------------------------------------------------------------------------------
 
     def _choose_env(self, env: int) -> None:
         rows = self._session.env_rows()

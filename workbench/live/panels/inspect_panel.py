@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from workbench.envs.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section
 from workbench.live.commands import ChooseInspected, ShowForces
 from workbench.live.events import ReadingChosen
-from workbench.live.inspect_polling import READ_EVERY
+from workbench.live.inspect_polling import READ_PERIOD_SECONDS
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.machine.text import number_text
@@ -28,15 +28,15 @@ from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
 
 TAB = "Inspect"
-NEAR_A_LIMIT = 0.02
-"""Share of a joint's range within which a joint counts as near its limit."""
+NEAR_LIMIT_SHARE = 0.02
+"""Share of a joint's range within which the joint counts as near its limit."""
 
 Row = dict[str, Any]
 """A row of the template ``inspect``."""
 
 
 def leaf_rows(leaves: Sequence[Leaf], before: Sequence[Leaf] | None) -> list[Row]:
-    """One row for each array; numbers that differ at all from the previous reading are marked.
+    """One row per array; numbers that differ from the previous reading are marked.
 
     Args:
         before: the previous reading of the same env; None marks nothing.
@@ -48,7 +48,7 @@ def leaf_rows(leaves: Sequence[Leaf], before: Sequence[Leaf] | None) -> list[Row
         if old is None or old.shape != leaf.values.shape:
             changed = np.zeros(leaf.values.shape, bool)
         else:
-            # NaN differs from itself, and an entry that stays NaN has not changed.
+            # NaN differs from itself, but an entry that stays NaN has not changed.
             changed = (old != leaf.values) & ~((old != old) & (leaf.values != leaf.values))
         count = math.prod(leaf.shape)
         whole = len(leaf.values) == count
@@ -85,14 +85,15 @@ def joint_rows(joints: JointReadings) -> list[Row]:
                 "limits": f"{number(low)} to {number(high)} {unit}" if bounded else f"no limits, {unit}",
                 "place": place,
                 "target_place": None if place is None or math.isnan(target) else _place(target, low, high),
-                "at_limit": place is not None and not 100 * NEAR_A_LIMIT < place < 100 * (1 - NEAR_A_LIMIT),
+                "at_limit": place is not None
+                and not 100 * NEAR_LIMIT_SHARE < place < 100 * (1 - NEAR_LIMIT_SHARE),
             }
         )
     return rows
 
 
 def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
-    """One row for each body of an env; `poses` is (B, 7), p and q (wxyz), NaN for bodies that it lacks."""
+    """One row per body of an env; `poses` is (B, 7), p and q (wxyz), NaN for bodies that the env lacks."""
     rows = []
     for name, pose in zip(names, poses, strict=True):
         if np.isfinite(pose).all():
@@ -103,7 +104,7 @@ def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
 
 
 def number(value: object) -> str:
-    """Short text of a value, of a stable width while it changes."""
+    """Short text of a value; its width stays stable while the value changes."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
@@ -147,9 +148,9 @@ CHOICES: dict[str, Section | None] = {
 
 
 class InspectPanel(PagePart[SessionView]):
-    """Reads what is chosen, of the selected env, from the worker.
+    """Reads the chosen section of the selected env from the worker.
 
-    Nothing is read until a page has opened the tab: reading takes the worker's time.
+    Nothing is read until a page has opened the tab, since reading takes the worker's time.
     """
 
     does = (ChooseInspected, ShowForces)
@@ -181,7 +182,7 @@ class InspectPanel(PagePart[SessionView]):
         server.gui.add_html(render("tell", command=TellUnfolded(panel=TAB)))
         self._now: Inspection | None = None
         self._before: Inspection | None = None
-        self._due = DrawThrottle(READ_EVERY, clock)
+        self._due = DrawThrottle(READ_PERIOD_SECONDS, clock)
 
     def draw(self, view: SessionView) -> None:
         chosen = self._chosen
@@ -206,7 +207,7 @@ class InspectPanel(PagePart[SessionView]):
                 self._choose()
 
     def forces(self, view: SessionView) -> Inspection | None:
-        """The reading whose contacts the 3-D view shows; None while the past is shown: contacts are read live only."""
+        """The reading whose contacts the 3-D view shows; None while the past is shown, since contacts are read live only."""
         here = self._now is not None and self._now.env == view.selected_env
         known = view.timeline.shown is None and not self._no_step_yet(view)
         shown = self._shows_forces and here and known
@@ -218,15 +219,15 @@ class InspectPanel(PagePart[SessionView]):
         self._choose()
 
     def _no_step_yet(self, view: SessionView) -> bool:
-        """Whether the selected env has made no step since it was built, reset or put back. PhysX finds contacts while
-        it steps: until then its list is empty or outdated."""
+        """Whether the selected env has made no step since it was built, reset or restored. PhysX finds contacts while it
+        steps: until then its list is empty or outdated."""
         if self._now is not None and self._now.env == view.selected_env and self._now.elapsed_steps == 0:
             return True
         lived = self._session.look(lambda run: run.segment()) if view.timeline.shown is None else None
         return lived is not None and lived[0] == lived[1]
 
     def _choose(self) -> None:
-        """Tell the session what is looked at."""
+        """Tell the session which sections to read."""
         needed = {
             CHOICES[self._chosen] if self._opened else None,
             "contacts" if self._shows_forces else None,
@@ -252,7 +253,7 @@ def inspect_html(
     before: Inspection | None,
     no_step_yet: bool = False,
 ) -> str:
-    """The tab's content; without contacts if the env made no step since it was set."""
+    """The tab's content; without contacts if the env made no step since it was set or restored."""
     leaves, articulations, contacts, poses = [], [], (), []
     note = ""
     env, section = view.selected_env, CHOICES[choice]
@@ -309,23 +310,24 @@ def _reading(now: Inspection, section: Section | None) -> object:
 FORCE_COLOUR = (255, 0, 200)
 """Magenta, unlike wood, steel, goals and cubes."""
 METRES_AT_ONE_NEWTON = 0.07
-LONGEST = 0.3
-SHAFT, HEAD, HEAD_LENGTH = 0.005, 0.012, 0.028
-"""Metres; viser does not draw an arrow shorter than its head as an arrow."""
-WEAKEST = 1e-3
-"""Minimum force in newtons that is drawn."""
+MAX_ARROW_METRES = 0.3
+SHAFT_METRES, HEAD_METRES, HEAD_LENGTH_METRES = 0.005, 0.012, 0.028
+"""Radii of the arrow's shaft and head, and length of its head; viser does not draw an arrow shorter than its head as an
+arrow."""
+MIN_NEWTONS = 1e-3
+"""Minimum force that is drawn."""
 
 
 class ForceArrows:
-    """Contact forces of one env as arrows in the 3D view.
+    """Draws the contact forces of one env as arrows in the 3D view.
 
-    One arrow for each contact point, along the force on the first body of the pair. Forces span five decades (a cube's
+    One arrow per contact point, along the force on the first body of the pair. Forces span five decades (a cube's
     weight on four corners, a hand pressed into a table), so the length grows with the cube root of the force and is
     bounded; the numbers are in the Inspect tab.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
-        look = {"shaft_radius": SHAFT, "head_radius": HEAD, "head_length": HEAD_LENGTH}
+        look = {"shaft_radius": SHAFT_METRES, "head_radius": HEAD_METRES, "head_length": HEAD_LENGTH_METRES}
         add = partial(server.scene.add_arrows, "/forces", colors=FORCE_COLOUR, **look)
         self._arrows = InView(add, "points")
 
@@ -333,7 +335,7 @@ class ForceArrows:
         """Show the contacts of this reading, or nothing.
 
         Args:
-            offset: (3,) of the env in the view.
+            offset: (3,) position of the env in the view.
         """
         arrows = () if inspection is None else arrows_of(inspection)
         if len(arrows):
@@ -350,7 +352,7 @@ def arrows_of(inspection: Inspection) -> NDArray[np.float32]:
     points = np.concatenate([pair.points for pair in pairs])
     forces = np.concatenate([pair.forces for pair in pairs])
     size = np.linalg.norm(forces, axis=1)
-    shown = np.isfinite(size) & (size > WEAKEST)
+    shown = np.isfinite(size) & (size > MIN_NEWTONS)
     points, forces, size = points[shown], forces[shown], size[shown]
-    length = np.minimum(METRES_AT_ONE_NEWTON * np.cbrt(size), LONGEST)
+    length = np.minimum(METRES_AT_ONE_NEWTON * np.cbrt(size), MAX_ARROW_METRES)
     return np.stack([points, points + forces / size[:, None] * length[:, None]], axis=1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The Log tab: captured output of the author's code in its colours, a filter, and memory of the processes."""
+"""The Log tab: captured output of the author's code in its colours, a filter, and memory use of the processes."""
 
 from __future__ import annotations
 
@@ -27,23 +27,22 @@ from workbench.page.widgets.visitors import Visitor
 Rgb = tuple[int, int, int]
 LIGHT_PAGE: Rgb = (241, 243, 245)
 DARK_PAGE: Rgb = (66, 66, 66)
-"""Backgrounds of the Log, a little nearer to the text than the real ones."""
-READABLE = 4.5
-"""Minimum contrast of text in WCAG 2.1."""
-MOST_SPANS = 1500
-"""Maximum number of spans in all lines; older lines are shown plain. A line may change its colour with each
-character."""
+"""Backgrounds of the Log, slightly closer to the text colour than the real ones."""
+MIN_CONTRAST = 4.5
+"""Minimum contrast ratio of text in WCAG 2.1."""
+MAX_SPANS = 1500
+"""Maximum number of spans in all lines; older lines are shown plain. A line may change its colour at every character."""
 SIXTEEN = TerminalTheme(
     (255, 255, 255), (0, 0, 0),
     [(0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229)],
     [(102, 102, 102), (241, 76, 76), (35, 209, 139), (245, 245, 67), (59, 142, 234), (214, 112, 214), (41, 184, 219), (255, 255, 255)],
 )  # fmt: skip
-"""Theme that is used where one of the sixteen colours is a background, or stands on one."""
+"""Theme for the sixteen colours as a background, or on a background colour."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """Text for the template; `look` and `css` take only numbers from the author's output."""
+    """Text for the template; `look` and `css` contain nothing of the author's output but numbers."""
 
     text: str
     look: str = ""
@@ -51,8 +50,8 @@ class Span:
 
 
 def spans_of_lines(lines: Sequence[tuple[str, tuple[StyledText, ...]]]) -> list[list[Span]]:
-    """The spans of each line (its text and its runs), at most `MOST_SPANS` in all."""
-    left = MOST_SPANS
+    """The spans of each line (its text and its runs), at most `MAX_SPANS` in total."""
+    left = MAX_SPANS
     found: list[list[Span]] = []
     for text, runs in reversed(lines):
         left -= len(runs)
@@ -76,7 +75,7 @@ def _look(style: Style) -> tuple[str, str]:
     if background is not None:
         behind = background.get_truecolor(SIXTEEN)
         text = _plain_on(behind) if colour is None else colour.get_truecolor(SIXTEEN)
-        if contrast(text, behind) < READABLE / 2:
+        if contrast(text, behind) < MIN_CONTRAST / 2:
             text = _plain_on(behind)
         return " ".join(classes), f"color:{ColorTriplet(*text).hex};background:{behind.hex}"
     if colour is not None and colour.type is ColorType.STANDARD:
@@ -90,11 +89,11 @@ def _look(style: Style) -> tuple[str, str]:
 
 
 def readable_on(colour: Rgb, page: Rgb) -> Rgb:
-    """`colour`, moved towards black or white until it can be read on `page`."""
+    """`colour`, moved towards black or white until it is readable on `page`."""
     end = 255 if _luminance(page) < 0.2 else 0
     found = colour
     for share in range(1, 21):
-        if contrast(found, page) >= READABLE:
+        if contrast(found, page) >= MIN_CONTRAST:
             break
         red, green, blue = (round(value + (end - value) * share / 20) for value in colour)
         found = red, green, blue
@@ -102,7 +101,7 @@ def readable_on(colour: Rgb, page: Rgb) -> Rgb:
 
 
 def contrast(one: Rgb, other: Rgb) -> float:
-    """Contrast of WCAG 2.1: 1 for equal colours, 21 for black on white."""
+    """Contrast ratio of WCAG 2.1: 1 for equal colours, 21 for black on white."""
     dark, light = sorted((_luminance(one), _luminance(other)))
     return (light + 0.05) / (dark + 0.05)
 
@@ -118,15 +117,15 @@ def _plain_on(behind: Rgb) -> Rgb:
 
 
 LINES_SHOWN = 200
-LONGEST_FILTER = 200
+MAX_FILTER_CHARACTERS = 200
 
 
 class LogPanel(PagePart[SessionView]):
-    """The last lines that pass the filter; only those are drawn, so that a task that prints in every hook stays cheap.
+    """The last lines that pass the filter; only these are drawn, so that a task that prints in every hook stays cheap.
 
     Args:
         server: The page.
-        clear: Asks the session to forget the output.
+        clear: Clears the session's output.
     """
 
     every = 0.3
@@ -142,7 +141,7 @@ class LogPanel(PagePart[SessionView]):
             "text",
             hint="Only lines that contain this; stderr: or stdout: before it selects one stream.",
             live=True,
-            longest=LONGEST_FILTER,
+            longest=MAX_FILTER_CHARACTERS,
         )
         self._hold = tick(server, "Pause", PauseLog, "on", False, hint="New lines wait while you read.")
         self._html = server.gui.add_html("")
@@ -167,7 +166,7 @@ class LogPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         self._vitals.content = vitals_html(view.vitals)
-        # An empty log needs no controls. One that is held needs them as soon as there are lines: to be let go.
+        # An empty log needs no controls. A paused one needs them as soon as there are lines, to be resumed.
         some = bool(view.printed.lines or view.printed.dropped)
         self._filter.visible = self._hold.visible = some
         self._hold.show(self._held)
@@ -207,7 +206,7 @@ def log_html(printed: Printed, wanted: str) -> str:
 
 
 def vitals_html(vitals: ProcessMemory) -> str:
-    """Memory of the processes, in words that change only when it matters."""
+    """Memory use of the processes, as text that changes only with a relevant difference."""
     if not vitals.memory:
         return ""
     return render("vitals", vitals=vitals, format_size=format_size)

@@ -21,32 +21,33 @@ from workbench.page.widgets.line_chart import YES_OR_NO, ChartLine, LineChart
 from workbench.page.widgets.templates import render, short_text
 from workbench.page.widgets.visitors import Visitor
 
-HEIGHT, TALL = 150, 170
-"""Pixels of a chart with one entry, and of one with many lines."""
+CHART_PIXELS, LINES_CHART_PIXELS = 150, 170
+"""Height of a chart with one entry, and of a chart with many lines."""
 BATCH_COLOUR = "#868e96"
 COLOURS = (
     "#228be6", "#f08c00", "#2f9e44", "#be4bdb", "#e03131", "#12b886",
     "#fab005", "#7950f2", "#fd7e14", "#15aabf", "#e64980", "#868e96",
 )  # fmt: skip
-MOST_LINES = len(COLOURS)
-MOST_CHARTS = 12
+MAX_LINES = len(COLOURS)
+MAX_CHARTS = 12
 """Maximum number of entries of ``evaluate`` with a chart."""
-MOST_NAMED = 12
+MAX_NAMED = 12
 CHOICE = "Choose curves"
 HOW_TO = (
     'For a curve of each part of the reward, put info["reward_terms"] = {"reach": reach, ...} (tensors of shape '
     "(num_envs,)) into the info that compute_dense_reward receives."
 )
 AT_FIRST = (Group.REWARD, Group.TERM)
-"""Groups that are drawn unless a person turns them off; success is drawn too."""
+"""Groups that are drawn unless the user turns them off; success is drawn too."""
 Entry = tuple[Group, str]
-"""Key of a choice: a column, or all parts of an entry of several."""
+"""Key of a choice: a column, or all parts of an entry with several numbers."""
 
 
 class CurvesPanel(MomentPart):
-    """Curves of the selected env and of the mean over the batch, over all steps: selecting an env keeps its past.
+    """Curves of the selected env and of the mean over the batch, over all steps. Selecting another env shows its whole
+    past.
 
-    A person chooses which; the choice is kept for each task. A press on a curve shows its step.
+    The user chooses the curves; the choice is kept per task. A press on a curve shows its step.
 
     Args:
         seek: Shows the moment after a control step.
@@ -63,7 +64,7 @@ class CurvesPanel(MomentPart):
         self._folder = gui.add_folder(None)
         self._charts: dict[Entry, LineChart] = {}
         self._toggled: dict[str, set[Entry]] = {}
-        """Entries that a person has turned on or off, by task."""
+        """Entries that the user has turned on or off, by task."""
         self._turned = 0
         self._task = ""
         self._asked: int | None = None
@@ -98,7 +99,7 @@ class CurvesPanel(MomentPart):
             if key not in drawn:
                 chart.hide()
 
-    # --- what is chosen ------------------------------------------------------------------------------
+    # --- choice of curves ----------------------------------------------------------------------------
 
     def _is_on(self, entry: Entry) -> bool:
         at_first = entry[0] in AT_FIRST or entry == entry_of(SUCCESS)
@@ -125,10 +126,10 @@ class CurvesPanel(MomentPart):
     # --- charts --------------------------------------------------------------------------------------
 
     def _draw_charts(self, view: SessionView, curves: Curves, chosen: Sequence[Entry]) -> set[Entry]:
-        """Draw what is chosen; returns the keys of the charts."""
+        """Draw the chosen curves; returns the keys of the charts."""
         env, drawn = view.selected_env, set()
         singles = [entry for entry in chosen if entry[0] in (Group.REWARD, Group.EVALUATE)]
-        for entry in singles[: MOST_CHARTS + 2]:
+        for entry in singles[: MAX_CHARTS + 2]:
             columns = [column for column in curves.columns if entry_of(column) == entry]
             if columns[0].part is not None:
                 self._draw_lines(entry, f"{entry[1]}, env {env}", curves, columns)
@@ -162,7 +163,7 @@ class CurvesPanel(MomentPart):
 
     def _draw_lines(self, key: Entry, title: str, curves: Curves, columns: Sequence[Column]) -> None:
         """Several lines of the selected env in one chart."""
-        x, values = curves.lines([(column, False) for column in columns[:MOST_LINES]])
+        x, values = curves.lines([(column, False) for column in columns[:MAX_LINES]])
         lines = [
             ChartLine(column.label, line, colour, 1.6)
             for column, line, colour in zip(columns, values, COLOURS, strict=False)
@@ -179,7 +180,7 @@ class CurvesPanel(MomentPart):
                 (Group.JOINT, ""): 1e5,
             }
             order = first.get(key, 10.0 + len(self._charts))
-            height = HEIGHT if key[1] else TALL
+            height = CHART_PIXELS if key[1] else LINES_CHART_PIXELS
             self._charts[key] = LineChart(self._server, self._folder, height, order)
         return self._charts[key]
 
@@ -188,7 +189,7 @@ class CurvesPanel(MomentPart):
     def _draw_notes(self, view: SessionView, curves: Curves | None) -> None:
         """
         Args:
-            curves: None where none are drawn.
+            curves: None if none are drawn.
         """
         lost = "" if curves is None else said_of(curves.newest)
         self._lost.content, self._lost.visible = render("warning", text=lost), bool(lost)
@@ -245,8 +246,8 @@ def said_of(reward: NDArray[np.float32]) -> str:
 
 
 def no_curve_text(names: tuple[str, ...]) -> str:
-    listed = ", ".join(names[:MOST_NAMED]) + (
-        f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    listed = ", ".join(names[:MAX_NAMED]) + (
+        f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
     )
     return f'No curve of {listed} in info["reward_terms"]: a curve needs one number for each env, of shape (num_envs,).'
 
@@ -254,9 +255,9 @@ def no_curve_text(names: tuple[str, ...]) -> str:
 # --- The table of numbers: one row for each entry, the selected env next to the whole batch ----
 
 
-LONGEST_VECTOR = 4
-LONGEST_TEXT = 160
-MOST_ROWS = 200
+MAX_VECTOR_NUMBERS = 4
+MAX_TEXT_CHARACTERS = 160
+MAX_ROWS = 200
 
 
 @dataclass(frozen=True)
@@ -264,7 +265,7 @@ class NumberRow:
     """A row of the table.
 
     A bool is counted over the batch, a number averaged, a vector shortened. Surprises (NaN, a string, None, an entry that
-    is not per env) are shown as they are: they are what an author looks for.
+    is not per env) are shown unchanged: they are what an author looks for.
     """
 
     name: str
@@ -277,7 +278,7 @@ class NumberRow:
     hint: str = ""
     """Further information about the value."""
     about: str = ""
-    """Text next to the name: the mode of a reward."""
+    """Text next to the name: the reward mode."""
 
 
 def number_rows(
@@ -292,7 +293,7 @@ def number_rows(
         rows.append(_earned_row("reward", step.reward, step, env, about))
     first = [key for key in ("success", "fail") if key in step.evaluate]
     rest = sorted(key for key in [*step.evaluate, *step.others] if key not in first)
-    shown = first + rest[: MOST_ROWS - len(first)]
+    shown = first + rest[: MAX_ROWS - len(first)]
     for key in shown:
         if key in step.others:
             rows.append(_other_row(key, step.others[key], env))
@@ -314,15 +315,22 @@ def _other_row(name: str, entry: OtherEntry, env: int) -> NumberRow:
     hint = entry.what if entry.whole else f"{entry.what}; only a part of it is shown, and recorded"
     if entry.per_env:
         return NumberRow(
-            name, short_text(entry.texts[env], LONGEST_TEXT) if env < len(entry.texts) else "—", "", hint=hint
+            name,
+            short_text(entry.texts[env], MAX_TEXT_CHARACTERS) if env < len(entry.texts) else "—",
+            "",
+            hint=hint,
         )
-    value = short_text("".join(entry.texts), LONGEST_TEXT) if entry.numbers is None else _value(entry.numbers)
+    value = (
+        short_text("".join(entry.texts), MAX_TEXT_CHARACTERS)
+        if entry.numbers is None
+        else _value(entry.numbers)
+    )
     return NumberRow(name, "", "", whole=value, hint=f"not per env: {hint}")
 
 
 def _earned_row(name: str, values: NDArray, step: StepResult, env: int, about: str = "") -> NumberRow:
-    """The row of the reward or of a term of it: a dash right after a reset, when there is none (neither zero nor a NaN of
-    the task)."""
+    """The row of the reward or of a reward term: a dash right after a reset, which has no reward (neither zero nor a NaN
+    of the task)."""
     there = (step.elapsed_steps > 0) & (np.isfinite(values) | (step.action is not None))
     return NumberRow(
         name,
@@ -342,8 +350,8 @@ def _value(item: NDArray) -> str:
     if item.ndim == 0:
         return _one(item)
     flat = item.reshape(-1)
-    shown = ", ".join(_one(value) for value in flat[:LONGEST_VECTOR])
-    more = f", … {len(flat)}" if len(flat) > LONGEST_VECTOR else ""
+    shown = ", ".join(_one(value) for value in flat[:MAX_VECTOR_NUMBERS])
+    more = f", … {len(flat)}" if len(flat) > MAX_VECTOR_NUMBERS else ""
     return f"[{shown}{more}]"
 
 

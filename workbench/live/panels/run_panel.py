@@ -39,13 +39,13 @@ ENVS = {"the selected env": "selected", "all envs": "all"}
 """Choices of a field *Envs*, with their values in commands."""
 HOLD = "Hold still"
 MOVED_HINT = "Whose robot a slider moves. The sliders show what the robot of the selected env is told."
-UNBOUNDED = 1.0
-"""Limit of the slider of a dimension without bounds: from -1 to 1."""
+DEFAULT_BOUND = 1.0
+"""Bound of the slider of a dimension without bounds: from -1 to 1."""
 
 
 class ActionSliders:
-    """A folder with one slider for each action dimension of the selected env's robot, shown while the source is
-    ``sliders``. A slider that is moved sets that dimension alone, in the env or envs that the folder names."""
+    """A folder with one slider per action dimension of the selected env's robot, shown while the source is ``sliders``.
+    Moving a slider sets only that dimension, in the env or envs chosen in the folder."""
 
     DOES = (MoveSlider, ChooseMoved, HoldStill)
 
@@ -91,8 +91,8 @@ class ActionSliders:
         told = view.told[min(view.selected_env, len(view.told) - 1)]
         for one, dimension, value in zip(self._sliders, self._dimensions, told, strict=False):
             low, high = slider_bounds(dimension)
-            # A policy's action may lie outside.
-            # Three digits: the field beside the slider has no place for more.
+            # A policy's action may lie outside the bounds.
+            # Three digits: the field next to the slider has no room for more.
             one.show(min(max(float(f"{value:.3g}"), low), high))
 
     def do(self, command: Command) -> None:
@@ -110,8 +110,8 @@ class ActionSliders:
 
 
 def slider_bounds(dimension: ActionDimension) -> tuple[float, float]:
-    low = dimension.low if math.isfinite(dimension.low) else -UNBOUNDED
-    high = dimension.high if math.isfinite(dimension.high) else UNBOUNDED
+    low = dimension.low if math.isfinite(dimension.low) else -DEFAULT_BOUND
+    high = dimension.high if math.isfinite(dimension.high) else DEFAULT_BOUND
     return (low, high) if low < high else (low, low + 1e-6)
 
 
@@ -138,7 +138,7 @@ KNOWN_HINT = "Functions of one parameter in the files where the command was star
 
 
 class RunPanel(PagePart[SessionView]):
-    """The tab's controls. Each shows the session's value, and its command goes to the session."""
+    """The tab's controls. Each shows the session's value and sends its command to the session."""
 
     does = ActionSliders.DOES
 

@@ -39,13 +39,13 @@ from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.tools import Tool, tool, tools_html
 from workbench.page.widgets.visitors import Visitor
 
-GAP = 12
-"""Distance in pixels between floating panels and the view's edges; the same in ``view_width.js``."""
-WIDEST = 760
-HEIGHT = 205
-"""Height in pixels of the view that it covers; framing a scene leaves these out."""
-RANGE_EVERY = 0.5
-"""Seconds between two changes of the slider's range. A slider whose ends move at every step cannot be held."""
+GAP_PIXELS = 12
+"""Distance between floating panels and the view's edges; the same in ``view_width.js``."""
+MAX_WIDTH_PIXELS = 760
+HEIGHT_PIXELS = 205
+"""Height of the view that the timeline covers; framing a scene leaves it out."""
+RANGE_PERIOD_SECONDS = 0.5
+"""Interval at which the slider's range changes. A slider whose ends move at every step cannot be dragged."""
 LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
 EPISODE, EVERYTHING = "this episode", "all episodes"
 GO_ON = "Continue from here"
@@ -58,8 +58,8 @@ class TimeBar(PagePart[View]):
     """A slider over time, a strip under it and a row of buttons, across the bottom of the view.
 
     Args:
-        name: Of the slider.
-        kind: The command that the slider's value goes into, in its field `field`.
+        name: Name of the slider.
+        kind: Command that the slider sends, with its value in the field `field`.
     """
 
     def __init__(self, server: viser.ViserServer, name: str, kind: type[Command], field: str) -> None:
@@ -71,14 +71,14 @@ class TimeBar(PagePart[View]):
             self._add_rows(gui)
             self._walk = gui.add_html("")
         # Across the bottom of the view: viser docks panels at the sides only.
-        self._panel.float(x=GAP, y=-GAP, width=WIDEST)
+        self._panel.float(x=GAP_PIXELS, y=-GAP_PIXELS, width=MAX_WIDTH_PIXELS)
         self._folded = False
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
         """Add rows between the strip and the buttons."""
 
     def fold(self, wanted: bool) -> None:
-        """Fold it to a bar, where it would cover what is looked at, or unfold what this has folded."""
+        """Fold the timeline to a bar where it would cover other content, or unfold it if this method folded it."""
         if wanted != self._folded:
             self._folded = wanted
             (self._panel.minimize if wanted else self._panel.expand)()
@@ -88,14 +88,14 @@ class TimeBar(PagePart[View]):
         return there
 
     def _show_slider(self, low: int, high: int, value: int) -> None:
-        # Never an empty range. Off, not hidden: the panel would grow at the first step.
+        # The range is never empty. Disabled, not hidden: the panel would grow at the first step.
         self._slider.show(value, bounds=(min(low, high - 1), high), off=low >= high)
 
 
 class TimelinePanel(TimeBar[SessionView], MomentPart):
     """The live page's timeline. It counts control steps backwards: 0 is live and -37 is 37 steps ago, so that the slider
-    rests at its right end while the simulation runs and nothing is sent. Dragging shows moments that the session has in
-    memory; the worker draws pictures only after a while at one moment.
+    stays at its right end while the simulation runs and nothing is sent. Dragging shows moments that the session has in
+    memory; the worker draws pictures only after the slider has rested at one moment.
     """
 
     does = (SeekBack, ZoomTimeline, GoToFirst)
@@ -107,7 +107,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         self._session, self._clock = session, clock
         self._episode_only = False
         self._range = (0, 0)
-        """Ticks of the slider's ends."""
+        """Ticks at the slider's ends."""
         self._newest = 0
         """Tick that the slider shows as 0."""
         self._range_at = -math.inf
@@ -115,12 +115,12 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         """Key of the data that the strip was drawn for."""
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
-        # One of these two is shown, and they have the same height: a panel that grows is moved up a moment later, its
+        # Exactly one of these two is shown, and they have the same height: viser moves a panel that grows with a delay, its
         # last row is cut off until then, and a second press on "step" would hit another button.
         self._hint = gui.add_html("")
         self._travel = gui.add_html("", visible=False)
 
-    # --- what a person does ------------------------------------------------------------------------
+    # --- commands ----------------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
         session = self._session
@@ -130,7 +130,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             case SeekBack(steps=steps):
                 session.do(self._seek_to(self._newest + steps))
             case GoToFirst():
-                # The left end of the slider; a slider with the focus goes there too.
+                # The left end of the slider, where the Home key also moves a focused slider.
                 if self._episode_only:
                     session.do(self._seek_to(self._range[0]))
                 else:
@@ -156,7 +156,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     def _draw_slider(self, view: SessionView) -> None:
         past, now = view.timeline, self._clock()
         moved = past.shown is not None and not self._range[0] <= past.tick <= self._range[1]
-        if now - self._range_at >= RANGE_EVERY or moved:
+        if now - self._range_at >= RANGE_PERIOD_SECONDS or moved:
             self._range_at = now
             episode = self._session.look(lambda run: run.episode_ticks()) if self._episode_only else None
             self._range = (past.first_tick, past.last_tick) if episode is None else episode
@@ -199,7 +199,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
 
 
 def walk_tools() -> list[Tool]:
-    """One step or event back or forward."""
+    """Buttons that go one step or event back or forward."""
     kinds = {
         LAST_EVENT: PreviousEvent(),
         LAST_STEP: StepBack(),
@@ -210,7 +210,7 @@ def walk_tools() -> list[Tool]:
 
 
 def continue_tools(view: SessionView) -> list[Tool]:
-    """The go-on buttons."""
+    """Buttons that continue from the shown moment."""
     if view.task is None or view.task.num_envs == 1:
         return [tool(GO_ON, ContinueFromHere())]
     env = f"env {view.selected_env}"
@@ -223,11 +223,11 @@ def continue_tools(view: SessionView) -> list[Tool]:
     ]
 
 
-POINTS = 240
+REWARD_POINTS = 240
 """Number of points of the reward's line, minimum and maximum of each interval in turn: a spike of one step stays
 visible."""
 LINE_HEIGHT = 30.0
-"""Height of the line in the picture's units; the marks are above."""
+"""Height of the line in units of the SVG; the marks are above."""
 FLAGS = {
     REWARD_NONFINITE: "odd",
     FAIL: "fail",
@@ -247,20 +247,20 @@ NAMES = {
     "other": "other event",
 }
 """Legend text of each style."""
-MOST_MARKS = 250
-"""Maximum number of places of the strip with a mark each: closer places cannot be told apart."""
+MAX_MARKS = 250
+"""Maximum number of marks on the strip: closer marks could not be distinguished."""
 
 
 def strip_values(
     low: int, high: int, reward: NDArray[np.float32], styles: Collection[str]
 ) -> dict[str, object]:
-    """The values that the templates of both timelines share.
+    """Values that the templates of both timelines share.
 
     Args:
-        low: First place of the strip.
-        high: Last place.
+        low: First tick of the strip.
+        high: Last tick.
         reward: (high - low + 1,), NaN where there is none.
-        styles: Of the marks on it.
+        styles: Styles of its marks.
     """
 
     def place(at: float) -> float:
@@ -277,7 +277,7 @@ def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
     marks: dict[int, tuple[int, int, str]] = {}
     for tick, flags in strip.events:
         flag = next(flag for flag in rank if flags & flag)
-        place = MOST_MARKS * (tick - strip.low) // (strip.high - strip.low + 1)
+        place = MAX_MARKS * (tick - strip.low) // (strip.high - strip.low + 1)
         if place not in marks or rank.index(flag) < rank.index(marks[place][1]):
             name = NAMES[FLAGS[flag]]
             if flag == WENT_BACK:
@@ -296,10 +296,10 @@ def strip_html(
     """The strip of one env with its shown moment.
 
     Args:
-        seek: the command that a press on a tick asks for.
+        seek: returns the command for a press on a tick.
     """
     has_reward = view.task is None or view.task.reward_mode != "none"
-    # ManiSkill's reward is 0 where a task has none.
+    # ManiSkill's reward is 0 if a task has none.
     reward = strip.reward if has_reward else np.full_like(strip.reward, np.nan)
     marks, finite = marks_of(strip), reward[np.isfinite(reward)]
     return render(
@@ -345,8 +345,8 @@ def where(view: SessionView) -> str:
 
 
 def reward_lines(reward: NDArray[np.float32]) -> list[str]:
-    """SVG polylines of the finite rewards over x 0..100 and y 0..`LINE_HEIGHT` (greatest on top), with gaps. One value
-    alone is a line in the middle."""
+    """SVG polylines of the finite rewards over x 0..100 and y 0..`LINE_HEIGHT` (greatest on top), with gaps. A constant
+    reward is a line in the middle."""
     finite = reward[np.isfinite(reward)]
     if not len(finite):
         return []
@@ -354,10 +354,10 @@ def reward_lines(reward: NDArray[np.float32]) -> list[str]:
     if low == high:
         low, high = low - 1.0, high + 1.0
     known = np.where(np.isfinite(reward), reward, np.nan)
-    if len(known) <= POINTS:
+    if len(known) <= REWARD_POINTS:
         places, values = np.arange(len(known)), known
     else:
-        edges = np.linspace(0, len(known), POINTS // 2 + 1).astype(int)[:-1]
+        edges = np.linspace(0, len(known), REWARD_POINTS // 2 + 1).astype(int)[:-1]
         values = np.stack([np.fmin.reduceat(known, edges), np.fmax.reduceat(known, edges)], 1).reshape(-1)
         places = np.repeat(edges, 2)
     x = 100 * places / max(len(known) - 1, 1)
@@ -368,7 +368,7 @@ def reward_lines(reward: NDArray[np.float32]) -> list[str]:
 def polylines(points: Sequence[str | None]) -> list[str]:
     """``points`` of SVG polylines through these points, with a gap at each None."""
     runs = [[point for point in run if point] for there, run in groupby(points, key=bool) if there]
-    # A polyline of one point is not drawn; one of length zero with round ends is a dot.
+    # SVG does not draw a polyline of one point; one of length zero with round ends is a dot.
     return [" ".join(run if len(run) > 1 else run * 2) for run in runs]
 
 

@@ -1,4 +1,4 @@
-"""How the running version was loaded, and buttons to load it again or choose the file's task."""
+"""How the running version was loaded, and buttons to reload it or choose the file's task."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from workbench.page.widgets.tools import Tool, tool, tools_html
 from workbench.task.problem import Problem
 
 LAST_LOADS = "Last reloads"
-MOST_SHOWN = 8
-"""Maximum number of items not carried over that are named; the rest is counted."""
+MAX_NAMED = 8
+"""Maximum number of named items that were not carried over; the rest is counted."""
 
 
 class VersionPanel(PagePart[SessionView]):
-    """Level, reason and time of the last load, and what a rebuild could not carry over.
+    """Level, reason and time of the last load, and state that a rebuild could not carry over.
 
-    A save loads by the smallest level that is safe, and the author must see which: one who thinks that the scene was rebuilt, when
-    only the reward was patched, looks for a bug that is not there.
+    A save reloads with the smallest level that is safe, and the author must see which: an author who thinks that the scene
+    was rebuilt, when only the reward was patched, looks for a bug that does not exist.
     """
 
     def __init__(self, server: viser.ViserServer, link: LinkTo = no_links) -> None:
@@ -90,7 +90,7 @@ def version_html(
     link: LinkTo = no_links,
     timeline_cleared: bool = False,
 ) -> str:
-    """The panel's text about the running version, and about the file where that was refused.
+    """The panel's text about the running version, and about the file if it was refused.
 
     Args:
         report: how the running version was loaded; None for the first.
@@ -99,7 +99,7 @@ def version_html(
         refused: why the file's present text does not run.
         notices: further notes for the author.
         link: links the line at which the file was refused.
-        timeline_cleared: with that load another history began.
+        timeline_cleared: whether that load started a new history.
     """
     return render(
         "version",
@@ -108,7 +108,7 @@ def version_html(
         loaded=loaded,
         refused=refused,
         notices=notices,
-        most=MOST_SHOWN,
+        most=MAX_NAMED,
         link=link,
         timeline_cleared=timeline_cleared,
     )

@@ -1,1 +1,1 @@
-"""The worker as a process: started, supervised, asked and logged; and background jobs with their progress."""
+"""The worker process: start, supervision, questions and captured output; and background jobs with their progress."""

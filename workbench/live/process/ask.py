@@ -1,4 +1,4 @@
-"""Asks questions of the worker that plays, and of a second process in the background."""
+"""Asks questions of the worker that plays and of a second process in the background."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from workbench.machine.processes.family import describe_exit
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import Call, Question, Unpacker, Unreadable, value_type
 
-_LOOK = 1.0
-"""Seconds between two checks whether a silent process still lives."""
+_POLL_SECONDS = 1.0
+"""Interval at which a silent process is checked for being alive."""
 _NICENESS = 10
-"""Niceness of the background process: the worker that plays comes first where there are fewer cores than work."""
+"""Niceness of the background process: the worker that plays has priority when cores are scarce."""
 WAITING = "waiting for other work in the background"
 IDLE_SECONDS = 300.0
-"""Seconds for which an idle process is kept."""
-_KEPT_OF_WORDS = 4096
-"""Bytes that are kept of a process's ``stderr``: its last line is quoted if the process ends with an error."""
-_PATIENCE = 3.0
-_LOAD_PATIENCE = 10.0
-"""Seconds in which a process must answer a cancelled load; then it is ended. For other questions see `_PATIENCE`."""
+"""Time for which an idle process is kept."""
+_STDERR_BYTES = 4096
+"""How much of the end of a process's ``stderr`` is kept: its last line is quoted if the process ends with an error."""
+_CANCEL_TIMEOUT_SECONDS = 3.0
+_LOAD_CANCEL_TIMEOUT_SECONDS = 10.0
+"""Timeout for the answer to a cancelled load; then the process is ended. For other questions it is
+`_CANCEL_TIMEOUT_SECONDS`."""
 Value = TypeVar("Value")
 OnProgress = Callable[[int, int, Any], None]
-"""Callback for progress: gets done, total, and the new part of the answer."""
+"""Progress callback: gets done, total, and the new part of the answer."""
 
 
 def _ignore(done: int, total: int, part: Any) -> None:
@@ -42,7 +43,7 @@ def _ignore(done: int, total: int, part: Any) -> None:
 
 @dataclass(frozen=True)
 class _Asked:
-    """A question under way."""
+    """A pending question."""
 
     question: Question[Any]
     answer: asyncio.Future[Any]
@@ -50,13 +51,13 @@ class _Asked:
 
 
 class QuestionClient:
-    """Asks the worker that plays; several questions may be under way. Used on the loop."""
+    """Asks questions of the worker that plays; several may be pending. Used on the loop."""
 
     def __init__(self, send: Callable[[Request], None]) -> None:
         self._send = send
         self._numbers = count(1)
         self._asked: dict[int, _Asked] = {}
-        """Questions under way, by number."""
+        """Pending questions by number."""
 
     async def ask(self, question: Question[Value], on_progress: OnProgress = _ignore) -> Value:
         """Ask a question and return the answer, unless the caller is cancelled meanwhile.
@@ -88,33 +89,33 @@ class QuestionClient:
             asked.answer.set_exception(error)
 
     def _fail(self, error: Exception) -> None:
-        """Fail all questions under way with `error`."""
+        """Fail all pending questions with `error`."""
         for asked in self._asked.values():
             if not asked.answer.done():
                 asked.answer.set_exception(error)
 
 
 class Preempted(Exception):
-    """A job of higher priority needs the process: ask again in another turn."""
+    """A job of higher priority needs the process; the question must be asked again in another turn."""
 
 
 Priority = Literal["person", "low", "lowest"]
-"""Whether a person waits for the job; else whether its results are wanted soon."""
+"""Priority of a job: ``person`` if the user waits for it, ``low`` if its results are wanted soon."""
 _ORDER: dict[Priority, int] = {"person": 2, "low": 1, "lowest": 0}
 _Rank = tuple[int, int]
-"""Rank of a job: its priority and its number; the highest rank comes first."""
+"""Rank of a job: its priority and its number; the highest rank runs first."""
 
 
 class Background(QuestionClient):
-    """Asks a process in the background, one question at a time. Jobs share it in turns. Used on the loop.
+    """Asks questions of a background process, one at a time. Jobs use it in turns. Used on the loop.
 
-    Rescoring the past, drawing it and searching cameras take seconds to minutes and move the envs, so they cannot run
-    in the worker that plays. This process has a lower priority; it costs some seconds to start and 0.75 GB. It ends
+    Rescoring the past, rendering it and searching for cameras take seconds to minutes and move the envs, so they cannot
+    run in the worker that plays. This process has a lower priority; it takes some seconds to start and 0.75 GB. It ends
     after `IDLE_SECONDS` without a job.
 
-    The job that was begun last comes first, since a person waits for it: the others give way and continue later. A
-    worker answers in order, so a job that stops or gives way leaves one answer that is still to come; the next turn begins when it
-    has, or the process is ended. A process that dies fails its job; the next job starts another.
+    The newest job runs first, since the user waits for it: the others are preempted and continue later. A worker answers in
+    order, so a job that stops or is preempted leaves one pending answer; the next turn starts when that has arrived, or
+    the process is ended. If the process dies, its job fails; the next job starts another process.
     """
 
     def __init__(self, niceness: int = _NICENESS) -> None:
@@ -125,7 +126,7 @@ class Background(QuestionClient):
         super().__init__(self._send_call)
         self._niceness = niceness
         self._turn: _Rank | None = None
-        """Rank of the job that has the process, until its last answer has come."""
+        """Rank of the job that has the process, until its last answer has arrived."""
         self._waiting: dict[_Rank, asyncio.Future[None]] = {}
         self._idle: asyncio.TimerHandle | None = None
         """Timer that ends an idle process."""
@@ -133,16 +134,16 @@ class Background(QuestionClient):
         self._ending: set[_Process] = set()
         self._unanswered: Call | None = None
         self._overdue: asyncio.TimerHandle | None = None
-        """Timer that ends the process if the answer to a cancelled question does not come."""
+        """Timer that ends the process if the answer to a cancelled question does not arrive."""
         self._loaded: Load | None = None
         """The last load; None after a failure."""
         self._placed: dict[CameraKey, PlaceCamera] = {}
         self.num_envs = 0
-        """Number of envs of the version that is open in the process; 0 for none."""
+        """Number of envs of the version that is loaded in the process; 0 for none."""
 
     @property
     def pid(self) -> int | None:
-        """Process id; None without a process. A process that is being ended counts until it has ended."""
+        """Process id; None without a process. A process that is being ended still counts."""
         process = self._process or next(iter(self._ending), None)
         return None if process is None else process.pid
 
@@ -151,8 +152,8 @@ class Background(QuestionClient):
     async def in_turns(
         self, job: Job, work: Callable[[], Awaitable[Value]], priority: Priority = "person"
     ) -> Value:
-        """Run `work` while no other job has the process and none of higher priority waits; again after each time it gave way
-        to one; the envs are elsewhere then."""
+        """Run `work` while no other job has the process and none of higher priority waits. `work` is started again each time
+        it was preempted; the envs are in another state then."""
         rank = _ORDER[priority], job.number
         while True:
             await self._begin_turn(rank)
@@ -172,7 +173,7 @@ class Background(QuestionClient):
             await granted
         except asyncio.CancelledError:
             if self._turn == rank:
-                self._end_turn()  # it was granted at the same moment
+                self._end_turn()  # the turn was granted at the same moment
             raise
         finally:
             self._waiting.pop(rank, None)
@@ -182,7 +183,7 @@ class Background(QuestionClient):
             return
         if self._idle is not None:
             self._idle.cancel()
-        # Of two jobs that are stopped at once one may not have left yet.
+        # If two jobs are stopped at once, one may still be in the list.
         waiting = [rank for rank, granted in self._waiting.items() if not granted.done()]
         if not waiting:
             self._idle = loop.later(IDLE_SECONDS, self.end)
@@ -194,8 +195,8 @@ class Background(QuestionClient):
         self._turn = None
         if self._unanswered is not None and self._process is not None:
             self._process.send(Cancel())
-            patience = _LOAD_PATIENCE if _is_load(self._question) else _PATIENCE
-            self._overdue = loop.later(patience, self.end)
+            timeout = _LOAD_CANCEL_TIMEOUT_SECONDS if _is_load(self._question) else _CANCEL_TIMEOUT_SECONDS
+            self._overdue = loop.later(timeout, self.end)
         self._grant()
 
     def _is_waited_for(self) -> bool:
@@ -260,14 +261,14 @@ class Background(QuestionClient):
 
         Raises:
             JobFailed: there is no answer.
-            ProcessDied: for that reason.
-            GaveWay: a job of higher priority waits. A load is finished first: that job most likely needs it too.
+            ProcessDied: there is no answer because the process died.
+            Preempted: a job of higher priority waits. A load is finished first: that job most likely needs it too.
         """
         # Before the question: the waiting job would wait for it too.
         if self._is_waited_for() and not _is_load(question):
             raise Preempted
         if self._idle is not None:
-            self._idle.cancel()  # also outside a turn, where a question may take hours
+            self._idle.cancel()  # also outside a turn: a question may take hours
         if self._process is None:
             self._process = _Process(self, self._niceness)
         return await super().ask(question, on_progress)
@@ -329,10 +330,10 @@ class _Process:
         self._worker: WorkerProcess | None = None
         self._unsent: list[Request] = []
         self._killed = False
-        self._said = b""
-        """The last bytes that the process wrote to ``stderr``."""
+        self._stderr = b""
+        """The last bytes of the process's ``stderr``."""
         self._lock = threading.Lock()
-        """Lock for the start: requests sent before it are queued and sent then."""
+        """Lock for the start: requests made before it are queued and sent then."""
         self._thread = threading.Thread(target=self._run, name="background", daemon=True)
         self._thread.start()
 
@@ -364,13 +365,13 @@ class _Process:
         except OSError as error:
             why = f"no process could be started in the background: {error}"
         except Exception as error:
-            report_failure("The process in the background could not be heard", error)
+            report_failure("Reading from the process in the background failed", error)
         finally:
             loop.do(partial(self._background._ended, self, why))
 
     def _serve(self) -> str:
         """Start the process and read its events until it ends; returns why it ended."""
-        # The worker that plays shows the author's output; here it would appear twice. Its last words tell why it died.
+        # The author's output is not shown: the worker that plays already shows it. The last lines explain a death.
         worker = WorkerProcess(self._hear, self._niceness)
         code: int | None = None
         with self._lock:
@@ -381,7 +382,7 @@ class _Process:
                 worker.kill()
         try:
             while True:
-                event: Any = worker.receive(timeout=_LOOK)
+                event: Any = worker.receive(timeout=_POLL_SECONDS)
                 if isinstance(event, Answer | Progress):
                     loop.do(partial(self._take, event))
         except Unreadable as error:
@@ -389,8 +390,8 @@ class _Process:
         except EOFError:
             code = worker.exit_code()
             why = describe_exit(code)
-        worker.stop(grace=0.0)  # all that it wrote is read then
-        if (code or 0) > 0 and (last := self._said.decode(errors="replace").strip().rpartition("\n")[2]):
+        worker.stop(grace=0.0)  # afterwards all its output has been read
+        if (code or 0) > 0 and (last := self._stderr.decode(errors="replace").strip().rpartition("\n")[2]):
             why += f": {last}"
         return f"the process in the background {why}"
 
@@ -400,7 +401,7 @@ class _Process:
 
     def _hear(self, stream: str, piece: bytes) -> bool:
         if stream == "stderr":
-            self._said = (self._said + piece)[-_KEPT_OF_WORDS:]
+            self._stderr = (self._stderr + piece)[-_STDERR_BYTES:]
         return False
 
 

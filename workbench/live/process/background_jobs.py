@@ -23,7 +23,7 @@ class JobProgress:
 
 
 class JobFailed(Exception):
-    """The job failed. The text is for the page; `problem` is what the author's code raised, if it did."""
+    """The job failed. The text is for the page; `problem` is that of the author's code, if it raised."""
 
     def __init__(self, why: str, problem: Problem | None = None) -> None:
         super().__init__(why)
@@ -31,7 +31,7 @@ class JobFailed(Exception):
 
 
 class ProcessDied(JobFailed):
-    """The process that worked on the job is gone; the next question starts another one."""
+    """The process of the job died; the next question starts another one."""
 
 
 class Job:
@@ -42,7 +42,7 @@ class Job:
     def __init__(self, what: str, on_change: Callable[[], None] = lambda: None) -> None:
         self._what, self._on_change = what, on_change
         self.number = next(self._numbers)
-        """Number of the job; a job that begins later has a higher one, whatever it is about."""
+        """Number of the job; a job of any kind that begins later has a higher number."""
         self.progress = JobProgress(what, 0, 0)
         self.stopped = False
         """Whether the job was stopped; work on another thread checks this."""
@@ -54,7 +54,7 @@ class Job:
 
 
 class Jobs:
-    """One job at a time: a new one stops the one before, which changes nothing from then on. Used on the loop."""
+    """Runs one job at a time: a new job stops the previous one, which then has no further effect. Used on the loop."""
 
     def __init__(self, on_change: Callable[[], None], on_failure: Callable[[JobFailed], object]) -> None:
         """
@@ -73,7 +73,7 @@ class Jobs:
         return None if self._job is None else self._job.progress
 
     def start(self, what: str, work: Callable[[Job], Awaitable[None]]) -> None:
-        """Begin a job in place of the one before."""
+        """Start a job in place of the previous one."""
         self.stop()
         if self._closed:
             return
@@ -89,7 +89,7 @@ class Jobs:
             self._job = self._task = None
 
     def close(self) -> None:
-        """Stop the job, and begin no more."""
+        """Stop the job; no further job can start."""
         self._closed = True
         self.stop()
 

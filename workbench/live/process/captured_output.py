@@ -18,18 +18,18 @@ from workbench.machine.text import COLOURS, HARMLESS, colour_codes, plain_text
 PLAIN = Style.null()
 SWITCHES = ("bold", "dim", "italic", "underline", "reverse", "strike")
 
-_LONGEST_LINE = 2000
+_MAX_LINE_BYTES = 2000
 _LINES_KEPT = 1000
 _LINES_PER_SECOND = 400
-"""Most lines a second; further ones are counted and dropped. Costs 1 % of a core."""
-_BAR_PERIOD = 0.1
-"""Least seconds between two reports of an unfinished line that is overwritten."""
-_KEPT_OF_PIECE = 16_384
-"""Bytes at the end of a piece that are split into lines during a flood."""
+"""Rate limit; further lines are counted and dropped. Handling them costs 1 % of a core."""
+_BAR_PERIOD_SECONDS = 0.1
+"""Minimum interval of reports of an unfinished line that is overwritten."""
+_FLOOD_BYTES = 16_384
+"""How much of the end of a piece is split into lines during a flood."""
 
 
 class StyledText(NamedTuple):
-    """Characters of one style, without control characters."""
+    """A text in one style, without control characters."""
 
     text: str
     style: Style
@@ -53,7 +53,7 @@ class Printed:
     lines: tuple[PrintedLine, ...]
     """Oldest first; an unfinished line that overwrites itself (a progress bar) is last."""
     dropped: int
-    """Lines that came too fast to be kept."""
+    """Number of lines that arrived too fast to be kept."""
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -66,16 +66,16 @@ NOTHING_PRINTED = Printed(0, (), 0)
 class PrintedLog:
     """The last lines of a worker's output. Thread-safe: reader threads feed it, the page reads it.
 
-    A print in a loop gives a gigabyte in a minute. Splitting and decoding each line costs microseconds of the server's
-    process, so a flood of millions would freeze the page: at most `_LINES_PER_SECOND` lines are split, and of the others
-    only the number is kept. Of a line that overwrites itself, as a progress bar does, the last version is kept.
+    A print in a loop writes a gigabyte per minute. Splitting and decoding a line takes microseconds in the server process,
+    so a flood of millions would freeze the page: at most `_LINES_PER_SECOND` lines are split, the others are only counted.
+    For a line that overwrites itself, such as a progress bar, the last version is kept.
     """
 
     def __init__(self, on_lines: Callable[[list[PrintedLine], int], None]) -> None:
         """
         Args:
-            on_lines: called on the feeding threads with the new lines and the number dropped before them; with no
-                lines where an unfinished line was overwritten.
+            on_lines: called on the feeding threads with the new lines and the number of lines dropped before them; without
+                lines if an unfinished line was overwritten.
         """
         self._on_lines = on_lines
         self._lock = threading.Lock()
@@ -84,18 +84,18 @@ class PrintedLog:
         self._serial = 0
         self._rest: dict[str, bytes] = {}
         self._styles: dict[str, Style] = {}
-        """The style in which each stream's next line begins."""
+        """Style at the start of each stream's next line."""
         self._budget = float(_LINES_PER_SECOND)
         self._refilled = time.monotonic()
         self._bar_reported = 0.0
         self._view = NOTHING_PRINTED
 
     def feed(self, stream: str, piece: bytes) -> bool:
-        """Add the next bytes of a stream, in any pieces; empty at its end. Returns True during a flood."""
+        """Add the next bytes of a stream, split anywhere; empty at its end. Returns True during a flood."""
         ended = not piece
         with self._lock:
             if ended:
-                # Text without an end of line is the last line.
+                # Remaining text without a newline is the last line.
                 piece = b"\n" if self._rest.get(stream) else b""
             now = time.monotonic()
             earned = (now - self._refilled) * _LINES_PER_SECOND
@@ -114,7 +114,7 @@ class PrintedLog:
             bar = b"\r" in self._rest[stream]
             if lines or dropped or bar:
                 self._serial += 1
-            report = bool(lines or dropped) or (bar and now - self._bar_reported > _BAR_PERIOD)
+            report = bool(lines or dropped) or (bar and now - self._bar_reported > _BAR_PERIOD_SECONDS)
             if report and bar:
                 self._bar_reported = now
         if report:
@@ -138,10 +138,10 @@ class PrintedLog:
         return "\n".join(self.view().texts[-count:])
 
     def _split(self, stream: str, piece: bytes) -> tuple[list[bytes], int]:
-        """The lines that end in `piece`, and the number of those that were dropped."""
+        """The lines that end in `piece`, and the number of dropped lines."""
         dropped = 0
-        if len(piece) > _KEPT_OF_PIECE and self._budget < _LINES_PER_SECOND / 2:
-            cut = piece.rfind(b"\n", 0, len(piece) - _KEPT_OF_PIECE) + 1
+        if len(piece) > _FLOOD_BYTES and self._budget < _LINES_PER_SECOND / 2:
+            cut = piece.rfind(b"\n", 0, len(piece) - _FLOOD_BYTES) + 1
             dropped = piece.count(b"\n", 0, cut)
             if cut:
                 piece, self._rest[stream] = piece[cut:], b""
@@ -149,8 +149,8 @@ class PrintedLog:
         # Only the last version of a progress bar and the one being written are needed.
         if rest.count(b"\r") > 1:
             rest = b"\r".join(rest.rsplit(b"\r", 2)[1:])
-        # Cut a line without an end, or a gigabyte of it would fill this process.
-        if len(rest) > _LONGEST_LINE:
+        # Cut a line that does not end, or a gigabyte of it would fill this process.
+        if len(rest) > _MAX_LINE_BYTES:
             whole.append(rest)
             rest = b""
         self._rest[stream] = rest
@@ -170,17 +170,17 @@ class PrintedLog:
 
 
 def _read(stream: str, raw: bytes, style: Style) -> tuple[PrintedLine, Style]:
-    """A line, and the style in which the next one begins."""
+    """A line, and the style at the start of the next one."""
     # Text after a carriage return overwrites the line.
     seen = raw.rstrip(b"\r").rpartition(b"\r")[2]
-    cut = seen if len(seen) <= _LONGEST_LINE else seen[:_LONGEST_LINE] + "…".encode()
+    cut = seen if len(seen) <= _MAX_LINE_BYTES else seen[:_MAX_LINE_BYTES] + "…".encode()
     runs, after = coloured_runs(cut.decode(errors="replace"), style)
     text = "".join(run.text for run in runs)
     return PrintedLine(stream, text, tuple(runs) if any(run.style != PLAIN for run in runs) else ()), after
 
 
 def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[StyledText], Style]:
-    """One line as runs, and the style in which the next line begins.
+    """One line as runs, and the style at the start of the next line.
 
     Args:
         style: at the end of the previous line.
@@ -220,7 +220,7 @@ def _changed(style: Style, numbers: str) -> Style:
         elif first in HARMLESS:
             decoder.decode_line(f"\x1b[{24 if (first, more) == (4, [0]) else first}m")
     found = decoder.style
-    # Switched off and never on compare equal.
+    # A colour that was switched off equals one that was never set.
     colour, background = (None if c is None or c.is_default else c for c in (found.color, found.bgcolor))
     on = Style.parse(" ".join(name for name in SWITCHES if getattr(found, name)))
     return Style(color=colour, bgcolor=background) + on

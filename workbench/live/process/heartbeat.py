@@ -1,4 +1,4 @@
-"""What a worker is doing, where it hangs or died, and how its work is interrupted."""
+"""The worker's heartbeat: what it is doing, where it hangs or died, and how to interrupt it."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from workbench.task.problem import HOOK_STAGES, Interrupted, Problem
 _FRAME = re.compile(r'^  File "(?P<file>.*)", line (?P<line>\d+|\?\?\?) in (?P<function>.*)$', re.MULTILINE)
 _FATAL = re.compile(r"^Fatal Python error: (?P<what>.+)$", re.MULTILINE)
 _EXIT = re.compile(r"^os\._exit\((?P<code>[^)]*)\)$", re.MULTILINE)
-_MOST_FRAMES = 60
+_MAX_FRAMES = 60
 _OURS = ("/workbench/session/", "/workbench/core/", "/workbench/authoring/", "<frozen runpy>")
 
 
 @dataclass(frozen=True)
 class Busy:
-    """A piece of work that takes long, and where it was at the last look."""
+    """A piece of work that takes long, and its position in the code at the last check."""
 
     seconds: float
     doing: str
@@ -40,13 +40,13 @@ class Busy:
     code: str | None = None
     traceback: str = ""
     drawing: bool = False
-    """Whether the renderer works, which may take long the first time."""
+    """Whether the worker renders, which may take long the first time."""
     getting_ready: bool = False
-    """Whether a new worker imports and compiles; none of the author's lines runs then."""
+    """Whether a new worker imports and compiles; none of the author's code runs then."""
     ignores_interrupt: bool = False
-    """Whether the worker was interrupted and continued nevertheless."""
+    """Whether the worker continued after an interrupt."""
     held: bool = False
-    """Whether a debugger has suspended the worker, or is waited for; the worker does not hang then."""
+    """Whether a debugger has suspended the worker, or the worker waits for one; it does not hang then."""
     awaited: bool = False
     """Whether the worker waits until a debugger attaches."""
 
@@ -54,8 +54,8 @@ class Busy:
 def parse_stack(dump: str) -> list[FrameSummary]:
     """The frames of the last stack in a dump of ``faulthandler``, innermost first; empty if there is none.
 
-    faulthandler writes from a signal handler without the interpreter's help, so it works in a process that loops in
-    native code or dies of a segmentation fault. Format: ``_Py_DumpTraceback`` in CPython's ``Python/traceback.c``;
+    faulthandler writes in a signal handler without the interpreter, so it works in a process that loops in native code or
+    dies of a segmentation fault. Format: ``_Py_DumpTraceback`` in CPython's ``Python/traceback.c``;
     innermost frame first, no source lines, characters beyond ASCII as backslash escapes.
     """
     last = dump.rfind("(most recent call first):")
@@ -64,11 +64,11 @@ def parse_stack(dump: str) -> list[FrameSummary]:
             found["file"], int(found["line"]) if found["line"].isdigit() else 0, found["function"], line=""
         )
         for found in _FRAME.finditer(dump, max(last, 0))
-    ][:_MOST_FRAMES]
+    ][:_MAX_FRAMES]
 
 
 def fatal_error(dump: str) -> str | None:
-    """How the process ended according to the dump: ``Segmentation fault``, ``called os._exit(3)``; None if not there."""
+    """How the process ended according to the dump: ``Segmentation fault``, ``called os._exit(3)``; None if unknown."""
     fatal, left = _FATAL.search(dump), _EXIT.search(dump)
     if fatal is not None:
         return fatal["what"]
@@ -100,7 +100,7 @@ def as_traceback(frames: Sequence[FrameSummary], texts: Mapping[str, str] | None
     """A traceback in Python's format, without the workbench's own frames at its start.
 
     Args:
-        texts: source by path, for files that run in another version than on disk.
+        texts: source by path, for files whose running version differs from the disk.
     """
     theirs = dropwhile(lambda frame: any(part in frame.filename for part in _OURS), reversed(frames))
     with_code = [_frame(f.filename, f.lineno or 0, f.name, texts) for f in theirs]
@@ -109,7 +109,7 @@ def as_traceback(frames: Sequence[FrameSummary], texts: Mapping[str, str] | None
 
 
 def _frame(file: str, line: int, function: str, texts: Mapping[str, str] | None) -> FrameSummary:
-    # Without a text Python would read the file, which may be a device or a pipe by now.
+    # Without a text Python would read the file, which may have become a device or a pipe.
     return FrameSummary(file, line, function, line=code_of(file, line, texts) or "")
 
 
@@ -117,7 +117,7 @@ def code_of(file: str, line: int, texts: Mapping[str, str] | None = None) -> str
     """Text of a line, stripped; None if it cannot be read."""
     text = None if texts is None else texts.get(file)
     try:
-        # Not linecache: the file may be a device or a pipe by now, which would block the page.
+        # Not linecache: the file may have become a device or a pipe, which would block the page.
         lines = (read_source(file) if text is None else text).splitlines()
     except (OSError, SyntaxError):
         return None
@@ -153,13 +153,13 @@ def busy_at(
 def death_problem(
     why: str, doing: str | None, dump: str, own_files: Sequence[str], printed: str, texts: Mapping[str, str]
 ) -> Problem:
-    """How a worker died, at the author's line if the last stack names one.
+    """The death of a worker as a problem, at the author's line if the last stack names one.
 
     Args:
         why: for example ``was killed by SIGSEGV``.
         doing: for example ``stepping``; None for an idle worker.
         dump: its last stack, or empty.
-        printed: its last lines of output.
+        printed: the last lines of its output.
         texts: source by path of the version that ran.
     """
     frames = parse_stack(dump)
@@ -186,15 +186,15 @@ def death_problem(
 
 
 def own_files_of(source_files: Iterable[str], own_file: Path | None) -> list[str]:
-    """The author's files, the task's own first, which is known before anything is loaded."""
+    """The author's files. The task's own file, which is known before anything is loaded, comes first."""
     own = [] if own_file is None else [str(own_file)]
     return own + [path for path in source_files if path not in own]
 
 
-# --- what the worker does now, in memory that both processes map -------------------------------------
-# A hanging worker and a paused one both send nothing, and asking would not tell them apart. So the worker writes when
-# it begins and ends a piece of work: two small writes a control step, no message. The clock is CLOCK_MONOTONIC, which
-# is the same in all processes of the machine.
+# --- the heartbeat in shared memory ------------------------------------------------------------------
+# A hanging worker and a paused one both send nothing, and a question would not distinguish them. So the worker writes
+# the start and end of each piece of work into shared memory: two small writes per control step, no message. The clock is
+# CLOCK_MONOTONIC, which is the same in all processes of the machine.
 
 
 Doing = Literal[
@@ -210,7 +210,7 @@ Doing = Literal[
 ]
 _DOINGS: tuple[Doing, ...] = get_args(Doing)
 _LAYOUT = struct.Struct("=QdB")
-"""Layout: number of the piece of work, its beginning in seconds, index into `_DOINGS`."""
+"""Layout: number of the piece of work, its start in seconds, index into `_DOINGS`."""
 _PID, _PID_AT = struct.Struct("=I"), 64
 """Layout and offset of the worker's process id; 0 until the worker has started."""
 _HELD_AT = 128
@@ -219,7 +219,7 @@ _HELD_AT = 128
 
 @dataclass(frozen=True)
 class Beat:
-    """What a worker was doing at one moment."""
+    """Activity of a worker at one moment."""
 
     number: int
     """Number of the piece of work, counting up; 0 before the first."""
@@ -227,7 +227,7 @@ class Beat:
     since: float
     """``time.monotonic()`` at the beginning of the work."""
     held: bool = False
-    """Whether a debugger has suspended the worker, or is waited for."""
+    """Whether a debugger has suspended the worker, or the worker waits for one."""
 
     @property
     def seconds(self) -> float:
@@ -256,7 +256,7 @@ class HeartbeatWriter:
         _LAYOUT.pack_into(self._memory, 0, self._number, time.monotonic(), _DOINGS.index(doing))
 
     def hold(self, held: bool) -> None:
-        """A debugger has suspended the worker, or has let it continue."""
+        """Report that a debugger has suspended the worker, or has let it continue."""
         self._memory[_HELD_AT] = held
 
 
@@ -284,24 +284,24 @@ class HeartbeatReader:
 # --- interrupting the author's code ------------------------------------------------------------------
 
 INTERRUPT_SIGNAL = signal.SIGUSR1
-"""Signal that interrupts the author's code. Not SIGINT, for which libraries and authors install handlers of their own."""
+"""Signal that interrupts the author's code. Not SIGINT, since libraries and authors install their own handlers for it."""
 STACK_SIGNAL = signal.SIGUSR2
 """Signal that makes faulthandler write the worker's stack into its file."""
 
 
 class Interrupts:
-    """Lets the server stop the author's code in the worker's main thread, and never the workbench's own.
+    """Lets the server stop the author's code in the worker's main thread, but never the workbench's own code.
 
-    A signal's handler runs in the main thread between two bytecodes and may raise there, so a Python loop that never ends
-    is left with a traceback that names the author's line. Elsewhere it must not raise: half a message in the pipe would
-    end the session. So a signal counts only while `allowed`, and not within `shielded`. Native code that does not return,
-    and a loop that catches everything, cannot be left this way; the supervisor reports that.
+    A signal handler runs in the main thread between two bytecodes and may raise there, so an endless Python loop is left
+    with a traceback at the author's line. In other code it must not raise: half a message in the pipe would end the
+    session. So a signal counts only while `allowed`, and not within `shielded`. It cannot stop native code that does not
+    return or a loop that catches everything; the supervisor reports that.
     """
 
     def __init__(self) -> None:
         self.allowed = False
-        """Set it after `begin`, and clear it in a ``finally``, by plain assignments: a signal can raise at the start of
-        any call, and would leave it set for good."""
+        """Set this after `begin`, and clear it in a ``finally``, by plain assignments: a signal can raise at the start of
+        any call, which would leave it set for ever."""
         self._waiting = False
         self._began = 0.0
 
@@ -310,12 +310,12 @@ class Interrupts:
         signal.signal(INTERRUPT_SIGNAL, self._on_signal)
 
     def begin(self) -> None:
-        """Forget the signals that came before the work that begins now."""
+        """Discard signals that arrived before the work that begins now."""
         self._began, self._waiting = time.monotonic(), False
 
     @contextmanager
     def shielded(self) -> Iterator[None]:
-        """Finish what is done within this; a signal that came meanwhile is raised afterwards."""
+        """Let the block finish; a signal that arrives meanwhile is raised afterwards."""
         before, self.allowed = self.allowed, False
         try:
             yield
@@ -327,7 +327,7 @@ class Interrupts:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.allowed:
             self._raise()
-        # Between two pieces of work there is nothing to stop; within `shielded` it is raised at its end.
+        # Between two pieces of work there is nothing to stop; within `shielded` the signal is raised at its end.
         self._waiting = True
 
     def _raise(self) -> None:

@@ -15,27 +15,27 @@ _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 _SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kmgt]?)i?b?", re.IGNORECASE)
 _SHARE = 0.8
 """Share of the memory of the machine or the container that ``auto`` allows."""
-_LEAST = 2**30
-"""Lowest limit in bytes; a worker that has only imported uses about half of it."""
+_MIN_BYTES = 2**30
+"""Lowest allowed limit; a worker that has only imported uses about half of it."""
 _CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-_COUNT_EVERY = 2.0
+_PSS_PERIOD_SECONDS = 2.0
 
 
 def parse_memory(text: str) -> int | None:
     """Bytes of ``8GB``, ``800 MiB`` (both count by 1024), ``auto``; None for ``none``.
 
     Raises:
-        ValueError: it is none of these, or too small for any worker.
+        ValueError: the text is none of these, or the limit is too small for any worker.
     """
     word = text.strip().lower()
     if word == "none":
         return None
     if word == "auto":
-        return max(_LEAST, int(_SHARE * total_memory()))
+        return max(_MIN_BYTES, int(_SHARE * total_memory()))
     size = size_in_bytes(word)
     if size is None or math.isinf(size):
         raise ValueError(f"--memory-limit takes a size such as 8GB, auto, or none; got {text!r}")
-    if size < _LEAST:
+    if size < _MIN_BYTES:
         raise ValueError(
             f"--memory-limit must be at least 1GB: a worker that has built nothing uses half of it, not {text}"
         )
@@ -62,12 +62,12 @@ def total_memory() -> int:
 class FamilyMemory:
     """Memory of all descendants of a process, measured ten times a second.
 
-    The server ends a worker above its limit before the kernel must choose a victim. ``RLIMIT_AS`` does not work: torch and
-    the renderer reserve far more address space than they use, and fail without naming the cause.
+    The server ends a worker above its limit before the OOM killer acts. ``RLIMIT_AS`` does not work: torch and the renderer
+    reserve far more address space than they use, and fail without naming the cause.
 
     Pages that a forked child shares with its parent count once: summed resident memory (RSS) would count a worker of
-    1 GB with seven children as 8 GB. The kernel's share of shared pages (PSS) takes milliseconds, so it is read every
-    two seconds, and at once where the memory seems above the limit. In between, new memory counts as not shared.
+    1 GB with seven children as 8 GB. Reading the proportional set size (PSS) takes milliseconds, so it is read every two
+    seconds, and at once if the memory seems above the limit. In between, new memory counts as not shared.
     """
 
     def __init__(self) -> None:
@@ -75,10 +75,10 @@ class FamilyMemory:
         self._counted = 0.0
 
     def measure(self, pid: int, limit: int | None = None) -> int:
-        """Bytes; exact where the quick estimate is above `limit`.
+        """Memory in bytes; exact if the quick estimate is above `limit`.
 
         Args:
-            pid: not counted itself.
+            pid: the process, which is not counted itself.
         """
         members = family(pid)[1:]
         resident = sum(map(resident_memory, members))
@@ -86,7 +86,9 @@ class FamilyMemory:
             self._shared = 0
             return resident
         now = time.monotonic()
-        if now - self._counted > _COUNT_EVERY or (limit is not None and resident - self._shared > limit):
+        if now - self._counted > _PSS_PERIOD_SECONDS or (
+            limit is not None and resident - self._shared > limit
+        ):
             self._shared = max(0, resident - proportional_memory(members))
             self._counted = now
         return resident - self._shared

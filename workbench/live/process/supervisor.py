@@ -32,29 +32,28 @@ from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import Call, Unreadable
 from workbench.task.problem import shorten
 
-_LOOK = 0.1
-"""Seconds between two checks of the worker."""
-_BUSY = 2.0
-_LONG: dict[Doing, float] = {"starting": 20.0, "warming up": 20.0, "drawing": 20.0}
-"""Seconds after which a piece of work is reported, for work that takes long anyway: imports, shaders. For other work
-see `_BUSY`."""
-_STACK_EVERY = 1.0
-"""Seconds between two reads of the worker's stack."""
-_IGNORED_AFTER = 1.5
-"""Seconds after an interrupt in which the author's code must have ended."""
-_LOAD_WAITS = 2.0
-"""Seconds that a load may wait behind other work; then that work is interrupted."""
-_LONGEST_SILENCE = 4.0
-"""Seconds after the interrupt at which the worker is ended if the load still waits."""
-_AFTER_A_FAILURE = 0.5
-_HEADLESS = 1.0
-"""Seconds without a main thread after which a worker is ended; a process that exits has none for a moment."""
-_MOST_DEATHS = 3
-"""Most workers that may die in a row without a load in between."""
-_SPARE_DELAY = 5.0
-"""Seconds between a load and the start of a spare."""
-_MOST_SPARE_FAILURES = 2
-"""Most spares that may die while they warm up; then no more are started."""
+_POLL_SECONDS = 0.1
+"""Interval at which the worker is checked."""
+_BUSY_SECONDS = 2.0
+_SLOW_WORK_SECONDS: dict[Doing, float] = {"starting": 20.0, "warming up": 20.0, "drawing": 20.0}
+"""Time after which slow kinds of work (imports, shaders) are reported as busy; other work is after `_BUSY_SECONDS`."""
+_STACK_PERIOD_SECONDS = 1.0
+"""Interval at which the worker's stack is read."""
+_INTERRUPT_TIMEOUT_SECONDS = 1.5
+"""Timeout for the author's code to end after an interrupt."""
+_LOAD_WAIT_SECONDS = 2.0
+"""Time that a load may wait behind other work; then that work is interrupted."""
+_SILENCE_TIMEOUT_SECONDS = 4.0
+"""Time after the interrupt at which the worker is ended if the load still waits."""
+_RESTART_DELAY_SECONDS = 0.5
+_HEADLESS_SECONDS = 1.0
+"""Time without a main thread after which a worker is ended; a process that exits has none for a moment."""
+_MAX_DEATHS = 3
+"""Maximum number of workers that may die in a row without a load in between."""
+_SPARE_DELAY_SECONDS = 5.0
+"""Time between a load and the start of a spare."""
+_MAX_SPARE_FAILURES = 2
+"""Maximum number of spares that may die while they warm up; then no more are started."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +61,17 @@ class WorkerOptions:
     """Limits and debugging of a session's workers."""
 
     memory_limit: int | None = None
-    """Bytes of memory of the worker and the processes that it started; None sets no limit."""
+    """Maximum memory in bytes of the worker and the processes that it started; None: no limit."""
     spare: bool = False
     """Keep a second, warmed-up worker to replace one that dies."""
     debug_port: int | None = None
-    """Every worker listens there, on this machine only, for a debugger; None for none."""
+    """Port on which every worker listens for a debugger, on this machine only; None: no debugger."""
     debug_wait: bool = False
-    """The first worker loads nothing until a debugger has attached."""
+    """Whether the first worker waits for a debugger before it loads anything."""
 
 
 class End(Enum):
-    """How a worker came to its end."""
+    """How a worker ended."""
 
     DIED = auto()
     ASKED = auto()
@@ -80,7 +79,7 @@ class End(Enum):
     FILE_WAITS = auto()
     """Killed because it did not begin a load."""
     HANDED_OVER = auto()
-    """Ended because another process has to continue, see `messages.hands_over`."""
+    """Ended so that another process continues, see `messages.hands_over`."""
 
 
 @dataclass(frozen=True)
@@ -111,11 +110,11 @@ class ProcessMemory:
 
 
 class SpareWorker:
-    """A second, warmed-up worker that replaces one that dies. Used on one thread, which must live as long as it.
+    """A second, warmed-up worker that replaces one that dies. Used on one thread, which must outlive the spare.
 
-    A new worker makes a render system and compiles its shaders, and where it is no fork (`worker_start`) it imports torch,
-    SAPIEN and ManiSkill, 4 s and more. The spare does this in the background once a task runs, and then sleeps; it costs
-    memory (`memory`). After it is taken, the next one is started a while later.
+    A new worker makes a render system and compiles its shaders; if it is not forked (`worker_start`), it also imports
+    torch, SAPIEN and ManiSkill, which takes 4 s or more. The spare does this in the background once a task runs, then
+    sleeps; it takes memory (`memory`). Some time after it is taken, the next one is started.
     """
 
     def __init__(self, warm_up: WarmUp) -> None:
@@ -126,16 +125,16 @@ class SpareWorker:
         self._due: float | None = None
 
     def begin_soon(self) -> None:
-        """Start a spare after `_SPARE_DELAY`, if there is none."""
-        if self._process is None and self._due is None and self._failures < _MOST_SPARE_FAILURES:
-            self._due = time.monotonic() + _SPARE_DELAY
+        """Start a spare after `_SPARE_DELAY_SECONDS`, if there is none."""
+        if self._process is None and self._due is None and self._failures < _MAX_SPARE_FAILURES:
+            self._due = time.monotonic() + _SPARE_DELAY_SECONDS
 
     def poll(self) -> None:
         """Start a spare if it is due, and read its events. Does not block."""
         if self._process is None:
             if self._due is not None and time.monotonic() >= self._due:
                 self._due = None
-                # ManiSkill and the renderer print in it what the first worker has shown already.
+                # Its output is dropped: ManiSkill and the renderer print what the first worker has already shown.
                 self._process = WorkerProcess(lambda stream, piece: False)
                 self._process.send(Call(0, self._warm_up))
             return
@@ -164,7 +163,7 @@ class SpareWorker:
         return 0 if process is None else process.memory()
 
     def kill(self) -> None:
-        """End the spare without waiting; `stop` waits."""
+        """End the spare without waiting, unlike `stop`."""
         if self._process is not None:
             self._process.kill()
 
@@ -176,13 +175,13 @@ class SpareWorker:
 
 
 class Supervisor:
-    """Runs one worker after the other, and reports why each ended.
+    """Runs one worker after another, and reports why each ended.
 
     The author's code may crash its process, exit it, loop for ever or fill the memory; the page must survive that. One
-    thread starts a worker, sends it the requests of `first_requests`, hands on its events and checks it ten times a second. When it
-    ends, the thread reports why and takes the next, from the spare if there is one.
+    thread starts a worker, sends the requests of `first_requests`, forwards its events and checks it ten times a second.
+    When the worker ends, the thread reports why and continues with the next, from the spare if there is one.
 
-    Only two things make it end a worker unasked: memory above the limit, and a load that waits behind work that cannot
+    It ends a worker on its own only in two cases: memory above the limit, and a load that waits behind work that cannot
     be interrupted, since a corrected file must not wait for a worker that hangs. A busy worker may just be slow: it is
     reported with its line and left alone. Time during which a debugger holds the worker does not count.
     """
@@ -202,9 +201,9 @@ class Supervisor:
         """The callbacks are called on this object's threads, and may call `send`, `replace` and `interrupt`.
 
         Args:
-            first_requests: requests for each new worker: the state that the previous one had.
+            first_requests: returns the requests for each new worker, which restore the previous one's state.
             on_busy: called about once a second during a long piece of work, and with None when it is done.
-            own_files: the author's files, to find their line on a stack.
+            own_files: returns the author's files, to find the author's line on a stack.
             output: as for `WorkerProcess`.
         """
         self._options, self._warm_up = options, warm_up
@@ -224,11 +223,11 @@ class Supervisor:
         self._closing = False
         self._hands_over = False
         self._pressed: list[Request] = []
-        """Requests from a person that wait for the next worker."""
+        """Requests of the user that wait for the next worker."""
         self._begun = False
-        """Whether the worker has got its first requests."""
+        """Whether the first requests were sent to the worker."""
         self._late: Load | None = None
-        """Load that was sent before the worker had its first requests, perhaps too late to be among them."""
+        """Load that was sent before the worker's first requests, perhaps too late to be among them."""
         self._deaths = 0
         self._interrupted: tuple[int, float] | None = None
         self._lives = 0
@@ -252,13 +251,13 @@ class Supervisor:
 
     @property
     def load_pending(self) -> bool:
-        """Whether the worker has not begun a load that was sent."""
+        """Whether a load was sent that the worker has not begun."""
         return self._load_sent is not None
 
     def send(self, request: Request) -> None:
-        """Send to the current worker. While one hands over to the next, what a person pressed waits, and so does a load that
-        came too late for the `first_requests` of the next. Everything else that is sent between two workers is lost;
-        `first_requests` must include its effect."""
+        """Send a request to the current worker. While one worker hands over to the next, the user's commands are queued, and so
+        is a load that came too late for the next worker's `first_requests`. All other requests sent between two workers are
+        lost; `first_requests` must include their effect."""
         with self._condition:
             worker = self._worker
             if isinstance(request, Load) and not self._begun:
@@ -279,7 +278,7 @@ class Supervisor:
             worker = self._worker
         if worker is not None:
             beat = worker.beat()
-            # A held worker runs the debugger's own code.
+            # A worker held by a debugger runs the debugger's own code.
             if beat.seconds > 0 and not beat.held:
                 self._interrupted = beat.number, time.monotonic()
                 worker.interrupt()
@@ -291,11 +290,11 @@ class Supervisor:
             self._condition.notify_all()
 
     def reset_deaths(self) -> None:
-        """Start counting deaths again from 0: a task was loaded."""
+        """Reset the count of deaths, because a task was loaded."""
         self._deaths = 0
 
     def stop(self) -> None:
-        """End the worker for good; returns when the thread has ended."""
+        """End the worker without a successor; returns when the thread has ended."""
         with self._condition:
             self._closing = True
             self._condition.notify_all()
@@ -310,16 +309,16 @@ class Supervisor:
                 self._spare.stop()
 
     def _run_worker_safely(self) -> bool:
-        """Run `_run_worker`; an exception in it ends the worker, not the thread."""
+        """Run `_run_worker`; an exception ends the worker, not the thread."""
         try:
             return self._run_worker()
         except Exception as error:
-            # Not in a new thread: the kernel ends a worker with the thread that started it.
+            # Do not start a new thread: the kernel ends a worker with the thread that started it.
             report_failure("The thread that supervises the worker failed and is started again", error)
             with self._condition:
                 worker, self._worker, self._begun = self._worker, None, False
                 self._deaths += 1
-                gives_up = self._deaths >= _MOST_DEATHS
+                gives_up = self._deaths >= _MAX_DEATHS
             if worker is not None:
                 worker.stop(grace=0.0)
             why = f"was lost by the thread that supervises it ({type(error).__name__}: {shorten(str(error))})"
@@ -328,14 +327,14 @@ class Supervisor:
         except Exception as failure:
             report_failure("The page cannot be told that the worker was lost", failure)
         with self._condition:
-            # A pause, or what fails at once would use up all attempts.
+            # A delay, or an immediate failure would use up all attempts.
             self._condition.wait_for(
-                lambda: self._replace_asked or self._closing, None if gives_up else _AFTER_A_FAILURE
+                lambda: self._replace_asked or self._closing, None if gives_up else _RESTART_DELAY_SECONDS
             )
             return not self._closing
 
     def _run_worker(self) -> bool:
-        """Run one worker from start to end. Returns False if there is to be no other."""
+        """Run one worker from start to end. Returns False if no other must follow."""
         worker = self._spare.take() if self._spare is not None else None
         if worker is None:
             worker = WorkerProcess(self._output)
@@ -350,7 +349,7 @@ class Supervisor:
         self._lives += 1
         requests = self._first_requests()
         if not any(isinstance(request, Load) for request in requests):
-            # No version to bring back: the mended file, which comes next, finds shaders and imports ready.
+            # There is no version to restore: warm up, so that the fixed file finds shaders and imports ready.
             requests.append(Call(0, self._warm_up))
         first = max((request.number for request in requests if isinstance(request, Load)), default=0)
         with self._condition:
@@ -371,17 +370,17 @@ class Supervisor:
             try:
                 self._drain_events(worker)
             except Exception as error:
-                report_failure("The last that a worker sent could not be taken", error)
+                report_failure("The last events of a worker could not be handled", error)
         except Exception as error:
-            # An event that does not fit the state is treated as one that cannot be read.
-            report_failure("What the worker sent could not be taken, so it is ended", error)
+            # An event that does not fit the state is treated like an unreadable one.
+            report_failure("An event of the worker could not be handled, so the worker is ended", error)
             state.why = f"sent unusable data ({type(error).__name__}: {shorten(str(error))}) and was ended"
             worker.kill()
         self._on_busy(None)
         if self._closing:
             if self._spare is not None:
                 self._spare.kill()  # before the worker: freeing a gigabyte takes a while, so both do it at once
-            worker.stop(grace=0.3)  # nothing is lost: the server has all that is kept
+            worker.stop(grace=0.3)  # nothing is lost: the server has all data worth keeping
             return False
         code = worker.exit_code()
         if code is None and state.why is None:
@@ -393,10 +392,10 @@ class Supervisor:
             if self._replace_asked:
                 state.end = End.ASKED
             self._deaths += state.end is End.DIED
-            gives_up = self._deaths >= _MOST_DEATHS
+            gives_up = self._deaths >= _MAX_DEATHS
         seen = state.stack if state.stack_of == beat.number else ""
         stack = report if fatal_error(report) is not None else seen
-        # A crash may take a while, and is then seen as a main thread that ended, or as half a message.
+        # A crash may take a while; before the exit code is known it shows as an ended main thread or half a message.
         crashed = code is not None and code < 0 and code != -signal.SIGKILL
         why = describe_exit(code) if crashed or state.why is None else state.why
         self._on_death(Death(why, state.end, _doing(beat), stack, gives_up))
@@ -406,10 +405,10 @@ class Supervisor:
             return not self._closing
 
     def _serve(self, worker: WorkerProcess, state: _WorkerState) -> None:
-        """Hand on events and check the worker until it is gone (EOFError) or this object closes."""
+        """Forward events and check the worker until it has ended (EOFError) or this object closes."""
         looked = 0.0
         while not self._closing:
-            event = worker.receive(timeout=_LOOK)
+            event = worker.receive(timeout=_POLL_SECONDS)
             if isinstance(event, Loading):
                 self._load_sent = None
             if isinstance(event, Loaded) and self._spare is not None:
@@ -423,16 +422,16 @@ class Supervisor:
                 state.end, state.why = End.HANDED_OVER, "was ended for another to go on"
                 worker.kill()
                 raise EOFError
-            if time.monotonic() - looked >= _LOOK:
+            if time.monotonic() - looked >= _POLL_SECONDS:
                 looked = time.monotonic()
                 self._check(worker, state)
                 if self._spare is not None:
                     self._spare.poll()
 
     def _drain_events(self, worker: WorkerProcess) -> None:
-        """Handle the events that the worker sent before it died: a recording loses only the step under way."""
+        """Handle the events that the worker sent before it died, so that a recording loses only the unfinished step."""
         try:
-            while (event := worker.receive(timeout=_LOOK)) is not None:
+            while (event := worker.receive(timeout=_POLL_SECONDS)) is not None:
                 self._on_event(event)
         except EOFError:
             return
@@ -447,33 +446,38 @@ class Supervisor:
             state.headless_since = None
         elif state.headless_since is None:
             state.headless_since = now
-        elif now - state.headless_since > _HEADLESS:
+        elif now - state.headless_since > _HEADLESS_SECONDS:
             state.why = "was ended because its main thread had ended and left another thread running,"
             self._end(worker, state)
         self._check_memory(worker, state)
         if beat.held != state.held:
-            # Reported at once, and time counts from here: the debugger's time is not the task's.
+            # Report at once, and count time from here: the debugger's time is not the task's.
             state.held, state.held_changed, state.reported = beat.held, now, 0.0
         load_sent = self._load_sent
-        if load_sent is not None and not beat.held and beat.doing not in _LONG and beat.since < load_sent:
+        if (
+            load_sent is not None
+            and not beat.held
+            and beat.doing not in _SLOW_WORK_SECONDS
+            and beat.since < load_sent
+        ):
             waited = now - max(load_sent, state.held_changed)
-            # Counted from the interrupt: a load that is interrupted must close what it built.
+            # Count from the interrupt: an interrupted load must close what it built.
             ignored = self._since_interrupt(beat)
-            if waited > _LOAD_WAITS and ignored is None:
+            if waited > _LOAD_WAIT_SECONDS and ignored is None:
                 self.interrupt()
-            elif waited > _LOAD_WAITS and ignored is not None and ignored > _LONGEST_SILENCE:
+            elif waited > _LOAD_WAIT_SECONDS and ignored is not None and ignored > _SILENCE_TIMEOUT_SECONDS:
                 state.why = f"did not answer for {waited:.0f} s"
                 state.end = End.FILE_WAITS
                 self._end(worker, state)
         seconds = min(beat.seconds, now - state.held_changed)
-        if not beat.held and seconds < _LONG.get(beat.doing, _BUSY):
+        if not beat.held and seconds < _SLOW_WORK_SECONDS.get(beat.doing, _BUSY_SECONDS):
             if state.reported is not None:
                 state.reported = None
                 self._on_busy(None)
-        elif state.reported is None or now - state.reported >= _STACK_EVERY:
+        elif state.reported is None or now - state.reported >= _STACK_PERIOD_SECONDS:
             state.reported = now
             self._read_stack(worker, state, beat)
-            ignores_interrupt = (self._since_interrupt(beat) or 0.0) > _IGNORED_AFTER
+            ignores_interrupt = (self._since_interrupt(beat) or 0.0) > _INTERRUPT_TIMEOUT_SECONDS
             self._on_busy(
                 busy_at(seconds, beat.doing, state.stack, self._own_files(), ignores_interrupt, beat.held)
             )
@@ -514,7 +518,7 @@ class _WorkerState:
     """State of one worker."""
 
     why: str | None = None
-    """Why the supervisor ended it."""
+    """Why the supervisor ended the worker."""
     end: End = End.DIED
     stack: str = ""
     stack_of: int = 0

@@ -42,43 +42,43 @@ from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import MessageSocket
 
 _ONLY_LAST = (Load, Settings)
-"""Types of requests of which only the last counts, if several are queued in a row."""
-_MOST_REQUESTS = 1000
-"""Longest queue while the worker reads nothing; then steps and resets are dropped (a key is held down)."""
-_PIECE = 1 << 20
-_FLOOD_PAUSE = 0.005
-"""Seconds between two reads during a flood: with pieces of a megabyte that drains 200 MB a second."""
+"""Request types of which only the last counts if several are queued in a row."""
+_MAX_REQUESTS = 1000
+"""Maximum queue length while the worker reads nothing; above it steps and resets are dropped (a key is held down)."""
+_PIECE_BYTES = 1 << 20
+_FLOOD_PAUSE_SECONDS = 0.005
+"""Pause between two reads during a flood: with pieces of a megabyte that drains 200 MB a second."""
 _F_SETPIPE_SZ = 1031
-_BEGINS = 60.0
-"""Start-up timeout of a worker in seconds; generous for a first start on a busy machine."""
+_START_TIMEOUT_SECONDS = 60.0
+"""Start-up timeout of a worker; generous for a cold first start on a loaded machine."""
 
 Output = Callable[[str, bytes], bool]
-"""Callback for output: gets ``stdout`` or ``stderr`` and new bytes (none at its end); True asks for a pause."""
+"""Output callback: gets ``stdout`` or ``stderr`` and new bytes (empty at its end); returns True to request a pause."""
 
 
 class WorkerProcess:
-    """One worker. `receive` is called on one thread, all else on any.
+    """One worker process. `receive` is called on one thread; all other methods are thread-safe.
 
-    Start it on a thread that outlives the worker: where it is no fork (`worker_start`) the kernel ends it with the thread
-    that started it, so that none is left behind when the server is killed.
+    Start it on a thread that outlives the worker: if it is not forked (`worker_start`), the kernel ends it with the thread
+    that started it, so that no worker is left behind when the server is killed.
 
-    It has no standard input, so that a task that reads it gets end of file and does not hang, and its own process group,
-    so that Ctrl-C in the terminal reaches the server alone. The author's code may keep it from reading, writing and
-    ending, so nothing here waits for it: requests go through a queue and a thread (an unread socket is full after some
-    hundred messages, and the page would block), what it does is in shared memory (`heartbeat`), and faulthandler writes
-    its stack from a signal handler into a memory file.
+    It has no standard input, so that a task that reads it gets EOF instead of hanging, and its own process group, so that
+    Ctrl-C in the terminal reaches only the server. The author's code may prevent it from reading, writing and ending, so
+    nothing here waits for it: requests go through a queue and a thread (an unread socket is full after some hundred
+    messages, and the page would block), its activity is in shared memory (`heartbeat`), and faulthandler writes its stack
+    in a signal handler into a memory file.
     """
 
     def __init__(self, output: Output, niceness: int = 0) -> None:
         """
         Args:
-            output: called with its output on threads of this object; see `redirect_output`.
+            output: called with the worker's output on threads of this object; see `redirect_output`.
             niceness: as for ``nice``.
         """
         ours, theirs = socket.socketpair()
         heartbeat = make_heartbeat()
         self._stacks = os.memfd_create("workbench-stacks")
-        # The worker appends, we read and truncate: the file position is shared.
+        # O_APPEND: the file position is shared; the worker appends, we read and truncate.
         fcntl.fcntl(self._stacks, fcntl.F_SETFL, os.O_APPEND)
         fds = [theirs.fileno(), heartbeat, self._stacks]
         try:
@@ -111,29 +111,29 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """Process id of the process that runs the task. Blocks until it has started: about 50 ms, some seconds for
-        the first worker.
+        """Id of the process that runs the task. Blocks until the process has started: about 50 ms, some seconds for the
+        first worker.
 
         Raises:
-            ProcessLookupError: it did not.
+            ProcessLookupError: it did not start.
         """
-        deadline = time.monotonic() + _BEGINS
+        deadline = time.monotonic() + _START_TIMEOUT_SECONDS
         while self._heartbeat.pid == 0 and self._process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.005)
         pid = self._heartbeat.pid or self._process.pid
-        if pid == 0:  # for `os.kill` that is this process and its group
+        if pid == 0:  # `os.kill` would signal this process and its group
             raise ProcessLookupError("the worker has not started")
         return pid
 
     # --- messages ----------------------------------------------------------------------------------
 
     def send(self, request: Request) -> None:
-        """Queue a request. Never blocks. Lost if the worker is gone; `receive` reports that."""
+        """Queue a request. Never blocks. If the worker has ended, the request is lost; `receive` reports the end."""
         with self._wake:
             if self._waiting and _replaces(request, self._waiting[-1]):
                 self._waiting.pop()
-            if len(self._waiting) >= _MOST_REQUESTS:
-                # Not the newest, whatever it is: a load or Pause would be lost. A step pauses first.
+            if len(self._waiting) >= _MAX_REQUESTS:
+                # Do not drop the newest request: a load or Pause would be lost. A step pauses first.
                 self._waiting = deque(r for r in self._waiting if not isinstance(r, (SingleStep, Reset)))
                 self._waiting.append(Play(False))
             self._waiting.append(request)
@@ -143,8 +143,8 @@ class WorkerProcess:
         """The next event; None after `timeout` seconds without one.
 
         Raises:
-            Unreadable: it sent no event; `kill` it.
-            EOFError: the worker is gone (see `exit_code`), and all its events were received.
+            Unreadable: the data is not an event; `kill` the worker.
+            EOFError: the worker has ended (see `exit_code`), and all its events were received.
         """
         message = self._line.receive(timeout)
         # A process that the author's code forked may hold the socket open after the worker's death.
@@ -158,14 +158,14 @@ class WorkerProcess:
         """Redirect the output from now on."""
         self._output = output
 
-    # --- looking at it -------------------------------------------------------------------------------
+    # --- inspection ----------------------------------------------------------------------------------
 
     def beat(self) -> Beat:
-        """What the worker is doing, and since when."""
+        """The worker's activity, and since when."""
         return self._heartbeat.read()
 
     def memory(self, limit: int | None = None) -> int:
-        """Bytes of memory, with all processes that it started; see `FamilyMemory.measure`."""
+        """Memory in bytes of the worker and all processes that it started; see `FamilyMemory.measure`."""
         return self._memory.measure(self._process.pid, limit)
 
     def main_thread_ended(self) -> bool:
@@ -173,18 +173,17 @@ class WorkerProcess:
         pid = self._heartbeat.pid
         return pid != 0 and main_thread_ended(pid) and self._process.poll() is None
 
-    def stack(self, patience: float = 0.3) -> str:
-        """The worker's current stack, as faulthandler writes it; empty if the stack does not come within `patience`
-        seconds."""
+    def stack(self, timeout: float = 0.3) -> str:
+        """The worker's current stack, as faulthandler writes it; empty if it does not arrive within `timeout` seconds."""
         if self.beat().number == 0 or self._process.poll() is not None:
-            return ""  # before its handlers are installed the signal would end it
+            return ""  # before its handlers are installed the signal would end the worker
         with self._look_lock:
             start = size = os.fstat(self._stacks).st_size
             try:
                 os.kill(self.pid, STACK_SIGNAL)
             except ProcessLookupError:
-                return ""  # it died meanwhile; `receive` reports it
-            deadline = time.monotonic() + patience
+                return ""  # the worker died meanwhile; `receive` reports it
+            deadline = time.monotonic() + timeout
             while time.monotonic() < deadline:
                 time.sleep(0.005)
                 now = os.fstat(self._stacks).st_size
@@ -222,7 +221,7 @@ class WorkerProcess:
         self._process.terminate()
 
     def stop(self, grace: float = 1.0) -> None:
-        """Ask the worker to quit, and after `grace` seconds end it with all processes that it started."""
+        """Send Quit, and after `grace` seconds end the worker with all processes that it started."""
         if grace > 0 and self._process.poll() is None:
             self.send(Quit())
             try:
@@ -233,14 +232,14 @@ class WorkerProcess:
         with self._wake:
             self._ending = True
             self._wake.notify()
-        # Or the writer would block for ever if a process that left the group holds the other end.
+        # Without this the writer would block for ever if a process that left the group holds the other end.
         self._line.end.shutdown(socket.SHUT_RDWR)
         self._writer.join()
-        # What was not forked yet has said nothing, and the fork server holds its pipes while it imports.
-        patience = 1.0 if self._process.pid else 0.0
+        # A worker that is not forked yet has no output, and the fork server holds its pipes while it imports.
+        timeout = 1.0 if self._process.pid else 0.0
         for reader in self._readers:
             # A process that left the group may hold the pipe: its reader thread is left behind.
-            reader.join(timeout=patience)
+            reader.join(timeout=timeout)
         self._line.end.close()
         os.close(self._stacks)
 
@@ -256,7 +255,7 @@ class WorkerProcess:
             try:
                 self._line.send(request)
             except OSError:
-                return  # it is gone; `receive` reports it
+                return  # the worker has ended; `receive` reports it
             except Exception as error:
                 report_failure(f"A {type(request).__name__} could not be sent to the worker", error)
 
@@ -264,12 +263,12 @@ class WorkerProcess:
         with stream as pipe:  # type: ignore[attr-defined]
             fd = pipe.fileno()
             try:
-                fcntl.fcntl(fd, _F_SETPIPE_SZ, _PIECE)
+                fcntl.fcntl(fd, _F_SETPIPE_SZ, _PIECE_BYTES)
             except OSError:
-                pass  # the user's limit for pipe memory is reached: smaller pieces then
+                pass  # the user's limit for pipe memory is reached: pieces are smaller then
             failed = False
             while True:
-                piece = os.read(fd, _PIECE)
+                piece = os.read(fd, _PIECE_BYTES)
                 try:
                     too_fast = self._output(name, piece)
                 except Exception as error:
@@ -281,7 +280,7 @@ class WorkerProcess:
                 if not piece:
                     return
                 if too_fast:
-                    time.sleep(_FLOOD_PAUSE)
+                    time.sleep(_FLOOD_PAUSE_SECONDS)
 
 
 def _replaces(request: Request, before: Request) -> bool:
@@ -296,15 +295,15 @@ def _replaces(request: Request, before: Request) -> bool:
 
 
 def signal_main_thread(pid: int, number: signal.Signals) -> None:
-    """Send a signal to the main thread of a process, in which Python's handlers run.
+    """Send a signal to the main thread of a process, where Python's handlers run.
 
-    The kernel delivers a signal for the whole process to any thread, on a busy machine also to one of torch's or the
-    renderer's. CPython 3.11 then notes the signal without waking the main thread, whose endless loop continues until
+    The kernel delivers a signal for the whole process to any thread, on a busy machine also to a thread of torch or the
+    renderer. CPython 3.11 then records the signal without waking the main thread, whose endless loop continues until
     another Python thread wants to run: never.
     """
     if _libc.tgkill(pid, pid, int(number)) != 0:
         error = ctypes.get_errno()
-        if error != errno.ESRCH:  # it died meanwhile; `receive` reports it
+        if error != errno.ESRCH:  # ESRCH: the worker died meanwhile; `receive` reports it
             raise OSError(error, os.strerror(error))
 
 

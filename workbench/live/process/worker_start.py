@@ -1,4 +1,4 @@
-"""Starts worker processes, as forks of a process that has imported what they need."""
+"""Starts worker processes by forking a process that has imported their modules."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from workbench.machine.processes.family import Keeper
 from workbench.machine.processes.wire import Unpacker, has_come, pack
 
 _GPUS = ("/dev/nvidiactl", "/dev/dxg")
-"""One of these is there where CUDA may be (the second in WSL). No worker is forked then: CUDA does not work in a fork of a
-process that has used it, and whether an import does is not in our hands."""
-_LONGEST = 1 << 12
+"""Device files of which one exists if CUDA may be available (the second in WSL). No worker is forked then: CUDA does not
+work in a fork of a process that has used it, and any import may use it."""
+_MAX_MESSAGE_BYTES = 1 << 12
 _UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
 
@@ -45,12 +45,12 @@ class ForkEnded:
 
 
 class ForkedKeeper:
-    """The keeper of a forked worker. Any thread may use it."""
+    """The keeper of a forked worker. Thread-safe."""
 
     def __init__(self, told: socket.socket, stdout: int, stderr: int) -> None:
         """
         Args:
-            told: what the fork server says of it.
+            told: socket on which the fork server reports the worker's start and end.
         """
         self.stdout: IO[bytes] | None = open(stdout, "rb", buffering=0)
         self.stderr: IO[bytes] | None = open(stderr, "rb", buffering=0)
@@ -67,11 +67,11 @@ class ForkedKeeper:
         return self._pid
 
     def poll(self) -> int | None:
-        """Exit code; None while the process runs. A fork server that is killed has killed its workers too."""
+        """Exit code; None while the process runs. If the fork server is killed, its workers are killed too."""
         with self._lock:
             while self._code is None and has_come(self._told):
                 try:
-                    said = self._told.recv(_LONGEST)
+                    said = self._told.recv(_MAX_MESSAGE_BYTES)
                 except ConnectionResetError:
                     said = b""
                 news = Unpacker((Forked, ForkEnded)).message(said) if said else ForkEnded(-signal.SIGKILL)
@@ -80,14 +80,14 @@ class ForkedKeeper:
                 else:
                     self._code = news.code
             if self._code is None and self._terminated and self._pid == 0:
-                # It will not be forked, which the fork server says when it has done its imports.
+                # The worker will not be forked; the fork server reports that only after its imports.
                 self._code = -signal.SIGTERM
             if self._code is not None:
                 self._told.close()
             return self._code
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for the end; returns the exit code, and raises as ``subprocess.Popen.wait`` does."""
+        """Wait for the end; returns the exit code, and raises like ``subprocess.Popen.wait``."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while (code := self.poll()) is None:
             left = None if deadline is None else deadline - time.monotonic()
@@ -111,7 +111,7 @@ class ForkedKeeper:
                 try:
                     self._told.send(pack(int(number)))
                 except OSError:
-                    pass  # it has ended; `poll` says how
+                    pass  # the process has ended; `poll` returns its exit code
 
 
 class WorkerForks:
@@ -122,7 +122,7 @@ class WorkerForks:
         self._process: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
         self._from: tuple[dict[str, str], str] | None = None
-        """Environment and current folder with which the fork server was started."""
+        """Environment and working directory with which the fork server was started."""
 
     def start(self, fds: Sequence[int], niceness: int) -> Keeper:
         """Start a worker without waiting for it.
@@ -139,7 +139,7 @@ class WorkerForks:
                 try:
                     return _forked(control, fds, niceness)
                 except (BrokenPipeError, ConnectionResetError):
-                    self._end()  # it was killed; the next worker starts another
+                    self._end()  # the fork server was killed; the next worker starts another
         return start_anew(fds, niceness)
 
     def end(self) -> None:
@@ -148,7 +148,7 @@ class WorkerForks:
             self._end()
 
     def _fork_server(self) -> socket.socket | None:
-        """Socket of the fork server; None if the environment or the current folder has changed since it was started."""
+        """Socket of the fork server; None if the environment or the working directory has changed since it was started."""
         come_from = (child_environment(**_UNBUFFERED), _current_folder())
         if self._control is None:
             self._process, self._control = start_with_socket(
@@ -169,7 +169,7 @@ class WorkerForks:
 def _current_folder() -> str:
     try:
         return os.getcwd()
-    except FileNotFoundError:  # it was removed
+    except FileNotFoundError:  # the folder was removed
         return ""
 
 

@@ -13,14 +13,14 @@ from workbench.machine.processes.wire import MessageSocket, Unreadable
 
 
 class ServerConnection:
-    """The connection to the server: requests in order, and events. Nothing raises if the server is gone; `closed` says
-    it. An interrupt never cuts a message in two."""
+    """The connection to the server: receives requests in order and sends events. No method raises if the server has ended;
+    `closed` is True then. An interrupt never cuts a message in two."""
 
     def __init__(self, connection: int, interrupts: Interrupts, questions: Sequence[type]) -> None:
         """
         Args:
             connection: file descriptor of the socket.
-            questions: all types that a `Call` may hold.
+            questions: all types that a `Call` may contain.
         """
         self._line = MessageSocket(socket.socket(fileno=connection), get_args(Request), questions)
         self._interrupts = interrupts
@@ -38,7 +38,7 @@ class ServerConnection:
         return self._queue.popleft() if self._queue else None
 
     def waits(self) -> bool:
-        """Whether a request has come that is not queued yet."""
+        """Whether a request has arrived that is not queued yet."""
         return self._line.waits()
 
     def send(self, event: Event) -> None:
@@ -49,20 +49,20 @@ class ServerConnection:
             self.closed = True
 
     def drop_steps(self) -> None:
-        """Drop waiting control steps, which were pressed while a hook hung and would make it hang again. Call before the
-        page is told of the interrupt: steps that are pressed after that are kept."""
+        """Drop waiting control steps, which were requested while a hook hung and would make it hang again. Call this before
+        the interrupt is reported to the page: steps that the user requests after that must be kept."""
         with self._interrupts.shielded():
             waiting = [*self._queue, *self._requests(0.0)]
             self._queue = deque(without_steps(waiting))
 
     def _requests(self, timeout: float) -> list[Request]:
-        """New requests; of several loads only the last, since each replaces the one before."""
+        """New requests; of several loads only the last, since each replaces the previous one."""
         requests: list[Request] = []
         try:
             while (request := self._line.receive(0.0 if requests else timeout)) is not None:
                 requests.append(request)
         except Unreadable:
-            raise  # the server is trusted: an unreadable request is a fault of the workbench
+            raise  # the server is trusted: an unreadable request is a bug of the workbench
         except EOFError:
             self.closed = True
         loads = [request for request in requests if isinstance(request, Load)]

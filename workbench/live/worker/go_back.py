@@ -26,24 +26,24 @@ from workbench.task.description import NO_MOMENT, Restored
 from workbench.task.open import OpenedTask
 from workbench.task.problem import Interrupted, TaskError
 
-MOST_SECONDS = 8.0
-"""Longest replay in seconds; a longer one is given up, and the state of the moment is restored instead."""
+MAX_REPLAY_SECONDS = 8.0
+"""Timeout of a replay; after it the state of the moment is restored instead."""
 
 
 def go_back(
     opened: OpenedTask, request: Restore, on_step: Callable[[int, int], None]
 ) -> tuple[StepResult, Restored]:
-    """Put the envs of `request` back to its moment: replayed where possible, else by restoring its state.
+    """Put the envs of `request` back to its moment: by a replay if possible, else by restoring its state.
 
-    A restored state lacks what PhysX keeps inside, above all contacts, so a run continues differently wherever bodies
-    press on each other (`envs.snapshots.snapshot`; ``tests/benchmarks/restore_distance.py`` measures it). But an episode
-    begins without such inner state (`envs.snapshots.snapshot.begin_anew`), and so does what follows a restored moment.
-    From such an exact point the same actions lead to the same moment, contacts included. The result is compared to the
-    last byte; where it differs (edited code, a task that draws numbers for the whole batch) the state is restored. What
-    is not in PhysX comes from the moment's snapshot in both cases.
+    A restored state lacks the internal state of PhysX, above all contacts, so a run continues differently if bodies press
+    on each other (`envs.snapshots.snapshot`; ``tests/benchmarks/restore_distance.py`` measures it). But an episode begins
+    without internal state (`envs.snapshots.snapshot.begin_anew`), and so does a run from a restored moment. From such an
+    exact point the same actions lead to the same moment, contacts included. The result is compared byte by byte; if it
+    differs (edited code, a task that draws numbers for the whole batch), the state is restored. State outside PhysX comes
+    from the moment's snapshot in both cases.
 
     Args:
-        on_step: called with the steps that were replayed, and their total.
+        on_step: called with the number of replayed steps, and their total.
 
     Raises:
         TaskError: the task's code raised at the moment itself.
@@ -58,7 +58,7 @@ def go_back(
         if put:
             report = restore_snapshot(env, snapshot, put, [source[i] for i in put])
         if replayed:
-            # All replayed envs together: what the task keeps for the batch belongs to the moment of all.
+            # All replayed envs together: state that the task keeps for the whole batch belongs to the moment of all envs.
             every, own = list(source), all(i == of for i, of in source.items())
             positions = [snapshot.env_idx.index(of) for of in source.values()]
             whole = own and snapshot.num_envs == env.num_envs == len(every)
@@ -84,7 +84,7 @@ def _replay_steps(
     source: Mapping[int, int],
     on_step: Callable[[int, int], None],
 ) -> list[int]:
-    """Replay all ways; returns the envs that are then at the moment to the last byte."""
+    """Replay all paths; returns the envs that then equal the moment byte by byte."""
     task, env = opened.env, opened.env.env
     width = actions.width(task.parts)
     ways = {i: way for i, way in request.ways.items() if way.actions.shape[1:] == (width,)}
@@ -98,7 +98,7 @@ def _replay_steps(
     try:
         with step_only(env, [*ways], task.snapshot(others) if others else None):
             for done in count():
-                # The shorter ways begin later, so that all end with the same step.
+                # Shorter paths begin later, so that all end at the same step.
                 for number, start in starts.items():
                     begin = [
                         i for i, w in ways.items() if w.start == number and total - len(w.actions) == done
@@ -114,17 +114,17 @@ def _replay_steps(
                 with blamed("step", opened.loaded, task):
                     task.step(actions.action_of(task.parts, task.num_envs, rows))
                 on_step(done + 1, total)
-                if time.monotonic() - began > MOST_SECONDS:
+                if time.monotonic() - began > MAX_REPLAY_SECONDS:
                     return []
             return [i for i in ways if in_this_state(env, i, snapshot, source[i])]
     except TaskError as error:
         if isinstance(error.__cause__, Interrupted):
             raise
-        return []  # an edited hook fails on the way: only an error at the moment itself is reported
+        return []  # an edited hook fails during the replay: only an error at the moment itself is reported
 
 
 def _of_simulation(report: RestoreReport) -> dict[str, str]:
-    """The part of `not_carried` about physics; the task's memory has a report of its own."""
+    """The part of `not_carried` about physics; the task's own state has a separate report."""
     return {what: why for what, why in report.not_carried.items() if what.startswith("fresh physics")}
 
 
@@ -151,7 +151,7 @@ def enter_recording(
     """Put the envs of `request` into the last state of its run.
 
     Raises:
-        TaskError: the task's code raised on the way; the envs are left there.
+        TaskError: the task's code raised during the replay; the envs are left there.
     """
     run = request.run
     step, replay_result = replay_to(opened, run, run.length, request.env_idx, on_step)

@@ -1,4 +1,4 @@
-"""Calls into the author's code from the worker, with their errors handled."""
+"""Calls the author's code in the worker and handles its errors."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _STAGE: dict[Doing, str] = {"loading": "build", "stepping": "step", "resetting":
 
 
 class GuardedTask:
-    """The open task. All parts of the worker call the author's code through this, so that each failure ends the same way:
-    an interrupt drops the waiting steps, the server gets the problem with the author's line, and the batch is put back to
-    the end of the last step."""
+    """The open task. All parts of the worker call the author's code through this object, so that each failure is handled the
+    same way: an interrupt drops the waiting steps, the server gets the problem with the author's line, and the batch is
+    restored to the end of the last step."""
 
     def __init__(
         self,
@@ -36,30 +36,30 @@ class GuardedTask:
     ) -> None:
         """
         Args:
-            steps: has the snapshot of the last step.
+            steps: holds the snapshot of the last step.
             on_failure: called after a failure was sent.
         """
         self.line, self.interrupts, self.heartbeat, self.steps = line, interrupts, heartbeat, steps
         self._on_failure = on_failure
         self.opened: OpenedTask | None = None
         self.requested_file: Path | None = None
-        """The file that was requested last, loaded or not."""
+        """The last requested file, loaded or not."""
         self.failed = False
-        """Whether `opened` has failed while it ran; what it was doing may be half done."""
+        """Whether `opened` has failed while it ran; its last call may be half done."""
         self.when_loaded: ProcessState | None = None
-        """Settings of the process when the load of `opened` ended."""
+        """Process settings at the end of the load of `opened`."""
         self.spoiled = False
-        """Whether the author's code left something in this process that cannot be taken back: the process has to end."""
+        """Whether the author's code left something in this process that cannot be undone: the process has to end."""
 
     def run(self, doing: Doing | None, work: Callable[[], object], loads: bool = False) -> Problem | None:
-        """Run `work`; if `doing` is not None it may run the author's code, and can be interrupted. Returns the failure,
-        which was sent.
+        """Run `work`; if `doing` is not None, it may run the author's code and can be interrupted. Returns the failure after
+        sending it, or None.
 
         Args:
-            loads: `work` loads a version, which a failure refuses.
+            loads: `work` loads a version, which is refused if it fails.
 
-        A BaseException that is no Exception (KeyboardInterrupt, which only the author's code raises here, or a class of
-        theirs) is a failure; an Exception is the workbench's own, and ends the process.
+        A BaseException that is not an Exception (KeyboardInterrupt, which only the author's code raises here, or an author's
+        class) is a failure; an Exception is a bug of the workbench, and ends the process.
         """
         if doing is None:
             work()
@@ -75,7 +75,7 @@ class GuardedTask:
         except Exception:
             raise
         except BaseException as error:
-            # Outside of `blamed`: between two hooks, or in the workbench's own code.
+            # Raised outside `blamed`: between two hooks, or in the workbench's own code.
             if isinstance(error, Interrupted):
                 self.line.drop_steps()
             problem = problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error))
@@ -89,7 +89,7 @@ class GuardedTask:
         return None
 
     def _own_files(self, error: BaseException) -> list[Path]:
-        """The author's files, and the files of the traceback in the task's folder, whose import may not have finished."""
+        """The author's files, plus files of the traceback in the task's folder, whose import may not have finished."""
         known = [] if self.opened is None else list(self.opened.loaded.source_files)
         if self.requested_file is not None:
             folder, frames = self.requested_file.parent, traceback.extract_tb(error.__traceback__)
@@ -107,14 +107,14 @@ class GuardedTask:
             self.fail(error.problem)
 
     def drop_steps_if_interrupted(self, error: TaskError) -> bool:
-        """Whether a person interrupted the author's code; then the waiting steps are dropped."""
+        """Drop the waiting steps if the user interrupted the author's code; returns whether that was so."""
         interrupted = isinstance(error.__cause__, Interrupted)
         if interrupted:
             self.line.drop_steps()
         return interrupted
 
     def fail(self, problem: Problem) -> None:
-        """Send a failure while the task runs, and stop playing. The batch is put back to the end of the last step, in another
+        """Send a failure of the running task, and stop playing. The batch is restored to the end of the last step, in another
         process if this one cannot be trusted with it."""
         self.failed = self.failed or problem.stage != "policy"
         spoiled = self._settings_changed()
@@ -136,12 +136,12 @@ class GuardedTask:
         self.line.send(failed)
 
     def restore_last_step(self) -> Problem | None:
-        """Put the batch back to the end of the last step, after one that was cut short. Returns why that failed."""
+        """Restore the batch to the end of the last step after a step was cut short. Returns the problem if that failed."""
         if self.opened is None or self.steps.moment is None:
             return None
         try:
-            # Not `TaskEnv.restore`: that calls `evaluate`, which may be what did not end.
+            # Not `TaskEnv.restore`: that calls `evaluate`, which may be the hook that did not end.
             restore_snapshot(self.opened.env.env, self.steps.moment)
-        except Exception as error:  # the failed code may have put anything in place of what is restored
+        except Exception as error:  # the failed code may have replaced the objects to restore by anything
             return problem_from_exception(error, "reset", self.opened.loaded.source_files)
         return None

@@ -1,4 +1,4 @@
-"""Makes the 3-D scenes of recordings that hold none, and pictures of registered tasks, in a worker without a task."""
+"""Builds 3-D scenes for recordings without one, and renders registered tasks, in a worker without a task."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from workbench.live.worker.pacing import throttled
 if TYPE_CHECKING:
     from workbench.envs.task_env import TaskEnv
 
-_PROGRESS_PERIOD = 0.2
-"""Seconds between two progress messages."""
+_PROGRESS_PERIOD_SECONDS = 0.2
+"""Interval of progress messages."""
 
 
 class SceneEnv:
-    """Makes scenes; keeps the env for the next episode with the same task and options."""
+    """Builds scenes of recordings; keeps the env for the next episode with the same task and options."""
 
     def __init__(self) -> None:
         self._made: tuple[object, TaskEnv] | None = None
@@ -54,7 +54,7 @@ class SceneEnv:
 
 
 def make(request: MakeScene) -> TaskEnv:
-    """One env of the recorded task, made with the recording's options."""
+    """One env of the recorded task, built with the recording's options."""
     from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
     from workbench.task.load import import_modules, load_task
     from workbench.task.problem import TaskError
@@ -75,7 +75,7 @@ def make(request: MakeScene) -> TaskEnv:
             raise CannotAnswer(f"{Path(file).name} cannot be loaded: {error.problem.message}") from error
     if loaded is None or loaded.env_id != request.task:
         try:
-            loaded = load_task(RecordedTask(request.task))  # an id that is registered, never a path
+            loaded = load_task(RecordedTask(request.task))  # a registered id, never a path
         except TaskError as error:
             raise CannotAnswer(
                 f"There is no env {request.task} here to make the scene with, so there are only numbers and curves. If it "
@@ -111,7 +111,7 @@ def scene_of(env: TaskEnv, request: MakeScene, on_progress: Callable[[int, int, 
     states = request.env_states
     count = min(len(values) for values in states.values())
     poses: list[Any] = []
-    report = throttled(on_progress, _PROGRESS_PERIOD)
+    report = throttled(on_progress, _PROGRESS_PERIOD_SECONDS)
     missed = (
         state_mismatches(env.env, 0, {name: values[0] for name, values in states.items()}) if count else {}
     )
@@ -130,7 +130,7 @@ def registered_ids() -> tuple[str, ...]:
 
 
 def draw_task(env_id: str) -> TaskPicture:
-    """The picture of a registered task after a reset."""
+    """Render a registered task after a reset."""
     from workbench.envs.assets import MissingAssets
     from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
     from workbench.pictures.render import list_cameras, take_pictures

@@ -1,4 +1,4 @@
-"""Realtime pacing: when the next control step is due, how many are made, how often progress is reported."""
+"""Realtime pacing of control steps, rates, and throttled progress reports."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-_LONGEST_DEBT = 0.1
-"""Most wall seconds of simulation that are caught up with."""
+_MAX_DEBT_SECONDS = 0.1
+"""Maximum wall time of simulation that is caught up with."""
 
 
 @dataclass
 class Pacer:
     """A budget of simulated time, as in mjlab's base viewer.
 
-    Wall time earns simulated time (times the speed), a step spends ``control_dt`` of it, and a step is due when there is
-    enough. So the speed is right for steps of any cost, even if the loop is uneven. What the machine cannot keep up with
-    is forgotten after `_LONGEST_DEBT`, or one slow picture would be followed by a burst.
+    Wall time adds simulated time (times the speed), a step subtracts ``control_dt``, and a step is due when there is enough.
+    So the speed is right for steps of any cost, even if the loop is uneven. Debt beyond `_MAX_DEBT_SECONDS` is dropped, or
+    one slow picture would be followed by a burst of steps.
     """
 
     control_dt: float
@@ -41,7 +41,7 @@ class Pacer:
         if math.isinf(self.speed):
             return True
         earned = (now - self._last) * self.speed
-        most = self.control_dt + _LONGEST_DEBT * self.speed
+        most = self.control_dt + _MAX_DEBT_SECONDS * self.speed
         self._budget, self._last = min(self._budget + earned, most), now
         return self._budget >= self.control_dt * (1 - 1e-9)
 
@@ -59,23 +59,23 @@ class Pacer:
 
 @dataclass
 class Rate:
-    """Events per second over the last second or so; over the last two seconds for slower events."""
+    """Events per second over a window; for events slower than that, over the last two."""
 
     window: float = 1.0
     _times: deque[float] = field(default_factory=deque)
 
     def tick(self, now: float) -> None:
         self._times.append(now)
-        self.per_second(now)  # forgets what is older
+        self.per_second(now)  # drops older events
 
     def per_second(self, now: float) -> float:
-        # Two are kept: steps that take longer than the window have a rate too.
+        # Keep at least two: steps that take longer than the window have a rate too.
         while len(self._times) > 2 and now - self._times[0] > self.window:
             self._times.popleft()
         if len(self._times) < 2:
             return 0.0
         first, last = self._times[0], self._times[-1]
-        # The one that is due may take longer than the ones before.
+        # The pending step may take longer than the previous ones.
         return (len(self._times) - 1) / max(last - first, now - last, 1e-9)
 
     def clear(self) -> None:
@@ -84,7 +84,7 @@ class Rate:
 
 @dataclass
 class Shares:
-    """Share of the last seconds that each kind of work took."""
+    """Shares of the last seconds that kinds of work took."""
 
     window: float = 2.0
     _spent: deque[tuple[float, str, float]] = field(default_factory=deque)
@@ -110,7 +110,7 @@ class Shares:
 
 
 def throttled(report: Callable[..., None], seconds: float) -> Callable[..., None]:
-    """`report`, called at most every `seconds` and not in the first `seconds`; other calls are dropped."""
+    """A function that calls `report` at most every `seconds`, not in the first `seconds`; other calls are dropped."""
     last = time.monotonic()
 
     def report_if_due(*arguments: Any) -> None:

@@ -1,4 +1,4 @@
-"""Settings of the whole process that a task may change and that no reload takes back."""
+"""Settings of the whole process that a task may change and that no reload undoes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MODULES = (
     *("torch", "torch.nn.functional", "numpy", "numpy.random", "random", "time", "math", "os", "builtins"),
     *("mani_skill.envs.sapien_env", "mani_skill.utils.common", "mani_skill.utils.sapien_utils", "sapien"),
 )
-"""Modules whose functions are compared: a task may have replaced one by its own."""
+"""Modules whose functions are compared: a task may have replaced one."""
 _FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType)
 
 _TRACED = "sys.settrace()"
@@ -56,10 +56,10 @@ def read_process_state() -> ProcessState:
 
 
 def changed_settings(before: ProcessState, now: ProcessState) -> list[str]:
-    """Names of what differs: what had another value, or is gone. A function that came in addition is no change, a variable
-    of the environment is."""
+    """Names of settings that have another value or were removed. An added environment variable is a change, an added
+    function is not."""
     if may_be_debugged():
-        # A debugger puts its own functions in place of Python's, some when it attaches.
+        # A debugger replaces functions of Python by its own, some when it attaches.
         before = {
             name: value
             for name, value in before.items()
@@ -70,7 +70,7 @@ def changed_settings(before: ProcessState, now: ProcessState) -> list[str]:
 
 
 def some_of(names: list[str]) -> str:
-    """The first of the names, in a sentence."""
+    """The first names, as part of a sentence."""
     more = f" and {len(names) - 2} more" if len(names) > 2 else ""
     return ", ".join(names[:2]) + more
 

@@ -1,4 +1,4 @@
-"""Loads a saved version of the task in place of the running one, and keeps as much state as possible."""
+"""Loads a saved version of the task in place of the running one and keeps as much state as possible."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class Running:
     """The running version."""
 
     request: Load
-    """The load that made the version."""
+    """The version's load."""
     opened: OpenedTask
     last: StepResult
     """Result of the last step."""
 
 
 class _MustRebuild(Exception):
-    """Why the new code does not fit the live env, and a new env must be built."""
+    """The new code does not fit the live env, and a new env must be built; the text is the reason."""
 
 
 def load_version(
@@ -62,16 +62,16 @@ def load_version(
     running: Running | None,
     opening: Opening | None = None,
 ) -> tuple[OpenedTask, ReloadReport | None]:
-    """Load the task, or its version on disk now, and keep what can be kept of `running`.
+    """Load the requested version of the task, and keep as much state of `running` as possible.
 
-    The env stays and gets the new class (``same``, ``patched``; ``cameras`` makes the cameras again); or another is built
+    The env stays and gets the new class (``same``, ``patched``; ``cameras`` rebuilds the cameras); or another env is built
     and takes over the state by name (``rebuilt``), and the caller closes the old one; or a new worker's env takes over a
     snapshot that the server kept (``restarted``). In each case the new version is tried first: on a copy of the current
     moment if only reward, evaluate or observation changed, and with a reset and a step, which are undone, if those
-    changed. No picture may be under way.
+    changed. No picture may be in progress.
 
     Raises:
-        TaskError: the version does not work. If its code ran, nothing that it did is undone: the process has to end.
+        TaskError: the version does not work. If its code ran, its effects are not undone: the process has to end.
     """
     opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
@@ -79,7 +79,7 @@ def load_version(
     try:
         return _bring_in(request, running, before, loaded, opening)
     except TaskError as error:
-        # No advice about other tasks of the file to a person who runs one of them, or has chosen one.
+        # No advice about other tasks of the file if the user runs one of them or has chosen one.
         knows_others = False
         if running is None:
             found = _open_another(request, loaded, error, opening)
@@ -144,19 +144,19 @@ def _bring_in(
 def why_new_process(
     request: Load, running: Running, failed: bool, at_start: ProcessState, when_loaded: ProcessState
 ) -> NewProcessNeeded | None:
-    """What the running version left in this process that no reload takes back; None if nothing, or if the new version
-    leaves it too.
+    """What the running version left in this process that no reload undoes; None if nothing, or if the new version leaves
+    it too.
 
     Args:
-        failed: it raised while it ran.
-        at_start: settings of the process before any version was loaded.
-        when_loaded: after the running version was loaded.
+        failed: whether the running version raised while it ran.
+        at_start: process settings before any version was loaded.
+        when_loaded: process settings after the running version was loaded.
     """
     before = with_late_imports(running.opened.loaded)
     same_file = named_file(request.task) == named_file(running.request.task)
     texts = _earlier_modules(before, request) if same_file else {}
     if same_file and before.file is not None and not _is_python(texts.get(str(before.file))):
-        return None  # it is refused before any of it runs
+        return None  # the new version is refused before any of it runs
     while_running = changed_settings(when_loaded, read_process_state()) + threads_of(before.source)
     at_load = changed_settings(at_start, when_loaded)
     gone = removed_effects(before.source, texts) if before.followed else ""
@@ -170,7 +170,7 @@ def why_new_process(
     elif while_running:
         reason = f"the version before has changed {some_of(while_running)}"
     elif same_scene or not before.followed:
-        return None  # what was imported and built stays as it is
+        return None  # imports and scene stay unchanged
     elif at_load:
         reason = f"the version before has changed {some_of(at_load)}"
     else:
@@ -224,7 +224,7 @@ def _what_changed(
 
 
 def _registration_text(before: LoadedTask, loaded: LoadedTask) -> str:
-    """How the class's registered id changed; an unregistered class has its own name as id."""
+    """Text: how the class's registered id changed; the id of an unregistered class is its name."""
     if loaded.env_id == loaded.class_name:
         lost = "" if before.max_episode_steps is None else ", and so has no time limit"
         return f"{loaded.chosen} is no longer registered as {before.env_id}{lost}"
@@ -234,7 +234,7 @@ def _registration_text(before: LoadedTask, loaded: LoadedTask) -> str:
 
 
 def _earlier_modules(before: LoadedTask, request: Load) -> dict[str, str]:
-    """Today's texts of the previous version's modules: a hook may import one late, and so may the new version's."""
+    """Present texts of the previous version's modules: hooks of the old and the new version may import them late."""
     texts: dict[str, str] = {}
     for path in before.source:
         given = (request.source or {}).get(path)
@@ -255,7 +255,7 @@ def _exchange(
     if change.level == "cameras" and not can_exchange_cameras(env):
         raise _MustRebuild(f"{change.reason}, and cameras cannot be exchanged here")
     rules = opened.env.broken_rules or BrokenRules({})
-    # Nothing of this is undone if it fails: the process ends then.
+    # Nothing of this is undone on failure: the process ends then.
     put_class(env, loaded.cls)
     left: dict[str, str] = {}
     if change.level != "same":
@@ -307,7 +307,7 @@ def _find_place(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[st
 
 
 def _rescore(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) -> StepResult:
-    # Without an action the reward is computed all the same, to find its mistakes now.
+    # Compute the reward even without an action, to find its errors now.
     action = last.action if last.action is not None else actions.hold_action(task.parts, task.num_envs)
     try:
         with blamed("step", loaded, task):
@@ -338,7 +338,7 @@ def _build(
     try:
         first, restored = _restore(opened, snapshot, action)
     except TaskError as error:
-        # The new version works, as its rehearsal has shown, but not from this moment on.
+        # The new version works, as its rehearsal has shown, but not from this moment.
         with blamed("reset", opened.loaded, opened.env):
             first = opened.env.reset(request.options.seed)
         restored = RestoreReport((), {"the moment": f"the new version fails in it: {error.problem.message}"})
@@ -360,7 +360,7 @@ def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snaps
     if running is None or running.opened.loaded.chosen != loaded.chosen:
         return None
     if changed_options(running.request.options, request.options):
-        return None  # made in another way, envs begin in another way
+        return None  # envs built with other options must start from a reset
     return running.opened.env.snapshot()
 
 

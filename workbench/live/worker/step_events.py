@@ -21,9 +21,9 @@ from workbench.task.open import OpenedTask
 
 
 class StepEvents:
-    """Makes `Stepped` events, and counts them.
+    """Makes and counts `Stepped` events.
 
-    The server never asks for the past: each event has a snapshot of the batch, packed so that unchanged parts are sent
+    The server never requests the past: each event has a snapshot of the batch, packed so that unchanged parts are sent
     once (`envs.snapshots.packing`), and during a recording the state columns and pictures of exactly this step.
     """
 
@@ -32,34 +32,33 @@ class StepEvents:
         self._from_reset: set[int] = set()
         self._columns_fail = False
         self._undrawable: set[CameraKey] = set()
-        """Cameras of the scene that cannot be drawn."""
+        """Cameras that cannot be drawn."""
         self.moment: Snapshot | None = None
         """The batch at the newest event, to restore after a step that was cut short; None if it cannot be copied."""
         self.number = 0
         self.recording_took = 0.0
-        """Seconds that the newest event took for the recording: pictures, states, observations."""
+        """Seconds that recording took in the newest event: pictures, states, observations."""
         self._packer: SnapshotPacker | None = SnapshotPacker()
 
     def new_scene(self) -> None:
-        """Start again for another env: parts that were sent before do not belong to it."""
+        """Start again for another env: parts that were already sent do not belong to it."""
         self.capture((), from_reset=False)
         self._packer = SnapshotPacker()
         self._columns_fail = False
         self._undrawable.clear()
 
     def capture(self, env_idx: tuple[int, ...], from_reset: bool) -> None:
-        """Start or stop capturing, as `SetCapture` asks; an env that is captured already continues, also with
-        `from_reset`."""
+        """Start or stop capturing, see `SetCapture`; an env that is already captured continues, also with `from_reset`."""
         begun = self._recording & set(env_idx) if from_reset else set(env_idx)
         self._recording, self._from_reset = begun, set(env_idx) - begun
 
     @property
     def recorded(self) -> frozenset[int]:
-        """The envs that are recorded, now or from their next reset."""
+        """The envs that are recorded now or from their next reset."""
         return frozenset(self._recording | self._from_reset)
 
     def pictures_due(self, step: StepResult, reset_mask: NDArray[np.bool_]) -> bool:
-        """Whether the event of this step draws; no other picture may be under way then."""
+        """Whether the event of this step draws; no other picture may be in progress then."""
         begun = {env for env in self._from_reset if reset_mask[env] and step.elapsed_steps[env] == 0}
         self._recording |= begun
         self._from_reset -= begun
@@ -137,7 +136,7 @@ class StepEvents:
             self.moment = opened.env.snapshot()
             return self._packer.pack(self.moment)
         except Exception as error:
-            # A task may keep anything on itself: objects that cannot be pickled must not end a task that works.
+            # A task may hold any object: one that cannot be pickled must not stop a working task.
             self._packer = self.moment = None
             print(
                 f"The history of this task can be viewed, but not restored: {type(error).__name__}: {error}",

@@ -1,1 +1,1 @@
-"""Serves the page on one port: who may connect, what a browser may send, and what it gets."""
+"""Serves the page on one port: access control, messages from browsers, HTTP responses."""

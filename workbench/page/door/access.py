@@ -1,4 +1,4 @@
-"""Decides whether one HTTP request or websocket handshake is let in. Pure functions."""
+"""Decides whether to admit an HTTP request or websocket handshake. Pure functions."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ class AccessRules:
     token: str | None
     """The token; None if no token is needed (loopback only, see `ServerOptions`)."""
     names: frozenset[str] = frozenset()
-    """Lower-case host names and addresses, without a port, that are ours; loopback always is."""
+    """Host names and addresses of this server, in lower case, without a port; loopback is always accepted."""
     any_address: bool = False
-    """Accept every IP address as Host: for a server that is bound wider than loopback."""
+    """Accept every IP address as Host, for a server that is not bound to loopback only."""
 
 
 @dataclass(frozen=True)
 class RequestParts:
-    """The parts of a request that the gate looks at. Each header is the list of all its values: a header that is sent
-    twice tries to make two programs read two different things."""
+    """The parts of a request that `decide` checks. Each header is the list of all its values: a header that is sent twice
+    tries to make two programs read different values."""
 
     path: str
-    """Path as the client sent it: percent-encoded, with the query."""
+    """Raw path: percent-encoded, with the query."""
     host: Sequence[str]
     origin: Sequence[str] = ()
     cookie: Sequence[str] = ()
@@ -50,7 +50,7 @@ class RequestParts:
 @dataclass(frozen=True)
 class Admitted:
     authority: str
-    """The Host header, known to be ours: safe to quote in a reply's headers."""
+    """The Host header, checked to be ours: safe to use in a reply's headers."""
 
 
 @dataclass(frozen=True)
@@ -60,27 +60,27 @@ class Entered:
     location: str
     set_cookie: str
     by_page: bool
-    """True where the browser followed a link on another site. A redirect would keep that site as its initiator, and
-    the browser would send no Strict cookie with it; a small page that redirects by itself makes us the initiator."""
+    """Whether the browser followed a link on another site. A redirect would keep that site as its initiator, and the browser
+    would not send a Strict cookie with it; a small page that redirects by itself makes us the initiator."""
 
 
 class Why(Enum):
-    """Why a request is refused."""
+    """Reason for refusing a request."""
 
     NAME = "name"
-    """Its Host is not ours."""
+    """Its Host is not a name of this server."""
     SITE = "site"
     """A page of another site made it."""
     NO_TOKEN = "no token"
     OTHER_TOKEN = "other token"
-    """A wrong token, or one that was renewed."""
+    """A wrong token, or one that was replaced by a new one."""
 
 
 @dataclass(frozen=True)
 class RefusedRequest:
     why: Why
     reason: str
-    """One sentence for the person who reads the 403 page. Holds no text from the request."""
+    """One sentence for the 403 page. Contains no text of the request."""
 
 
 Decision = Admitted | Entered | RefusedRequest
@@ -118,7 +118,7 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def is_loopback(host: str) -> bool:
-    """``localhost``, 127.0.0.0/8 or ::1; ``host`` as `split_authority` gives it."""
+    """Whether ``host``, as returned by `split_authority`, is ``localhost``, 127.0.0.0/8 or ::1."""
     address = _address(host)
     return host == "localhost" if address is None else address.is_loopback
 
@@ -126,9 +126,9 @@ def is_loopback(host: str) -> bool:
 def host_is_ours(rules: AccessRules, host: str) -> bool:
     """Whether ``host`` is a name of this server.
 
-    The port is not compared: ``ssh -L 9000:localhost:8080`` and a container's port map make the browser say another
-    one. That is safe: rebinding makes a *foreign name* point here, and no attacker can re-point ``localhost`` or a
-    bare IP address.
+    The port is not compared: with ``ssh -L 9000:localhost:8080`` or a container's port map the browser sends another one.
+    That is safe: rebinding makes a *foreign name* point here, and no attacker can re-point ``localhost`` or a bare IP
+    address.
     """
     if is_loopback(host) or host in rules.names:
         return True
@@ -136,7 +136,7 @@ def host_is_ours(rules: AccessRules, host: str) -> bool:
 
 
 def cookie_name(port: int) -> str:
-    """The cookie's name for a page on the browser's ``port``. Cookies ignore ports: without the port in the name two
+    """Name of the cookie for a page on the browser's ``port``. Cookies ignore ports: without the port in the name, two
     workbenches on one machine would log each other out at every load."""
     return f"workbench-token-{port}"
 
@@ -153,7 +153,7 @@ def _equal(given: str, token: str) -> bool:
 
 
 def _same_origin(origin: str, host: tuple[str, int | None]) -> bool:
-    """An Origin header against the Host header; ``https`` too, for a TLS proxy in front of us."""
+    """Whether an Origin header matches the Host header; ``https`` is accepted too, for a TLS proxy in front of us."""
     scheme, separator, authority = origin.partition("://")
     default = {"http": 80, "https": 443}.get(scheme.lower())
     split = split_authority(authority)
@@ -163,7 +163,7 @@ def _same_origin(origin: str, host: tuple[str, int | None]) -> bool:
 
 
 def _without_token(path: str) -> str:
-    """``path`` without its token, always as a path on this server."""
+    """``path`` without its token; always a path on this server."""
     plain, _, query = path.partition("?")
     rest = [(key, value) for key, value in parse_qsl(query, keep_blank_values=True) if key != "token"]
     # "//evil.example" and "/\evil.example" are other hosts to a browser, not paths.
@@ -174,13 +174,13 @@ def _without_token(path: str) -> str:
 def decide(rules: AccessRules, asked: RequestParts) -> Decision:
     """Decide on one request or handshake. Never raises, for any client input.
 
-    Checked in this order. *Host*: is the name ours? A rebound name cannot fake this. *Origin*: does the asking page
-    come from this very address? *Sec-Fetch-Site*: the same for requests without an Origin (an image or script tag in
-    a foreign page). *Token*: 256 random bits, once in the printed address, afterwards in a cookie that scripts cannot
-    read and that other sites' pages do not send.
+    Checks, in this order. *Host*: is the name ours? A rebound name cannot fake this. *Origin*: does the requesting page
+    come from exactly this address? *Sec-Fetch-Site*: the same for requests without an Origin (an image or script tag in a
+    foreign page). *Token*: 256 random bits, first in the printed address, afterwards in a cookie that scripts cannot read
+    and that pages of other sites do not send.
 
-    Not stopped: cookies know hosts but no ports, so another *server* that the author visits under the same host name
-    gets our cookie too. No cookie attribute prevents that; on a shared machine use a Unix socket (`ServerOptions.socket`).
+    Not prevented: cookies ignore ports, so another *server* that the author visits under the same host name gets our cookie
+    too. No cookie attribute prevents that; on a shared machine use a Unix socket (`ServerOptions.socket`).
     """
     host = split_authority(asked.host[0]) if len(asked.host) == 1 else None
     if host is None or not host_is_ours(rules, host[0]):
@@ -193,9 +193,9 @@ def decide(rules: AccessRules, asked: RequestParts) -> Decision:
     if len(asked.origin) > 1 or (asked.origin and not _same_origin(asked.origin[0], host)):
         return RefusedRequest(Why.SITE, "It came from a page of another site.")
 
-    # Requests without an Origin: an <img> or <script> in a foreign page. A link that a person follows passes on to
-    # the token check. Websocket handshakes of browsers always have an Origin, and browsers disagree about
-    # Sec-Fetch-Site for ws://.
+    # Requests without an Origin: an <img> or <script> in a foreign page. A link that the user follows continues to the
+    # token check. Websocket handshakes of browsers always have an Origin, and browsers disagree about Sec-Fetch-Site for
+    # ws://.
     opened_by_link = list(asked.fetch_mode) == ["navigate"] and list(asked.fetch_dest) == ["document"]
     foreign = any(site not in ("same-origin", "none") for site in asked.fetch_site)
     if foreign and not opened_by_link and not asked.websocket:
@@ -204,7 +204,7 @@ def decide(rules: AccessRules, asked: RequestParts) -> Decision:
     if rules.token is None:
         return Admitted(asked.host[0])
 
-    # The browser's port, not ours: behind ssh -L they differ.
+    # Use the browser's port, not ours: behind ssh -L they differ.
     name = cookie_name(host[1] or 80)
     tokens = [value for key, value in parse_qsl(asked.path.partition("?")[2]) if key == "token"]
     if tokens and not asked.websocket:

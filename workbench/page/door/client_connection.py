@@ -1,4 +1,4 @@
-"""The line to one page: how many bytes may be unanswered, and whether messages are compressed."""
+"""The connection to one page: flow control by unacknowledged bytes, and compression on slow connections."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from websockets.extensions.permessage_deflate import PerMessageDeflate, ServerPe
 from websockets.frames import Frame
 from websockets.typing import ExtensionParameter
 
-FAR = 0.003
-"""Minimum round trip in seconds of a page that is far away."""
-QUEUED = 0.05
-"""Seconds that a message may wait behind others on the line."""
-LATE = 0.25
-"""Timeout in seconds, beyond the quickest round trip, after which a missing answer stops all further messages: the
-line has become slower."""
+REMOTE_TRIP_SECONDS = 0.003
+"""Minimum round trip of a page that counts as remote."""
+MAX_QUEUE_SECONDS = 0.05
+"""Longest time that a message may wait behind others in the connection."""
+ANSWER_TIMEOUT_SECONDS = 0.25
+"""Timeout for an answer, in addition to the shortest round trip; after it no more messages are sent, since the
+connection has become slower."""
 SAMPLES = 20
-"""Number of the last answers from which the line's rate is computed."""
+"""Number of the last answers from which the connection's rate is computed."""
 
 
 @dataclass(frozen=True)
@@ -34,20 +34,20 @@ class _Sent:
 
 
 class PageConnection:
-    """Sends messages of viser to one page, as fast as it answers.
+    """Sends viser's messages to one page as fast as it acknowledges them.
 
-    A socket takes megabytes before it makes a sender wait, and so does ``ssh -L``: seconds on a slow line, and the answer
-    to a click waits behind them. So each message is followed by a ping, which a browser answers when it has read what came
-    before. While `send` waits viser gathers what changes, and sends the newest of it.
+    A socket buffers megabytes before a sender has to wait, and so does ``ssh -L``: seconds on a slow connection, and the
+    reply to a click waits behind them. So each message is followed by a ping, which a browser answers when it has read
+    everything before it. While `send` waits, viser collects changes and later sends only the newest.
 
-    All on the event loop of the connection.
+    Used on the event loop of the connection.
     """
 
     def __init__(self, connection: ServerConnection) -> None:
         self._ping, self._send = connection.ping, connection.send
         self._deflate = next((e for e in connection.protocol.extensions if isinstance(e, WhenFar)), None)
         self._loop = asyncio.get_running_loop()
-        # viser sends from two tasks: what is for all pages, and what is for this one.
+        # viser sends from two tasks: messages for all pages, and messages for this one.
         self._turn = asyncio.Lock()
         self._freed = asyncio.Event()
         self._sent: deque[_Sent] = deque()
@@ -55,13 +55,13 @@ class PageConnection:
         self._rates: deque[float] = deque(maxlen=SAMPLES)
         self._trip = math.inf
         self.unanswered = 0
-        """Bytes that were sent and that the page has not acknowledged."""
+        """Bytes that were sent but not acknowledged by the page."""
 
     async def send(self, message: bytes) -> None:
-        """Send a message, as soon as there is room for it; ends with `websockets`' error when the page has left."""
+        """Send a message as soon as there is room; raises the error of `websockets` if the page has left."""
         async with self._turn:
             if math.isinf(self._trip):
-                # Before the first message, which may be the largest.
+                # Measure before the first message, which may be the largest.
                 await self._probe()
             while not self._has_room():
                 self._freed.clear()
@@ -81,17 +81,17 @@ class PageConnection:
     def _has_room(self) -> bool:
         if not self._sent:
             return True
-        if self._loop.time() - self._sent[0].at > self._trip + LATE:
+        if self._loop.time() - self._sent[0].at > self._trip + ANSWER_TIMEOUT_SECONDS:
             return False
-        # One more message than has room, or large ones would never be two on the way.
-        return self.unanswered <= max(self._rates, default=0.0) * (self._trip + QUEUED)
+        # Allow one message beyond the limit, or there would never be two large ones in transit.
+        return self.unanswered <= max(self._rates, default=0.0) * (self._trip + MAX_QUEUE_SECONDS)
 
     def _on_answer(self, sent: _Sent, pong: asyncio.Future[float]) -> None:
         self._sent.remove(sent)
         self.unanswered -= sent.size
         self._freed.set()
         if pong.cancelled() or pong.exception() is not None:
-            return  # the page has left, and the next message says so
+            return  # the page has left; the next `send` raises
         took = max(self._loop.time() - sent.at, 1e-6)
         self._answered += sent.size
         self._rates.append((self._answered - sent.answered_before) / took)
@@ -100,13 +100,13 @@ class PageConnection:
 
     def _decide(self) -> None:
         if self._deflate is not None:
-            self._deflate.on = self._trip >= FAR
+            self._deflate.on = self._trip >= REMOTE_TRIP_SECONDS
 
 
 class WhenFar(PerMessageDeflate):
-    """Compresses what is sent while `on`.
+    """Compresses sent messages while `on`.
 
-    Poses that did not change are found in the messages before, 32 kB back. On the same machine there is nothing to gain.
+    Unchanged poses are found in previous messages, up to 32 kB back. On the same machine compression gains nothing.
     """
 
     on = False
@@ -119,7 +119,7 @@ class CompressWhenFar(ServerPerMessageDeflateFactory):
     """Negotiates `WhenFar`; for ``extensions`` of `websockets`."""
 
     def __init__(self) -> None:
-        # Level 3: level 6 saves a sixth more for twice the time. The page's own messages are short.
+        # Level 3: level 6 saves one sixth more for twice the time. The page's own messages are short.
         super().__init__(client_max_window_bits=10, compress_settings={"level": 3})
 
     def process_request_params(

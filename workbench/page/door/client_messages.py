@@ -10,11 +10,11 @@ import msgspec
 T = TypeVar("T")
 
 MAX_BYTES = 256 * 1024
-"""Maximum size of a message in bytes; the largest is a pasted text. viser's pictures of a view are never requested."""
-FARTHEST = 1e12
-"""Maximum number of a camera, a ray or a gizmo, in any unit."""
-LARGEST_PICTURE = 100_000
-"""Maximum size in pixels of one side of a page."""
+"""Maximum size of a message; the largest is a pasted text. viser's pictures of a view are never requested."""
+MAX_NUMBER = 1e12
+"""Maximum absolute value of a number of a camera, a ray or a gizmo, in any unit."""
+MAX_SIDE_PIXELS = 100_000
+"""Maximum length of one side of a page."""
 
 Name = Annotated[str, msgspec.Meta(max_length=1024)]
 Uuid = Annotated[str, msgspec.Meta(max_length=64)]
@@ -27,18 +27,18 @@ Modifier = Literal[
 
 
 class MalformedMessage(ValueError):
-    """A frame that no page of ours sends; its connection is closed."""
+    """A frame that no page of ours sends; the connection must be closed."""
 
 
 class ImpossibleValue(ValueError):
-    """An impossible number in a well-formed message; the message is dropped."""
+    """An impossible number in a well-formed message; the message must be dropped."""
 
 
 class ClientMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=True):
-    """One of the kinds below, with the fields of viser's message of that name.
+    """Base of the messages below, which have the fields of viser's message of the same name.
 
-    A frame is decoded straight into its structure and refused at the first byte that does not fit, so that megabytes
-    of nested lists never become millions of Python objects on the event loop.
+    A frame is decoded directly into its structure and refused at the first byte that does not fit, so that megabytes of
+    nested lists never become millions of Python objects on the event loop.
     """
 
     def check(self) -> None:
@@ -90,7 +90,7 @@ class ViewerCameraMessage(ClientMessage):
     fov: float
     near: float
     far: float
-    # Some browsers have half pixels.
+    # float: some browsers report half pixels.
     image_height: float
     image_width: float
     look_at: Triple
@@ -101,8 +101,8 @@ class ViewerCameraMessage(ClientMessage):
         _check_numbers(*self.position, *self.look_at, *self.up_direction, self.near, self.far)
         if not 0 < self.fov < math.pi:
             raise ImpossibleValue("a field of view that no camera has")
-        # 0 by 0 is a page whose view is folded away.
-        if not (0 <= self.image_height <= LARGEST_PICTURE and 0 <= self.image_width <= LARGEST_PICTURE):
+        # 0 by 0 is the view of a page that has folded it.
+        if not (0 <= self.image_height <= MAX_SIDE_PIXELS and 0 <= self.image_width <= MAX_SIDE_PIXELS):
             raise ImpossibleValue("a size that no page has")
 
 
@@ -120,16 +120,16 @@ _decoders = {name: msgspec.msgpack.Decoder(kind) for name, kind in KINDS.items()
 def _decoded(decoder: msgspec.msgpack.Decoder[T], raw: bytes | msgspec.Raw, problem: ValueError) -> T:
     try:
         return decoder.decode(raw)
-    # A ValidationError is a DecodeError; the others are endless nesting and text that is not UTF-8.
+    # ValidationError is a subclass of DecodeError; the others come from endless nesting and text that is not UTF-8.
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError, OverflowError):
         raise problem from None
 
 
 def kind_of(raw: object) -> str:
-    """The ``type`` of a frame; the rest is skipped.
+    """The ``type`` of a frame; other fields are skipped.
 
     Raises:
-        MalformedMessage: A text frame, too long, not msgpack, or without a type.
+        MalformedMessage: The frame is text, too long, not msgpack, or without a type.
     """
     if not isinstance(raw, bytes):
         raise MalformedMessage("a text frame")
@@ -142,7 +142,7 @@ def read_message(raw: bytes, kind: str) -> ClientMessage:
     """Decode `raw`, a message of this kind.
 
     Raises:
-        MalformedMessage: Fields are missing, surplus, of another type or of another length.
+        MalformedMessage: Fields are missing, unknown, or have a wrong type or length.
         ImpossibleValue: A number is not finite, or far out of range.
     """
     message = _decoded(_decoders[kind], raw, MalformedMessage(f"wrong fields in {kind}"))
@@ -151,8 +151,8 @@ def read_message(raw: bytes, kind: str) -> ClientMessage:
 
 
 def _check_numbers(*numbers: float) -> None:
-    # Written so that NaN fails too: every comparison with it is false.
-    if not all(abs(number) <= FARTHEST for number in numbers):
+    # In this form NaN fails too: every comparison with it is false.
+    if not all(abs(number) <= MAX_NUMBER for number in numbers):
         raise ImpossibleValue("a number that is not finite, or too large")
 
 

@@ -23,16 +23,15 @@ from workbench.machine.text import short_line
 
 log = logging.getLogger("workbench.door")
 
-PATIENCE = 10.0
-"""Timeout in seconds until a connection must have shown the token."""
-MOST = 64
-"""Maximum number of connections without a token at a time. A browser has about ten to one host."""
-LONGEST_HEAD = 64 * 1024
-"""Maximum size of a request's head in bytes. The head carries cookies of other programs on the same host name, up
-to 4 kB each."""
-READ_AT_ONCE = 16 * 1024
-"""Bytes. `websockets` parses everything that was read before anything else runs, and a quarter of a megabyte of frames
-of six bytes holds the event loop for a third of a second."""
+TOKEN_TIMEOUT_SECONDS = 10.0
+"""Timeout for a connection to present the token."""
+MAX_WITHOUT_TOKEN = 64
+"""Maximum number of simultaneous connections without a token. A browser has about ten to one host."""
+MAX_HEAD_BYTES = 64 * 1024
+"""Maximum size of a request's head. The head carries cookies of other programs on the same host name, up to 4 kB each."""
+READ_BYTES = 16 * 1024
+"""Maximum size of one read. `websockets` parses everything that was read before anything else runs, and a quarter of a
+megabyte of frames of six bytes blocks the event loop for a third of a second."""
 
 _TOO_LONG = Response(
     431,
@@ -43,12 +42,12 @@ _TOO_LONG = Response(
 
 
 class ConnectionLimits:
-    """All connections that have not shown the token yet, on their event loop.
+    """All connections that have not presented the token yet. Used on their event loop.
 
-    A connection costs a task and its buffers before anything is known of it, so its time, the size of its head and the
-    number of such connections are limited. When there are too many the oldest is closed, not the newest: a browser
-    sends its request with the first packet, and idle sockets of an attacker must not lock it out. (Chromium holds some
-    idle sockets itself, and opens others when they are closed.)
+    A connection costs a task and its buffers before anything is known about it, so its duration, the size of its head and
+    the number of such connections are limited. If there are too many, the oldest is closed, not the newest: a browser sends
+    its request with the first packet, and idle sockets of an attacker must not lock it out. (Chromium holds some idle
+    sockets itself, and opens new ones when they are closed.)
     """
 
     def __init__(self, told: RateLimitedLog) -> None:
@@ -59,19 +58,19 @@ class ConnectionLimits:
         return len(self._waiting)
 
     def connection(self, protocol: ServerProtocol, server: Server, **options: Any) -> Connection:
-        """Makes the connections of a server; for ``create_connection`` of `websockets`."""
+        """Make a connection of a server; for ``create_connection`` of `websockets`."""
         return Connection(self, protocol, server, **options)
 
     def arrived(self, connection: Connection, peer: str) -> None:
-        if len(self._waiting) >= MOST:
-            # The oldest connection of the machine that has the most.
+        if len(self._waiting) >= MAX_WITHOUT_TOKEN:
+            # Close the oldest connection of the peer that has the most.
             busiest = Counter(self._waiting.values()).most_common(1)[0][0]
             oldest = next(one for one, its_peer in self._waiting.items() if its_peer == busiest)
             self.left(oldest)
             oldest.transport.abort()
             self._told.happened(
                 "crowd",
-                f"{MOST} connections are open without the token{of_peer(busiest)}; the oldest are closed.",
+                f"{MAX_WITHOUT_TOKEN} connections are open without the token{of_peer(busiest)}; the oldest are closed.",
             )
         self._waiting[connection] = peer
 
@@ -80,7 +79,7 @@ class ConnectionLimits:
 
 
 class Connection(ServerConnection):
-    """One connection. It is a stranger until `admit`."""
+    """One connection. Its limits apply until `admit`."""
 
     def __init__(
         self, strangers: ConnectionLimits, protocol: ServerProtocol, server: Server, **options: Any
@@ -95,14 +94,14 @@ class Connection(ServerConnection):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         # asyncio has no public way to set this; its default is 256 kB.
-        transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]
+        transport.max_size = READ_BYTES  # type: ignore[attr-defined]
         address = transport.get_extra_info("peername")
         self.peer = address[0] if isinstance(address, tuple) else ""
-        self._deadline = self.loop.call_later(PATIENCE, self.transport.abort)
+        self._deadline = self.loop.call_later(TOKEN_TIMEOUT_SECONDS, self.transport.abort)
         self._strangers.arrived(self, self.peer)
 
     def admit(self) -> None:
-        """The connection has shown the token."""
+        """Lift the limits, because the connection has presented the token."""
         self.admitted = True
         self._strangers.left(self)
         if self._deadline is not None:
@@ -111,8 +110,8 @@ class Connection(ServerConnection):
     def data_received(self, data: bytes) -> None:
         if self.protocol.state is CONNECTING:
             self._head_bytes += len(data)
-            if self._head_bytes > LONGEST_HEAD:
-                # After a head that is none `websockets` has closed its side, and nothing can be written.
+            if self._head_bytes > MAX_HEAD_BYTES:
+                # After an invalid head `websockets` has closed its side, and nothing can be written.
                 if self.request is None and self.protocol.handshake_exc is None:
                     self.transport.write(_TOO_LONG)
                     self.transport.close()
@@ -135,10 +134,10 @@ def of_peer(peer: str) -> str:
 
 # --- stalled clients ---------------------------------------------------------------------------------
 
-READ_WITHIN = 30.0
-"""Timeout in seconds within which a client must read something. A busy page (a large scene drawn by the processor)
-reads nothing for some seconds."""
-_LOOKS = 30
+READ_TIMEOUT_SECONDS = 30.0
+"""Timeout for a client to read something. A busy page (a large scene rendered in software) reads nothing for some
+seconds."""
+_CHECKS = 30
 """Number of checks of the unsent bytes in that time."""
 
 
@@ -148,8 +147,8 @@ def unsent(connection: ServerConnection) -> int:
     sock = connection.transport.get_extra_info("socket")
     if sock is None or sock.fileno() < 0:
         return waiting
-    # For a socket this is SIOCOUTQ (tcp(7)). Without it a slow line would look stalled: the kernel takes some megabytes
-    # at once, and then nothing until a third of them has gone.
+    # For a socket this is SIOCOUTQ (tcp(7)). Without it a slow connection would look stalled: the kernel accepts some
+    # megabytes at once, and then nothing until a third of them has been sent.
     (in_kernel,) = struct.unpack("i", fcntl.ioctl(sock.fileno(), termios.TIOCOUTQ, bytes(4)))
     return waiting + in_kernel
 
@@ -157,51 +156,50 @@ def unsent(connection: ServerConnection) -> int:
 async def close_when_stalled(
     connection: ServerConnection, told: RateLimitedLog, unanswered: Callable[[], int] = lambda: 0
 ) -> None:
-    """Close the connection when its client has read nothing for `READ_WITHIN` seconds. A task of the connection.
+    """Close the connection when its client has read nothing for `READ_TIMEOUT_SECONDS`. Run it as a task of the connection.
 
-    A suspended browser or a sleeping laptop behind ``ssh -L`` keeps its connection open for hours. What waits for it is
-    bounded, but it counts as a viewer, for whom pictures are rendered, and viser remembers every removal until each
-    client has read it. The ping of `websockets` would wait behind the unsent bytes.
+    A suspended browser or a sleeping laptop behind ``ssh -L`` keeps its connection open for hours. The data queued for it
+    is bounded, but it counts as a viewer, for whom pictures are rendered, and viser stores every removal until each client
+    has read it. The ping of `websockets` would wait behind the unsent bytes.
 
-    The client is stalled if bytes wait and no look finds fewer than the one before; new bytes written meanwhile do not
-    matter. A slow line takes some now and then. A page that wakes up reconnects and gets the present state.
+    The client is stalled if bytes are queued and no check finds fewer than the previous one; new bytes written meanwhile do
+    not matter. A slow connection accepts some from time to time. A page that wakes up reconnects and gets the present state.
 
     Args:
-        unanswered: Bytes that the machine may have taken and the page has not read, as `PageConnection.unanswered`.
+        unanswered: Returns the bytes that the page has not acknowledged, see `PageConnection.unanswered`.
     """
     before = silent = 0
-    while silent < _LOOKS:
-        await asyncio.sleep(READ_WITHIN / _LOOKS)
+    while silent < _CHECKS:
+        await asyncio.sleep(READ_TIMEOUT_SECONDS / _CHECKS)
         left = unsent(connection) + unanswered()
-        # Looks are counted, not seconds: while this machine sleeps no client can read.
+        # Count checks, not seconds: while this machine sleeps no client can read.
         silent = 0 if left == 0 or left < before else silent + 1
         before = left
     told.happened(
         "stalled",
-        f"Closed a browser's connection: it has read nothing for {READ_WITHIN:.0f} s. It may reconnect at any time.",
+        f"Closed a browser's connection: it has read nothing for {READ_TIMEOUT_SECONDS:.0f} s. It may reconnect at any time.",
     )
     connection.transport.abort()
 
 
-# --- log lines about them, and about all else that clients cause ----------------------------------------------------------------------------
+# --- log lines about events that clients cause -------------------------------------------------------
 
-PAUSE = 60.0
-"""Seconds between two lines of the same kind, at first."""
-LONGEST_PAUSE = 3600.0
-"""Maximum pause in seconds between two lines of the same kind. A tab that was left open reconnects once a second."""
-MOST_KINDS = 256
-LONGEST_LINE = 300
-"""Maximum length of a line in characters."""
+PAUSE_SECONDS = 60.0
+"""Initial pause between two lines of the same kind."""
+MAX_PAUSE_SECONDS = 3600.0
+"""Maximum pause between two lines of the same kind. A tab that was left open reconnects once a second."""
+MAX_KINDS = 256
+MAX_LINE_CHARACTERS = 300
 
 
 class RateLimitedLog:
-    """Logs each kind of event at once, again after `pause` seconds, after twice that, and so on. Thread-safe.
+    """Logs each kind of event at once, then again after `pause` seconds, after twice that, and so on. Thread-safe.
 
     Args:
         say: Prints one line.
     """
 
-    def __init__(self, say: Callable[[str], None] = log.warning, pause: float = PAUSE) -> None:
+    def __init__(self, say: Callable[[str], None] = log.warning, pause: float = PAUSE_SECONDS) -> None:
         self._say, self._pause = say, pause
         self._silent_until: dict[Hashable, float] = {}
         self._pauses: dict[Hashable, float] = {}
@@ -213,22 +211,22 @@ class RateLimitedLog:
         """Log an event, or count it if its kind was logged recently.
 
         Args:
-            kind: Events of equal kind count as the same.
+            kind: Events with equal kinds count as the same.
             sentence: The line, with a full stop; control characters are shown escaped.
-            error: Logged with its traceback, if the line is.
+            error: Logged with its traceback if the line is logged.
         """
         now = time.monotonic()
         with self._lock:
             if now < self._silent_until.get(kind, 0.0):
                 self._untold[kind] = self._untold.get(kind, (0, ""))[0] + 1, sentence
                 return
-            if len(self._pauses) >= MOST_KINDS:
+            if len(self._pauses) >= MAX_KINDS:
                 rest = self._forget()
             else:
                 rest = ()
             pause = self._pauses.get(kind, self._pause)
             self._silent_until[kind] = now + pause
-            self._pauses[kind] = min(2 * pause, LONGEST_PAUSE)
+            self._pauses[kind] = min(2 * pause, MAX_PAUSE_SECONDS)
             before, _ = self._untold.pop(kind, (0, ""))
         for line in rest:
             self._say(line)
@@ -238,7 +236,7 @@ class RateLimitedLog:
             log.error("%s", _line(sentence, before), exc_info=error)
 
     def say_the_rest(self) -> None:
-        """Log all that was held back; for the end of the program."""
+        """Log all lines that were held back; for the end of the program."""
         with self._lock:
             rest = self._forget()
         for line in rest:
@@ -254,4 +252,4 @@ class RateLimitedLog:
 
 def _line(sentence: str, times: int) -> str:
     more = "once more" if times == 1 else f"{times} more times"
-    return short_line(sentence, LONGEST_LINE) + (f" ({more} since the last message.)" if times else "")
+    return short_line(sentence, MAX_LINE_CHARACTERS) + (f" ({more} since the last message.)" if times else "")

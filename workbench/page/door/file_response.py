@@ -19,33 +19,32 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Response
 
-BLOCK = 1 << 18
-"""Number of bytes that are read and sent at a time."""
+BLOCK_BYTES = 1 << 18
 
 
 @dataclass(frozen=True)
 class FileReply:
-    """A route's answer that is a file instead of bytes."""
+    """A route's reply that sends a file instead of bytes."""
 
     path: Path
     kind: str
-    """Content type that the browser gets."""
+    """Content type."""
     gzipped: bool = False
-    """Whether the file holds gzipped content (rerun's viewer: 43 MB, 14 packed). It is sent packed where the
-    browser accepts gzip."""
+    """Whether the file's content is gzipped (rerun's viewer: 43 MB, 14 MB compressed). It is sent compressed if the browser
+    accepts gzip."""
     download_as: str | None = None
     """Name under which the browser saves the file instead of showing it."""
 
 
 Handler = Callable[[str], tuple[int, str, bytes] | FileReply]
-"""Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns status, content type
-and body, or a file. Runs in a thread, so it may read files."""
+"""Gets the path after its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns status, content type and
+body, or a file. Runs in a thread, so it may read files."""
 AddRoute = Callable[[str, Handler, Mapping[str, str]], object]
-"""Adds a route: its prefix, what answers it, and headers of every reply."""
+"""Adds a route: its prefix, its handler, and headers of every reply."""
 
 
 class _Sent(Response):
-    """For `websockets`: a response whose bytes were all written already."""
+    """A response for `websockets` whose bytes are already written."""
 
     def serialize(self) -> bytes:
         return b""
@@ -58,14 +57,14 @@ async def send_file(
     accepts_gzip: bool,
     not_found: Callable[[], Response],
 ) -> Response:
-    """Send the file over the connection, a block at a time, each when the one before is nearly gone.
+    """Send the file over the connection block by block, each when the previous one is nearly sent.
 
-    A recording may be gigabytes, and `websockets` takes a response as one string of bytes only: a file that is open in
+    A recording may have gigabytes, and `websockets` accepts a response only as one bytes object: a file that is open in
     three tabs would be in memory three times. So head and blocks are written to the connection here.
 
     Args:
-        headers: Of the response, without content type, length and encoding.
-        not_found: Makes the response where the file is gone or cannot be read.
+        headers: Headers of the response, without content type, length and encoding.
+        not_found: Makes the response if the file does not exist or cannot be read.
 
     Returns:
         The response for `websockets`, with nothing left to send.
@@ -91,17 +90,17 @@ async def send_file(
 
 
 def _quoted(name: str) -> str:
-    """A file's name for an address; of one that is not UTF-8 the bytes are escaped."""
+    """A file name for a URL; bytes that are not UTF-8 are escaped."""
     return urllib.parse.quote(name.encode(errors="backslashreplace"), safe="")
 
 
 def _open(reply: FileReply, accepts_gzip: bool) -> tuple[BinaryIO, int, bool]:
-    """The file, the number of bytes to send, and whether they are packed."""
+    """The file, the number of bytes to send, and whether they are compressed."""
     file = reply.path.open("rb")
     length = os.fstat(file.fileno()).st_size
     if not reply.gzipped or accepts_gzip:
         return file, length, reply.gzipped
-    # The last four bytes of a gzip are the length of what is in it (RFC 1952).
+    # The last four bytes of a gzip file are the length of its content (RFC 1952).
     file.seek(-4, os.SEEK_END)
     plain = int.from_bytes(file.read(), "little")
     file.seek(0)
@@ -114,12 +113,12 @@ async def _pour(connection: ServerConnection, file: BinaryIO, head: bytes, lengt
     left = length
     while left:
         try:
-            # Never more than announced: a recording may grow while it is read.
-            block = await asyncio.to_thread(file.read, min(BLOCK, left))
-        except (OSError, EOFError, zlib.error):  # an error of the disk, or a gzip that is cut short
+            # Never send more than announced: a recording may grow while it is read.
+            block = await asyncio.to_thread(file.read, min(BLOCK_BYTES, left))
+        except (OSError, EOFError, zlib.error):  # a disk error, or a truncated gzip
             block = b""
         if not block:
-            # Shorter than announced: aborted, so that the browser does not take a part for the whole.
+            # Shorter than announced: abort, so that the browser does not take a part for the whole file.
             transport.abort()
             return
         left -= len(block)
@@ -127,12 +126,12 @@ async def _pour(connection: ServerConnection, file: BinaryIO, head: bytes, lengt
         try:
             await connection.drain()
         except OSError:
-            return  # the browser went away
+            return  # the browser has disconnected
         if transport.is_closing():
             return
 
 
-# --- files that the server offers for download, under addresses that cannot be guessed ----------------
+# --- downloads, under addresses that cannot be guessed -------------------------------------------------
 
 PREFIX = "/offered/"
 _POLICY = {
@@ -143,10 +142,10 @@ _POLICY = {
 
 
 class Downloads:
-    """The files that a page may fetch. One for each `GatedServer`.
+    """The files that a page may fetch. One object per `GatedServer`.
 
-    A browser never sends a path: it gets an address with a random part, made for one file, and the file is looked up
-    by that part alone. The name behind it is for people (and for rerun, which tells a recording by its suffix).
+    A browser never sends a path: it gets an address with a random part for one file, and the file is looked up by that part
+    alone. The name after it is for people (and for rerun, which recognizes a recording by its suffix).
     """
 
     def __init__(self, add_route: AddRoute) -> None:
@@ -156,15 +155,15 @@ class Downloads:
         """
         self._secret = secrets.token_bytes(32)
         self._files: dict[str, FileReply] = {}
-        """Files by the random part of their address; requests read it on other threads."""
+        """Files by the random part of their address; requests read this dict on other threads."""
         add_route(PREFIX, self._answer, _POLICY)
 
     def address(self, path: Path, kind: str = "application/octet-stream", download: bool = False) -> str:
-        """The address of a file, from the root of the server; always the same for the same file.
+        """The address of a file, from the root of the server; the same for the same file.
 
         Args:
             kind: Its content type.
-            download: The browser saves it instead of showing it.
+            download: Whether the browser saves it instead of showing it.
         """
         path = Path(path).absolute()
         reply = FileReply(path, kind, download_as=path.name if download else None)

@@ -36,8 +36,8 @@ from workbench.page.door.responses import (
 )
 
 RESPONSE_SECONDS = 300.0
-"""`websockets` gives 10 s for a request and its whole response: too little for viser's page over a slow line, and far
-too little for a recording."""
+"""Timeout for a request and its whole response. The 10 s of `websockets` are too short for viser's page over a slow
+connection, and far too short for a recording."""
 
 TURNED_AWAY = {
     access.Why.NAME: "Refused a request{} for a host name that is not this machine's.",
@@ -49,7 +49,7 @@ TURNED_AWAY = {
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """Where the page is served, and who may open it."""
+    """Address of the page, and who may open it."""
 
     host: str = "127.0.0.1"
     """Address or name to listen on: loopback for this machine (and ``ssh -L``), ``0.0.0.0`` for everyone who can reach
@@ -57,10 +57,10 @@ class ServerOptions:
     port: int = DEFAULT_PORT
     """0 takes any free port. If 8080, the default, is taken, the next free one is used and printed."""
     socket: Path | None = None
-    """Listen on a Unix socket at this path instead, which only its owner can connect to; `port` is then the one at the
-    other end of ``ssh -L``, and `host` is not used."""
+    """Listen on a Unix socket at this path instead, to which only its owner can connect; `port` is then the port at the
+    other end of ``ssh -L``, and `host` is ignored."""
     token: bool = True
-    """Ask for the token of the printed address. False is allowed on a loopback port only."""
+    """Require the token of the printed address. False is allowed only on a loopback port."""
 
     def __post_init__(self) -> None:
         if not self.host:
@@ -87,9 +87,9 @@ class ServerOptions:
 class GatedServer:
     """The running server. Make it with `open_server`.
 
-    viser by itself listens on every interface, knows no token, checks no Origin, moves to another port silently, lets
-    any client publish the page through a tunnel and trusts every value of a client. The page it serves runs the
-    author's code. One port suits work over ssh: one ``ssh -L`` line carries all of it.
+    viser itself listens on every interface, has no token, checks no Origin, moves to another port silently, lets any client
+    publish the page through a tunnel and trusts every value of a client. The page that it serves runs the author's code.
+    Everything is on one port, so that one ``ssh -L`` is enough.
     """
 
     options: ServerOptions
@@ -97,11 +97,11 @@ class GatedServer:
     port: int
     """The bound port."""
     ssh_hint: str
-    """What to type on one's own machine to reach the page over ssh."""
+    """Command to type on the user's own machine to reach the page over ssh."""
     warning: str | None
-    """For the terminal: what a binding wider than loopback means, and a viser that is not known. None if neither."""
+    """Warning for the terminal about a binding wider than loopback or an unknown viser version; None without either."""
     notice: str | None
-    """For the terminal: the page is on another port than usual. None if it is not."""
+    """Notice for the terminal that the page is not on its default port; None if it is."""
     _listening: Listening = field(repr=False)
     _access_check: _AccessCheck = field(repr=False)
     _gated: viser_private.GatedViser = field(repr=False)
@@ -114,11 +114,11 @@ class GatedServer:
         return self._access_check.turned_away
 
     def add_route(self, prefix: str, handler: Handler, headers: Mapping[str, str] | None = None) -> None:
-        """Answer GET requests below ``prefix`` (``/recordings/``), behind the same checks. The longest prefix wins.
+        """Add a route for GET requests below ``prefix`` (``/recordings/``), behind the same checks. The longest prefix wins.
 
         Args:
             prefix: begins and ends with a slash.
-            handler: see `responses.Handler`. If it raises, the browser gets a 500 and the log the traceback.
+            handler: see `file_response.Handler`. If it raises, the browser gets a 500 and the log the traceback.
             headers: added to every reply; they replace the server's own of the same name (such as the
                 Content-Security-Policy).
         """
@@ -131,7 +131,7 @@ class GatedServer:
         self._routes[prefix] = (handler, dict(headers or {}))
 
     def add_channel(self, path: str, serve: viser_private.Serve) -> None:
-        """Talk with pages that open a WebSocket at this path, behind the same checks."""
+        """Serve WebSockets that pages open at this path, behind the same checks."""
         self._gated.channels[path] = serve
 
     @property
@@ -140,19 +140,19 @@ class GatedServer:
         return self.addresses()[0]
 
     def addresses(self, path: str = "/") -> tuple[str, ...]:
-        """The addresses, with the token, of ``path`` (from the root: ``/rerun/...``): for a browser on this machine,
-        then for those on other machines (none on loopback; which of them works depends on their network)."""
+        """The addresses, with the token, of ``path`` (from the root: ``/rerun/...``): first for a browser on this machine,
+        then for other machines (none on loopback; which of them works depends on the network)."""
         token = self._access_check.rules.token
         shown = f"?token={token}" if token else ""
         hosts = dict.fromkeys((self._listening.host, *self._listening.hosts_elsewhere()))
         return tuple(f"http://{host}:{self.port}{path}{shown}" for host in hosts)
 
     def renew_token(self) -> str:
-        """Make a new token and return the new address. The old token and its cookies are refused, and every open page
-        is closed. Call it on any thread but the event loop's.
+        """Make a new token and return the new address. The old token and its cookies are refused, and every open page is
+        closed. Must not be called on the event loop.
 
         Raises:
-            ValueError: the server asks for no token.
+            ValueError: the server requires no token.
         """
         if not self.options.token:
             raise ValueError("This page asks for no token; there is none to renew.")
@@ -198,15 +198,15 @@ class _AccessCheck:
             connection.admit()
         if asked.websocket and isinstance(decision, access.Admitted):
             return viser_hook(connection, request)
-        # websockets gives up 10 s after it handed the last byte to the kernel; on a slow line megabytes are still on
-        # their way then.
+        # `websockets` closes the connection 10 s after it passed the last byte to the kernel; on a slow connection
+        # megabytes are still in transit then.
         connection.close_timeout = RESPONSE_SECONDS
         if isinstance(decision, access.Entered):
             return entered_reply(decision)
         return await admitted_reply(routes, viser_hook, connection, request, decision.authority, self._told)
 
     def say_the_rest(self) -> None:
-        """At the end: print what was held back, and how many requests were refused in all."""
+        """Print lines that were held back, and the number of refused requests; for the end of the program."""
         self._told.say_the_rest()
         if self.turned_away > 1:
             self._told.happened("total", f"{self.turned_away} requests were refused in total.")
@@ -221,15 +221,15 @@ class _AccessCheck:
 def open_server(options: ServerOptions = ServerOptions(), label: str | None = None) -> GatedServer:
     """Serve viser's page behind the checks of `access`.
 
-    Binds the socket itself (so that the printed address is the bound one) and tests itself with a request that must be
-    refused before it returns an address.
+    It binds the socket itself, so that the printed address is the bound one. Before it returns, it tests the server with a
+    request that must be refused.
 
     Args:
-        options: where, and to whom.
+        options: address and access.
         label: shown at the top of viser's panel.
 
     Raises:
-        ServerError: the host or port cannot be bound, or the installed viser is not the known one.
+        ServerError: the host or port cannot be bound, or the installed viser is an unknown version.
     """
     if options.socket is None:
         listening = listen_on_port(options.host, options.port)
@@ -289,10 +289,10 @@ def _our_names(options: ServerOptions) -> frozenset[str]:
 
 
 def _test_refusal(listening: Listening) -> None:
-    """Send a request as from a rebound name: it must be refused, or the checks are not in front of viser.
+    """Send a request with a rebound host name. If it is not refused, the checks are not in front of viser.
 
     Raises:
-        ServerError: it was not refused.
+        ServerError: the request was not refused.
     """
     knock = http.client.HTTPConnection("rebound.invalid", timeout=10)
     knock.sock = listening.connect(timeout=10)

@@ -18,13 +18,13 @@ import psutil
 
 DEFAULT_PORT = 8080
 PORTS_TO_TRY = 100
-LONGEST_PATH = 107
-"""Maximum length of the path of a Unix socket in bytes (unix(7)); ssh cannot reach a longer one either."""
+MAX_PATH_BYTES = 107
+"""Maximum length of the path of a Unix socket (unix(7)); ssh cannot reach a longer one either."""
 BACKLOG = 100
 
 
 class ServerError(RuntimeError):
-    """The page cannot be served. The message says what to do."""
+    """The page cannot be served. The message includes the remedy."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class Listening:
 
     @property
     def ssh_hint(self) -> str:
-        """The ``ssh -L`` command to type on one's own machine."""
+        """The ``ssh -L`` command to type on the user's own machine."""
         to = f"{self.host if self.loopback else '127.0.0.1'}:{self.port}" if self.path is None else self.path
         return f"ssh -L {self.port}:{to} {_user()}@{socket.gethostname()}"
 
     def hosts_elsewhere(self) -> tuple[str, ...]:
-        """This machine's name and addresses for browsers on other machines. Where every interface is listened on, loopback
-        comes last: of a container's addresses it is what works outside, by the port that is published there."""
+        """This machine's name and addresses for browsers on other machines. When listening on every interface, loopback is
+        last: outside a container it is the address that works, through the published port."""
         if self.loopback:
             return ()
         address = ipaddress.ip_address(self.bound_host.partition("%")[0])
@@ -67,7 +67,7 @@ class Listening:
         return tuple(dict.fromkeys(host for host in hosts if host and host != "localhost"))
 
     def connect(self, timeout: float) -> socket.socket:
-        """A client's connection to it, on this machine."""
+        """Connect to the socket as a client on this machine."""
         if self.path is None:
             address = ipaddress.ip_address(self.bound_host.partition("%")[0])
             loopback = "::1" if address.version == 6 else "127.0.0.1"
@@ -91,12 +91,12 @@ def listen_on_port(host: str, port: int) -> Listening:
 
     Args:
         host: An address or a name of this machine.
-        port: 0 takes any free one. If `DEFAULT_PORT` is taken, the next free one is used.
+        port: 0 takes any free port. If `DEFAULT_PORT` is taken, the next free one is used.
 
     Raises:
         ServerError: The host is not this machine's, or the port is taken or forbidden.
     """
-    # "localhost" may be 127.0.0.1, ::1 or both; the printed address has to be the bound one.
+    # "localhost" may be 127.0.0.1, ::1 or both; the printed address must be the bound one.
     asked = "127.0.0.1" if host.lower() == "localhost" else host
     try:
         family, _, _, _, address = socket.getaddrinfo(
@@ -129,25 +129,25 @@ def listen_on_port(host: str, port: int) -> Listening:
 def listen_on_file(path: Path, port: int) -> Listening:
     """Listen on a Unix socket with mode 0600.
 
-    On a shared machine every user can connect to a loopback port, and a browser sends its cookies to every port of a
-    host. For a Unix socket the kernel checks who connects, and the browser reaches it by its user's ``ssh -L``.
+    On a shared machine every user can connect to a loopback port, and a browser sends its cookies to every port of a host.
+    For a Unix socket the kernel checks the user who connects, and the browser reaches it through the user's ``ssh -L``.
 
     Args:
-        path: Of the socket. The socket of a workbench that was killed is replaced.
-        port: On the browser's machine, at the other end of ``ssh -L``.
+        path: Path of the socket. The socket of a killed workbench is replaced.
+        port: Port on the browser's machine, at the other end of ``ssh -L``.
 
     Raises:
-        ServerError: Something else is at `path`, or other users may write into its folder.
+        ServerError: `path` exists and is something else, or other users may write into its folder.
     """
     folder = path.expanduser().absolute().parent.resolve()
     place = folder / path.name
-    if len(os.fsencode(place)) > LONGEST_PATH:
-        raise ServerError(f"The path of a socket has at most {LONGEST_PATH} bytes; {place} is longer.")
+    if len(os.fsencode(place)) > MAX_PATH_BYTES:
+        raise ServerError(f"The path of a socket has at most {MAX_PATH_BYTES} bytes; {place} is longer.")
     made = socket.socket(socket.AF_UNIX)
     try:
         with _alone_in(folder):
             _make_room(place)
-            # Linux makes the file with the mode of the socket: it never exists with a wider one.
+            # Linux creates the file with the mode of the socket, so it never exists with a wider one.
             os.fchmod(made.fileno(), 0o600)
             made.bind(str(place))
             made.listen(BACKLOG)
@@ -201,18 +201,18 @@ def _make_room(place: Path) -> None:
         except ConnectionRefusedError:
             place.unlink()
             return
-        except OSError:  # it listens, too busy to answer
+        except OSError:  # a program listens but is too busy to answer
             pass
     raise ServerError(f"Another program is listening at {place}, perhaps a workbench; give another path.")
 
 
 def _reach(host: str) -> str:
-    """``host`` as a browser needs it: IPv6 in brackets, and for "every interface" the address of the one that leads
-    out. Connecting a datagram socket sends nothing."""
+    """``host`` for a URL: IPv6 in brackets; for "every interface", the address of the interface with the default route.
+    Connecting a datagram socket sends nothing."""
     address = ipaddress.ip_address(host.partition("%")[0])
     if not address.is_unspecified:
         return _in_address(address)
-    # TEST-NET-1 and the prefix for documentation, RFC 5737 and 3849. A socket of ours for IPv6 takes no IPv4.
+    # TEST-NET-1 and the documentation prefix, RFC 5737 and 3849. Our IPv6 sockets do not accept IPv4.
     family, far = (socket.AF_INET6, "2001:db8::1") if address.version == 6 else (socket.AF_INET, "192.0.2.1")
     with socket.socket(family, socket.SOCK_DGRAM) as probe:
         try:

@@ -1,4 +1,4 @@
-"""Builds the HTTP responses: headers, refusals, files, and viser's page with our scripts in its head."""
+"""Builds HTTP responses: headers, refusals, files, and viser's page with our scripts in its head."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ SCRIPTS = (
     "curve_clicks.js",
     "view_width.js",
 )
-"""Names of the scripts in ``web_assets/`` that the page runs."""
+"""Scripts of ``web_assets/`` injected into viser's index.html, in load order."""
 STYLES = "panels/page.css"
-"""Style sheet in ``web_assets/``. It goes into the page's head: viser removes an HTML element while its panel is
+"""Style sheet of ``web_assets/``. It is in the page's head, since viser removes an HTML element while its panel is
 folded."""
 
-LONGEST_NAME = 255
-"""Maximum length of a file's name in bytes, in every usual file system."""
-LONGEST_PATH = 3000
-"""Maximum length in bytes of a path below a folder."""
+MAX_NAME_BYTES = 255
+"""Maximum length of a file name in all common file systems."""
+MAX_PATH_BYTES = 3000
+"""Maximum length of a path below a folder."""
 
 
 def request_parts(request: Request) -> access.RequestParts:
@@ -51,13 +51,13 @@ def request_parts(request: Request) -> access.RequestParts:
         fetch_site=get("Sec-Fetch-Site"),
         fetch_mode=get("Sec-Fetch-Mode"),
         fetch_dest=get("Sec-Fetch-Dest"),
-        # Exactly viser's own test: what viser takes for a handshake must have been checked as one.
+        # Exactly viser's own test: a request that viser treats as a handshake must have been checked as one.
         websocket=get("Upgrade") == ["websocket"],
     )
 
 
 def refusals(example: str) -> Callable[[str], Response]:
-    """Returns a function that makes 403 replies with a reason; ``example`` is the address that they tell to open."""
+    """Returns a function that makes 403 replies with a reason; they tell the user to open the address ``example``."""
     folder = web_assets_folder()
     page = (folder / "refused.html").read_text(encoding="utf-8")
     page = page.replace("{{logo}}", (folder / "logo.svg").read_text(encoding="utf-8"))
@@ -93,18 +93,18 @@ async def admitted_reply(
     told: RateLimitedLog,
 ) -> Response:
     page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
-    # Decoded once, as viser does: what is still encoded is part of a file's name.
+    # Decode once, like viser: anything still encoded is part of a file name.
     path = unquote(request.path.partition("?")[0]).replace("\\", "/")
     if not _is_path_of_files(path):
         return _no_such_file(page)
     prefix = max((prefix for prefix in routes if path.startswith(prefix)), key=len, default=None)
     if prefix is None:
         response = viser_hook(connection, request)
-        if response is None:  # viser took for a handshake what was not checked as one
+        if response is None:  # viser treats the request as a handshake, but it was not checked as one
             return reply(400, "text/plain; charset=utf-8", b"Bad request.", page)
         if response.headers.get("Content-Type", "").startswith("text/html"):
             zipped = response.headers.get("Content-Encoding") == "gzip"
-            # In a thread: packing viser's page takes a while, the first time.
+            # In a thread: compressing viser's page takes a while the first time.
             response.body = await asyncio.to_thread(with_our_head, bytes(response.body), zipped)
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
@@ -135,13 +135,13 @@ async def admitted_reply(
 
 
 def _is_path_of_files(path: str) -> bool:
-    """Whether a file could have this path: the system raises on a name that is too long or holds a NUL."""
+    """Whether a file could have this path: the system raises on a name that is too long or contains a NUL."""
     parts = path.encode("utf-8", "surrogatepass").split(b"/")
     return (
         b".." not in parts
         and "\0" not in path
-        and all(len(part) <= LONGEST_NAME for part in parts)
-        and sum(map(len, parts)) <= LONGEST_PATH
+        and all(len(part) <= MAX_NAME_BYTES for part in parts)
+        and sum(map(len, parts)) <= MAX_PATH_BYTES
     )
 
 
@@ -151,10 +151,10 @@ def _no_such_file(headers: Mapping[str, str]) -> Response:
 
 @functools.lru_cache(maxsize=4)
 def with_our_head(page: bytes, zipped: bool) -> bytes:
-    """viser's page with `STYLES` and `SCRIPTS` in its head; viser itself offers no way to add one.
+    """viser's page with `STYLES` and `SCRIPTS` in its head; viser itself has no way to add them.
 
     Raises:
-        ValueError: it has no head, so this is another version of viser.
+        ValueError: the page has no head, so the viser version is unknown.
     """
     plain = gzip.decompress(page) if zipped else page
     before, head_end, after = plain.partition(b"</head>")
@@ -177,13 +177,13 @@ def _compresses(kind: str) -> bool:
 
 
 def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
-    """A handler that serves the files below ``folder``, but no target of a link that lies outside."""
+    """A handler that serves the files below ``folder``; it does not follow links to files outside."""
     root = folder.resolve()
 
     def handle(path: str) -> tuple[int, str, bytes]:
         try:
             file = (root / path.lstrip("/")).resolve()
-        except RuntimeError:  # a link that leads to itself
+        except RuntimeError:  # a symlink loop
             file = root
         if not file.is_relative_to(root) or not file.is_file():
             return 404, "text/plain; charset=utf-8", b"There is no such file."
@@ -193,7 +193,7 @@ def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
 
 
 def content_type(name: str) -> str:
-    """Content type by suffix. The system's table may call JavaScript plain text, which browsers refuse to run."""
+    """Content type by suffix. The system's table may list JavaScript as plain text, which browsers refuse to run."""
     known = {
         ".css": "text/css; charset=utf-8",
         ".html": "text/html; charset=utf-8",
@@ -206,11 +206,11 @@ def content_type(name: str) -> str:
     return known.get(Path(name).suffix.lower()) or mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
-# --- The headers that tell a browser what a served page may do --------------------------------
+# --- Security headers ------------------------------------------------------------------------------
 
 
 def _scripts() -> str:
-    """Source list of the scripts that may run in the page. All scripts may run in the page of an unknown viser
+    """Source list of the scripts that may run in the page. If viser's version is unknown, all scripts may run
     (`unknown_page_text`)."""
     known = viser_private.page_scripts()
     if known is None:
@@ -218,16 +218,17 @@ def _scripts() -> str:
     return " ".join(f"'sha256-{one}'" for one in known)
 
 
-# Everything is forbidden that is not listed, and each exception is needed: `tests/page/door/test_page_policy.py` removes
+# Everything that is not listed is forbidden, and each exception is needed: `tests/ui/server/test_page_policy.py` removes
 # them one by one and finds the page broken.
-# - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not unsafe-inline: HTML from a name,
-#   a note or a file that slipped past escaping still would not run. wasm-unsafe-eval is for
-#   the program that unpacks the server's messages. eval stays forbidden: viser needs it for Gaussian splats and Plotly, which the workbench has not (web_assets/browser.js).
-# - worker-src blob: viser's connection and its sorting run in workers made from texts.
-# - style-src 'unsafe-inline': viser's widgets and our HTML have styles in their tags; a style runs no code.
+# - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not unsafe-inline: HTML
+#   from a name, a note or a file that slipped past escaping still would not run. wasm-unsafe-eval is for the program that
+#   decodes the server's messages. eval stays forbidden: viser needs it for Gaussian splats and Plotly, which the workbench
+#   does not use (web_assets/browser.js).
+# - worker-src blob: viser's connection and its sorting run in workers made from strings.
+# - style-src 'unsafe-inline': viser's widgets and our HTML have inline styles; a style runs no code.
 # - img-src data: blob: pictures from the websocket, and viser's icons.
-# - connect-src: this server only. viser's page obeys another one in its address (?websocket=, ?playbackPath=). data: and
-#   blob: are textures and programs of the page. The websocket is named for browsers where 'self' excludes ws:.
+# - connect-src: only this server. viser's page would use another one given in its address (?websocket=, ?playbackPath=).
+#   data: and blob: are textures and programs of the page. The websocket is listed for browsers where 'self' excludes ws:.
 # - frame-src 'self': rerun's viewer.
 DIRECTIVES: dict[str, str] = {
     "default-src": "'none'",
@@ -274,8 +275,8 @@ EVERY_REPLY = {
     + ", clipboard-write=(self), fullscreen=(self)",
     "Connection": "close",
 }
-"""Headers of every reply, refusals included: no guessing of types, no referrer, no framing, opening or embedding
-by other sites, no devices."""
+"""Headers of every reply, including refusals: no MIME sniffing, no referrer, no framing, opening or embedding by other
+sites, no devices."""
 PAGE_OF_OURS = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'self'",

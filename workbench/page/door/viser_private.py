@@ -1,4 +1,4 @@
-"""The only module that uses private names of viser: its server behind our checks."""
+"""The only module that uses private names of viser: it runs viser's server behind our checks."""
 
 from __future__ import annotations
 
@@ -47,24 +47,24 @@ from workbench.page.door.page_guard import PageGuard
 
 Hook = Callable[[ServerConnection, Request], Response | None]
 Serve = Callable[[ServerConnection], Awaitable[None]]
-"""Talks with one page until it leaves."""
+"""Serves one page until it disconnects."""
 AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 
 PAGES = {
     "1.1.1": ("5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw=", "o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE="),
 }
-"""sha256 of the two scripts of viser's page, by viser's version: the one in the page, and the one that it unpacks.
+"""sha256 of the two scripts of viser's page, by viser's version: the one in the page, and the one that it decompresses.
 
-A browser that is allowed them and no others runs no script that slipped past escaping (`responses.page_policy`). It names
-the second hash in its console when it is allowed the first alone.
+A browser that allows only these runs no script that slipped past escaping (`responses.page_policy`). If only the first is
+allowed, the browser prints the hash of the second in its console.
 """
 
 REFUSED_FROM_CLIENTS = (
     "ShareUrlRequest",  # opens a tunnel that makes the page public, for any client
     "ShareUrlDisconnect",
-    "FileTransferStartUpload",  # no size limit, file name taken as sent; we take no uploads
+    "FileTransferStartUpload",  # no size limit, file name used as sent; we accept no uploads
     "FileTransferPart",
-    "SceneNodeClickMessage",  # no node of ours takes clicks or drags, no button is held
+    "SceneNodeClickMessage",  # none of our nodes handles clicks or drags, no button is held
     "SceneNodeDragMessage",
     "GuiButtonHoldMessage",
 )
@@ -102,11 +102,11 @@ PRIVATE_ATTRIBUTES = (
 """Attributes of a `viser.ViserServer` that this module relies on."""
 
 STOP_SECONDS = 1.0
-"""Timeout in seconds for a page to answer the closing handshake."""
+"""Timeout for a page to answer the closing handshake."""
 
 _making = threading.Lock()
 
-# A page may have closed a moment before a message is queued for it.
+# A page may have closed just before a message is queued for it.
 warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
 
 # Any: viser does not export these names.
@@ -114,14 +114,14 @@ infra: Any = viser.infra._infra
 
 
 def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
-    """Change what is written on a tab; viser has this for icons alone."""
+    """Change the label of a tab; viser can change only its icon."""
     if tab._label != label:
         tab._label = label
         tab._parent._rebuild_tab_props()
 
 
 def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
-    """Tabs of a page, and folds in them or outside of tabs: the labels of both, empty for none; in the order of making."""
+    """Tabs of a page, and folds inside or outside tabs: labels of tab and fold, empty for none; in order of creation."""
     containers = server.gui._container_handle_from_uuid
     for handle in list(containers.values()):
         if isinstance(handle, viser.GuiTabHandle):
@@ -139,20 +139,20 @@ def send_lines(
     data: tuple[NDArray[np.float64], ...],
     sent: tuple[NDArray[np.float64] | list[float | None], ...],
 ) -> None:
-    """Set a chart's data, and send `sent` to the browsers, with None for gaps: viser's property would send NaN."""
+    """Set a chart's data, but send `sent`, with None for gaps, to the browsers: viser's property would send NaN."""
     props: Any = handle._impl.props
     props.data = data
     handle._queue_update("data", sent)
 
 
-def wait_until_taken(server: viser.ViserServer, patience: float) -> None:
-    """Return when all messages so far are in a batch on the way to each page, or after `patience` seconds.
+def wait_until_taken(server: viser.ViserServer, timeout: float) -> None:
+    """Wait until all messages so far are in a batch that is being sent to each page, at most `timeout` seconds.
 
-    A page takes a batch as a whole: messages written after this do not delay those before.
+    A page handles a batch as a whole: messages written after this do not delay earlier ones.
     """
     buffer = server._websock_server._broadcast_buffer
-    written, end = buffer.message_counter - 1, time.monotonic() + patience
-    # A slow page is behind by more than this wait, and must not delay the others.
+    written, end = buffer.message_counter - 1, time.monotonic() + timeout
+    # A slow page lags by more than this timeout, and must not delay the others.
     while any(taken < written for taken in list(buffer.generator_cursors.values())):
         if time.monotonic() > end:
             return
@@ -163,7 +163,7 @@ def remove_nodes_but(server: viser.ViserServer | viser.ClientHandle, kept: tuple
     """Remove every node of the 3-D view except those at and below these names."""
     for name, handle in list(server.scene._handle_from_node_name.items()):
         stays = name == "/WorldAxes" or any(name == root or name.startswith(f"{root}/") for root in kept)
-        # A child goes with its parent.
+        # Removing a parent removes its children.
         if not stays and not handle._impl.removed:
             handle.remove()
 
@@ -192,12 +192,12 @@ def missing_names() -> list[str]:
 
 
 def page_scripts() -> tuple[str, str] | None:
-    """Hashes of the scripts of the installed viser's page, as in `PAGES`; None if that page is not known."""
+    """Hashes of the scripts of the installed viser's page, see `PAGES`; None if the version is unknown."""
     return PAGES.get(viser.__version__)
 
 
 def unknown_page_text() -> str:
-    """Text: what does not work with a viser whose page is not known; empty if it is known."""
+    """Warning about a viser version whose page is unknown; empty if it is known."""
     if page_scripts() is not None:
         return ""
     return (
@@ -226,7 +226,7 @@ def _watched(handler: Serve, channels: dict[str, Serve], told: RateLimitedLog) -
             await ours(connection)
             return
         if connection.subprotocol != f"viser-v{viser.__version__}":
-            # viser prints the client's version and sends it back, of any length.
+            # Handled here, since viser prints the client's version, of any length, and sends it back.
             told.happened("version", "Refused a page that another version of viser has served: reload it.")
             await connection.close(1002, f"Version mismatch. Server: {viser.__version__}")
             return
@@ -247,10 +247,10 @@ def _watched(handler: Serve, channels: dict[str, Serve], told: RateLimitedLog) -
         try:
             await handler(connection)
         except MalformedMessage as error:
-            # Else websockets closes the connection too, but prints a traceback into the author's terminal for every
-            # such frame.
+            # Without this `websockets` closes the connection too, but prints a traceback into the author's terminal for
+            # every such frame.
             told.happened("malformed", f"Closed a page's connection: it sent {error}.")
-            # It may keep sending and never answer the closing handshake.
+            # The page may keep sending and never answer the closing handshake.
             connection.close_timeout = STOP_SECONDS
             await connection.close(1008, "malformed message")
         finally:
@@ -260,8 +260,8 @@ def _watched(handler: Serve, channels: dict[str, Serve], told: RateLimitedLog) -
 
 
 class _Terminal(logging.Filter):
-    """Keeps what viser, `websockets` and asyncio print and log of pages to some lines a minute: a page could fill the
-    terminal, by each frame a line, by each connection a traceback. Installed once in a process."""
+    """Limits the output of viser, `websockets` and asyncio about pages to some lines a minute: a page could fill the
+    terminal with a line per frame or a traceback per connection. Installed once per process."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -277,7 +277,8 @@ class _Terminal(logging.Filter):
         print_rich = rich.print
 
         def print_unless_viser(*things: Any, **options: Any) -> None:
-            # ``verbose=False`` does not stop its lines of start, stop and refused pages. Others may print meanwhile.
+            # ``verbose=False`` does not suppress viser's lines about start, stop and refused pages. Other code may print
+            # meanwhile.
             if not sys._getframe(1).f_globals.get("__name__", "").startswith("viser"):
                 print_rich(*things, **options)
 
@@ -306,16 +307,16 @@ _terminal = _Terminal()
 
 @dataclass(frozen=True)
 class GatedViser:
-    """A `viser.ViserServer` on our socket and behind our checks. Make it with `make_viser`."""
+    """A `viser.ViserServer` on our socket behind our checks. Make it with `make_viser`."""
 
     server: viser.ViserServer
     _serving: websockets.asyncio.server.serve
     channels: dict[str, Serve]
-    """WebSockets of ours, by path."""
+    """Our own WebSocket handlers by path."""
     _closing: set[asyncio.Task[None]] = field(default_factory=set)
 
     def close_pages(self, reason: str) -> None:
-        """Close every page and every response in progress; returns when that has begun."""
+        """Close every page and every response in progress; returns when closing has begun."""
         listening = self._serving.server
         begun = threading.Event()
 
@@ -348,11 +349,11 @@ class GatedViser:
             for connection in list(listening.handlers):
                 if not (patient and connection in listening.connections):
                     connection.transport.abort()
-            # Again: a socket that was just accepted is not among the handlers yet.
+            # Repeat: a socket that was just accepted is not among the handlers yet.
             loop.call_later(0.02, drop)
 
         if not loop.is_closed():
-            with contextlib.suppress(RuntimeError):  # closed since: nothing is left to drop
+            with contextlib.suppress(RuntimeError):  # the loop has closed: there is nothing to drop
                 loop.call_soon_threadsafe(drop)
         with _making:
             self.server.stop()
@@ -365,23 +366,24 @@ def make_viser(
     response_seconds: float,
     told: RateLimitedLog,
 ) -> GatedViser:
-    """Make a `viser.ViserServer` that serves on ``listening`` only, behind the hook that ``wrap`` makes of viser's own.
+    """Make a `viser.ViserServer` that serves only on ``listening``, behind the hook that ``wrap`` makes from viser's own.
 
-    viser serves page and websocket from one ``websockets`` server that it starts in ``viser/infra/_infra.py``, with no
-    way to check a request first, choose the socket, refuse a message or keep quiet. So while the server is made, the
-    name ``websockets`` in that module is a look-alike whose ``serve`` is ours. It passes viser's arguments on with
-    four changed: the socket, ``process_request``, compression, and the handler, which checks every message first, sends
-    as fast as the page answers and closes stalled clients. `missing_names` is asked before, and `gated_server` tests the result with a forbidden request.
+    viser serves page and websocket from one ``websockets`` server that it starts in ``viser/infra/_infra.py``, without a
+    way to check a request first, choose the socket, refuse a message or suppress output. So while the server is made, the
+    name ``websockets`` in that module is a stand-in whose ``serve`` is ours. It passes viser's arguments on with four
+    changes: the socket, ``process_request``, compression, and the handler, which checks every message first, sends as fast
+    as the page acknowledges and closes stalled clients. `missing_names` is checked before, and `gated_server` tests the
+    result with a forbidden request.
 
     Args:
         listening: bound and listening; the server owns it from here on.
         wrap: gets viser's ``process_request`` (files for plain requests, None for a handshake).
         label: shown at the top of viser's panel.
-        response_seconds: longest that one request may take, its whole response included.
-        told: logs what pages did that they should not.
+        response_seconds: timeout of one request including its whole response.
+        told: logs misbehaviour of pages.
 
     Raises:
-        ServerError: the installed viser is not the known one. Nothing is left listening.
+        ServerError: the installed viser is an unknown version. Nothing is left listening.
     """
     missing = missing_names()
     if missing:
@@ -395,7 +397,7 @@ def make_viser(
     strangers = ConnectionLimits(told)
 
     def serve(handler: Serve, host: str, port: int, **options: Any) -> websockets.asyncio.server.serve:
-        # Without viser's host and port: it would silently bind another port if this one were taken, or the one of the
+        # Do not use viser's host and port: viser silently binds another port if this one is taken, or the port of the
         # environment (_VISER_PORT_OVERRIDE).
         options.update(
             process_request=wrap(options["process_request"]),
@@ -420,7 +422,7 @@ def make_viser(
         real = infra.websockets
         infra.websockets = look_alike  # type: ignore[assignment]
         try:
-            # Where viser binds if it ever stops calling our serve: loopback, any port.
+            # If viser ever stops calling our serve, it binds to loopback, on any port.
             server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
         finally:
             infra.websockets = real
@@ -434,7 +436,7 @@ def make_viser(
     for name in REFUSED_FROM_CLIENTS:
         server._websock_server.unregister_handler(getattr(viser._messages, name))
     with unchanged_environment():
-        # For its first picture viser imports OpenCV, which adds the current folder to where all children look for libraries.
+        # For its first picture viser imports OpenCV, which adds the working directory to the library path of all children.
         server.gui.add_image(np.zeros((1, 1, 3), np.uint8)).remove()
     return GatedViser(server, serving[0], channels)
 
@@ -450,8 +452,8 @@ def _quiet_logger() -> logging.Logger:
 
 
 def _has_left(error: BaseException | None) -> bool:
-    """Whether it comes from a port scanner's garbage, or from a browser that leaves before its response is complete."""
+    """Whether the error comes from a port scanner's garbage, or from a browser that leaves before its response is complete."""
     if isinstance(error, AssertionError):
-        # `websockets` ends a connection after its response and asserts that it is still open: here the client has left.
+        # `websockets` asserts that a connection is still open after its response: here the client has left.
         return traceback.extract_tb(error.__traceback__)[-1].name == "send_eof"
     return isinstance(error, (InvalidHandshake, ConnectionClosed, ConnectionError, EOFError))

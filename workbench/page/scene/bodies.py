@@ -1,4 +1,4 @@
-"""Draws the bodies of the envs in the 3-D view: built once a scene, moved once a frame."""
+"""Draws the bodies of the envs in the 3-D view: built once per scene, moved once per frame."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from workbench.page.widgets.parts import Clock
 
 NAMES = ("/envs", "/floor")
 """Roots of the nodes in viser's tree."""
-LEAVES_AFTER = 0.7
-"""Seconds for which old shapes stay when finer or coarser ones replace them: until the page has read the new ones,
-nothing would be there."""
+REMOVAL_DELAY_SECONDS = 0.7
+"""Time for which old shapes stay when finer or coarser ones replace them: until the page has read the new ones, the
+view would be empty."""
 
 
 @dataclass(frozen=True)
@@ -31,24 +31,24 @@ class DrawStyle:
     """How a scene is drawn."""
 
     triangles: int = 200_000
-    """Approximate maximum number of triangles; rich shapes are simplified to fit."""
+    """Approximate maximum number of triangles; shapes with many triangles are simplified to fit."""
     dark: bool = True
-    """The page's theme: in the light one a dark floor is lighter than the task's."""
+    """Whether the page's theme is dark; the light theme lightens a dark floor."""
     error: float = 0.0
-    """Error in metres that shapes may have, so that they have fewer triangles."""
+    """Simplification tolerance of shapes in metres."""
 
 
 class SceneView:
     """The batched nodes of one scene under ``/envs``.
 
-    One viser node a body is too slow in a browser from a hundred bodies on (measured: 1 frame a second at 3,840), one
-    batched node a shape is not (30 a second). A frame is two arrays a node: world positions and quaternions, each env's
-    own pose plus its grid offset. World poses, not parent frames: viser's batches bypass its scene graph, and a parent
-    that moves in the same frame makes them shake.
+    One viser node per body is too slow in a browser from a hundred bodies on (measured: 1 frame a second at 3,840); one
+    batched node per shape is not (30 a second). A frame is two arrays per node: world positions and quaternions, each env's
+    own pose plus its grid offset. World poses, not parent frames: viser's batches bypass its scene graph, and a parent that
+    moves in the same frame makes them shake.
 
-    Showing one env sends one env: a batch's arrays may change their length. Bodies that an env lacks (NaN) are left out
-    the same way. Triangles limit a browser, so fewer envs are drawn with finer shapes. What moves by less than a pixel is
-    not sent (`pixels`).
+    If one env is shown, only that env is sent: a batch's arrays may change their length. Bodies that an env lacks (NaN) are
+    left out the same way. Triangles limit a browser, so fewer envs are drawn with finer shapes. Motion below a pixel is not
+    sent (`visible_motion`).
     """
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
@@ -75,11 +75,11 @@ class SceneView:
         """Show this scene instead of the last; groups that look the same stay and are not sent again.
 
         Args:
-            geometry: Of the scene.
+            geometry: Geometry of the scene.
             layout: The grid of the envs.
             poses: (N, B, 7) in env frames.
             only_env: Show this env alone; None shows all.
-            looks: How it is drawn.
+            looks: Style of the drawing.
         """
         shown_envs = geometry.num_envs if only_env is None else 1
         limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, looks.triangles)
@@ -108,7 +108,7 @@ class SceneView:
                 self._leaving.append(drawn)
             else:
                 drawn.handle.remove()
-        self._geometry, self._leave_at = geometry, self._clock() + LEAVES_AFTER
+        self._geometry, self._leave_at = geometry, self._clock() + REMOVAL_DELAY_SECONDS
         if layout.has_floor:
             self._grid.draw()
         else:
@@ -118,7 +118,7 @@ class SceneView:
         self.move(poses, layout, only_env)
 
     def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
-        """Move every body to its pose. To be called again while nothing moves, for the exact poses at rest.
+        """Move every body to its pose. Call it also while nothing moves, so that bodies at rest get their exact poses.
 
         Args:
             poses: (N, B, 7) in env frames.
@@ -187,7 +187,7 @@ class _DrawnGroup:
             glb,
             batched_wxyzs=np.array([[1, 0, 0, 0]], np.float32),
             batched_positions=np.array([[0, 0, -1000]], np.float32),
-            # viser's levels of detail leave holes in open meshes and switch visibly.
+            # Off: viser's levels of detail leave holes in open meshes and switch visibly.
             lod="off",
             cast_shadow=False,
             receive_shadow=False,
@@ -195,11 +195,11 @@ class _DrawnGroup:
         self.set_instances(group, None)
 
     def set_instances(self, group: VisualGroup, once: NDArray[np.float32] | None) -> None:
-        """Set the (env, body) pairs that it is drawn for; a floor or wall is drawn once, moved by `once` (3,)."""
+        """Set the (env, body) pairs for which the group is drawn; a floor or wall is drawn once, offset by `once` (3,)."""
         self._group, self._once = group, once
         corners = [np.abs(visual.mesh.vertices).max(axis=0) for visual in group.visuals]
         self.reach = float(max(np.linalg.norm(corner) for corner in corners))
-        """Radius in metres around its frame that contains it."""
+        """Radius in metres of a sphere around its frame that contains the group."""
 
     @property
     def is_plane(self) -> bool:
@@ -208,7 +208,7 @@ class _DrawnGroup:
     def rows(
         self, layout: EnvLayout, only_env: int | None
     ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-        """Envs (K,) and bodies (K,) of what is drawn, and what is added to their positions (K, 3)."""
+        """Envs (K,) and bodies (K,) of the drawn instances, and offsets of their positions (K, 3)."""
         envs, bodies = self._group.envs, self._group.bodies
         if self._once is not None:
             envs, bodies = envs[:1], bodies[:1]
@@ -219,7 +219,7 @@ class _DrawnGroup:
         return envs[mine], bodies[mine], np.zeros((int(mine.sum()), 3), np.float32)
 
     def draw(self, instances: NDArray[np.float32]) -> None:
-        """Draw it at these poses (K, 7); rows of absent bodies are NaN."""
+        """Draw the group at these poses (K, 7); rows of absent bodies are NaN."""
         there = np.isfinite(instances).all(axis=1)
         if not there.all():
             instances = instances[there]
@@ -231,7 +231,7 @@ class _DrawnGroup:
 
 
 class _Rows:
-    """All instances of all groups as one array: a call of numpy costs more than its work on one group."""
+    """All instances of all groups in one array, since a NumPy call costs more than its work on one group."""
 
     def __init__(self, groups: tuple[_DrawnGroup, ...], layout: EnvLayout, only_env: int | None) -> None:
         self._layout, self._only_env = layout, only_env

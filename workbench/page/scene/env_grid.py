@@ -1,4 +1,4 @@
-"""The grid of envs in the 3-D view: offset of each env, env under a ray, and the mark of the selected env."""
+"""The grid of envs in the 3-D view: offset of each env, the env under a ray, and the mark of the selected env."""
 
 from __future__ import annotations
 
@@ -14,32 +14,31 @@ from viser.transforms import SO3
 
 from workbench.envs.scene.shapes import SceneGeometry, Visual
 
-FLOOR_WIDTH = 8.0
-"""Metres. A flat static body wider than this in both directions is a floor: ManiSkill's ground is 40 to 100 m wide, the
-largest table 2.4 m."""
-FLOOR_THICKNESS = 0.05
-LEVEL = 0.9
+MIN_FLOOR_METRES = 8.0
+"""Minimum width of a floor: a flat static body wider than this in both directions is a floor. ManiSkill's ground is 40 to
+100 m wide, the largest table 2.4 m."""
+MAX_FLOOR_THICKNESS_METRES = 0.05
+MIN_FLOOR_UP = 0.9
 """Minimum upward component of a floor's normal; below it a plane is a wall."""
-WIDER = 1.4
+WIDTH_TO_DEPTH = 1.4
 """Ratio of width to depth of the grid: a view is wider than tall, and depth is foreshortened."""
-MARGIN = 0.35
-"""Distance in metres between two envs at rest; a robot that reaches out needs some of it."""
-ACTING_MARGIN = np.float32(0.08)
-"""Margin in metres around the frames of links and bodies."""
+MARGIN_METRES = 0.35
+"""Distance between two envs at rest; a robot that reaches out needs some of it."""
+ACTING_MARGIN_METRES = np.float32(0.08)
+"""Margin around the frames of links and bodies."""
 
 
 @dataclass(frozen=True)
 class EnvLayout:
-    """The box of one env and the offset of each, in metres, z up.
+    """The bounding box of one env and the offset of each env, in metres, z up.
 
-    All envs sit at the origin of their own frames. A pose in the page is the env's own pose plus its offset on a grid,
-    whose spacing comes from what stands in one env (table and robot, without floor or backdrop). Floors are wide
-    enough for the whole grid and drawn once: sixteen overlapping floors would flicker and cost sixteen times the
-    triangles.
+    All envs are at the origin of their own frames. A pose in the page is the env's own pose plus its offset on a grid. The
+    grid's spacing comes from the contents of one env (table and robot, without floor or backdrop). Floors are wide enough
+    for the whole grid and drawn once: sixteen overlapping floors would flicker and cost sixteen times the triangles.
     """
 
     offsets: NDArray[np.float32]
-    """(N, 3) added to an env's own coordinates."""
+    """(N, 3) offset added to an env's own coordinates."""
     low: NDArray[np.float32]
     """(3,) lowest corner of one env's contents without the floor, in the env's frame."""
     high: NDArray[np.float32]
@@ -65,19 +64,19 @@ def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDA
         return None
     extent = np.ptp(visual.mesh.vertices, axis=0)
     thin = int(extent.argmin())
-    if extent[thin] > FLOOR_THICKNESS or np.sort(extent)[1] < FLOOR_WIDTH:
+    if extent[thin] > MAX_FLOOR_THICKNESS_METRES or np.sort(extent)[1] < MIN_FLOOR_METRES:
         return None
     pose = poses[visual.envs[0], visual.bodies[0]].astype(np.float64)
     return SO3(pose[3:]).apply(np.eye(3)[thin]) if np.isfinite(pose).all() else None
 
 
 def place_of_plane(normal: NDArray, visual: Visual, poses: NDArray, layout: EnvLayout) -> NDArray[np.float32]:
-    """(3,) offset of a plane that is drawn once for the whole grid.
+    """(3,) offset of a plane drawn once for the whole grid.
 
-    A floor lies under the middle; a wall goes behind the last env on its side, or it would cut through the envs.
+    A floor lies under the middle; a wall is moved behind the last env on its side, or it would cut through the envs.
     """
     normal = np.asarray(normal, np.float64)
-    if abs(normal[2]) > LEVEL:
+    if abs(normal[2]) > MIN_FLOOR_UP:
         return np.zeros(3, np.float32)
     point = poses[visual.envs[0], visual.bodies[0], :3]
     outwards = normal if (point - (layout.low + layout.high) / 2) @ normal >= 0 else -normal
@@ -101,7 +100,7 @@ def lay_out(geometry: SceneGeometry, poses: NDArray[np.float32]) -> EnvLayout:
             continue
         normal = plane_normal(visual, geometry, poses)
         if normal is not None:
-            if abs(normal[2]) > LEVEL:
+            if abs(normal[2]) > MIN_FLOOR_UP:
                 floors.append(float(corners[..., 2].max()))
         else:
             lows.append(corners.min(axis=1))
@@ -113,7 +112,7 @@ def lay_out(geometry: SceneGeometry, poses: NDArray[np.float32]) -> EnvLayout:
         low, high = np.full(3, -0.5), np.full(3, 0.5)
     floor = max(floors) if floors else float(low[2])
     return EnvLayout(
-        offsets=grid_offsets(geometry.num_envs, high[:2] - low[:2] + MARGIN),
+        offsets=grid_offsets(geometry.num_envs, high[:2] - low[:2] + MARGIN_METRES),
         low=low.astype(np.float32),
         high=high.astype(np.float32),
         floor_height=floor,
@@ -126,7 +125,7 @@ def acting_box(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Lowest and highest corner, in the env's frame, of robots and movable bodies.
 
-    Static and kinematic bodies are left out, and positions are clipped to the env. The whole env where nothing moves.
+    Static and kinematic bodies are left out, and positions are clipped to the env. If nothing moves, the whole env.
 
     Args:
         poses: (K, B, 7) of one env at K moments, or of K envs.
@@ -137,18 +136,18 @@ def acting_box(
     places = np.clip(places, layout.low, layout.high)
     if not len(places):
         return layout.low, layout.high
-    # The places are origins of frames; bodies reach beyond them.
-    return places.min(axis=0) - ACTING_MARGIN, places.max(axis=0) + ACTING_MARGIN
+    # The positions are origins of frames; bodies extend beyond them.
+    return places.min(axis=0) - ACTING_MARGIN_METRES, places.max(axis=0) + ACTING_MARGIN_METRES
 
 
 def grid_offsets(num_envs: int, spacing: NDArray) -> NDArray[np.float32]:
     """(N, 3) offsets of a grid around the origin, env 0 in front on the left as seen from +x.
 
-    Rows run along y and are filled from +x (nearest to the first viewpoint) backwards. Their number makes the grid
-    about `WIDER` times as wide as deep.
+    Rows run along y and are filled from +x (nearest to the initial viewpoint) backwards. Their number makes the grid about
+    `WIDTH_TO_DEPTH` times as wide as deep.
     """
     width, depth = float(spacing[1]), float(spacing[0])
-    columns = max(1, min(num_envs, round((num_envs * WIDER * depth / width) ** 0.5)))
+    columns = max(1, min(num_envs, round((num_envs * WIDTH_TO_DEPTH * depth / width) ** 0.5)))
     rows = -(-num_envs // columns)
     row, column = np.divmod(np.arange(num_envs), columns)
     x = ((rows - 1) / 2 - row) * depth
@@ -159,8 +158,8 @@ def grid_offsets(num_envs: int, spacing: NDArray) -> NDArray[np.float32]:
 def env_under_ray(layout: EnvLayout, origin: NDArray, direction: NDArray) -> int | None:
     """The env whose box a ray hits first, or None.
 
-    The slab test on one box an env; clickable meshes would make the browser rebuild a search tree over all triangles
-    at every frame.
+    A slab test with one box per env; clickable meshes would make the browser rebuild a search tree over all triangles in
+    every frame.
     """
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     if not (np.isfinite(origin).all() and np.isfinite(direction).all()):
@@ -192,11 +191,11 @@ COLOUR = (34, 139, 230)
 
 
 class InView:
-    """A node of the 3-D view that is added, changed and removed.
+    """A node of the 3-D view that can be added, changed and removed.
 
     Args:
-        add: viser's function that adds it, called with the values of `names`.
-        names: of the properties that change.
+        add: viser's function that adds the node, called with the values of `names`.
+        names: names of the properties that change.
     """
 
     def __init__(self, add: Callable[..., Any], *names: str) -> None:
@@ -205,7 +204,7 @@ class InView:
         """Handle of viser's node while it is shown."""
 
     def draw(self, *values: Any) -> None:
-        """Show it with these values; without values, remove it."""
+        """Show the node with these values; without values, remove it."""
         if not values:
             if self.handle is not None:
                 self.handle.remove()
@@ -220,18 +219,18 @@ class InView:
 def line_set(
     server: viser.ViserServer | viser.ClientHandle, name: str, colour: tuple[int, int, int], thickness: float
 ) -> InView:
-    """Line segments (K, 2, 3), metres in the view, `thickness` pixels wide."""
+    """Line segments (K, 2, 3), in metres in the view, `thickness` pixels wide."""
     more = {"colors": colour, "thickness": thickness, "thickness_units": "screen"}
     return InView(partial(server.scene.add_line_segments, name, **more), "points")
 
 
 def view_label(server: viser.ViserServer, name: str, anchor: Literal["top-center", "bottom-left"]) -> InView:
-    """A text at (3,) metres in the view; `anchor` is the part of the text that lies there."""
+    """A text at a point (3,) of the view, in metres; `anchor` is the part of the text at that point."""
     return InView(partial(server.scene.add_label, name, anchor=anchor), "text", "position")
 
 
 class SelectionMark:
-    """A frame around an env, level with its table and around its bodies, so that it covers nothing, and a label."""
+    """The mark of the selected env: a frame around its bodies at table height, so that it covers nothing, and a label."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._frame = line_set(server, "/selected/frame", COLOUR, 3.0)
@@ -249,11 +248,11 @@ class SelectionMark:
             return
         self._drawn = wanted
         offset = layout.offsets[env]
-        corner_low = layout.low[:2] + offset[:2] - MARGIN * 0.4
-        corner_high = layout.high[:2] + offset[:2] + MARGIN * 0.4
+        corner_low = layout.low[:2] + offset[:2] - MARGIN_METRES * 0.4
+        corner_high = layout.high[:2] + offset[:2] + MARGIN_METRES * 0.4
         (x0, y0), (x1, y1) = corner_low, corner_high
-        # On the floor it would be hidden by the tables in front, so it lies on the table top (z = 0 in ManiSkill), a
-        # centimetre above, or the two flicker.
+        # On the floor the tables in front would hide the frame, so it lies a centimetre above the table top (z = 0 in
+        # ManiSkill); in the same plane the two would flicker.
         z = max(layout.floor_height, min(0.0, float(layout.high[2]))) + 0.01
         corners = np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)], np.float32)
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)

@@ -1,4 +1,4 @@
-"""Converts shapes of a scene to GLB, grouped and simplified for the browser."""
+"""Converts the shapes of a scene to GLB, grouped and simplified for the browser."""
 
 from __future__ import annotations
 
@@ -13,24 +13,23 @@ from trimesh.visual.material import PBRMaterial
 
 from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
 
-LARGEST_TEXTURE = 1024
-"""Maximum size of a texture in pixels. A page loads every texture before it shows anything; 4k scans are megabytes
-each."""
+MAX_TEXTURE_PIXELS = 1024
+"""Maximum side of a texture. A page loads every texture before it shows anything; 4k scans are megabytes each."""
 
 
-LIGHT = 0.6
-"""Minimum mean of the sRGB channels of a floor that counts as light."""
+MIN_LIGHT_MEAN = 0.6
+"""Minimum mean of the sRGB channels of a light floor."""
 DARKNESS_KEPT = 0.3
 
-LAYER = 4e-4
-"""Distance in metres between painted layers; two steps of a 24 bit depth buffer at ten metres."""
+LAYER_METRES = 4e-4
+"""Distance between painted layers; two steps of a 24-bit depth buffer at ten metres."""
 
 
 @dataclass(frozen=True)
 class VisualGroup:
-    """Visuals of exactly the same (env, body) pairs, drawn as one node.
+    """Visuals with the same (env, body) pairs, drawn as one node.
 
-    A frame then costs two messages a link instead of two a part; viser tears a frame that needs more than 128.
+    A frame then costs two messages per link instead of two per part; viser splits a frame of more than 128 messages.
     """
 
     name: str
@@ -55,9 +54,9 @@ def group_visuals(geometry: SceneGeometry) -> tuple[VisualGroup, ...]:
 
 
 def face_limit(visuals: tuple[Visual, ...], shown_envs: int, num_envs: int, budget: int) -> int:
-    """The most triangles of one visual with which all instances together stay within the budget, at least 200.
+    """The maximum number of triangles per visual with which all instances together stay within the budget, at least 200.
 
-    Simple shapes keep all triangles, only rich ones are reduced.
+    Simple shapes keep all triangles; only shapes with many triangles are reduced.
     """
     faces = np.array([len(visual.mesh.faces) for visual in visuals], np.int64)
     shown = np.array([len(visual.envs) for visual in visuals], np.int64) * shown_envs / num_envs
@@ -72,11 +71,11 @@ def face_limit(visuals: tuple[Visual, ...], shown_envs: int, num_envs: int, budg
 
 
 def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
-    """One GLB of these parts, in the frame of their body.
+    """One GLB with these parts, in the frame of their body.
 
-    viser draws bare triangles in one colour and without normals (a box is shaded like a ball), or a GLB with textures,
-    metal and roughness; hence GLB for everything. The browser merges the parts into one buffer and refuses parts with
-    different attributes: normals are always written, texture coordinates as soon as one part has some.
+    viser draws plain triangles in one colour without normals (a box is shaded like a ball), or a GLB with textures, metal
+    and roughness; hence GLB for everything. The browser merges the parts into one buffer and refuses parts with different
+    attributes: normals are always written, texture coordinates if any part has them.
     """
     textured = any(mesh.uvs is not None for mesh, _ in parts)
     parts = list(zip(lift_painted_layers([mesh for mesh, _ in parts]), [m for _, m in parts], strict=True))
@@ -86,11 +85,11 @@ def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
             mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False, validate=False
         )
         if mesh.normals is None:
-            # Reading them fills the cache, and only cached normals are exported.
+            # Reading the normals fills the cache, and only cached normals are exported.
             _ = solid.vertex_normals
         uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs.copy()
-        # trimesh counts v from the bottom of the image and flips it for glTF, which counts from the top, as SAPIEN
-        # does: without this every texture would be upside down.
+        # trimesh counts v from the bottom of the image and flips it for glTF, which counts from the top like SAPIEN:
+        # without this every texture would be upside down.
         uvs[:, 1] = 1.0 - uvs[:, 1]
         solid.visual = TextureVisuals(uv=uvs if textured else None, material=_pbr(material, number))
         scene.add_geometry(solid, geom_name=str(number))
@@ -100,11 +99,11 @@ def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
 
 
 def lift_painted_layers(meshes: list[Mesh]) -> list[Mesh]:
-    """Move thin layers of one body that lie on each other apart, as far as a browser's depth buffer needs.
+    """Separate stacked thin layers of one body as far as a browser's depth buffer needs.
 
-    ManiSkill paints its targets as discs that rise by a hundredth of a millimetre each. SAPIEN's float depth keeps
-    them apart; a browser's 24 bits do not, and the rings turn into noise. Layers thinner than a millimetre are moved
-    along their thin axis so that each is `LAYER` beyond the one before; thicker parts stay.
+    ManiSkill paints its targets as discs that rise by a hundredth of a millimetre each. SAPIEN's float depth buffer
+    separates them; a browser's 24 bits do not, and the rings turn into noise. Layers thinner than a millimetre are moved
+    along their thin axis so that each is `LAYER_METRES` beyond the previous one; thicker parts stay.
     """
     layers: dict[int, list[int]] = {}
     for number, mesh in enumerate(meshes):
@@ -120,20 +119,20 @@ def lift_painted_layers(meshes: list[Mesh]) -> list[Mesh]:
         for rank, number in enumerate(numbers):
             mesh = meshes[number]
             vertices = mesh.vertices.copy()
-            vertices[:, axis] += np.sign(vertices[:, axis]) * rank * LAYER
+            vertices[:, axis] += np.sign(vertices[:, axis]) * rank * LAYER_METRES
             lifted[number] = replace(mesh, vertices=vertices)
     return lifted
 
 
 def lightened(material: Material) -> Material:
-    """A dark material nearer to white, so that a floor goes with the light theme; a light one as it is."""
+    """A dark material lightened, so that a floor fits the light theme; a light material unchanged."""
     if material.texture is not None:
         rgb = material.texture[..., :3]
-        if rgb.mean() >= 255 * LIGHT:
+        if rgb.mean() >= 255 * MIN_LIGHT_MEAN:
             return material
         lighter = np.concatenate([(255 - (255 - rgb) * DARKNESS_KEPT), material.texture[..., 3:]], axis=-1)
         return replace(material, texture=lighter.astype(np.uint8))
-    if np.mean(material.srgb_color[:3]) >= LIGHT:
+    if np.mean(material.srgb_color[:3]) >= MIN_LIGHT_MEAN:
         return material
     red, green, blue = (1 - (1 - c) * DARKNESS_KEPT**2 for c in material.base_color[:3])
     return replace(material, base_color=(red, green, blue, material.base_color[3]))
@@ -147,11 +146,11 @@ def _pbr(material: Material, number: int) -> PBRMaterial:
         name=f"part {number}",
         baseColorFactor=[red, green, blue, alpha],
         baseColorTexture=texture,
-        # Bare metal shows only reflections, and the page has no surroundings to reflect.
+        # Limited: metal shows only reflections, and the page has no environment to reflect.
         metallicFactor=float(np.clip(material.metallic, 0.0, 0.4)),
         roughnessFactor=float(np.clip(material.roughness, 0.0, 1.0)),
         alphaMode="BLEND" if see_through else "OPAQUE",
-        # Meshes of robots are often open shells with mixed winding: single-sided they would have holes.
+        # Robot meshes are often open shells with mixed winding: single-sided they would have holes.
         doubleSided=True,
     )
 
@@ -160,9 +159,9 @@ def _texture(pixels: NDArray[np.uint8]) -> Image.Image:
     image = Image.fromarray(pixels[..., :3])
     if pixels.shape[-1] == 4 and pixels[..., 3].min() < 255:
         image = Image.fromarray(pixels)
-    if max(image.size) > LARGEST_TEXTURE:
-        image.thumbnail((LARGEST_TEXTURE, LARGEST_TEXTURE), Image.Resampling.LANCZOS)
+    if max(image.size) > MAX_TEXTURE_PIXELS:
+        image.thumbnail((MAX_TEXTURE_PIXELS, MAX_TEXTURE_PIXELS), Image.Resampling.LANCZOS)
     if image.mode == "RGB":
-        # trimesh writes JPEG only if the image claims that format; a PNG of a photograph is five times the size.
+        # trimesh writes JPEG only if the image has that format; a PNG of a photograph is five times the size.
         image.format = "JPEG"
     return image

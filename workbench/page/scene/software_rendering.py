@@ -1,4 +1,4 @@
-"""Pages that draw their view in software, and the simplified scene for them."""
+"""Tracks pages that render in software and simplifies the scene for them."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ from workbench.machine.processes.watched_thread import report_failure
 from workbench.page.commands import TellDrawnInSoftware
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import EnvLayout
-from workbench.page.scene.visible_motion import NEAREST, Eye, eyes_of
+from workbench.page.scene.visible_motion import NEAR_METRES, Eye, eyes_of
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
 
-TOLERANCE = 0.75
-"""Pixels within which 99 % of a surface must stay. With 1.5 a white part comes through the black one around it."""
-FEW = 25_000
-"""Number of triangles in the view below which shapes are not simplified: pixels, not triangles, then take the time."""
-STEADY = 1.6
-"""Factor by which a wanted tolerance must differ before the tolerance is changed: each tolerance is other meshes
-for the page."""
-AT_REST = 0.4
-"""Seconds without a motion of any page's camera after which the view counts as still."""
-PATIENCE = 3.0
-"""Timeout in seconds within which a page says that it draws in software. Until then nothing changes: a reloaded
-page would be sent fine shapes and then simple ones."""
+TOLERANCE_PIXELS = 0.75
+"""Distance within which 99 % of a surface must stay. With 1.5 a white part shows through the black one around it."""
+MIN_TRIANGLES = 25_000
+"""Number of triangles in the view below which shapes are not simplified: then pixels, not triangles, take the time."""
+TOLERANCE_FACTOR = 1.6
+"""Factor by which a wanted tolerance must differ before the tolerance is changed, since each tolerance sends other meshes
+to the page."""
+AT_REST_SECONDS = 0.4
+"""Time without motion of any page's camera after which the view counts as still."""
+REPORT_TIMEOUT_SECONDS = 3.0
+"""Timeout for a page to report that it renders in software. Until then nothing changes, or a reloaded page would be sent
+fine shapes and then simple ones."""
 Scene = tuple[SceneGeometry, EnvLayout, bool]
-"""A drawn scene, the grid of its envs, and whether one env alone is shown."""
+"""A drawn scene, the grid of its envs, and whether a single env is shown."""
 
 
 class InSoftware:
-    """Which pages draw in software, and the looks for them. Outlives the pages of a server.
+    """Knows which pages render in software, and chooses the drawing style for them. Outlives the pages of a server.
 
-    All pages of a server are sent the same shapes: simplified ones only while every open page draws in software.
+    All pages of a server get the same shapes: simplified ones only while every open page renders in software.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._pages: dict[int, bool | None] = {}
-        """Whether each open page draws in software; None if that is not known yet."""
+        """Whether each open page renders in software; None if not known yet."""
         self.all_pages = False
-        """Whether all open pages draw in software."""
+        """Whether all open pages render in software."""
         self._drawn: Scene | None = None
-        """The scene that is drawn, if it is drawn of simplified shapes."""
+        """The drawn scene, if its shapes may be simplified."""
         self._made: tuple[SceneGeometry, float] | None = None
         """Scene and tolerance for which the simplified shapes are ready."""
         self._simplifying: asyncio.Task[None] | None = None
@@ -58,11 +58,11 @@ class InSoftware:
         server.on_client_disconnect(self._left)
 
     def ask(self) -> None:
-        """Let the pages tell (``browser.js``). Call it in the main panel of each new page."""
+        """Ask the browsers to report (``browser.js``). Call it in the main panel of each new page."""
         self._server.gui.add_html(render("tell", command=TellDrawnInSoftware(), only="drawn-in-software"))
 
     def told_by(self, visitor: Visitor) -> None:
-        """Handle that a page draws its view in software."""
+        """Handle the report that a page renders in software."""
         post(partial(self._know, visitor.client.client_id, True))
 
     async def _came(self, client: viser.ClientHandle) -> None:
@@ -74,7 +74,7 @@ class InSoftware:
     def _expect(self, page: int) -> None:
         self._pages[page] = None
         self._decide()
-        later(PATIENCE, lambda: self._know(page, self._pages.get(page) or False))
+        later(REPORT_TIMEOUT_SECONDS, lambda: self._know(page, self._pages.get(page) or False))
 
     def _know(self, page: int, in_software: bool) -> None:
         if page in self._pages:
@@ -95,31 +95,31 @@ class InSoftware:
             self._simplifying = begin(self._simplify())
 
     def looks(self, looks: DrawStyle, geometry: SceneGeometry, layout: EnvLayout, alone: bool) -> DrawStyle:
-        """These looks, or cheaper ones that differ by about a pixel in the pages that are open.
+        """This style, or a cheaper one that differs by about a pixel in the open pages.
 
-        Shapes are simplified in the background, and drawn so when they are ready. Who asks for finer ones than usual has
-        them, and so has who looks at few.
+        Shapes are simplified in the background, and used when they are ready. They stay unchanged if the user chose a finer
+        level of detail than the default, or if the view has few triangles.
 
         Args:
-            looks: As the person has chosen.
-            geometry: Of the scene.
+            looks: The style that the user has chosen.
+            geometry: Geometry of the scene.
             layout: The grid of the envs.
-            alone: One env is shown, at the origin.
+            alone: Whether a single env is shown, at the origin.
         """
         usual = not self.all_pages or looks.triangles > DrawStyle().triangles
-        if usual or _triangles(geometry, alone) <= FEW:
+        if usual or _triangles(geometry, alone) <= MIN_TRIANGLES:
             self._drawn = None
             return looks
         self._drawn, made = (geometry, layout, alone), self._made
         return replace(looks, error=made[1] if made is not None and made[0] is geometry else 0.0)
 
     async def _simplify(self) -> None:
-        """Simplify the shapes that are drawn, as long as all pages draw in software."""
+        """Simplify the drawn shapes while all pages render in software."""
         seen: object = None
         unfit: SceneGeometry | None = None
         try:
             while self.all_pages and self._pages:
-                await asyncio.sleep(AT_REST)
+                await asyncio.sleep(AT_REST_SECONDS)
                 eyes, before = eyes_of(self._server), seen
                 seen = [(eye.position.tobytes(), eye.pixel) for eye in eyes]
                 wanted = self._wanted(eyes, seen == before)
@@ -128,7 +128,7 @@ class InSoftware:
                 try:
                     await self._aside.run(partial(_simplify_shapes, *wanted))
                 except Exception as why:
-                    unfit = wanted[0]  # else it would be tried again and again
+                    unfit = wanted[0]  # do not retry a scene that fails
                     report_failure("Shapes cannot be simplified for pages that draw in software", why)
                 else:
                     self._made = wanted
@@ -136,13 +136,13 @@ class InSoftware:
             self._simplifying = None
 
     def _wanted(self, eyes: tuple[Eye, ...], at_rest: bool) -> tuple[SceneGeometry, float] | None:
-        """The scene to simplify, and its tolerance; None if what was made is good enough."""
+        """The scene to simplify, and its tolerance; None if the present shapes are good enough."""
         if not eyes or self._drawn is None:
             return None
         geometry, layout, alone = self._drawn
-        error = 2.0 ** (round(2 * np.log2(TOLERANCE * pixel_of(eyes, layout, alone))) / 2)
+        error = 2.0 ** (round(2 * np.log2(TOLERANCE_PIXELS * pixel_of(eyes, layout, alone))) / 2)
         if self._made is not None and self._made[0] is geometry:
-            if not at_rest or 1 / STEADY < error / self._made[1] < STEADY:
+            if not at_rest or 1 / TOLERANCE_FACTOR < error / self._made[1] < TOLERANCE_FACTOR:
                 return None
         return geometry, error
 
@@ -158,15 +158,15 @@ def _triangles(geometry: SceneGeometry, alone: bool) -> int:
 
 
 def pixel_of(eyes: tuple[Eye, ...], layout: EnvLayout, alone: bool) -> float:
-    """Metres of a pixel at the env that is nearest to an eye.
+    """Size of a pixel in metres at the env nearest to an eye.
 
     Args:
-        alone: One env, at the origin.
+        alone: Whether a single env is shown, at the origin.
     """
     offsets = np.zeros((1, 3)) if alone else layout.offsets
     sizes = []
     for eye in eyes:
         at = eye.position - offsets
         away = np.linalg.norm(at - np.clip(at, layout.low, layout.high), axis=1).min()
-        sizes.append(eye.pixel * max(float(away), NEAREST))
+        sizes.append(eye.pixel * max(float(away), NEAR_METRES))
     return min(sizes)

@@ -19,15 +19,15 @@ from workbench.page.scene.env_grid import EnvLayout, box_corners
 from workbench.page.scene.software_rendering import InSoftware
 from workbench.page.widgets.parts import Clock
 
-FOV = 0.75
-"""Vertical field of view in radians. viser's own 75 degrees distorts the edges of a grid."""
-USUAL_ASPECT = 1.25
-"""Aspect (width over height) of the view in a 1280 x 720 window, used until a page has sent its own."""
-USUAL_HEIGHT = 720.0
-"""Height of the view in pixels, used until a page has sent its own."""
-MOST_COVERED = 0.45
+FOV_RADIANS = 0.75
+"""Vertical field of view. viser's default of 75 degrees distorts the edges of a grid."""
+DEFAULT_ASPECT = 1.25
+"""Aspect ratio (width over height) of the view in a 1280 x 720 window, used until a page has sent its own."""
+DEFAULT_HEIGHT_PIXELS = 720.0
+"""Height of the view, used until a page has sent its own."""
+MAX_COVERED_SHARE = 0.45
 FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
-"""ManiSkill's robots face +x, so they are seen from there; a little from the side."""
+"""Direction from the scene to the eye: ManiSkill's robots face +x, so they are seen from there, slightly from the side."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +38,16 @@ class Viewpoint:
     look_at: NDArray[np.float64]
 
 
-def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT, covered: float = 0.0) -> Viewpoint:
-    """The nearest upright view from the front and above with the whole box in its uncovered part.
+def frame_box(low: NDArray, high: NDArray, aspect: float = DEFAULT_ASPECT, covered: float = 0.0) -> Viewpoint:
+    """The closest upright view from the front and above with the whole box in its uncovered part.
 
-    Let the camera stand at ``target - d * forward - k * up``. A corner c, as seen from the target, is inside the
-    picture when ``|right . c| <= tan(fov_x / 2) * (d + forward . c)``, and when ``up . c + k`` lies between
-    ``-(1 - 2 * covered)`` and 1 times ``tan(fov_y / 2) * (d + forward . c)``. So d is the largest of the bounds that
-    the corners and the pairs of corners give, and k the middle of what is left to it.
+    Let the camera be at ``target - d * forward - k * up``. A corner c, relative to the target, is inside the picture when
+    ``|right . c| <= tan(fov_x / 2) * (d + forward . c)``, and when ``up . c + k`` lies between ``-(1 - 2 * covered)`` and 1
+    times ``tan(fov_y / 2) * (d + forward . c)``. So d is the largest of the bounds from corners and pairs of corners, and k
+    is the middle of the range that remains.
 
     Args:
-        covered: Part of the picture's height, from below, that the timeline covers.
+        covered: Share of the picture's height, from below, that the timeline covers.
     """
     target = (np.asarray(low, np.float64) + high) / 2
     forward = -FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
@@ -55,9 +55,9 @@ def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT, covered
     right /= np.linalg.norm(right)
     up = np.cross(right, forward)
     corners = box_corners(low, high) - target
-    tall = np.tan(FOV / 2)
+    tall = np.tan(FOV_RADIANS / 2)
     wide = tall * float(np.clip(aspect, 0.3, 4.0))
-    below = tall * (1 - 2 * float(np.clip(covered, 0.0, MOST_COVERED)))
+    below = tall * (1 - 2 * float(np.clip(covered, 0.0, MAX_COVERED_SHARE)))
     ahead, height = corners @ forward, corners @ up
     pairs = height[:, None] - height - tall * ahead[:, None] - below * ahead
     distance = 1.04 * max(
@@ -71,16 +71,16 @@ def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT, covered
     return Viewpoint(position=look_at - forward * distance, look_at=look_at)
 
 
-def frame_all(layout: EnvLayout, aspect: float = USUAL_ASPECT, covered: float = 0.0) -> Viewpoint:
+def frame_all(layout: EnvLayout, aspect: float = DEFAULT_ASPECT, covered: float = 0.0) -> Viewpoint:
     return frame_box(*layout.box_of_all(), aspect, covered)
 
 
 def frame_one(
     layout: EnvLayout,
     picture: Picture | None,
-    aspect: float = USUAL_ASPECT,
+    aspect: float = DEFAULT_ASPECT,
     covered: float = 0.0,
-    fovy: float = FOV,
+    fovy: float = FOV_RADIANS,
     acting: tuple[NDArray, NDArray] | None = None,
 ) -> Viewpoint:
     """The view of one env at the origin, in the uncovered part of the picture.
@@ -88,21 +88,21 @@ def frame_one(
     With a human camera: from its direction, at a distance at which its picture fits the uncovered part, centred there.
 
     Args:
-        picture: Of the human camera; only its pose is used.
-        covered: As of `frame_box`.
+        picture: Picture of the human camera; only its pose is used.
+        covered: See `frame_box`.
         fovy: The human camera's vertical field of view, radians.
-        acting: Box to frame where there is no human camera; None takes the whole env.
+        acting: Box to frame without a human camera; None takes the whole env.
     """
     if picture is None:
         low, high = (layout.low, layout.high) if acting is None else acting
         return frame_box(low, high, aspect, covered)
-    covered = float(np.clip(covered, 0.0, MOST_COVERED))
+    covered = float(np.clip(covered, 0.0, MAX_COVERED_SHARE))
     position = picture.pose[:3].astype(np.float64)
     forward = SO3(picture.pose[3:].astype(np.float64)).apply(np.array([1.0, 0.0, 0.0]))
     centre = (layout.low + layout.high) / 2
-    # The page orbits around its look-at point, so that has to be at the depth of the env.
+    # The page orbits around its look-at point, which must therefore be at the depth of the env.
     depth = max(float((centre - position) @ forward), 0.2)
-    tall = float(np.tan(FOV / 2))
+    tall = float(np.tan(FOV_RADIANS / 2))
     left = min(1 - covered, float(np.clip(aspect, 0.3, 4.0)))
     away = depth * float(np.tan(fovy / 2)) / (tall * left)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -113,18 +113,18 @@ def frame_one(
 
 
 Frame = Callable[[float, float], Viewpoint]
-"""Gives the viewpoint for a view of this aspect (width over height) and height in pixels."""
+"""Returns the viewpoint for a view of this aspect ratio (width over height) and height in pixels."""
 
 
-MOST_LEFT = 8
-"""Maximum number of scenes whose viewpoints are remembered."""
+MAX_SCENES = 8
+"""Maximum number of scenes whose viewpoints are stored."""
 
 
 class Framing:
-    """Points the open pages at the scene until a person has moved the view.
+    """Points the open pages at the scene until the user has moved the view.
 
-    A page's panels take their places some moments after it has come (later on a busy machine), and a person opens
-    more: as long as the view is untouched it is framed for its present shape.
+    A page's panels take their places some time after it has connected (later on a busy machine), and the user opens more:
+    while the view is untouched, it is framed for its present shape.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -132,13 +132,13 @@ class Framing:
         self._pointed: dict[int, tuple[np.ndarray, float]] = {}
         self._framed: Hashable = None
         self._left: dict[Hashable, dict[int, tuple[NDArray, NDArray]]] = {}
-        """Position and look-at of pages on which a person had moved the view, by framed object and client id."""
+        """Position and look-at of pages on which the user had moved the view, by framed object and client id."""
         self._came_back: frozenset[int] = frozenset()
-        """Pages that returned to the viewpoint that they had when the framed object was left."""
+        """Pages that returned to the viewpoint that they had when they left the framed object."""
 
     def is_new(self, what: Hashable) -> bool:
-        """Whether this differs from the last call's: then it has to be framed. Where a person had moved the view of it
-        before, the page looks from there again, and `frame` leaves it so."""
+        """Whether `what` differs from that of the last call, so that it must be framed. If the user had already moved the
+        view of this object, the page returns to that viewpoint, and `frame` leaves it there."""
         if what == self._framed:
             return False
         clients = self._server.get_clients()
@@ -148,7 +148,7 @@ class Framing:
                 for number, client in clients.items()
                 if not self._is_untouched(client)
             }
-            while len(self._left) > MOST_LEFT:
+            while len(self._left) > MAX_SCENES:
                 del self._left[next(iter(self._left))]
         self._framed = what
         back = {} if what is None else self._left.pop(what, {})
@@ -158,12 +158,12 @@ class Framing:
         return True
 
     def frame_new(self, frame: Frame) -> None:
-        """Point every open page, and those to come, at the new scene, except pages that returned to their earlier
+        """Frame the new scene in every open page and in pages opened later, except pages that returned to their earlier
         viewpoint."""
         self.frame(frame, but=self._came_back)
 
     def follow(self) -> int:
-        """Forget closed pages; returns the number of open ones."""
+        """Drop closed pages; returns the number of open ones."""
         clients = self._server.get_clients()
         for number in self._pointed.keys() - clients.keys():
             del self._pointed[number]
@@ -175,8 +175,8 @@ class Framing:
         return frozenset(self._pointed)
 
     def frame(self, frame: Frame, untouched_only: bool = False, but: Set[int] = frozenset()) -> None:
-        """Point every open page (or only untouched ones), and those to come."""
-        usual = frame(USUAL_ASPECT, USUAL_HEIGHT)
+        """Frame the scene in every open page (or only untouched ones) and in pages opened later."""
+        usual = frame(DEFAULT_ASPECT, DEFAULT_HEIGHT_PIXELS)
         self._server.initial_camera.position = usual.position
         self._server.initial_camera.look_at = usual.look_at
         for number, client in self._server.get_clients().items():
@@ -186,26 +186,28 @@ class Framing:
     def frame_untouched(self, frame: Frame) -> None:
         """Frame each untouched page again whose viewpoint or shape is not the framed one."""
         for number, client in self._server.get_clients().items():
-            position, aspect = self._pointed.get(number, (self._server.initial_camera.position, USUAL_ASPECT))
+            position, aspect = self._pointed.get(
+                number, (self._server.initial_camera.position, DEFAULT_ASPECT)
+            )
             as_framed = _is_at(client, position) and abs(aspect_of(client) / aspect - 1) <= 0.05
-            # Not as framed: it lost its connection and came back, or the person was quicker.
+            # Not at the framed viewpoint: the page reconnected, or the user moved the view first.
             if not as_framed and self._is_untouched(client):
                 self._point(client, frame)
 
     def _is_untouched(self, client: viser.ClientHandle) -> bool:
-        """True while the page looks from where it was last pointed, or from where every page begins.
+        """Whether the page is at the viewpoint that it was last given, or at that of every new page.
 
-        The latter, since the initial viewpoint may reach a new page after the one that it was pointed at.
+        The latter, since the initial viewpoint may reach a new page after the one that it was given.
         """
         position, _ = self._pointed.get(client.client_id, (None, None))
         begins = self._server.initial_camera.position
         return _is_at(client, begins) or (position is not None and _is_at(client, position))
 
     def _point(self, client: viser.ClientHandle, frame: Frame) -> None:
-        viewpoint = frame(aspect_of(client), client.camera.image_height or USUAL_HEIGHT)
+        viewpoint = frame(aspect_of(client), client.camera.image_height or DEFAULT_HEIGHT_PIXELS)
         client.camera.position = viewpoint.position
         client.camera.look_at = viewpoint.look_at
-        # Last: a caller that waits for it may close the page, and viser warns of writes to a closed page.
+        # Last: a caller that waits for this may close the page, and viser warns about writes to a closed page.
         self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
 
 
@@ -217,15 +219,15 @@ def aspect_of(client: viser.ClientHandle) -> float:
     """Width over height of the view in this page."""
     camera = client.camera
     if not camera.image_height or not camera.image_width:
-        return USUAL_ASPECT
+        return DEFAULT_ASPECT
     return camera.image_width / camera.image_height
 
 
 def light(server: viser.ViserServer) -> None:
-    """Add the lights to the scene; once a server.
+    """Add the lights to the scene; once per server.
 
-    viser's own lights burn out white plastic and textures; an environment map or shadows would make a browser without
-    a graphics card pay for each pixel.
+    viser's own lights overexpose white plastic and textures; an environment map or shadows would cost a browser without a
+    graphics card time for each pixel.
     """
     server.scene.configure_default_lights(enabled=False, cast_shadow=False)
     server.scene.configure_environment_map(None)
@@ -238,19 +240,19 @@ def light(server: viser.ViserServer) -> None:
 
 
 class View3D:
-    """Bodies, lights and viewpoint on this server, shared by the pages.
+    """The 3-D view of a server, shared by its pages: bodies, lights and viewpoint.
 
-    The bodies stay in the browser while one page replaces the other, so that equal ones are not sent again, and the view
-    is empty only until a task has loaded. Labels, frustums, marks and handles go with their page.
+    The bodies stay in the browser while one page replaces another, so that equal ones are not sent again and the view is
+    empty only until a task has loaded. Labels, frustums, marks and handles are removed with their page.
     """
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         self._server = server
         server.scene.set_up_direction("+z")
         light(server)
-        server.initial_camera.fov = FOV
-        # Depth has 24 bits: with viser's near plane of a centimetre a goal painted a millimetre above a table flickers
-        # from a few metres on.
+        server.initial_camera.fov = FOV_RADIANS
+        # The depth buffer has 24 bits: with viser's near plane of one centimetre, a goal painted a millimetre above a table
+        # flickers from a few metres on.
         server.initial_camera.near = 0.05
         server.initial_camera.far = 300.0
         self.scene = SceneView(server, clock)
@@ -259,8 +261,8 @@ class View3D:
         self.choice = ViewChoice()
 
     def clear(self) -> None:
-        """Remove everything of a page but the bodies and lights."""
-        # Callbacks first: a click that comes now has no page to answer it.
+        """Remove everything of a page except the bodies and lights."""
+        # Callbacks first: a click that arrives now has no page to handle it.
         self._server.scene.remove_click_callback("all")
         remove_nodes_but(self._server, (*BODIES, "/lights"))
         for client in self._server.get_clients().values():
@@ -268,14 +270,13 @@ class View3D:
 
 
 DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
-"""Number of triangles in the view, by level of detail. A browser without a graphics card needs the fewest."""
+"""Number of triangles in the view by level of detail. A browser without a graphics card needs the fewest."""
 ALL, ONE = "all envs", "the selected env"
 
 
 @dataclass
 class ViewChoice:
-    """Choices in the View panel. They outlive a page, which is built again with each change between review and
-    live page."""
+    """Choices in the View panel. They outlive a page, which is rebuilt with each change between review and live page."""
 
     show: str = ALL
     detail: str = "normal"

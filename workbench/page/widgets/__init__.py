@@ -1,1 +1,1 @@
-"""Inputs, charts and other parts that panels are made of."""
+"""Building blocks of panels: inputs, charts, buttons, templates."""

@@ -8,7 +8,7 @@ from workbench.page.widgets.templates import render
 
 
 class Dialog:
-    """One modal window with a question, open on all pages until it is answered or closed."""
+    """A modal window with a question, open on all pages until it is answered or closed."""
 
     def __init__(self, server: viser.ViserServer, title: str) -> None:
         self.modal = server.gui.add_modal(title)
@@ -16,7 +16,7 @@ class Dialog:
             server.gui.add_html(render("context", context="dialog"))
 
     def close(self) -> bool:
-        """Close it; False if it was closed already: only the first answer counts."""
+        """Close it; returns False if it was already closed, since only the first answer counts."""
         if self.modal.closed:
             return False
         self.modal.close()

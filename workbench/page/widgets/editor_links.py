@@ -14,10 +14,10 @@ EDITORS = {
     "pycharm": "pycharm://open?file={file}&line={line}",
     "none": "",
 }
-"""Address by name of the editor; ``{file}`` is an absolute path, which begins with a slash."""
+"""Address template by name of the editor; ``{file}`` is an absolute path, which begins with a slash."""
 _SCHEME = re.compile(r"([a-z][a-z0-9+.-]*):[^\s\x00-\x1f]+", re.IGNORECASE)
 _RUNS_CODE = ("javascript", "vbscript", "data", "blob", "about", "view-source", "filesystem", "file")
-"""Schemes by which a link would run a script, show another page in place of this one, or be refused by the browser."""
+"""Schemes that would run a script, replace this page by another, or be refused by the browser."""
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,20 @@ class EditorLink:
     address: str
     """Address; empty if the file is not linked."""
     copied: str
-    """Text that is copied: ``/home/me/push.py:88``."""
+    """Text to copy: ``/home/me/push.py:88``."""
     new_tab: bool = False
-    """Whether the address is a web page: opened in the same tab it would replace this one."""
+    """Whether the address is a web page, which in the same tab would replace this one."""
 
 
 LinkTo = Callable[[str | None, int | None], EditorLink]
-"""Gives the link to a line of a file."""
+"""Returns the link to a line of a file."""
 
 
 def parse_editor(text: str) -> str:
-    """The address template of ``--editor``: of a name in `EDITORS`, or the text itself.
+    """The address template for ``--editor``: that of a name in `EDITORS`, or the text itself.
 
     Raises:
-        ValueError: it is neither.
+        ValueError: the text is neither.
     """
     if text in EDITORS:
         return EDITORS[text]
@@ -59,8 +59,9 @@ def editor_link(
     """The link to a line of a file.
 
     Args:
-        template: as `parse_editor` gives it; empty for no editor.
-        known: whether a file is the author's. Others are not linked: their names come from the process that runs the task.
+        template: result of `parse_editor`; empty for no editor.
+        known: whether a file is the author's. Other files are not linked: their names come from the process that runs the
+            task.
     """
     if not file:
         return EditorLink("", "")
@@ -68,7 +69,7 @@ def editor_link(
     copied = f"{path}:{line}" if line else path
     if not template or not known(path):
         return EditorLink("", copied)
-    # Not str.format: a template may hold other braces, and a file name may hold "{line}".
+    # Not str.format: a template may contain other braces, and a file name may contain "{line}".
     parts = re.split(r"(\{file\}|\{line\})", template)
     filled = {"{file}": quote(path, safe="/"), "{line}": str(line or 1)}
     address = "".join(filled.get(part, part) for part in parts)
@@ -76,5 +77,5 @@ def editor_link(
 
 
 def no_links(file: str | None, line: int | None) -> EditorLink:
-    """A `LinkTo` that links nothing."""
+    """A `LinkTo` without links."""
     return editor_link("", file, line, lambda path: False)

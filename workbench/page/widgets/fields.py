@@ -1,4 +1,4 @@
-"""Inputs of our own: what is entered goes on the channel of commands, so that a command that follows it finds it done."""
+"""Our own input fields: values go through the command channel, so that a later command sees them applied."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import viser
 from workbench.page.command import Command, name_of
 from workbench.page.widgets.templates import render
 
-LONGEST = 4096
-"""Maximum number of characters."""
+MAX_CHARACTERS = 4096
 Plain = str | float | bool | None
 Look = Literal["text", "choice", "tick", "slider"]
 
@@ -21,10 +20,10 @@ Look = Literal["text", "choice", "tick", "slider"]
 class Field:
     """One input, or several in a row, in the present container.
 
-    What is entered goes into a field of a command. It is sent when it has been typed (Enter, Tab, or a press elsewhere) or
-    chosen; that of a slider, and of a `live` text, at once, the newest while one is unanswered. Whole and other numbers have
-    the bounds of the command's field, and what is no such number is refused in the browser. An input is drawn once, since one
-    that is drawn again loses the cursor; what the server has comes beside it (`show`), and is copied into it while nobody uses it.
+    The value goes into a field of a command. It is committed on Enter, Tab or blur, or when an option is chosen; a slider and
+    a `live` text send at once, and only the newest value while a reply is pending. Numbers have the bounds of the command's
+    field, and the browser refuses other values. An input is drawn once, since redrawing loses the cursor; the server's value
+    is sent separately (`show`) and copied into the input while it is not in use.
     """
 
     def __init__(
@@ -40,21 +39,21 @@ class Field:
         hint: str = "",
         live: bool = False,
         enter: Command | None = None,
-        longest: int = LONGEST,
+        longest: int = MAX_CHARACTERS,
         lines: int = 1,
         step: float = 1.0,
         options: Mapping[str, Plain] | None = None,
     ) -> None:
         """
         Args:
-            kind: the command that what is entered goes into.
-            field: its field.
-            value: what is shown at first; one for each of `given`, if there are several.
-            given: the command's other fields, for each of the inputs in the row.
-            enter: what Enter does; by default it leaves the field.
-            lines: more than one for a larger box, in which Enter begins a line.
-            step: of a number: what an arrow key adds.
-            options: of a choice: values of the field by what is shown for them.
+            kind: the command that the value goes into.
+            field: the command's field.
+            value: initial value; one for each of `given`, if there are several.
+            given: the command's other fields, for each input in the row.
+            enter: command for Enter; by default Enter leaves the field.
+            lines: more than one for a larger box, in which Enter begins a new line.
+            step: for a number: what an arrow key adds.
+            options: for a choice: values of the field by their label.
         """
         self._names = [".".join([look, name_of(kind), field, *map(str, one.values())]) for one in given]
         self._options = None if options is None else _encoded(options)
@@ -90,13 +89,13 @@ class Field:
         options: Mapping[str, Plain] | None = None,
         bounds: tuple[float, float] | None = None,
     ) -> None:
-        """Show what the server has.
+        """Show the server's value.
 
         Args:
-            value: one for each input of the row, if there are several.
-            off: nobody can use it.
-            options: the new ones of a choice.
-            bounds: of a slider.
+            value: one for each input in the row, if there are several.
+            off: whether the input is disabled.
+            options: new options of a choice.
+            bounds: new bounds of a slider.
         """
         if options is not None:
             self._options = _encoded(options)
@@ -115,7 +114,7 @@ class Field:
 
     @property
     def name(self) -> str:
-        """Name of its first input, in the page."""
+        """Name of its first input in the page."""
         return self._names[0]
 
     @property
@@ -142,10 +141,10 @@ def choice(
     given: Mapping[str, Plain] | None = None,
     hint: str = "",
 ) -> Field:
-    """A list of which one is chosen.
+    """A list from which one option is chosen.
 
     Args:
-        options: values of the command's field by what is shown for them, or texts that are both.
+        options: values of the command's field by their label, or texts that are both.
     """
     return Field(
         server,
@@ -174,7 +173,7 @@ def tick(
     given: Mapping[str, Plain] | None = None,
     hint: str = "",
 ) -> Field:
-    """A box to tick."""
+    """A checkbox."""
     return Field(server, label, kind, field, value, look="tick", given=(given or {},), hint=hint)
 
 
@@ -192,7 +191,7 @@ def slider(
     """A slider with its number next to it, at its lower end until `Field.show` sets a value.
 
     Args:
-        bounds: its ends, by default those of the command's field.
+        bounds: its ends; by default the bounds of the command's field.
     """
     low, high, _ = _number(kind, field, float) or (None, None, False)
     ends = bounds or (low or 0.0, high or 0.0)
@@ -208,10 +207,10 @@ def _encoded(options: Mapping[str, Plain]) -> list[tuple[str, str]]:
 
 
 def _number(kind: type[Command], field: str, entered: type) -> tuple[float | None, float | None, bool] | None:
-    """Least, greatest, and whether it is whole, of a number; None for a text.
+    """Minimum, maximum and whether the number is an integer; None for a text.
 
     Args:
-        entered: of a field with several types, the one of this input.
+        entered: type of this input, for a field with several types.
     """
     (types,) = (one.type for one in msgspec.structs.fields(kind) if one.name == field)
     found: Any = msgspec.inspect.type_info(types)

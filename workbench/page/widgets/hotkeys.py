@@ -1,4 +1,4 @@
-"""The commands of a page: its keys, their list (?), and its command palette (Ctrl+K)."""
+"""Keys of a page, their list (?), and its command palette (Ctrl+K)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitors
 
 _LAST = 2e6
-"""Order of the elements in viser's panel: after all others."""
+"""Order value that puts elements after all others in viser's panel."""
 
 
 def with_key(kind: type[Command], hint: str = "") -> str:
@@ -25,19 +25,19 @@ def with_key(kind: type[Command], hint: str = "") -> str:
 
 
 def key_rows(commands: CommandList, kinds: Collection[type[Command]]) -> list[tuple[str, str]]:
-    """Key and help of those that have a key, in the order of the list of commands."""
+    """Key and help of each command that has a key, in the order of the list of commands."""
     return [(key_in_words(kind.key), kind.help()) for kind in commands if kind.key and kind in kinds]
 
 
 def register(
     server: viser.ViserServer, visitors: Visitors, kinds: Collection[type[Command]], contexts: str
 ) -> None:
-    """Put these commands into the palette of every page, and their keys where ``input.js`` finds them. Call it in no
+    """Add these commands to the palette of every page, and their keys to the page for ``input.js``. Call it outside any
     container.
 
     Args:
-        kinds: what the page does.
-        contexts: whose keys always count, separated by spaces.
+        kinds: commands that the page carries out.
+        contexts: contexts whose keys always work, separated by spaces.
     """
     keys = [
         (key.key, key.context, key.command, key.repeats)
@@ -64,10 +64,10 @@ def register(
 def add(
     server: viser.ViserServer, visitors: Visitors, label: str, command: Command, about: str = ""
 ) -> viser.CommandHandle:
-    """Put one command into the palette of every page.
+    """Add one command to the palette of every page.
 
     Args:
-        about: below its label; the palette looks for words in it too.
+        about: text below its label, which the palette searches too.
     """
     handle = server.gui.add_command(label, description=about or None)
     handle.on_trigger(visitors.on(command))
@@ -75,5 +75,5 @@ def add(
 
 
 def add_hints(server: viser.ViserServer) -> viser.GuiHtmlHandle:
-    """Four hints in the present container, until a person closes them for good."""
+    """Add four hints to the present container, until the user closes them for good."""
     return server.gui.add_html("" if kept_choices().hints_closed else render("hints", close=CloseHints()))

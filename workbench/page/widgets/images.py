@@ -24,7 +24,7 @@ VIRIDIS = np.array(
 )  # fmt: skip
 """Ten colours of matplotlib's viridis (CC0), reversed: bright is near, as in most depth viewers."""
 NOTHING = np.array((24, 24, 27), np.uint8)
-LONGEST_LEGEND = 10
+MAX_LEGEND_ENTRIES = 10
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class DepthRange:
 
 
 def depth_range(depth: NDArray[np.float32]) -> DepthRange | None:
-    """The range of most finite positive depths; None where there are none.
+    """The range of most finite positive depths; None if there are none.
 
-    From the 1st to the 98th percentile, and at most three times the median: a floor that runs to the horizon behind
-    a table would leave the whole table one colour.
+    From the 1st to the 98th percentile, and at most three times the median: with a floor that extends to the horizon, the
+    whole table in front would have one colour.
     """
     met = depth[np.isfinite(depth) & (depth > 0)]
     if not met.size:
@@ -74,7 +74,7 @@ def colour_position(position: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def colour_normal(normal: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(H, W, 3) unit vectors as RGB, as normal maps are drawn: -1 is 0 and 1 is 255."""
+    """(H, W, 3) unit vectors as RGB, like normal maps: -1 is 0 and 1 is 255."""
     met = np.isfinite(normal).all(axis=-1) & (np.abs(normal).max(axis=-1) > 0)
     colours = np.clip((np.nan_to_num(normal) + 1) * 127.5, 0, 255).round().astype(np.uint8)
     return np.where(met[..., None], colours, NOTHING)
@@ -83,7 +83,7 @@ def colour_normal(normal: NDArray[np.float32]) -> NDArray[np.uint8]:
 def segment_colour(identity: int) -> tuple[int, int, int]:
     """RGB of a segmentation id, the same in every picture; 0, the background, is dark.
 
-    Hues advance by the golden ratio and lightness alternates, so that ids close to each other differ well.
+    Hues advance by the golden ratio and lightness alternates, so that neighbouring ids differ clearly.
     """
     if identity == 0:
         return int(NOTHING[0]), int(NOTHING[1]), int(NOTHING[2])
@@ -110,9 +110,9 @@ def segments_seen(
     seen = [int(identities[i]) for i in order]
     legend = [
         ("rgb({},{},{})".format(*segment_colour(i)), "background" if i == 0 else names.get(i, f"id {i}"))
-        for i in seen[:LONGEST_LEGEND]
+        for i in seen[:MAX_LEGEND_ENTRIES]
     ]
-    return legend, max(0, len(seen) - LONGEST_LEGEND)
+    return legend, max(0, len(seen) - MAX_LEGEND_ENTRIES)
 
 
 def data_address(pixels: NDArray[np.uint8], longest: int) -> str:
@@ -120,7 +120,7 @@ def data_address(pixels: NDArray[np.uint8], longest: int) -> str:
 
     Args:
         pixels: (H, W, 3) RGB.
-        longest: Pixels of its longer side at most; a larger picture is averaged down. 128 takes 3 to 6 kB.
+        longest: Maximum pixels of the longer side; a larger picture is downsampled by averaging. 128 takes 3 to 6 kB.
     """
     image = Image.fromarray(np.ascontiguousarray(pixels))
     if max(image.size) > longest:
@@ -143,7 +143,7 @@ _NORMAL = "red, green, blue: right, up, towards the camera"
 
 
 def depth_span(before: DepthRange | None, picture: Picture) -> DepthRange | None:
-    """The range of the colour scale with this picture: only ever widened, or a body at rest would change its colour."""
+    """The range of the colour scale including this picture. It is never narrowed, or a body at rest would change its colour."""
     span = None if picture.depth is None else depth_range(picture.depth)
     return before if span is None else span if before is None else before.widened(span)
 
@@ -154,8 +154,8 @@ def in_colours(
     """Pixels (H, W, 3) and a caption in HTML; None if the picture lacks this modality.
 
     Args:
-        names: of the ids in a segmentation.
-        span: of depth, see `depth_span`.
+        names: names of the ids in a segmentation.
+        span: depth range, see `depth_span`.
     """
     if modality == COLOUR and picture.rgb is not None:
         return picture.rgb, ""
@@ -177,10 +177,10 @@ def in_colours(
 
 
 def narrowed(pixels: NDArray[np.uint8], width: int, smooth: bool) -> NDArray[np.uint8]:
-    """A picture at most so many pixels wide.
+    """A picture scaled to at most `width` pixels.
 
     Args:
-        smooth: Mean colours; else colours that are in the picture.
+        smooth: Average colours; if False, use only colours of the picture.
     """
     high, wide = pixels.shape[:2]
     if wide <= width:

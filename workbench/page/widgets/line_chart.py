@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from workbench.page.door.viser_private import send_lines
 
-TAKING_TURNS = 3
-"""Number of charts, one of them shown. With two, a busy browser may miss that two changes followed each other."""
-LONGEST = 600
+ROTATED_CHARTS = 3
+"""Number of charts used in turn, one of them shown. With two, a busy browser may miss that two changes followed each
+other."""
+MAX_POINTS = 600
 """Maximum number of points of a curve. More do not fit in the panel's 300 pixels."""
 SELECTED_COLOUR = "#228be6"
 STEP = uplot.Series(label="step")
@@ -34,18 +35,18 @@ class ChartLine:
 
     name: str
     values: NDArray
-    """(K,) values, with a gap where one is not finite."""
+    """(K,) values; a value that is not finite is a gap."""
     colour: str = SELECTED_COLOUR
     width: float = 1.8
 
 
 class LineChart:
-    """A chart in a folder, made when there is something to draw.
+    """A chart in a folder, created when there is something to draw.
 
-    viser keeps the visible part of the x axis as a share of the data's range, and computes it from two charts at once
-    when uPlot rebuilds its chart, which it does for a change of anything but the data: from then on the axis shows
-    another part of the data, in the end none. So a chart that is shown gets new data only, and other lines are drawn
-    in another chart. uPlot finds no range for data with NaN, and draws through it: NaN is sent as a gap.
+    viser keeps the visible part of the x axis as a share of the data's range, and mixes two charts when uPlot rebuilds its
+    chart, which happens on a change of anything but the data: from then on the axis shows another part of the data, in the
+    end none. So a visible chart gets only new data, and other lines are drawn in another chart. uPlot finds no range for
+    data with NaN, and draws through it: NaN is sent as a gap.
     """
 
     def __init__(
@@ -57,12 +58,12 @@ class LineChart:
     ) -> None:
         self._server, self._folder, self._height, self._order = server, folder, height, order
         self._charts: list[viser.GuiUplotHandle] = []
-        """At most one is visible: the last."""
+        """The charts; at most one is visible, the last."""
         self._made_for: object = None
 
     @property
     def handle(self) -> viser.GuiUplotHandle | None:
-        """The chart that was drawn last, if any."""
+        """The last drawn chart, if any."""
         return self._charts[-1] if self._charts else None
 
     def hide(self) -> None:
@@ -77,14 +78,14 @@ class LineChart:
         dot: NDArray | None = None,
         span: Span | None = None,
     ) -> None:
-        """Draw lines; hide the chart where no line has a finite value, or K < 2.
+        """Draw lines; hide the chart if no line has a finite value, or K < 2.
 
         Args:
-            title: Over the chart.
+            title: Title above the chart.
             x: (K,) steps.
-            lines: Each over all of `x`.
-            dot: (K,) finite at the one dot, NaN elsewhere.
-            span: The range of the y axis; None fits the data.
+            lines: Lines over all of `x`.
+            dot: (K,) finite at the single dot, NaN elsewhere.
+            span: Range of the y axis; None fits the data.
         """
         if len(x) < 2 or not any(np.isfinite(line.values).any() for line in lines):
             self.hide()
@@ -95,7 +96,7 @@ class LineChart:
         )
         series = (STEP, *map(_series, lines), *(CURSOR for _ in dots))
         wanted = (title, series, span)
-        # The data must fit the series in every state that the browser may see.
+        # The number of data rows must match the series in every state that the browser may receive.
         with self._server.atomic():
             if self.handle is None or wanted != self._made_for:
                 self._change_to(title, data, series, span)
@@ -111,13 +112,13 @@ class LineChart:
         series: tuple[uplot.Series, ...],
         span: Span | None,
     ) -> None:
-        """Draw in a chart that is not shown: it begins with a fresh x axis.
+        """Draw in a hidden chart, which starts with a fresh x axis.
 
-        It is hidden, not removed: a busy browser would report data that arrives for a chart that is gone.
+        The old chart is hidden, not removed: a busy browser would report an error for data of a removed chart.
         """
         scales = {"x": uplot.Scale(time=False)} | ({} if span is None else {"y": uplot.Scale(range=span)})
         self.hide()
-        if len(self._charts) == TAKING_TURNS:
+        if len(self._charts) == ROTATED_CHARTS:
             chart = self._charts.pop(0)
             chart.title, chart.series, chart.scales = title, series, scales
             self._charts.append(chart)
@@ -132,7 +133,7 @@ class LineChart:
                 legend=uplot.Legend(show=True),
                 height=self._height,
                 padding=(6, 22, 0, 0),
-                # All of them at the same position of the folder.
+                # All charts have the same position in the folder.
                 order=self._order,
                 visible=False,
             )
@@ -145,7 +146,7 @@ def _series(line: ChartLine) -> uplot.Series:
 
 
 def with_gaps(values: NDArray[np.float64]) -> NDArray[np.float64] | list[float | None]:
-    """A line for uPlot: None, which uPlot shows as a gap, where a value is not finite."""
+    """A line for uPlot, with None, which uPlot shows as a gap, for values that are not finite."""
     finite = np.isfinite(values)
     if finite.all():
         return values
@@ -153,12 +154,12 @@ def with_gaps(values: NDArray[np.float64]) -> NDArray[np.float64] | list[float |
 
 
 def part_round(count: int, place: int | None) -> slice:
-    """At most `LONGEST` of `count` points: around a place, or the newest."""
-    end = count if place is None else min(max(place + LONGEST // 2, LONGEST), count)
-    return slice(max(0, end - LONGEST), end)
+    """At most `MAX_POINTS` of `count` points: around an index, or the newest."""
+    end = count if place is None else min(max(place + MAX_POINTS // 2, MAX_POINTS), count)
+    return slice(max(0, end - MAX_POINTS), end)
 
 
 def span_of(lines: Sequence[NDArray[np.float64]]) -> Span | None:
-    """The y range of a chart: fixed for curves of 0 and 1, else None (that of the data)."""
+    """The y range of a chart: fixed for curves of 0 and 1, else None (fit the data)."""
     values = np.concatenate([[], *lines])
     return YES_OR_NO if np.isin(values[np.isfinite(values)], (0.0, 1.0)).all() else None

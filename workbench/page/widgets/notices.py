@@ -16,7 +16,7 @@ def tell_all(
     color: Literal["orange", "red"] | None = "orange",
     seconds: float | None = None,
 ) -> None:
-    """Notify every open page: a key does not tell on which one it was pressed."""
+    """Notify every open page, since a key event does not tell on which one it was pressed."""
     for client in server.get_clients().values():
         client.add_notification(title, text, color=color, auto_close_seconds=seconds)
 
@@ -27,7 +27,7 @@ def refusals_told(
     title: str = "Not possible",
     then: Callable[[], None] = lambda: None,
 ) -> Iterator[None]:
-    """Catch a ValueError of the block and show it to the page that asked."""
+    """Catch a ValueError of the block and show it on the page that sent the command."""
     try:
         yield
     except ValueError as error:

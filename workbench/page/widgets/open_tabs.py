@@ -1,4 +1,4 @@
-"""Keeps which tab of the main panel each page has open, and opens another."""
+"""Tracks the open tab of the main panel in each page, and opens another."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from workbench.page.widgets.visitors import Visitor, Visitors
 
 
 class OpenTabs:
-    """Open tab of each page. Only the browser knows it and reports it when asked (``panels.js``)."""
+    """The open tab of each page. Only the browser knows it, and reports it on request (``panels.js``)."""
 
     def __init__(self, visitors: Visitors) -> None:
         self._visitors = visitors
         self._open: dict[str, str] = {}
         """Name of the open tab, by page."""
         self._opening: dict[str, viser.GuiHtmlHandle] = {}
-        """Element that opened a tab last, by page."""
+        """Element that last opened a tab, by page."""
 
     def pages_at(self, name: str) -> frozenset[int]:
-        """The pages that have this tab open, by client id."""
+        """Client ids of the pages that have this tab open."""
         here = self._visitors.all()
         return frozenset(one.client.client_id for one in here if self._open.get(one.name) == name)
 
     def open(self, visitor: Visitor, name: str, fold: str = "") -> None:
-        """Open a tab on a page, and a fold in it."""
+        """Open a tab, and a fold in it, on a page."""
         before = self._opening.pop(visitor.name, None)
         if before is not None:
             before.remove()

@@ -1,4 +1,4 @@
-"""Parts of a page, each drawn again when what it shows has changed."""
+"""Parts of a page, each redrawn when its content has changed."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from workbench.page.command import Command, Refused
 from workbench.page.widgets.visitors import Done, Visitor
 
 Clock = Callable[[], float]
-"""Seconds: `time.monotonic`, or a test's own clock. All parts of a page share one."""
+"""Returns seconds: `time.monotonic`, or a test's clock. All parts of a page share one."""
 View = TypeVar("View", contravariant=True)
 
 
 class PagePart(Generic[View]):
     """One part of a page, drawn from an immutable view.
 
-    It is drawn again when its `key` changes, at most once per `every` seconds, and at once when `urgent` changes.
-    By default every view is drawn: viser sends no value that is equal (``tests/page/test_assigning.py``), so a part
-    needs a key only where what it shows is expensive to make.
+    It is redrawn when its `key` changes, at most once per `every` seconds, and at once when `urgent` changes. By default
+    every view is drawn: viser does not send equal values (``tests/ui/test_assigning.py``), so a part needs a key only if
+    its content is expensive to make.
     """
 
     every: ClassVar[float] = 0.0
-    """Minimum seconds between two drawings."""
+    """Minimum interval of drawings in seconds."""
     does: tuple[type[Command], ...] = ()
     """Commands that this part carries out."""
     of_the_moment: ClassVar[bool] = False
-    """It shows numbers of the shown moment. Such parts are drawn together, from one view: while a task plays, a page whose
-    parts are drawn at rates of their own shows several moments at once."""
+    """Whether it shows numbers of the shown moment. Such parts are drawn together, from one view: with individual rates a
+    page would show several moments at once while a task plays."""
 
     def key(self, view: View) -> object:
-        """Key of what it shows of the view; equal keys mean equal drawings."""
+        """Key of the content that it shows; equal keys mean equal drawings."""
         return object()
 
     def urgent(self, view: View) -> object:
-        """Value that a person waits for; a change is drawn at once."""
+        """Value that the user waits for; a change is drawn at once."""
         return None
 
     def draw(self, view: View) -> None:
@@ -47,11 +47,11 @@ class PagePart(Generic[View]):
 
 
 class DrawThrottle:
-    """When to draw one thing.
+    """Decides when to redraw one thing.
 
     Args:
-        every: Seconds between two drawings at least.
-        clock: Of the page.
+        every: Minimum interval of drawings in seconds.
+        clock: Clock of the page.
     """
 
     def __init__(self, every: float, clock: Clock = time.monotonic) -> None:
@@ -60,11 +60,11 @@ class DrawThrottle:
         """Key, urgent value and time of the last drawing."""
 
     def drawn(self, key: object, urgent: object = None) -> None:
-        """Remember this as drawn."""
+        """Store this as drawn."""
         self._drawn = key, urgent, self._clock()
 
     def is_due(self, key: object, urgent: object = None) -> bool:
-        """Whether to draw now; if so, remembers this as drawn."""
+        """Whether to draw now; if so, store this as drawn."""
         if self._drawn is not None:
             drawn, was_urgent, at = self._drawn
             if urgent == was_urgent and (key == drawn or self._clock() - at < self._every):
@@ -74,7 +74,7 @@ class DrawThrottle:
 
 
 class Parts(Generic[View]):
-    """The parts of a page, in the order in which they are drawn."""
+    """The parts of a page, in drawing order."""
 
     def __init__(self, parts: Iterable[PagePart[View]], clock: Clock = time.monotonic) -> None:
         self._clock = clock
@@ -84,7 +84,7 @@ class Parts(Generic[View]):
             self.add(part)
 
     def add(self, part: PagePart[View]) -> None:
-        """Draw this one too, after the others."""
+        """Add a part, which is drawn after the others."""
         self._parts.append((part, DrawThrottle(part.every, self._clock)))
         for kind in part.does:
             assert kind not in self._owners, f"two parts do {kind.__name__}"
@@ -96,8 +96,7 @@ class Parts(Generic[View]):
         return frozenset(self._owners)
 
     def do(self, command: Command, visitor: Visitor) -> Done:
-        """Let the part carry out the command that has it in `does`. Raises `Refused`, also for a command that no
-        part has."""
+        """Let the part that has the command in `does` carry it out. Raises `Refused`, also if no part has it."""
         owner = self._owners.get(type(command))
         if owner is None:
             raise Refused(f"Not on this page: {command.help()}.")

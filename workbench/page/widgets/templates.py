@@ -1,4 +1,4 @@
-"""HTML of the panels, rendered from the templates in ``web_assets/panels`` with every value escaped."""
+"""Renders the HTML of the panels from the templates in ``web_assets/panels``, with every value escaped."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from workbench.page.command import Command
 
 
 def render(template: str, **values: Any) -> str:
-    """``web_assets/panels/<template>.html`` with these values, all of them escaped.
+    """Render ``web_assets/panels/<template>.html`` with these values, all escaped.
 
-    viser puts the text of ``add_html`` into the page as it is: an exception message with a ``<script>`` would run
-    there. So all HTML is made here; no other module writes a tag. Invisible characters are shown: one that turns the
-    direction of writing makes a name look like another, and half of a surrogate pair, as in a file name that is not
-    UTF-8, cannot be sent to a page at all.
+    viser inserts the text of ``add_html`` into the page unchanged: an exception message with a ``<script>`` would run
+    there. So all HTML is made here; no other module writes a tag. Invisible characters are made visible: one that changes
+    the writing direction makes a name look like another, and half of a surrogate pair, as in a file name that is not UTF-8,
+    cannot be sent to a page at all.
     """
     return _environment().get_template(f"{template}.html").render(**values)
 
@@ -33,14 +33,14 @@ class _HasFileLine(Protocol):
 
 
 def place(thing: _HasFileLine | None) -> str:
-    """``push.py:88`` of a problem, a finding or a busy worker; empty where no file is known."""
+    """``push.py:88`` for a problem, a finding or a busy worker; empty if no file is known."""
     if thing is None or not thing.file:
         return ""
     return Path(thing.file).name + (f":{thing.line}" if thing.line else "")
 
 
 def size(count: float) -> str:
-    """Bytes to three digits: ``640 B``, ``2.5 MB``, ``1.2 GB`` (1 kB is 1000 B)."""
+    """Bytes with three digits: ``640 B``, ``2.5 MB``, ``1.2 GB`` (1 kB is 1000 B)."""
     for unit in ("B", "kB", "MB"):
         if count < 999.5:
             return f"{count:.3g} {unit}"
@@ -49,7 +49,7 @@ def size(count: float) -> str:
 
 
 def percent(done: float, total: float) -> int:
-    """The done part of a total; 0 while the total is not known."""
+    """Completed share in percent; 0 while the total is unknown."""
     return round(100 * done / total) if total else 0
 
 
@@ -71,7 +71,7 @@ def short_text(text: str, longest: int = 120) -> str:
 
 
 def sentence(why: str) -> str:
-    """The text with a capital and a full stop."""
+    """The text with a capital letter and a full stop."""
     end = "" if why.endswith((".", "?", "!", "…")) else "."
     return f"{why[:1].upper()}{why[1:]}{end}" if why else ""
 
@@ -82,12 +82,12 @@ def counted(count: int, what: str) -> str:
 
 
 def asks(command: Command) -> str:
-    """The value of ``data-do``: a press asks for this command (``web_assets/input.js``)."""
+    """The value of ``data-do``: a press sends this command (``web_assets/input.js``)."""
     return json.dumps(command.encode())
 
 
 def _shown(value: Any) -> Any:
-    # Not Markup: that is a template's own text, whose values were escaped already.
+    # Not Markup: that is a template's own text, whose values are already escaped.
     return plain_text(value, "\n\t") if type(value) is str else value
 
 
@@ -100,7 +100,7 @@ def _environment() -> jinja2.Environment:
         finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,
-        auto_reload=False,  # else every panel looks at its file on every drawing
+        auto_reload=False,  # with it every drawing would stat the template's file
     )
     filters = (place, size, percent, counted, rate_text, short_text, letter, colour, asks)
     environment.filters.update({filter.__name__: filter for filter in filters})

@@ -1,4 +1,4 @@
-"""Rows of buttons of our own: viser's groups of buttons can neither be disabled nor hinted one by one."""
+"""Our own rows of buttons: the buttons of viser's groups cannot be disabled or given hints individually."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Tool:
     name: str
     command: Command
     hint: str = ""
-    """Hint; by default the command's help and key."""
+    """Tooltip; by default the command's help and key."""
     on: bool = False
     """Whether it is the chosen one of several."""
     off: bool = False
@@ -29,7 +29,7 @@ class Tool:
 
 @dataclass(frozen=True)
 class Label:
-    """Label of the tools after it."""
+    """Label of the following tools."""
 
     name: str
     hint: str
@@ -37,7 +37,7 @@ class Label:
 
 
 def tool(name: str, command: Command, off: bool = False, tone: Literal["", "main", "danger"] = "") -> Tool:
-    """A button whose hint is the command's help and key."""
+    """A button whose tooltip is the command's help and key."""
     return Tool(name, command, with_key(type(command)), off=off, tone=tone)
 
 

@@ -1,4 +1,4 @@
-"""The open pages, and their numbered commands on a WebSocket of ours: in order, one reply each."""
+"""The open pages, and our WebSocket for their numbered commands: handled in order, one reply each."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from workbench.page.widgets.templates import render
 log = logging.getLogger(__name__)
 
 PATH = "/do"
-TOLD_SECONDS = 8.0
-"""Seconds for which a refusal is shown."""
+NOTICE_SECONDS = 8.0
+"""Time for which a refusal is shown."""
 
 
 class Message(msgspec.Struct, forbid_unknown_fields=True):
@@ -46,33 +46,33 @@ class Visitor:
     """One open page: a browser's tab."""
 
     name: str
-    """Random name, sent to the page only."""
+    """Random name, sent only to this page."""
     client: viser.ClientHandle
     page_width: int = 0
-    """Width of the page in CSS pixels when it connected last; 0 before."""
+    """Width of the page in CSS pixels at its last connection; 0 before the first."""
 
     def tell(self, text: str, title: str = "Not possible") -> None:
-        self.client.add_notification(title, text, color="orange", auto_close_seconds=TOLD_SECONDS)
+        self.client.add_notification(title, text, color="orange", auto_close_seconds=NOTICE_SECONDS)
 
 
 Done = Coroutine[Any, Any, None] | None
-"""The rest of a command that waits for something; None if it is carried out."""
+"""Coroutine for the rest of a command that has to wait; None if the command is done."""
 Do = Callable[[Command, Visitor], Done]
-"""Carries out a command of a page, on the loop (`machine.loop`). Raises `Refused` with a sentence for the person."""
+"""Carries out a command of a page, on the loop (`machine.loop`). Raises `Refused` with a sentence for the user."""
 
 
 class Visitors:
-    """The open pages of a server, and the one way by which they ask for anything: `do`.
+    """The open pages of a server. All their commands go through `do`.
 
     Args:
-        server: Of viser.
-        commands: All commands that a page can ask for.
+        server: The viser server.
+        commands: All commands that a page can send.
     """
 
     def __init__(self, server: viser.ViserServer, commands: CommandList) -> None:
         self.commands = commands
         self.do: Do = _nothing
-        """Carries out a command; changes with the page that is shown."""
+        """Carries out a command; replaced with each shown page."""
         self._told = RateLimitedLog()
         self._by_name: dict[str, Visitor] = {}
         self._by_client: dict[int, Visitor] = {}
@@ -80,7 +80,7 @@ class Visitors:
         server.on_client_disconnect(self._left)
 
     async def _came(self, client: viser.ClientHandle) -> None:
-        # viser counts its clients from 0 at each start, and again when one reconnects.
+        # A random name: viser numbers its clients from 0 at each start, and gives a new number to one that reconnects.
         visitor = Visitor(secrets.token_urlsafe(12), client)
         self._by_name[visitor.name] = self._by_client[client.client_id] = visitor
         client.gui.add_html(render("page_name", name=visitor.name))
@@ -94,7 +94,7 @@ class Visitors:
         return list(self._by_name.values())
 
     def on(self, command: Command) -> Callable[[viser.CommandEvent], Coroutine[Any, Any, None]]:
-        """A callback for an entry of viser's palette."""
+        """Callback for an entry of viser's palette."""
 
         async def asked(event: viser.CommandEvent) -> None:
             visitor = event.client and self._by_client.get(event.client.client_id)
@@ -104,7 +104,8 @@ class Visitors:
         return asked
 
     async def ask(self, command: Command, visitor: Visitor) -> str:
-        """Do it after what any page asked for before. Returns why it was refused, or an empty text; the page is told."""
+        """Carry out a command after all earlier commands of any page. Returns the reason of a refusal, or an empty text; the
+        page shows it."""
         try:
             await asyncio.wrap_future(submit(self._carry_out(command, visitor)))
         except Refused as reason:
@@ -122,7 +123,7 @@ class Visitors:
             await rest
 
     async def serve(self, connection: ServerConnection) -> None:
-        """Answer one page's commands until it leaves."""
+        """Handle one page's commands until it disconnects."""
         assert connection.request is not None
         query = parse_qs(urlsplit(connection.request.path).query)
         visitor = self._by_name.get(query.get("page", [""])[0])
