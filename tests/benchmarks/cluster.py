@@ -5,13 +5,12 @@ episode is over) and the rate from there to the last; a cluster's own start is t
 the parts that do not grow with the number of machines: a message through the broker, a result at the process that deals,
 one in the job file, the files that travel.
 
-    python tests/benchmarks/cluster.py --write    # also into web_assets/docs/jobs/cluster.md
+    python tests/benchmarks/cluster.py --write    # also a row of the table of benchmarks
 """
 
 from __future__ import annotations
 
 import os
-import re
 import statistics
 import sys
 import tempfile
@@ -25,6 +24,7 @@ from typing import Any
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.benchmarks.table import Row, keep
 from workbench.jobs.local_processes import Processes
 from workbench.jobs.ray_cluster import Cluster, MessageBroker
 from workbench.jobs.ray_connection import connected
@@ -38,11 +38,9 @@ from workbench.record.job_worker import RecordOptions, Written
 from workbench.task.description import TaskOptions
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "web_assets" / "docs" / "jobs" / "cluster.md"
-MARKS = "<!-- cluster -->\n", "<!-- /cluster -->"
 CORES = len(os.sched_getaffinity(0))
 MANY = 1000
-"""Cores that the page speaks of."""
+"""Cores for which `on_paper` computes."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,7 @@ class Options:
     num_envs: int = 16
     turns: int = 3
     write: bool = False
+    """Keep a row in the table of benchmarks."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def result_cost(one: Written) -> tuple[int, float, float]:
     return len(packed[0]), taken, kept
 
 
-def text(options: Options) -> Iterator[str]:
+def text(options: Options, kept_rows: list[Row]) -> Iterator[str]:
     began = time.monotonic()
     with connected("local") as ray:
         started = time.monotonic() - began
@@ -164,6 +163,8 @@ def text(options: Options) -> Iterator[str]:
     worker_files = pack_worker_files([ROOT / "tasks"])
     packed = time.perf_counter() - began
     local, cluster, alone = middle["local"], middle["ray"], middle["one"]
+    what = f"Recording {options.task} with {CORES} workers of Ray, against {CORES} local processes"
+    kept_rows.append(Row(what, cluster.rate, local.rate, "episodes/s", "more", "cluster.py"))
     yield (
         f"Measured on {date.today():%B %-d, %Y}: {CORES} cores, {options.task}, {options.episodes} episodes of 50 steps "
         f"without pictures, {options.num_envs} envs a worker, medians of {options.turns} runs (`tests/benchmarks/cluster.py`)."
@@ -217,13 +218,10 @@ def on_paper(rate: float, messages: float, taken: float, kept: float, envs: int)
 
 
 def main(options: Options) -> None:
-    lines = list(text(options))
-    print("\n".join(lines))
+    kept: list[Row] = []
+    print("\n".join(text(options, kept)))
     if options.write:
-        pattern = f"{re.escape(MARKS[0])}.*?{re.escape(MARKS[1])}"
-        content = "\n".join([*lines, ""])
-        page = re.sub(pattern, lambda _: f"{MARKS[0]}{content}{MARKS[1]}", PAGE.read_text(), flags=re.DOTALL)
-        PAGE.write_text(page)
+        keep(kept)
 
 
 if __name__ == "__main__":

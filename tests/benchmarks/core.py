@@ -2,7 +2,7 @@
 
     python tests/benchmarks/core.py                       # everything, about 15 minutes on two cores
     python tests/benchmarks/core.py --parts speed shares  # some of it
-    python tests/benchmarks/core.py --write               # also into web_assets/docs/reference/core_benchmarks.md, part by part
+    python tests/benchmarks/core.py --write               # also rows of the table of benchmarks, part by part
 
 Both sides of every comparison run in this one call, in turns, each turn in a process of its own. Take the
 ratios; the absolute numbers are those of the machine. Run it on a machine that does nothing else.
@@ -11,10 +11,9 @@ ratios; the absolute numbers are those of the machine. Run it on a machine that 
 from __future__ import annotations
 
 import multiprocessing
-import platform
 import queue
-import re
 import statistics
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,9 @@ from typing import Any, Literal
 import core_sides as sides
 import tyro
 
-PAGE = Path(__file__).resolve().parents[2] / "web_assets" / "docs" / "reference" / "core_benchmarks.md"
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from tests.benchmarks.table import Row, keep
+
 Part = Literal["speed", "one", "shares", "scaling", "pictures", "snapshots", "memory"]
 PARTS: tuple[Part, ...] = ("speed", "one", "shares", "scaling", "pictures", "snapshots", "memory")
 MB = 1 << 20
@@ -42,7 +43,7 @@ class Options:
     resets: int = 1000
     rebuilds: int = 100
     write: bool = False
-    """Put the tables into the docs page instead of only printing them."""
+    """Keep rows in the table of benchmarks instead of only printing tables."""
 
 
 def _answer(function: Callable[..., Any], args: tuple[Any, ...], results: Any) -> None:
@@ -80,11 +81,15 @@ def table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
     yield ""
 
 
+def more(what: str, ours: float, other: float) -> Row:
+    return Row(what, ours, other, "env-steps/s", "more", "core.py")
+
+
 def spread(values: list[float]) -> str:
     return f"{statistics.median(values):.0f} ({min(values):.0f} to {max(values):.0f})"
 
 
-def speed(options: Options) -> Iterator[str]:
+def speed(options: Options, kept: list[Row]) -> Iterator[str]:
     n, rows = options.num_envs, []
     for env_id in options.env_ids:
         batched, stock, asynchronous = [], [], []
@@ -92,17 +97,13 @@ def speed(options: Options) -> Iterator[str]:
             batched.append(in_own_process(sides.batched_rate, env_id, n, None, options.seconds))
             stock.append(in_own_process(sides.stock_rate, env_id, options.seconds))
             asynchronous.append(in_own_process(sides.async_rate, env_id, n, options.seconds))
-        middle = statistics.median(batched)
-        rows.append(
-            [
-                env_id,
-                spread(batched),
-                spread(stock),
-                spread(asynchronous),
-                f"{middle / statistics.median(stock):.1f}",
-                f"{middle / statistics.median(asynchronous):.1f}",
-            ]
-        )
+        middle, one_stock = statistics.median(batched), statistics.median(stock)
+        vector = statistics.median(asynchronous)
+        what = f"Stepping {n} envs of {env_id}, states"
+        kept.append(more(f"{what}, against one stock env", middle, one_stock))
+        kept.append(more(f"{what}, against AsyncVectorEnv of {n}", middle, vector))
+        ratios = [f"{middle / one_stock:.1f}", f"{middle / vector:.1f}"]
+        rows.append([env_id, spread(batched), spread(stock), spread(asynchronous), *ratios])
     yield f"## Stepping {n} envs, state observations, all cores"
     yield ""
     yield "Env-steps a second, median (lowest to highest) of the turns. The batched core in its default mode, which is exact."
@@ -111,21 +112,23 @@ def speed(options: Options) -> Iterator[str]:
     yield from table(head, rows)
 
 
-def one(options: Options) -> Iterator[str]:
+def one(options: Options, kept: list[Row]) -> Iterator[str]:
     rows = []
     for env_id in options.env_ids:
         batched, stock = [], []
         for _ in range(options.turns):
             batched.append(in_own_process(sides.batched_rate, env_id, 1, None, options.seconds))
             stock.append(in_own_process(sides.stock_rate, env_id, options.seconds))
-        ratio = statistics.median(batched) / statistics.median(stock)
-        rows.append([env_id, spread(batched), spread(stock), f"{ratio:.2f}"])
+        ours, other = statistics.median(batched), statistics.median(stock)
+        if env_id == options.env_ids[0]:
+            kept.append(more(f"Stepping one env of {env_id}, states, against one stock env", ours, other))
+        rows.append([env_id, spread(batched), spread(stock), f"{ours / other:.2f}"])
     yield "## One env"
     yield ""
     yield from table(["task", "batched core, N = 1", "one stock env", "ratio"], rows)
 
 
-def shares(options: Options) -> Iterator[str]:
+def shares(options: Options, kept: list[Row]) -> Iterator[str]:
     rows = []
     for env_id in options.env_ids:
         share = in_own_process(sides.physics_share, env_id, options.num_envs)
@@ -138,7 +141,7 @@ def shares(options: Options) -> Iterator[str]:
     yield from table(["task", "of the wall time", "of the cores"], rows)
 
 
-def scaling(options: Options) -> Iterator[str]:
+def scaling(options: Options, kept: list[Row]) -> Iterator[str]:
     from workbench.envs.simulation.stepping import usable_cores
 
     cores = usable_cores()
@@ -158,7 +161,7 @@ def scaling(options: Options) -> Iterator[str]:
     yield from table(["envs", *(f"{t} thread{'s' * (t > 1)}" for t in threads), "all / 1"], rows)
 
 
-def pictures(options: Options) -> Iterator[str]:
+def pictures(options: Options, kept: list[Row]) -> Iterator[str]:
     took = in_own_process(sides.picture_seconds, options.env_ids[0], 16, 4 * options.seconds)
     yield "## A picture, rgb 128 x 128, of 16 envs"
     yield ""
@@ -173,7 +176,7 @@ def pictures(options: Options) -> Iterator[str]:
     yield from table(["", "a picture", "to bare"], rows)
 
 
-def snapshots(options: Options) -> Iterator[str]:
+def snapshots(options: Options, kept: list[Row]) -> Iterator[str]:
     took = in_own_process(sides.snapshot_seconds, options.env_ids[0], options.num_envs)
     rows = [
         [name, f"{1e3 * took[side]:.2f} ms", f"{100 * took[side] / took['step']:.1f} %"]
@@ -184,7 +187,14 @@ def snapshots(options: Options) -> Iterator[str]:
             ("restore, `fresh_physics=False`", "quick"),
         )
     ]
-    yield f"## Snapshots of {options.num_envs} envs of {options.env_ids[0]}"
+    envs = f"{options.num_envs} envs of {options.env_ids[0]}"
+    for what, ours, other in (
+        (f"Snapshot of {envs}, against a control step", "snapshot", "step"),
+        (f"Snapshot restored exactly (default), {envs}, against a control step", "exact", "step"),
+        (f"Snapshot restored with `fresh_physics=False`, {envs}, against an exact restore", "quick", "exact"),
+    ):
+        kept.append(Row(what, 1e3 * took[ours], 1e3 * took[other], "ms", "less", "core.py"))
+    yield f"## Snapshots of {envs}"
     yield ""
     yield "The exact restore gives every env a PhysX scene without a past, so that it goes on in the same way to the"
     yield "last bit each time. The quick one keeps the scene: contacts may then be solved in another order, and what"
@@ -193,7 +203,7 @@ def snapshots(options: Options) -> Iterator[str]:
     yield from table(["", "median", "of a control step"], rows)
 
 
-def memory(options: Options) -> Iterator[str]:
+def memory(options: Options, kept: list[Row]) -> Iterator[str]:
     env_id = options.env_ids[0]
     counts = [16, 64, 256]
     held = [in_own_process(sides.memory_of, env_id, count) for count in counts]
@@ -202,6 +212,7 @@ def memory(options: Options) -> Iterator[str]:
     rows = [[str(count), f"{b / MB:.0f} MB"] for count, b in zip(counts, held, strict=True)]
     yield from table(["envs", "process holds"], rows)
     each = (held[-1] - held[0]) / (counts[-1] - counts[0]) / MB
+    kept.append(Row(f"Memory of a further env of {env_id}", each, None, "MB", "less", "core.py"))
     yield f"A further env costs {each:.2f} MB (from {counts[0]} to {counts[-1]})."
     yield ""
     for name, values in (
@@ -218,24 +229,6 @@ def memory(options: Options) -> Iterator[str]:
         yield ""
 
 
-def head_lines() -> list[str]:
-    from workbench.envs.simulation.stepping import usable_cores
-
-    return [
-        "# The batched CPU core in figures",
-        "",
-        f"Made by `python tests/benchmarks/core.py --write` on {usable_cores()} cores ({platform.machine()}), without a GPU.",
-        "Both sides of each comparison ran in one call: take the ratios.",
-        "",
-    ]
-
-
-def sections_of(page: str) -> dict[str, str]:
-    """The text of each part of a page that was written before."""
-    found = re.split(r"<!-- (\w+) -->\n", page)
-    return dict(zip(found[1::2], found[2::2], strict=True))
-
-
 def main(options: Options) -> None:
     makers = {
         "speed": speed,
@@ -246,18 +239,13 @@ def main(options: Options) -> None:
         "snapshots": snapshots,
         "memory": memory,
     }
-    sections = sections_of(PAGE.read_text()) if PAGE.exists() else {}
     for part in options.parts:
-        lines = []
-        for line in makers[part](options):
-            lines.append(line)
+        kept: list[Row] = []
+        for line in makers[part](options, kept):
             print(line, flush=True)
-        sections[part] = "\n".join(lines) + "\n"
         if options.write:
             # After each part: a call that is broken off keeps what it measured.
-            body = "".join(f"<!-- {p} -->\n{sections[p]}" for p in PARTS if p in sections)
-            PAGE.parent.mkdir(exist_ok=True)
-            PAGE.write_text("\n".join(head_lines()) + "\n" + body.rstrip() + "\n")
+            keep(kept)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How long a person waits for the first picture: of a session that starts, and of a worker that is started again.
 
-    python tests/benchmarks/first_picture.py [--num-envs 4] [--rounds 3] [--no-parts]
+    python tests/benchmarks/first_picture.py [--num-envs 4] [--rounds 3] [--no-parts] [--write]
 
 A real session on the example task with both its cameras looked through, as `workbench open` has it, without a browser. The
 machine's disk caches are warm after the first round, which is left out. Once with workers that are forks of a process that has
@@ -25,6 +25,7 @@ import psutil
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.benchmarks.table import Row, keep
 from tests.drive.page import TASK
 from workbench.app.session import Session
 from workbench.live.commands import RestartWorker
@@ -37,6 +38,7 @@ from workbench.live.view import SessionView
 from workbench.machine.processes.family import proportional_memory
 from workbench.task.description import TaskOptions
 
+WITHOUT_SPARE = "without a spare, s"
 CAMERAS = (CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human"))
 
 
@@ -46,6 +48,8 @@ class Options:
     rounds: int = 3
     parts: bool = True
     """Also what a worker does, one after the other."""
+    write: bool = False
+    """Keep a row in the table of benchmarks."""
 
 
 def wait(session: Session, reached: Callable[[SessionView], bool], patience: float = 300.0) -> float:
@@ -96,7 +100,7 @@ def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
             wait(session, lambda view: view.vitals.spare_ready)
             yield "processor until then and until the spare is warm, s", processor()
             yield "memory of both, MB", memory()
-            for restarted in ("a restarted worker's, with the spare warm, s", "without a spare, s"):
+            for restarted in ("a restarted worker's, with the spare warm, s", WITHOUT_SPARE):
                 before = session.view()
                 began = time.monotonic()
                 session.do(RestartWorker())
@@ -177,6 +181,11 @@ def main(options: Options) -> None:
             numbers = found[way][what][1:]
             each = ", ".join(f"{one:.2f}" for one in numbers)
             print(f"{what:52s} {way:7s} {statistics.median(numbers):8.2f} ({each})", flush=True)
+    if options.write:
+        what = f"Worker that is restarted without a spare: until its first picture, {options.num_envs} envs, forked, "
+        what += "against one that imports for itself"
+        forked, anew = (statistics.median(found[way][WITHOUT_SPARE][1:]) for way in WAYS)
+        keep([Row(what, forked, anew, "s", "less", "first_picture.py")])
     if options.parts:
         print(f"parts of a worker's start: {'':27s}   wall    processor, s", flush=True)
         call = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import first_picture; first_picture.parts({options.num_envs})"

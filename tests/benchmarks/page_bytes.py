@@ -1,4 +1,4 @@
-"""Bytes of an update of the page while the task plays: python tests/benchmarks/page_bytes.py [--num-envs 16 64 256]
+"""Bytes of an update of the page while the task plays: python tests/benchmarks/page_bytes.py [--num-envs 16 64 256] [--write]
 
 The whole live page of the example task, on its real server, in this process: the envs make random steps, and
 at 30 Hz and four times real time an update shows each 2.67th of them. The page's clock moves a thirtieth of a
@@ -30,6 +30,7 @@ import tyro
 from websockets.asyncio.client import connect
 
 sys.path.append(str(Path(__file__).parents[2]))
+from tests.benchmarks.table import Row, keep
 from tests.drive.far_line import FarLine, line_to
 from tests.drive.panels import Clock
 from tests.drive.scripted import ScriptedWorker, no_success
@@ -51,6 +52,7 @@ TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 HERTZ, SPEED, EPISODE = 30, 4.0, 50
 FAR = 0.01
 """Seconds one way."""
+KEPT_ENVS = 64
 
 
 @dataclass
@@ -59,6 +61,8 @@ class Options:
     updates: int = 90
     settle: int = 15
     """Updates before those that count: the page's charts fill."""
+    write: bool = False
+    """Keep a row in the table of benchmarks, of `KEPT_ENVS`."""
 
 
 @dataclass
@@ -253,8 +257,10 @@ def main(options: Options) -> None:
     count = int((options.updates + options.settle) * SPEED / HERTZ / 0.05) + 2
     for num_envs in options.num_envs:
         played = play(num_envs, count)
+        rates = []
         for what, exact in (("exact", True), ("as sent", False)):
             found = measure(played, options, exact)
+            rates.append(HERTZ * found.wire / 1e6)
             parts = found.wire, found.metadata, found.arrays
             print(
                 f"| {num_envs} | {what} | {' | '.join(f'{part / 1e3:.1f}' for part in parts)} "
@@ -262,6 +268,9 @@ def main(options: Options) -> None:
                 f"| {1e3 * found.draw:.1f} | {1e3 * found.send:.1f} |",
                 flush=True,
             )
+        if options.write and num_envs == KEPT_ENVS:
+            what = f"Page through `ssh -L`: data while {num_envs} envs play at four times real time, against every pose in full"
+            keep([Row(what, rates[1], rates[0], "MB/s", "less", "page_bytes.py")])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What recording costs, beside ManiSkill's own RecordEpisode: python tests/benchmarks/recording.py
+"""What recording costs, beside ManiSkill's own RecordEpisode: python tests/benchmarks/recording.py [--write]
 
 The same env, the same seed, the same actions: inside RecordEpisode, inside `workbench.Recorder`, in turn, several rounds. Both
 recorders keep actions, rewards, flags, state observations and env states. With a camera, both keep the base camera's colour, depth and
@@ -36,6 +36,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 import workbench
+from tests.benchmarks.table import Row, keep
 from workbench.episodes.writing import finish as make_files
 from workbench.record import recorder as recorder_module
 
@@ -59,6 +60,8 @@ class Options:
     all that it has at every step, so its steps grow slower with the episode."""
     camera_rounds: tuple[int, ...] = (3, 1)
     """With a camera, for each of `num_envs`; 0 leaves it out."""
+    write: bool = False
+    """Keep rows in the table of benchmarks, of the most envs without a camera."""
 
 
 class Timed(gym.Wrapper):
@@ -258,6 +261,21 @@ def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: i
             f"  {name:38s} {ours[0]:14.3f} {theirs:14.3f} {ours[0] / theirs:6.2f}"
             + "".join(f" {one:14.3f} {one / theirs:6.2f}" for one in ours[1:]),
             flush=True,
+        )
+    if options.write and not camera and num_envs == max(options.num_envs):
+        about = f"Recording {num_envs} envs of {options.task}, states: a step"
+        keep(
+            [
+                Row(what, took("Recorder", part), took("RecordEpisode", part), "ms", "less", "recording.py")
+                for what, part in (
+                    (f"{about} beyond the env's own, against RecordEpisode", "stepping"),
+                    (
+                        f"{about} of the whole run beyond the env's own, with all files, against RecordEpisode, "
+                        "which writes no `.rrd`",
+                        "whole",
+                    ),
+                )
+            ]
         )
 
 

@@ -1,6 +1,6 @@
 """From saving a task's file to new numbers on the screen, by reload level, against a cold restart.
 
-    python tests/benchmarks/reload.py [--num-envs 16] [--saves 7] [--restarts 3]
+    python tests/benchmarks/reload.py [--num-envs 16] [--saves 7] [--restarts 3] [--write]
 
 ``workbench open`` with the cameras on, and a real Chromium before it. Of every level the same file is saved again and
 again with another edit, and the clock runs from the end of the write until the page shows what it changed:
@@ -30,6 +30,7 @@ import tyro
 from playwright.sync_api import Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.benchmarks.table import Row, keep
 from tests.drive.page import TASK, browser_at, page_on
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
@@ -52,6 +53,8 @@ class Options:
     num_envs: int = 16
     saves: int = 7
     restarts: int = 3
+    write: bool = False
+    """Keep rows in the table of benchmarks."""
 
 
 def cold_restart(file: Path) -> float:
@@ -150,6 +153,21 @@ def main(options: Options) -> None:
     if cold:
         spread = f"{min(cold):.2f} | {max(cold):.2f} | | |"
         print(f"| cold restart, stock, 1 env | {statistics.median(cold):.2f} | {spread}")
+    if cold and options.write:
+        keep(
+            [
+                Row(
+                    f"Reload, {level}: from saving `push_cube.py` to the result in Chromium, {options.num_envs} envs, "
+                    "against the stock script started again",
+                    statistics.median(value[0] for value in seen[level]),
+                    statistics.median(cold),
+                    "s",
+                    "less",
+                    "reload.py",
+                )
+                for level in ("patched", "rebuilt")
+            ]
+        )
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ For each task, in turns in one process: *quick* and *exact*, one plan of K rollo
 of an episode, with each of the two ways to restore; *bare*, the same actions from the same state in K envs as
 `workbench.make` gives them, which are restored before the clock starts. Printed are the medians and their ratios.
 
-    python tests/benchmarks/solve.py --write    # also into web_assets/docs/reference/benchmarks.md
+    python tests/benchmarks/solve.py --write    # also a row of the table of benchmarks
     python tests/benchmarks/solve.py --demonstrations 20 --packages numpy1
 
 With ``--demonstrations``, in place of that: successes an hour of ``workbench record --actions solve --successes`` and of
@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import resource
 import statistics
 import subprocess
@@ -38,14 +37,15 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import workbench
+from tests.benchmarks.table import Row, keep
 from workbench.envs.maniskill_private import open_env
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import RolloutPlanner, make_rollout_env
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "web_assets" / "docs" / "reference" / "benchmarks.md"
 _LONGEST = 3600.0
-HEAD = "## Planning (`tests/benchmarks/solve.py`)"
+KEPT_TASK = "PickCube-v1"
+"""The task of the rows in the table of benchmarks."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Options:
     packages: Path | None = None
     """A folder whose packages the motion-planning scripts import before others."""
     write: bool = False
-    """Put the table of plans into the docs page too."""
+    """Keep a row of `KEPT_TASK` in the table of benchmarks."""
 
 
 def seconds(action: Callable[[], Any], clock: Callable[[], float]) -> float:
@@ -125,12 +125,17 @@ def measure(env_id: str, options: Options) -> dict[str, float]:
     return {name: statistics.median(each) for name, each in took.items()} | {"horizon": horizon}
 
 
-def table(options: Options) -> Iterator[str]:
+def table(options: Options, kept: list[Row]) -> Iterator[str]:
     yield "| task | rollouts x steps | bare, ms | plan, quick restore, ms | plan, exact restore, ms | quick / bare | exact / bare |"
     yield "|---|---|---|---|---|---|---|"
     for env_id in options.env_ids:
         took = measure(env_id, options)
         bare, quick, exact = took["bare"], took["quick"], took["exact"]
+        if env_id == KEPT_TASK:
+            what = f"Planning {env_id}: a plan of {options.plan.rollouts} rollouts of {took['horizon']:.0f} steps"
+            what += " with exact restores, against the bare steps"
+            unit = "ms of CPU time" if options.processor else "ms"
+            kept.append(Row(what, 1e3 * exact, 1e3 * bare, unit, "less", "solve.py"))
         yield (
             f"| {env_id} | {options.plan.rollouts} x {took['horizon']:.0f} | {1e3 * bare:.0f} | {1e3 * quick:.0f} | "
             f"{1e3 * exact:.0f} | {quick / bare:.2f} | {exact / bare:.2f} |"
@@ -152,10 +157,11 @@ def factories(env_id: str, count: int, folder: Path) -> dict[str, list[str]]:
     return {"solve": ours, "motion planning": theirs}
 
 
-def factory_table(options: Options) -> Iterator[str]:
+def factory_table(options: Options, kept: list[Row]) -> Iterator[str]:
     yield "| task | side | successes | wall, s | successes an hour | processor's seconds a success |"
     yield "|---|---|---|---|---|---|"
     for env_id in options.env_ids:
+        rates: dict[str, float] = {}
         with tempfile.TemporaryDirectory() as folder:
             for side, command in factories(env_id, options.demonstrations, Path(folder)).items():
                 used, began = _children_seconds(), time.perf_counter()
@@ -174,7 +180,13 @@ def factory_table(options: Options) -> Iterator[str]:
                 count = sum(map(_successes, Path(folder).rglob("*.json")))
                 for file in Path(folder).rglob("*.json"):
                     file.unlink()
-                yield f"| {env_id} | {side} | {count} | {wall:.0f} | {3600 * count / wall:.0f} | {processor / count:.1f} |"
+                rates[side] = 3600 * count / wall
+                yield f"| {env_id} | {side} | {count} | {wall:.0f} | {rates[side]:.0f} | {processor / count:.1f} |"
+        if env_id == KEPT_TASK:
+            what = f"Planning {env_id}: demonstrations, against ManiSkill's motion-planning script"
+            kept.append(
+                Row(what, rates["solve"], rates["motion planning"], "successes/h", "more", "solve.py")
+            )
 
 
 def _successes(file: Path) -> int:
@@ -188,25 +200,11 @@ def _children_seconds() -> float:
 
 def main(options: Options) -> None:
     torch.set_num_threads(1)
-    if options.demonstrations:
-        for line in factory_table(options):
-            print(line, flush=True)
-        return
-    lines = []
-    for line in table(options):
+    kept: list[Row] = []
+    for line in (factory_table if options.demonstrations else table)(options, kept):
         print(line, flush=True)
-        lines.append(line)
     if options.write:
-        cores = len(os.sched_getaffinity(0))
-        clock = "the processor's time of all threads" if options.processor else "wall time"
-        text = (
-            f"{HEAD}\n\nOn {cores} cores, without a GPU, {clock}; all sides in one run: take the ratios.\n\n"
-        )
-        text += "\n".join(lines)
-        page = PAGE.read_text()
-        there = re.search(rf"^{re.escape(HEAD)}$.*?(?=^## |\Z)", page, re.M | re.S)
-        page = page.replace(there[0], f"{text}\n\n") if there else f"{page.rstrip()}\n\n{text}\n"
-        PAGE.write_text(page.rstrip() + "\n")
+        keep(kept)
 
 
 if __name__ == "__main__":

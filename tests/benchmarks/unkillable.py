@@ -1,6 +1,6 @@
 """Every way to hang or kill the worker under an open page: does the page answer, and when is the task back?
 
-    python tests/benchmarks/unkillable.py [--num-envs 4] [--ways loop segfault ...] [--screenshot FILE]
+    python tests/benchmarks/unkillable.py [--num-envs 4] [--ways loop segfault ...] [--screenshot FILE] [--write]
 
 ``workbench open`` on a task that misbehaves on demand (`tests/live/hazards.py`), a real Chromium before it, the
 spare worker warm. For each way the task is put into it by a single step; until it is back, a control of the page
@@ -29,6 +29,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import NO_DRAWING
+from tests.benchmarks.table import Row, keep
 from tests.drive.page import launch, new_page, open_workbench
 from tests.drive.processes import workers_of
 from tests.live.hazards import calm, provocation, provoke, write_task
@@ -86,6 +87,8 @@ class Options:
     ways: tuple[str, ...] = (*HANGS, *DEATHS, *OTHERS)
     screenshot: Path | None = None
     """Where to leave a picture of the banner of the first way that hangs."""
+    write: bool = False
+    """Keep a row in the table of benchmarks."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +132,8 @@ def page_text(page: Page) -> str:
     return page.inner_text("body")
 
 
-def one_way(desk: Desk, way: str) -> str:
-    """Provoke it, see it through, and the row of the table."""
+def one_way(desk: Desk, way: str) -> tuple[str, float]:
+    """Provoke it and see it through; returns the line to print, and the seconds until the task was back."""
     desk.poke_until(lambda: desk.says("the spare worker") and not desk.says("being warmed up"), [], 180.0)
     worker, trips = desk.workers()[0], []
     usage = desk.server.cpu_times()
@@ -170,11 +173,12 @@ def one_way(desk: Desk, way: str) -> str:
     memory = desk.server.memory_info().rss / 2**20
     desk.click("Step")
     time.sleep(1.0)
-    return (
+    line = (
         f"| {way} | {said} | {back:.2f} | {median_and_worst([trip.whole for trip in trips])} "
         f"| {median_and_worst([trip.answer for trip in trips if trip.answer is not None])} "
         f"| {len(trips)} | {cpu:.1f} | {memory:.0f} |"
     )
+    return line, back
 
 
 def median_and_worst(times: list[float]) -> str:
@@ -202,8 +206,17 @@ def main(options: Options) -> None:
                 "| trips | CPU | memory |"
             )
             print("|" + "---|" * 10, flush=True)
+            slowest = 0.0
             for way in options.ways:
-                print(one_way(desk, way), flush=True)
+                line, back = one_way(desk, way)
+                slowest = max(slowest, back)
+                print(line, flush=True)
+            if options.write:
+                what = (
+                    f"Worker that hangs or dies: until the page has the task back, {options.num_envs} envs, "
+                )
+                what += f"slowest of {len(options.ways)} ways"
+                keep([Row(what, slowest, None, "s", "less", "unkillable.py")])
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from packaging.version import Version
 
+from tests.benchmarks import table
 from tests.docs import generate
 
 
@@ -34,3 +35,43 @@ def made(child_process: None) -> dict[Path, str]:
 )
 def test_a_page_says_what_the_code_says(page: Path, made: dict[Path, str]) -> None:
     assert page.read_text() == made[page], "write it again: python -m tests.docs.generate"
+
+
+def test_the_page_of_benchmarks_is_made_from_their_results() -> None:
+    assert table.PAGE.read_text() == table.page(table.read()), (
+        "write it again: python -m tests.benchmarks.table"
+    )
+
+
+def test_the_table_of_benchmarks_is_short_and_names_scripts_that_there_are() -> None:
+    rows = table.read()
+    assert len(rows) <= table.MAX_ROWS and len({row.what for row in rows}) == len(rows)
+    assert all((table.RESULTS.parent / row.script).is_file() for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("ours", "other", "unit", "better", "ratio"),
+    [
+        (5335, 905, "env-steps/s", "more", "5.9 times as many"),
+        (0.67, 7.9, "s", "less", "12 times as fast"),
+        (405, 357, "ms of CPU time", "less", "0.88 times as fast"),
+        (0.19, 0.668, "MB/s", "less", "0.28 times as much"),
+        (1.36, None, "MB", "less", ""),
+    ],
+)
+def test_a_ratio_says_which_side_is_better(ours, other, unit, better, ratio) -> None:
+    assert table.Row("x", ours, other, unit, better, "core.py").ratio == ratio
+
+
+def test_a_script_replaces_its_rows_and_adds_none_beyond_the_limit(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(table, "RESULTS", tmp_path / "results.json")
+    monkeypatch.setattr(table, "PAGE", tmp_path / "benchmarks.md")
+    table.RESULTS.write_text("[]")
+    rows = [table.Row(f"row {number}", 1, 2, "s", "less", "core.py") for number in range(table.MAX_ROWS)]
+    table.keep(rows)
+    table.keep([table.Row("row 7", 3.14159, None, "s", "less", "core.py")])
+    (seventh,) = (row for row in table.read() if row.what == "row 7")
+    assert seventh.ours == 3.142 and seventh.measured and len(table.read()) == table.MAX_ROWS
+    assert table.PAGE.read_text() == table.page(table.read())
+    with pytest.raises(ValueError, match="26 rows"):
+        table.keep([table.Row("another", 1, 2, "s", "less", "core.py")])
