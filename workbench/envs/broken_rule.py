@@ -22,7 +22,7 @@ from workbench.envs.gpu_rules import Degree, Finding, Silence, silence_of
 from workbench.machine.library_files import is_installed
 from workbench.machine.parse_python import parse_python
 
-MOST_ROWS = 64
+MAX_PLACES = 64
 """Places that are kept; breaches at further places are only counted."""
 OWN_CODE = ("workbench.envs.", "workbench.pictures.")
 """Prefixes of the core's own modules."""
@@ -117,7 +117,7 @@ class BrokenRules:
         self._silenced: dict[_Key, tuple[Finding, Silence]] = {}
         self._now: Occasion = "reset"
         self.more = 0
-        """Breaches at places beyond `MOST_ROWS`."""
+        """Breaches at places beyond `MAX_PLACES`."""
         self.serial = 0
         """Increases with every change."""
         self.step: int = 0
@@ -190,7 +190,7 @@ class BrokenRules:
         self.serial += 1
         key = rule, place or message if subject is None else subject
         row = self._rows.get(key)
-        if row is None and len(self._rows) >= MOST_ROWS:
+        if row is None and len(self._rows) >= MAX_PLACES:
             self.more += 1
             return
         if row is None:

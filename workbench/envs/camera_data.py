@@ -54,12 +54,12 @@ class CallSite:
     """Qualified name of the code that it is in, as Python has it: ``PushCubeEnv._default_sensor_configs``."""
 
 
-CLOSE = 1e-6
+SETTING_TOLERANCE = 1e-6
 """Largest difference of equal cameras: metres, quaternion components, radians; relative for pixels, near and far. A
 config keeps its pose in single precision."""
 
 
-def differences(a: CameraSettings, b: CameraSettings, close: float = CLOSE) -> tuple[str, ...]:
+def differences(a: CameraSettings, b: CameraSettings, close: float = SETTING_TOLERANCE) -> tuple[str, ...]:
     """Which of ``position orientation fov intrinsic width height near far shader_pack`` are not the same."""
     turned = tuple(-x for x in b.quaternion)
     found = []
@@ -120,27 +120,27 @@ def _value(settings: CameraSettings, what: str) -> object:
 
 
 NOT_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
-MOST_PIXELS = 4096
+MAX_SIDE_PIXELS = 4096
 """Limit of pixels per side; a digit too many would take the memory of all envs."""
 
 
-_FURTHEST = 1e6
+_MAX_DISTANCE_METRES = 1e6
 """Metres."""
 
 
 def why_no_camera(settings: CameraSettings) -> str | None:
     """Why these settings are invalid, as a sentence without its full stop; None if they are valid."""
     numbers = (*settings.position, *settings.quaternion, settings.near, settings.far)
-    if not all(abs(number) <= _FURTHEST for number in numbers):
+    if not all(abs(number) <= _MAX_DISTANCE_METRES for number in numbers):
         return "the camera's pose, near and far must be finite numbers"
     if abs(math.hypot(*settings.quaternion) - 1.0) > 1e-3:
         return "the camera's quaternion must be of unit length"
     if not 0 < settings.near < settings.far:
         return f"near must be above 0 and below far, not {settings.near:g} and {settings.far:g} metres"
     if not all(
-        isinstance(size, int) and 1 <= size <= MOST_PIXELS for size in (settings.width, settings.height)
+        isinstance(size, int) and 1 <= size <= MAX_SIDE_PIXELS for size in (settings.width, settings.height)
     ):
-        return f"width and height must be 1 to {MOST_PIXELS}, not {settings.width} x {settings.height}"
+        return f"width and height must be 1 to {MAX_SIDE_PIXELS}, not {settings.width} x {settings.height}"
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,60}", settings.shader_pack):
         return f"{settings.shader_pack!r} is no shader pack"
     if (settings.fov is None) == (settings.intrinsic is None):

@@ -77,7 +77,7 @@ from workbench.envs.snapshots.snapshot import begin_anew
 from workbench.envs.snapshots.task_state import note_constructed, note_scene
 from workbench.envs.strict import StrictMixin
 
-_UNIT = 1e-3
+_UNIT_TOLERANCE = 1e-3
 """Largest difference of a quaternion's length from 1."""
 SIM_BACKEND = "physx_cpu_batched"
 """Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
@@ -88,7 +88,7 @@ _NO_WINDOW = (
     "`workbench open` with this task's file or id shows all envs in the browser. For pictures "
     'use render_mode="rgb_array", "sensors" or "all" and render().'
 )
-_MOST_NESTED = 16
+_MAX_NESTED_CALLS = 16
 """Calls of `step` or `reset` within each other; a hook that steps in each step would do so until Python's recursion ends."""
 
 
@@ -212,7 +212,9 @@ class BatchedCpuScene(ManiSkillScene):
         Always exact where the camera's quaternion is not of unit length (``look_at`` straight down): SAPIEN turns and zooms
         its picture, and what is out of its view is not known.
         """
-        if (asked or self.pictures) == "exact" or abs(float(np.linalg.norm(camera.local_pose.q)) - 1) > _UNIT:
+        if (asked or self.pictures) == "exact" or abs(
+            float(np.linalg.norm(camera.local_pose.q)) - 1
+        ) > _UNIT_TOLERANCE:
             return "exact"
         return "fast"
 
@@ -459,9 +461,9 @@ class BatchedCpuMixin:
     @contextmanager
     def _in_turn(self, what: str) -> Iterator[None]:
         """Context in which the env is stepped or reset."""
-        if self._nested >= _MOST_NESTED:
+        if self._nested >= _MAX_NESTED_CALLS:
             raise RefusedCall(
-                f"{what}() was called {_MOST_NESTED} times within itself: a hook that it runs calls it again."
+                f"{what}() was called {_MAX_NESTED_CALLS} times within itself: a hook that it runs calls it again."
             )
         self._nested += 1
         try:
@@ -613,7 +615,7 @@ def batched_class(
 # --- how many scenes a process can hold --------------------------------------------------------------
 
 
-_SPARE = 8
+_SPARE_KEYS = 8
 """Thread-local keys kept free: for threads, drivers and libraries that start later, and the second scene during a
 restore."""
 
@@ -625,10 +627,10 @@ def require_scenes(count: int) -> None:
         ValueError: with the number that it can.
     """
     free = free_thread_keys()
-    if free is not None and count > free - _SPARE:
+    if free is not None and count > free - _SPARE_KEYS:
         raise RefusedValue(
             f"num_envs={count} is more than this process has room for: PhysX takes one of Linux's 1024 thread-local "
-            f"keys for each env, and {max(free - _SPARE, 0)} are left here. Use fewer envs, close envs that "
+            f"keys for each env, and {max(free - _SPARE_KEYS, 0)} are left here. Use fewer envs, close envs that "
             "are not needed, or divide the envs among processes."
         )
 

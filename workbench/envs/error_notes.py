@@ -12,9 +12,9 @@ from workbench.machine.library_files import is_installed
 
 Place = tuple[str, int, str]
 """File, line, and the name of the function."""
-_MOST_REFUSALS = 3
+_MAX_REFUSALS = 3
 """Remembered in one call: each keeps its frames alive."""
-_MOST_LETTERS = 400
+_MAX_CHARACTERS = 400
 
 
 class ErrorNote(str):
@@ -99,7 +99,7 @@ class _Running(threading.local):
         self.refusals: list[CoreRefusal] = []
 
     def remember(self, refusal: CoreRefusal) -> None:
-        if self.depth and len(self.refusals) < _MOST_REFUSALS:
+        if self.depth and len(self.refusals) < _MAX_REFUSALS:
             self.refusals.append(refusal)
 
 
@@ -131,7 +131,7 @@ def _caught_note(refusal: CoreRefusal) -> ErrorNote | None:
     caught = frames[0]
     at = refusal.place or next((place for place in reversed(frames) if not is_installed(place[0])), caught)
     text = " ".join(str(refusal).split())
-    text = text if len(text) <= _MOST_LETTERS else text[: _MOST_LETTERS - 1] + "…"
+    text = text if len(text) <= _MAX_CHARACTERS else text[: _MAX_CHARACTERS - 1] + "…"
     where = "there" if at[:2] == caught[:2] else f"at {_text_of(caught)}"
     return ErrorNote(f"Before this, {_text_of(at)} was refused, and caught {where}: {text}", at, before=True)
 

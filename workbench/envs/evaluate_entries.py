@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 from workbench.envs.step_result import OtherEntry
 
 FLAGS = ("success", "fail")
-MOST_LETTERS = 400
+MAX_TEXT_CHARACTERS = 400
 """Longest text of a value."""
-MOST_NUMBERS = 1024
+MAX_KEPT_NUMBERS = 1024
 """Largest value of the whole batch that is kept as numbers; of a larger one only type and shape."""
-MOST_ENTRIES = 1000
+MAX_ENTRIES = 1000
 """Most leaves; of the others only the count."""
-_MOST_NAME = 200
-_MOST_READ = 1 << 26
+_MAX_NAME_CHARACTERS = 200
+_MAX_READ_NUMBERS = 1 << 26
 """Numbers of one value; a sparse tensor's shape may exceed the memory."""
 _NOT_EVALUATED = ("elapsed_steps", "reconfigure")
 """ManiSkill's own entries of ``info``."""
-_REAL = "biuf"
-_PLAIN = {torch.bool, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8}
+_REAL_KINDS = "biuf"
+_NUMPY_DTYPES = {torch.bool, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8}
 """Types that numpy also has."""
-_DEEPEST = 16
-_NOT_SHOWN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+_MAX_DEPTH = 16
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters and surrogates, which no file and no browser takes."""
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 """Memory address in a default repr: differs in every run."""
@@ -40,7 +40,7 @@ _short = reprlib.Repr()
 _short.maxlevel = 4
 _short.maxdict = _short.maxlist = _short.maxtuple = _short.maxset = _short.maxfrozenset = 20
 _short.maxdeque = _short.maxarray = 20
-_short.maxstring = _short.maxlong = _short.maxother = MOST_LETTERS
+_short.maxstring = _short.maxlong = _short.maxother = MAX_TEXT_CHARACTERS
 
 
 def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDArray], dict[str, OtherEntry]]:
@@ -56,7 +56,7 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
     for path, value in leaves(info):
         if path in _NOT_EVALUATED:
             continue
-        if len(columns) + len(others) >= MOST_ENTRIES:
+        if len(columns) + len(others) >= MAX_ENTRIES:
             left_out += 1
             continue
         name = _name(path, columns, others)
@@ -80,7 +80,7 @@ def leaves(value: Any, path: str = "", above: tuple[int, ...] = ()) -> Iterator[
     """Leaves of nested dicts, each with its keys joined by ``/``. An empty dict, or one that contains itself, is a leaf."""
     if (
         not isinstance(value, Mapping)
-        or len(above) > _DEEPEST
+        or len(above) > _MAX_DEPTH
         or id(value) in above[1:]
         or (above and not value)
     ):
@@ -112,7 +112,7 @@ def _name(path: str, columns: Mapping[str, Any], others: Mapping[str, Any]) -> s
 @lru_cache(maxsize=4096)
 def _clean_name(path: str) -> str:
     name = clean_text(path)
-    return name if len(name) <= _MOST_NAME else name[: _MOST_NAME - 1] + "…"
+    return name if len(name) <= _MAX_NAME_CHARACTERS else name[: _MAX_NAME_CHARACTERS - 1] + "…"
 
 
 def _array(value: Any) -> NDArray | None:
@@ -120,10 +120,10 @@ def _array(value: Any) -> NDArray | None:
     if isinstance(value, torch.Tensor):
         return _of_tensor(value)
     if isinstance(value, np.ndarray):
-        return value.copy() if value.dtype.kind in _REAL else None
+        return value.copy() if value.dtype.kind in _REAL_KINDS else None
     if isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating)):
         found = np.asarray(value)
-        return found if found.dtype.kind in _REAL else None  # an int of more than 64 bits is an object
+        return found if found.dtype.kind in _REAL_KINDS else None  # an int of more than 64 bits is an object
     if isinstance(value, (list, tuple)) and value:
         return _of_list(value)
     if isinstance(value, Pose):
@@ -132,11 +132,11 @@ def _array(value: Any) -> NDArray | None:
 
 
 def _of_tensor(value: torch.Tensor) -> NDArray | None:
-    if value.dtype in _PLAIN and value.layout is torch.strided and value.device.type == "cpu":
+    if value.dtype in _NUMPY_DTYPES and value.layout is torch.strided and value.device.type == "cpu":
         # The common case; the general way takes three times as long.
         found = value.detach().numpy() if value.requires_grad else value.numpy()
         return found.copy()
-    if value.is_complex() or value.numel() > _MOST_READ:
+    if value.is_complex() or value.numel() > _MAX_READ_NUMBERS:
         return None
     try:
         if value.layout is not torch.strided:
@@ -150,7 +150,7 @@ def _of_tensor(value: torch.Tensor) -> NDArray | None:
 
 
 def _of_list(value: list[Any] | tuple[Any, ...]) -> NDArray | None:
-    if len(value) > _MOST_READ or any(isinstance(item, (str, bytes, Mapping)) for item in value):
+    if len(value) > _MAX_READ_NUMBERS or any(isinstance(item, (str, bytes, Mapping)) for item in value):
         return None
     rows: list[Any] = [_of_tensor(item) if isinstance(item, torch.Tensor) else item for item in value]
     if any(row is None for row in rows):
@@ -159,14 +159,14 @@ def _of_list(value: list[Any] | tuple[Any, ...]) -> NDArray | None:
         found = np.array(rows)
     except (ValueError, TypeError, OverflowError):  # rows of several lengths
         return None
-    return found if found.dtype.kind in _REAL else None
+    return found if found.dtype.kind in _REAL_KINDS else None
 
 
 def _numbers(value: Any, array: NDArray) -> OtherEntry:
     what = type_text(value)
     if array.size == 0:
         return OtherEntry(what, ("[]",))
-    if array.size > MOST_NUMBERS:
+    if array.size > MAX_KEPT_NUMBERS:
         return OtherEntry(what, (f"{array.size:,} numbers",), whole=False)
     return OtherEntry(what, numbers=array if array.flags.owndata else array.copy())
 
@@ -207,8 +207,8 @@ def _text(value: Any) -> tuple[str, bool]:
         text = str.__str__(value)
     else:
         text = safe_repr(value)
-    if len(text) > MOST_LETTERS:
-        return clean_text(text[: MOST_LETTERS - 1]) + "…", False
+    if len(text) > MAX_TEXT_CHARACTERS:
+        return clean_text(text[: MAX_TEXT_CHARACTERS - 1]) + "…", False
     return clean_text(text), isinstance(value, str) or "..." not in text
 
 
@@ -226,7 +226,7 @@ def safe_repr(value: object) -> str:
 
 def clean_text(text: str) -> str:
     """`text` with what files and browsers refuse replaced."""
-    return _NOT_SHOWN.sub("\ufffd", text)
+    return _UNPRINTABLE.sub("\ufffd", text)
 
 
 # --- what is wrong with them -------------------------------------------------------------------------

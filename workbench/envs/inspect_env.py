@@ -22,7 +22,7 @@ from workbench.envs.simulation.cpu_system import batched_system
 from workbench.envs.state_columns import env_states, flat_names, split_flat
 from workbench.envs.task_env import TaskEnv, to_numpy
 
-MOST_VALUES = 64
+MAX_VALUES = 64
 """Numbers of one array that are sent; a joint vector has fewer, a picture more."""
 
 
@@ -177,7 +177,7 @@ def _row(value: Any, env: int, num_envs: int) -> NDArray:
 def _leaf(name: str, value: NDArray, dtype: str | None = None) -> Leaf:
     numeric = value.dtype.kind in "fiub" and value.size > 0
     low, high = (float(value.min()), float(value.max())) if numeric else (np.nan, np.nan)
-    values = value.reshape(-1)[:MOST_VALUES].copy()
+    values = value.reshape(-1)[:MAX_VALUES].copy()
     return Leaf(name, tuple(value.shape), dtype or str(value.dtype), values, low, high)
 
 

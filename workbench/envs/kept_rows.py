@@ -26,9 +26,9 @@ from workbench.envs.snapshots.task_attributes import Walk, walk_task_values
 from workbench.envs.snapshots.task_state import is_per_env, version_of
 from workbench.machine.library_files import is_installed
 
-MOST_LINES = 2000
+MAX_TRACED_LINES = 2000
 """Lines of the author's code after which values are compared, in one reset."""
-_ROUNDED = 1e-5
+_ROUNDING_TOLERANCE = 1e-5
 """Tolerance for values computed again from the same poses: 1e-7 of a rotation was seen."""
 _ITEM = re.compile(r"\[(\d+)\]")
 
@@ -147,7 +147,7 @@ def _array(value: torch.Tensor | np.ndarray) -> np.ndarray:
 def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Where they differ; NaN equals NaN."""
     if a.dtype.kind in "fc" and b.dtype.kind in "fc":
-        return ~np.isclose(a, b, rtol=_ROUNDED, atol=_ROUNDED, equal_nan=True)
+        return ~np.isclose(a, b, rtol=_ROUNDING_TOLERANCE, atol=_ROUNDING_TOLERANCE, equal_nan=True)
     return np.asarray((a != b) & ~((a != a) & (b != b)))
 
 
@@ -171,7 +171,7 @@ class _Lines:
     def __init__(self, rows: KeptRows) -> None:
         self.rows = rows
         self._files: Collection[str] = ()
-        self._left = MOST_LINES
+        self._left = MAX_TRACED_LINES
         self._seen: dict[str, tuple[Any, int, bool]] = {}
         self._at: Frame | None = None
         """The running line."""
@@ -228,7 +228,7 @@ class _Lines:
 # --- reports -----------------------------------------------------------------------------------------
 
 
-_TRIES = 3
+_MAX_TRACED_RESETS = 3
 """Partial resets of a class in which lines are traced."""
 
 
@@ -245,7 +245,7 @@ class ResetWatch:
         self._chosen: tuple[int, ...] = ()
         self._task: type | None = None
         self._tries = 0
-        """Remaining attempts of `_TRIES`."""
+        """Remaining attempts of `_MAX_TRACED_RESETS`."""
         self._seeks = False
         """Trace lines in the next reset."""
         self.whole = False
@@ -258,7 +258,7 @@ class ResetWatch:
     def start(self, env: BaseEnv, task: type, chosen: Sequence[int]) -> None:
         """Envs `chosen` are about to be reset."""
         if self._task is not task:
-            self._task, self._tries, self._seeks = task, _TRIES, True
+            self._task, self._tries, self._seeks = task, _MAX_TRACED_RESETS, True
         self._chosen = tuple(chosen)
         self._lines = _Lines(KeptRows(env, chosen))
         if self._seeks:

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 KeywordKind = Literal["bool", "int", "float", "str", "choice", "json"]
-LONGEST_TEXT = 2000
+MAX_TEXT_CHARACTERS = 2000
 """Characters of a value's text."""
-MOST_CHOICES = 200
-MOST_KEYWORDS = 40
+MAX_CHOICES = 200
+MAX_KEYWORDS = 40
 MODES = ("robot_uids", "control_mode", "obs_mode", "reward_mode")
 """Keywords that every task of ManiSkill has and that a person chooses."""
-_NOT_ITS_OWN = frozenset(
+_BASE_PARAMETERS = frozenset(
     {
         *MODES, "num_envs", "render_mode", "shader_dir", "enable_shadow", "sensor_configs", "sim_config", "sim_backend",
         "human_render_camera_configs", "viewer_camera_configs", "reconfiguration_freq", "render_backend",
@@ -77,8 +77,8 @@ def describe_keywords(
     effective = {**registered, **given}
     own = [
         _describe(name, parameter, effective.get(name, _ABSENT), registered.get(name, _ABSENT))
-        for name, parameter in list(parameters.items())[:MOST_KEYWORDS]
-        if name not in _NOT_ITS_OWN
+        for name, parameter in list(parameters.items())[:MAX_KEYWORDS]
+        if name not in _BASE_PARAMETERS
     ]
     robots = [str(getattr(agent, "uid", type(agent).__name__)) for agent in _agents_of(env)]
     return HowMade(", ".join(robots), tuple(_modes(cls, env)), tuple(own))
@@ -128,7 +128,7 @@ def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
     texts = dict.fromkeys(text for one in choices if (text := as_json(one)) is not None)
     if now is None:
         return Keyword(name, "json", _in_words(value), fixed="its value is an object of Python")
-    return Keyword(name, "choice", now, choices=tuple(dict.fromkeys((*texts, now)))[:MOST_CHOICES])
+    return Keyword(name, "choice", now, choices=tuple(dict.fromkeys((*texts, now)))[:MAX_CHOICES])
 
 
 def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parameter]]:
@@ -180,7 +180,7 @@ def _describe(name: str, parameter: inspect.Parameter, given: Any, registered: A
         return Keyword(name, "json", _in_words(value), fixed="its value is an object of Python")
     if choices and text not in choices and text != "null":
         choices = (*choices, text)
-    return Keyword(name, kind, text, usual or "", choices[:MOST_CHOICES], optional)
+    return Keyword(name, kind, text, usual or "", choices[:MAX_CHOICES], optional)
 
 
 def _plain(value: Any) -> Any:
@@ -218,7 +218,7 @@ def as_json(value: Any) -> str | None:
     except (TypeError, ValueError, RecursionError):
         return None
     same = back == value or (isinstance(value, tuple) and back == list(value))
-    return text if same and len(text) <= LONGEST_TEXT else None
+    return text if same and len(text) <= MAX_TEXT_CHARACTERS else None
 
 
 def _in_words(value: Any) -> str:
@@ -271,8 +271,8 @@ def read_value(keyword: Keyword, text: str) -> Any:
         ValueError: it is none of this kind; the message names the keyword and says what it takes.
     """
     text = text.strip()
-    if len(text) > LONGEST_TEXT:
-        raise ValueError(f"{keyword.name} takes at most {LONGEST_TEXT} characters.")
+    if len(text) > MAX_TEXT_CHARACTERS:
+        raise ValueError(f"{keyword.name} takes at most {MAX_TEXT_CHARACTERS} characters.")
     if keyword.optional and text in ("", "null", "None"):
         return None
     if keyword.kind == "str":
@@ -294,14 +294,14 @@ _TAKES: dict[KeywordKind, str] = {
     "choice": "one of its choices",
     "json": 'a value in JSON, such as 0.5, [1, 2] or "text"',
 }
-LARGEST_INT = 2**63
+MAX_INT = 2**63
 
 
 def _fits(keyword: Keyword, value: Any) -> bool:
     if keyword.kind == "bool":
         return isinstance(value, bool)
     if keyword.kind == "int":
-        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < LARGEST_INT
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_INT
     if keyword.kind == "float":
         return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     if keyword.kind == "choice":

@@ -307,7 +307,7 @@ def install_base_env_hooks() -> None:
 
 
 _BASE_ARGUMENTS = "_workbench_base_arguments"
-_TECHNICAL = ("num_envs", "render_backend", "reward_mode")
+_WORKBENCH_ARGUMENTS = ("num_envs", "render_backend", "reward_mode")
 """Arguments that the workbench gives on its own."""
 
 
@@ -322,7 +322,7 @@ def base_arguments(env: Any, task: type, kwargs: dict[str, Any]) -> Iterator[dic
     left = (
         {}
         if any_name
-        else {name: kwargs[name] for name in _TECHNICAL if name in kwargs.keys() - taken.keys()}
+        else {name: kwargs[name] for name in _WORKBENCH_ARGUMENTS if name in kwargs.keys() - taken.keys()}
     )
     defaults = {name: value for name, value in left.items() if name != "render_backend"}
     fixed = {"sim_backend": "physx_cpu", **{k: v for k, v in left.items() if k == "render_backend"}}

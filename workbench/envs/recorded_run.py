@@ -95,20 +95,20 @@ def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
 # --- keywords of ``gym.make`` that make an env again ------------------------------------------------
 
 
-HOW_IT_IS_RUN = frozenset({"num_envs", "sim_backend", "render_backend", "render_device", "render_mode"})
+RUN_KEYWORDS = frozenset({"num_envs", "sim_backend", "render_backend", "render_device", "render_mode"})
 """Keywords that change how an env is run, not what it is."""
 
 
 def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
     """Keywords of ``gym.make`` that make `env` again: those `given` and the modes it took, as far as JSON holds them.
 
-    ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. The replay chooses `HOW_IT_IS_RUN`.
+    ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. The replay chooses `RUN_KEYWORDS`.
     """
     modes: dict[str, Any] = {"obs_mode": env.obs_mode, "reward_mode": env.reward_mode}
     if (mode := control_mode_of(env)) is not None:
         modes["control_mode"] = mode
     every = {**given, **modes}
-    return {name: every[name] for name in every if name not in HOW_IT_IS_RUN and _is_json(every[name])}
+    return {name: every[name] for name in every if name not in RUN_KEYWORDS and _is_json(every[name])}
 
 
 def _is_json(value: Any) -> bool:

@@ -34,7 +34,7 @@ _FILE_ARGUMENTS = ("urdf_file", "mjcf_file", "asset_path")
 """Names of the robot's file in the loaders and in ``BaseAgent._load_articulation``."""
 _ELEMENTS = ("origin_node", "node", "geom", "mesh", "texture", "material", "body")
 """Names of an element of the file in the functions that read one."""
-_OF_A_LOOP = ("mimic", "joint", "x", "link")
+_LOOP_NAMES = ("mimic", "joint", "x", "link")
 """Names that may be of an earlier turn where a function called others."""
 
 
@@ -125,7 +125,7 @@ def _part_at_fault(frames: list[FrameType]) -> _Part | None:
     found: _Part | None = None
     for frame in frames:
         values = frame.f_locals
-        names = (*_ELEMENTS, *_OF_A_LOOP) if frame is frames[0] else _ELEMENTS
+        names = (*_ELEMENTS, *_LOOP_NAMES) if frame is frames[0] else _ELEMENTS
         if frame.f_code.co_name == "_build_link":
             names = (*names, "link")
         parts = [_part_of(values[name]) for name in names if values.get(name) is not None]

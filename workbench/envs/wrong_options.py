@@ -26,9 +26,9 @@ _OBS_PARTS = (
     *("state", "state_dict", "none", "sensor_data", "pointcloud"),
     *("rgb", "depth", "segmentation", "position", "normal", "albedo"),
 )
-_CORE = f"{Path(__file__).parent}{os.sep}"
+_CORE_FOLDER = f"{Path(__file__).parent}{os.sep}"
 """The folder of the core, which wraps constructors."""
-_MOST_NAMES = 12
+_MAX_NAMES = 12
 """Most names that a message lists where none is similar."""
 
 
@@ -49,7 +49,7 @@ def wrong_option(task: type[BaseEnv], given: Mapping[str, Any], error: BaseExcep
         return None
     raised_in = frames[-1].f_code
     if isinstance(first, TypeError) and (
-        raised_in.co_name == "__init__" or raised_in.co_filename.startswith(_CORE)
+        raised_in.co_name == "__init__" or raised_in.co_filename.startswith(_CORE_FOLDER)
     ):
         # An unknown name fails in the frame of the call.
         known, popped = {name for name, _ in parameters_of(task, object)}, _taken_by_name(task)
@@ -146,7 +146,7 @@ def _instead(wrong: str, names: Collection[str]) -> str:
     near = difflib.get_close_matches(wrong, names, n=3, cutoff=0.6)
     if near:
         return f" Did you mean {' or '.join(near)}?"
-    return f" There is {', '.join(sorted(names)[:_MOST_NAMES])}{', ...' if len(names) > _MOST_NAMES else ''}."
+    return f" There is {', '.join(sorted(names)[:_MAX_NAMES])}{', ...' if len(names) > _MAX_NAMES else ''}."
 
 
 def _local(error: BaseException, function: Any, name: str) -> Any:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from email.parser import HeaderParser
 from pathlib import Path
 
-LOCK_WAIT_S = 180
+LOCK_TIMEOUT_SECONDS = 180
 
 
 class AptFailed(RuntimeError):
@@ -51,7 +51,15 @@ def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: fl
     Raises:
         AptFailed: it is missing, failed, or took longer than `timeout_s`.
     """
-    command = ["apt-get", "-q", "-y", "-o", f"DPkg::Lock::Timeout={LOCK_WAIT_S}", *options, *arguments]
+    command = [
+        "apt-get",
+        "-q",
+        "-y",
+        "-o",
+        f"DPkg::Lock::Timeout={LOCK_TIMEOUT_SECONDS}",
+        *options,
+        *arguments,
+    ]
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C.UTF-8"}
     print("+ " + " ".join(["apt-get", *arguments]), file=sys.stderr, flush=True)
     try:

@@ -31,12 +31,12 @@ from workbench.machine.render_probe import driver_files
 from workbench.machine.software_vulkan import ensure_render_device
 
 DEFAULT_PORT = 8080
-LEAST_MEMORY_GIB = 6.0
+MIN_MEMORY_GIB = 6.0
 """Least available memory, in GiB: one worker with 16 envs and cameras on a software driver, its warm spare, the
 server and a browser."""
-CHILD_TIMEOUT_S = 120
+CHILD_TIMEOUT_SECONDS = 120
 
-GPU_QUESTIONS = """
+GPU_SCRIPT = """
 import json, torch
 from workbench.envs.backends import gpu_library_path, why_no_gpu_simulation
 cuda = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
@@ -44,7 +44,7 @@ print(json.dumps({"built": torch.version.cuda, "cuda": cuda,
                   "why_not": why_no_gpu_simulation(), "library": str(gpu_library_path())}))
 """
 
-VERSION_QUESTIONS = """
+VERSION_SCRIPT = """
 import json
 from workbench.core import maniskill_private
 from workbench.machine.versions import moved_text
@@ -165,7 +165,7 @@ def _maniskill() -> list[DoctorFinding]:
         return [DoctorFinding(topic, False, *lacking)]
     if (mixed := lines_if_mixed()) is not None:
         return [DoctorFinding(topic, None, mixed[0], "\n".join(mixed[1:]))]
-    answer = _ask_child(VERSION_QUESTIONS)
+    answer = _ask_child(VERSION_SCRIPT)
     if isinstance(answer, str):
         return [
             DoctorFinding(
@@ -214,7 +214,7 @@ def _render_device() -> list[DoctorFinding]:
 
 def _gpu() -> list[DoctorFinding]:
     """Check CUDA through torch, then PhysX on it, without a download by SAPIEN."""
-    answer = _ask_child(GPU_QUESTIONS)
+    answer = _ask_child(GPU_SCRIPT)
     if isinstance(answer, str):
         return [
             DoctorFinding("CUDA", False, f"torch or SAPIEN does not load: {answer}", "See the lines above.")
@@ -260,11 +260,11 @@ def _ask_child(code: str) -> Any:
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
-            timeout=CHILD_TIMEOUT_S,
+            timeout=CHILD_TIMEOUT_SECONDS,
         )
     except subprocess.TimeoutExpired:
         # Its own text is the whole program that was asked.
-        raise _TookTooLong(f"it took more than {CHILD_TIMEOUT_S} s") from None
+        raise _TookTooLong(f"it took more than {CHILD_TIMEOUT_SECONDS} s") from None
     if child.returncode != 0:
         return (child.stderr.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
     return json.loads(child.stdout.strip().splitlines()[-1])
@@ -275,9 +275,9 @@ def _cores_and_memory() -> list[DoctorFinding]:
     memory = psutil.virtual_memory()
     total, free = memory.total / 2**30, memory.available / 2**30
     what = f"{cores} cores, {total:.1f} GiB of memory, {free:.1f} GiB of it available"
-    if free < LEAST_MEMORY_GIB:
+    if free < MIN_MEMORY_GIB:
         advice = (
-            f"Less than {LEAST_MEMORY_GIB:.0f} GiB available: close something, or use a smaller --num-envs."
+            f"Less than {MIN_MEMORY_GIB:.0f} GiB available: close something, or use a smaller --num-envs."
         )
         return [DoctorFinding("cores, memory", None, what, advice)]
     return [DoctorFinding("cores, memory", True, what)]

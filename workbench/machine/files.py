@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-MOST_BYTES = 64 << 20
+MAX_COMPARED_BYTES = 64 << 20
 """Most bytes of a file that is compared before it is replaced."""
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
 
@@ -92,7 +92,7 @@ def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> b
                 os.chown(temporary, status.st_uid, status.st_gid)
             with contextlib.suppress(PermissionError):  # a drive without modes
                 os.chmod(temporary, stat.S_IMODE(status.st_mode))
-        if expected is not None and read_regular_file(path, MOST_BYTES) != expected:
+        if expected is not None and read_regular_file(path, MAX_COMPARED_BYTES) != expected:
             return False
         os.replace(temporary, path)
     return True
@@ -144,9 +144,9 @@ def _taken(path: Path) -> FileExistsError:
 # --- reading files that others may have replaced: regular files of limited size ---------------------
 
 
-MOST_SOURCE_BYTES = 16 << 20
+MAX_SOURCE_BYTES = 16 << 20
 """Most bytes of one Python file; 50 times the largest file of the standard library."""
-_PIECE = 1 << 20
+_READ_BYTES = 1 << 20
 _KINDS = (
     (stat.S_ISDIR, "folder"),
     (stat.S_ISFIFO, "named pipe"),
@@ -180,7 +180,7 @@ def read_regular_file(path: str | os.PathLike[str], most_bytes: int) -> bytes:
     with open_regular_file(path, most_bytes) as file:
         pieces, size = [], 0
         # In pieces: one read of `most_bytes` would allocate them all for a file of ten bytes.
-        while piece := file.read(min(_PIECE, most_bytes + 1 - size)):
+        while piece := file.read(min(_READ_BYTES, most_bytes + 1 - size)):
             pieces.append(piece)
             size += len(piece)
             if size > most_bytes:

@@ -14,7 +14,7 @@ import platformdirs
 
 from workbench.machine.files import create_file, written_beside
 
-MOST_BYTES = 16 << 20
+MAX_FILE_BYTES = 16 << 20
 
 
 class NoUserFolder(OSError):
@@ -73,11 +73,11 @@ def read_private(name: str, folder: Path | None = None) -> bytes | None:
     try:
         _check_private(path.parent, path.parent.stat())
         _check_private(path, status := os.fstat(descriptor))
-        if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
-            raise NoUserFolder(f"{path} is no ordinary file of at most {MOST_BYTES >> 20} MB")
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:
+            raise NoUserFolder(f"{path} is no ordinary file of at most {MAX_FILE_BYTES >> 20} MB")
         # After the checks: for a folder fdopen raises, and leaves the descriptor open.
         with os.fdopen(descriptor, "rb", closefd=False) as file:
-            return file.read(MOST_BYTES)
+            return file.read(MAX_FILE_BYTES)
     finally:
         os.close(descriptor)
 

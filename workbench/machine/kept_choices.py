@@ -11,7 +11,7 @@ import msgspec
 from workbench.machine.folders import locked, read_private, write_private
 
 FILE = "choices.json"
-MOST_FOLDERS, MOST_POLICIES = 100, 10
+MAX_FOLDERS, MAX_POLICIES = 100, 10
 log = logging.getLogger(__name__)
 
 
@@ -57,8 +57,8 @@ def keep_policy(folder: Path, reference: str) -> None:
     def change(kept: KeptChoices) -> KeptChoices:
         known = [one for one in kept.policies.get(str(folder), ()) if one != reference]
         others = {place: used for place, used in kept.policies.items() if place != str(folder)}
-        newest = dict([*others.items()][-(MOST_FOLDERS - 1) :])
-        policies = {**newest, str(folder): [reference, *known][:MOST_POLICIES]}
+        newest = dict([*others.items()][-(MAX_FOLDERS - 1) :])
+        policies = {**newest, str(folder): [reference, *known][:MAX_POLICIES]}
         return msgspec.structs.replace(kept, policies=policies)
 
     _change(change)

@@ -19,7 +19,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from workbench.machine.processes.watched_thread import report_failure
 
-_LOOK = 0.05
+_POLL_SECONDS = 0.05
 """Seconds between two checks whether a result is still wanted."""
 _tasks: set[asyncio.Task[Any]] = set()
 Value = TypeVar("Value")
@@ -156,7 +156,7 @@ def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lamb
     """
     future = submit(work)
     while True:
-        done, _ = futures.wait([future], _LOOK)
+        done, _ = futures.wait([future], _POLL_SECONDS)
         if done:
             return future.result()
         try:

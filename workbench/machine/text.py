@@ -163,9 +163,9 @@ def guard_terminal() -> None:
         logging.lastResort.setFormatter(_OneLine())
 
 
-MOST_LINES = 80
+MAX_TRACEBACK_LINES = 80
 """Most lines of a traceback."""
-LONGEST_LINE = 500
+MAX_LINE_CHARACTERS = 500
 
 
 class _OneLine(logging.Formatter):
@@ -176,9 +176,9 @@ class _OneLine(logging.Formatter):
 
     def formatException(self, ei: Any) -> str:
         # An error's text may be as long as what a recording or a page sent.
-        lines = [line[:LONGEST_LINE] for line in super().formatException(ei).splitlines()]
-        if len(lines) > MOST_LINES:
-            lines = [*lines[: MOST_LINES // 2], "    ...", *lines[-MOST_LINES // 2 :]]
+        lines = [line[:MAX_LINE_CHARACTERS] for line in super().formatException(ei).splitlines()]
+        if len(lines) > MAX_TRACEBACK_LINES:
+            lines = [*lines[: MAX_TRACEBACK_LINES // 2], "    ...", *lines[-MAX_TRACEBACK_LINES // 2 :]]
         return plain_text("\n".join(lines), "\n\t")
 
 

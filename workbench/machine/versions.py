@@ -18,7 +18,7 @@ from workbench.machine.maniskill_installed import EXTRAS, installed_maniskills, 
 
 MANISKILL = tuple(EXTRAS)
 """Two distributions with the same files: the release, and the nightly build."""
-_OF_AN_EPISODE = (DISTRIBUTION, *MANISKILL, "sapien", "torch", "rerun-sdk")
+_EPISODE_PACKAGES = (DISTRIBUTION, *MANISKILL, "sapien", "torch", "rerun-sdk")
 TESTED = {
     "mani_skill": ("3.0.1",),
     "mani_skill-nightly": ("2026.8.2.400",),
@@ -116,7 +116,7 @@ def installed(distribution: str) -> str | None:
 @cache
 def package_versions() -> Mapping[str, str]:
     """Versions of the packages that an episode depends on, as this process has them."""
-    versions = {name: installed(name) for name in _OF_AN_EPISODE}
+    versions = {name: installed(name) for name in _EPISODE_PACKAGES}
     return {name: version for name, version in versions.items() if version is not None}
 
 

@@ -32,7 +32,7 @@ _AXES: dict[str, Floats] = {
     "opencv": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
     "opengl": np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
 }
-VERTICAL = 1e-6
+VERTICAL_SINE = 1e-6
 """Sine of the angle to the vertical below which a camera looks straight down or up, and "upright" says nothing."""
 ROTATION_TOLERANCE = 1e-3
 """How far a matrix may be from a rotation: calibrations are printed with four digits."""
@@ -143,7 +143,7 @@ def quaternion_from_axes(forward: ArrayLike, up: ArrayLike) -> Floats:
     """
     ahead = _direction(forward, "forward")
     left = np.cross(_direction(up, "up"), ahead)
-    if np.linalg.norm(left) < VERTICAL:
+    if np.linalg.norm(left) < VERTICAL_SINE:
         raise ValueError("up must not point along forward: which way the camera is turned stays open")
     left /= np.linalg.norm(left)
     return quaternion_of(np.stack([ahead, left, np.cross(ahead, left)], axis=1))
@@ -159,7 +159,7 @@ def rpy_of(quaternion: ArrayLike) -> tuple[float, float, float]:
     r = rotation_matrix(quaternion)
     flat = math.hypot(r[0, 0], r[1, 0])
     pitch = math.atan2(-r[2, 0], flat)
-    if flat < VERTICAL:
+    if flat < VERTICAL_SINE:
         roll, yaw = 0.0, math.atan2(-r[0, 1], r[1, 1])
     else:
         roll, yaw = math.atan2(r[2, 1], r[2, 2]), math.atan2(r[1, 0], r[0, 0])
@@ -250,7 +250,7 @@ def upright(forward: ArrayLike) -> Floats:
     """(3, 3) rotation of the camera that looks along `forward` and is level; see `LookAt.roll` for the vertical."""
     ahead = _direction(forward, "forward")
     flat = math.hypot(ahead[0], ahead[1])
-    left = np.array([0.0, 1.0, 0.0]) if flat < VERTICAL else np.array([-ahead[1], ahead[0], 0.0]) / flat
+    left = np.array([0.0, 1.0, 0.0]) if flat < VERTICAL_SINE else np.array([-ahead[1], ahead[0], 0.0]) / flat
     left = left - ahead * (ahead @ left)
     left /= np.linalg.norm(left)
     return np.stack([ahead, left, np.cross(ahead, left)], axis=1)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from workbench.envs.camera_data import CameraKey, CameraKind, CameraSettings, Picture
 from workbench.pictures.camera_conventions import intrinsic_of
 
-DEPTH_EDGES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
+DEPTH_EDGES_METRES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
 """Metres, (41,). Ten bins a decade, the same for every camera, so that histograms can be compared; values outside count
 in the first or last bin."""
-ENOUGH_PIXELS = 100.0
+LARGE_ENOUGH_PIXELS = 100.0
 """An object of fewer pixels counts as small: a cube of ten by ten still shows its rotation."""
 
 
@@ -90,7 +90,7 @@ class ObjectSeen:
         Product of the share that nothing covers, one half if the border cuts it, and for small objects the square root of
         their pixels (a length: twice as far away is half as good).
         """
-        size = np.sqrt(np.clip(self.alone / ENOUGH_PIXELS, 0, 1))
+        size = np.sqrt(np.clip(self.alone / LARGE_ENOUGH_PIXELS, 0, 1))
         open_share = np.clip(self.pixels / np.maximum(self.alone, 1e-6), 0, 1)
         marks = np.where(self.pixels > 0, size * open_share * np.where(self.cut, 0.5, 1.0), 0.0)
         return np.where(self.present, marks, np.nan).astype(np.float32)
@@ -117,7 +117,7 @@ class DepthReport:
     """Depth of all that the camera sees, the robot included."""
 
     counts: NDArray[np.int64]
-    """(E, 40) pixels of the measured pictures between `DEPTH_EDGES`, without background."""
+    """(E, 40) pixels of the measured pictures between `DEPTH_EDGES_METRES`, without background."""
     background: NDArray[np.float32]
     """(E,) share of the picture where a ray meets nothing (depth 0)."""
     beyond: NDArray[np.float32]

@@ -41,19 +41,19 @@ from workbench.pictures.visibility import (
     small_size,
 )
 
-WIDE_MARGIN = 0.1
+WIDE_MARGIN_SHARE = 0.1
 """Share of the picture's shorter side that is enough between an object and the border."""
-ROOM = 0.1
+FREE_METRES = 0.1
 """Metres that must be free in front of the lens: the camera's own body is there."""
-FROM_THE_ROBOT = 0.2
+ROBOT_DISTANCE_METRES = 0.2
 """Least distance in metres of an eye from the origin of every robot link, in the searched envs."""
-FROM_ITS_MOUNT = 0.05
+MOUNT_DISTANCE_METRES = 0.05
 """Least distance in metres of an eye on a mount from the origin of every robot link; it is meant to be near one."""
-GOOD_ENOUGH = 0.995
+SUFFICIENT_SCORE = 0.995
 """Score at which no further round is sampled."""
 ROUNDS = 2
 """Rounds of samples around the best candidates."""
-TRIES = 50
+MAX_EYE_ATTEMPTS = 50
 """Attempts to sample an eye clear of the robot; a box within the robot is searched anyway."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
@@ -93,10 +93,10 @@ def score_of(report: CameraReport, objects: Sequence[str]) -> float:
     """
     marks = []
     for thing in report.wanted_objects(objects):
-        inside = 0.8 + 0.2 * np.clip(thing.margin / WIDE_MARGIN, 0, 1)
+        inside = 0.8 + 0.2 * np.clip(thing.margin / WIDE_MARGIN_SHARE, 0, 1)
         marks.append(np.where(thing.present, thing.marks() * inside, np.nan))
     worst = np.min(np.nan_to_num(marks, nan=np.inf), axis=0)
-    room = np.clip(np.nan_to_num(report.depth.nearest) / ROOM, 0, 1)
+    room = np.clip(np.nan_to_num(report.depth.nearest) / FREE_METRES, 0, 1)
     there = np.isfinite(worst)
     known = worst[there] * room[there]
     return float((known.mean() + known.min()) / 2) if len(known) else 0.0
@@ -152,7 +152,7 @@ class _Search:
         self._measure_best_of(drawn, self.keep)
         for round_ in range(ROUNDS):
             chosen = self._chosen()
-            if len(chosen) == self.space.best and chosen[-1][0] >= GOOD_ENOUGH:
+            if len(chosen) == self.space.best and chosen[-1][0] >= SUFFICIENT_SCORE:
                 break
             centres = [candidate for _, candidate, _ in chosen]
             reach = 0.12 / (round_ + 1)
@@ -213,7 +213,7 @@ class _Search:
 
     def _draw(self) -> _Candidate:
         eye = self.rng.uniform(self.low, self.high)
-        for _ in range(TRIES):
+        for _ in range(MAX_EYE_ATTEMPTS):
             if self._is_clear(eye):
                 break
             eye = self.rng.uniform(self.low, self.high)
@@ -225,7 +225,7 @@ class _Search:
         return eye, self._apart_from(eye, centre[1] + self.rng.normal(0, 0.5, 3) * reach * self.spread)
 
     def _is_clear(self, eye: NDArray[np.float64]) -> bool:
-        least = FROM_THE_ROBOT if self.mounts is None else FROM_ITS_MOUNT
+        least = ROBOT_DISTANCE_METRES if self.mounts is None else MOUNT_DISTANCE_METRES
         return not len(self.links) or np.linalg.norm(self.links - eye, axis=1).min() >= least
 
     def _apart_from(self, eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -29,7 +29,7 @@ from workbench.envs.task_env import TaskEnv
 from workbench.pictures.placed_cameras import rows_of_pose, settings_of
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
-_INT16_END = 32.767
+_MAX_INT16_METRES = 32.767
 """Metres. The minimal shader writes positions as int16 millimetres."""
 
 KINDS: tuple[CameraKind, ...] = ("sensor", "human")
@@ -366,7 +366,7 @@ def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component
     if np.issubdtype(transformed.dtype, np.floating):
         return transformed.astype(np.float32)
     depth = transformed.astype(np.float32) / np.float32(1000.0)
-    beyond = (depth < 0.0) | (depth >= _INT16_END)
+    beyond = (depth < 0.0) | (depth >= _MAX_INT16_METRES)
     if beyond.any():
         # Vulkan's depth in 0..1 of a perspective camera: z = f (1 - n / d) / (f - n).
         buffer = component.get_picture("GbufferDepth")

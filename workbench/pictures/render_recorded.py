@@ -15,7 +15,7 @@ from workbench.envs.rendering.drawing import drawing
 from workbench.envs.scene.normals import with_normals
 from workbench.envs.scene.shapes import Material, SceneGeometry, Visual
 
-NEAR, FAR = 0.01, 300.0
+NEAR_METRES, FAR_METRES = 0.01, 300.0
 
 
 class RecordedScene:
@@ -54,7 +54,7 @@ class RecordedScene:
         self._eye = sapien.Entity()
         camera: Any = sapien.render.RenderCameraComponent(width, height)
         camera.set_fovy(fovy)
-        camera.near, camera.far = NEAR, FAR
+        camera.near, camera.far = NEAR_METRES, FAR_METRES
         self._eye.add_component(camera)
         with selected(DEFAULT):
             self._scene.add_entity(self._eye)

@@ -19,11 +19,17 @@ from workbench.envs.camera_data import CameraKey, CameraKind, CameraSettings, Pi
 from workbench.envs.indices import require_env
 from workbench.envs.scene.scene_index import SceneIndex, read_poses, scene_index
 from workbench.pictures.camera_conventions import compose, matrix3, pose_of, triple
-from workbench.pictures.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, ObjectToSee
+from workbench.pictures.camera_report import (
+    DEPTH_EDGES_METRES,
+    CameraReport,
+    DepthReport,
+    ObjectSeen,
+    ObjectToSee,
+)
 from workbench.pictures.render import cameras_of, mount_of
 from workbench.pictures.temporary_camera import TemporaryCamera, temporary_camera, undrawn
 
-SMALL = 64
+MEASURED_SIDE_PIXELS = 64
 """Pixels of the shorter side, enough to compare placements."""
 
 
@@ -205,7 +211,7 @@ def present_settings(camera: Any, env_index: int) -> CameraSettings:
     )
 
 
-def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]:
+def small_size(width: int, height: int, shorter: int = MEASURED_SIDE_PIXELS) -> tuple[int, int]:
     """Width and height with about the same aspect, the shorter side at most `shorter`."""
     scale = min(1.0, shorter / min(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
@@ -318,7 +324,9 @@ def _depths(
     """Depth report of one picture (H, W), from masks `something` (no background) and `counts` (robot or object)."""
     far, of_objects = depth[something], depth[counts]
     limit = float(of_objects.max()) if len(of_objects) else np.nan
-    histogram, _ = np.histogram(np.clip(far, DEPTH_EDGES[0], DEPTH_EDGES[-1]), DEPTH_EDGES)
+    histogram, _ = np.histogram(
+        np.clip(far, DEPTH_EDGES_METRES[0], DEPTH_EDGES_METRES[-1]), DEPTH_EDGES_METRES
+    )
     return DepthReport(
         counts=histogram.astype(np.int64)[None],
         background=_one(1 - something.mean()),

@@ -39,7 +39,7 @@ from workbench.source.parsed import (
     is_starred,
 )
 
-_DEPTH = 40
+_MAX_NAME_CHAIN = 40
 """Longest chain of names that is followed; a longer one is a circle."""
 _CONDITION_NODES = (
     ast.Name,
@@ -128,7 +128,7 @@ class ValueReader:
 
     def part(self, file: SourceFile, node: ast.expr, reads: Reads = ()) -> TracedValue:
         """The parts of an expression. Raises Unknown."""
-        if len(reads) > _DEPTH:
+        if len(reads) > _MAX_NAME_CHAIN:
             raise Unknown(f"`{file.code(node)}` is defined by itself")
         if isinstance(node, ast.IfExp):
             return self.part(file, node.body if self._test(file, node.test) else node.orelse, reads)
@@ -409,7 +409,7 @@ class ValueReader:
         except Unknown as exc:
             raise Unknown(f"`{code}` depends on what only the running task knows") from exc
         where, base, others = file, node.value, None
-        for _ in range(_DEPTH):
+        for _ in range(_MAX_NAME_CHAIN):
             if isinstance(base, _NAME_NODES):
                 where, base, more = self._follow(where, base)
                 others = others or more

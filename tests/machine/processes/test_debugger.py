@@ -174,7 +174,7 @@ def test_a_port_that_is_taken_is_refused_or_another_found(monkeypatch: pytest.Mo
         taken = other.getsockname()[1]
         with pytest.raises(ValueError, match=f"--debug-port {taken} cannot be listened on"):
             port_for_debugger(taken)
-        monkeypatch.setattr("workbench.machine.processes.debugger.USUAL_PORT", taken)
+        monkeypatch.setattr("workbench.machine.processes.debugger.DEFAULT_PORT", taken)
         assert port_for_debugger(None) not in (0, taken)
 
 

@@ -30,24 +30,24 @@ from workbench.envs.scene.shapes import Mesh
 from workbench.envs.scene.simplify import drop_uvs
 from workbench.envs.simulation.drawn_poses import NOWHERE_ELSE, Places
 
-HEAVY = 500
+HEAVY_FACES = 500
 """Triangles above which a body's mesh is simplified. Cylinders, spheres and the like stay exact too: layered thin
 discs, such as ManiSkill's targets, would lose a layer."""
-TOLERANCE = 0.6
-"""Pixels that a surface may be off in a picture of `_SMALL` pixels; more in larger pictures, where fewer of the pixels
+TOLERANCE_PIXELS = 0.6
+"""Pixels that a surface may be off in a picture of `_TOLERANCE_SIDE_PIXELS` pixels; more in larger pictures, where fewer of the pixels
 are on edges."""
-_SMALL = 128
-_NEAREST = 0.02
+_TOLERANCE_SIDE_PIXELS = 128
+_MIN_DISTANCE_METRES = 0.02
 """Smallest distance in metres that tolerances assume: no camera stays nearer for long, and one within its own mount
 would forbid any simplification."""
-_FINEST = 1e-4
+_TOLERANCE_UNIT_METRES = 1e-4
 """Unit of the tolerances in metres: they are this times powers of the fourth root of two, so that similar poses give
 the same meshes."""
 
-_WORTH_FEWER_TEXTURES = 256 * 256
+_MIN_LEAN_PIXELS = 256 * 256
 """Pixels of a picture below which fewer textures save no more than it costs to check whether the author changed the
 material."""
-_SAME_PLACE = 1e-5, 1e-4
+_SAME_POSE_TOLERANCES = 1e-5, 1e-4
 """Tolerance in metres and (roughly) radians: a body that moved less, as seen from a camera, has not moved."""
 
 Bodies = tuple[tuple[sapien.render.RenderBodyComponent, sapien.render.RenderBodyComponent | None], ...]
@@ -120,7 +120,7 @@ class FastShapes:
             self._tolerances[key] = self._tolerances_of(camera)
         component, of_env = camera[env], self._heavy[env]
         drawn: list[tuple[Any, Any]] = []
-        if component.width * component.height >= _WORTH_FEWER_TEXTURES:
+        if component.width * component.height >= _MIN_LEAN_PIXELS:
             drawn += [(body, lean.component) for body, lean in self._lean[env] if lean.is_like_exact()]
         if of_env:
             drawn += self._drawn_of_heavy(env, key, component, places)
@@ -275,7 +275,11 @@ class _Cut:
         now, then = np.asarray(pose.q), np.asarray(self.pose.q)
         # A quaternion and its negative are one rotation.
         turned = min(np.abs(now - then).max(), np.abs(now + then).max())
-        return off <= _SAME_PLACE[0] and turned <= _SAME_PLACE[1] and np.array_equal(planes, self.planes)
+        return (
+            off <= _SAME_POSE_TOLERANCES[0]
+            and turned <= _SAME_POSE_TOLERANCES[1]
+            and np.array_equal(planes, self.planes)
+        )
 
 
 def _pose(entity: sapien.Entity, places: Places) -> sapien.Pose:
@@ -292,7 +296,7 @@ def heavy_bodies(sub_scene: sapien.Scene) -> Iterator[sapien.render.RenderBodyCo
 
 
 def _is_heavy(body: Any) -> bool:
-    return _faces(body) > HEAVY and not _has_tangents(body)
+    return _faces(body) > HEAVY_FACES and not _has_tangents(body)
 
 
 def _bodies(sub_scene: sapien.Scene) -> Iterator[Any]:
@@ -446,8 +450,8 @@ def _shared_name(entity: Any, env: int) -> str:
 
 def _tolerance(camera: sapien.render.RenderCameraComponent, distance: float) -> float:
     """Metres that a surface at this distance may be off."""
-    pixels_off = TOLERANCE * max(1.0, camera.height / _SMALL) ** 0.5
-    return pixels_off * _pixel(camera) * max(distance, _NEAREST)
+    pixels_off = TOLERANCE_PIXELS * max(1.0, camera.height / _TOLERANCE_SIDE_PIXELS) ** 0.5
+    return pixels_off * _pixel(camera) * max(distance, _MIN_DISTANCE_METRES)
 
 
 def _pixel(camera: sapien.render.RenderCameraComponent) -> float:
@@ -462,6 +466,6 @@ def _distance(point: NDArray[np.floating], low: NDArray[np.floating], high: NDAr
 
 
 def _rounded(tolerance: float) -> float:
-    if tolerance < _FINEST:
+    if tolerance < _TOLERANCE_UNIT_METRES:
         return tolerance
-    return _FINEST * 2.0 ** (np.floor(4 * np.log2(tolerance / _FINEST)) / 4)
+    return _TOLERANCE_UNIT_METRES * 2.0 ** (np.floor(4 * np.log2(tolerance / _TOLERANCE_UNIT_METRES)) / 4)

@@ -16,7 +16,7 @@ from trimesh.convex import hull_points
 
 from workbench.envs.scene.shapes import Mesh
 
-_MARGIN = 1.0
+_MARGIN_PIXELS = 1.0
 """Pixels around the picture that count as in view: a tolerance for poses that moved since they were measured."""
 
 Planes = NDArray[np.float64]
@@ -33,10 +33,10 @@ def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
         np.eye(4)[0],
     )
     planes = [
-        column + _MARGIN * x,
-        (camera.width + _MARGIN) * x - column,
-        row + _MARGIN * x,
-        (camera.height + _MARGIN) * x - row,
+        column + _MARGIN_PIXELS * x,
+        (camera.width + _MARGIN_PIXELS) * x - column,
+        row + _MARGIN_PIXELS * x,
+        (camera.height + _MARGIN_PIXELS) * x - row,
         x - [0, 0, 0, 0.99 * camera.near],
     ]
     return np.array(planes)

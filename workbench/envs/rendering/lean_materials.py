@@ -20,7 +20,7 @@ _VALUES = (
 )
 _TEXTURES = ("base_color", "emission", "normal", "roughness", "metallic", "transmission")
 _KNOWN_FORMATS = ("R8G8B8A8Unorm", "R8Unorm")
-_MOST_TEXELS = 1 << 24
+_MAX_READ_TEXELS = 1 << 24
 """Limit of texels that are read in a scene: a million take 10 to 20 ms, and a furnished house has hundreds of millions."""
 
 
@@ -91,7 +91,7 @@ class LeanMaterials:
             if known == texture:
                 return value
         self._texels += texture.width * texture.height
-        value = _constant(texture) if self._texels <= _MOST_TEXELS else None
+        value = _constant(texture) if self._texels <= _MAX_READ_TEXELS else None
         self._constants.append((texture, value))
         return value
 

@@ -32,25 +32,25 @@ from workbench.machine.folders import cache_folder, read_private, write_private
 
 _VERSION = 3
 """Version of the cached files; increase it when the levels change."""
-_FEWEST_FACES = 24
-_LOST, _USELESS = 0.01, 0.1
+_MIN_FACES = 24
+_LOST_PIECE_ERROR, _USELESS_ERROR = 0.01, 0.1
 """Errors relative to the size of the mesh: above the first, a piece of the mesh may be missing, so coarsening by pieces
 is tried too; above the second, no level is made."""
-_SIMPLE = 150
+_SIMPLE_FACES = 150
 """Triangles up to which a mesh stays as it is: layered thin discs, such as ManiSkill's targets, would lose a layer (see
 `from_afar`)."""
-_FEW = 32, 48, 72, 100, 144, 200, 280, 400, 800, 1600
-"""Triangle counts that `from_afar` tries, fewest first; for each it tries grids of `_GRIDS` cells."""
-_GRIDS = 12, 24, 48
-_LARGE = 20_000
+_AFAR_FACES = 32, 48, 72, 100, 144, 200, 280, 400, 800, 1600
+"""Triangle counts that `from_afar` tries, fewest first; for each it tries grids of `_AFAR_CELLS` cells."""
+_AFAR_CELLS = 12, 24, 48
+_LARGE_FACES = 20_000
 """Triangles above which a level is made from the level before: making it from the exact mesh takes too long."""
 _CHECKED_POINTS = 1500
 """Points on the exact surface at which the distance to a level is measured."""
-_SAMPLES = 10_000
+_SEARCHED_POINTS = 10_000
 """Most points on a level that are searched for the triangle nearest to a point."""
-_MOST_KEPT = 500
+_MAX_MESHES = 500
 """Most meshes in memory."""
-_MOST_ON_DISK = 512 << 20
+_MAX_CACHE_BYTES = 512 << 20
 """Limit of the cache in bytes, including files of other versions; the least recently used files are deleted first."""
 
 
@@ -96,7 +96,7 @@ def levels_of(mesh: Mesh) -> tuple[Level, ...]:
 def _keep(name: str, levels: tuple[Level, ...]) -> None:
     with _keeping:
         _kept[name] = levels
-        if len(_kept) > _MOST_KEPT:
+        if len(_kept) > _MAX_MESHES:
             _kept.popitem(last=False)
 
 
@@ -122,7 +122,7 @@ def from_afar(mesh: Mesh, error: float) -> Mesh:
     of loose pieces keep their triangles. Simple meshes and textured ones stay as they are. The first call for a mesh takes
     some 0.2 s.
     """
-    if len(mesh.faces) <= _SIMPLE or mesh.uvs is not None or error <= 0:
+    if len(mesh.faces) <= _SIMPLE_FACES or mesh.uvs is not None or error <= 0:
         return mesh
     name = f"{content_hash(mesh)}-afar-{error:.3g}"
     with _keeping:
@@ -137,8 +137,11 @@ def from_afar(mesh: Mesh, error: float) -> Mesh:
 
 def _few_faces(mesh: Mesh, error: float) -> Mesh:
     """The first of ever finer meshes that is near enough; `mesh` itself where none is."""
-    for faces in (count for count in _FEW if count < 0.8 * len(mesh.faces)):
-        for coarser in (collapse_mesh(mesh, faces), *(cluster_mesh(mesh, faces, cells) for cells in _GRIDS)):
+    for faces in (count for count in _AFAR_FACES if count < 0.8 * len(mesh.faces)):
+        for coarser in (
+            collapse_mesh(mesh, faces),
+            *(cluster_mesh(mesh, faces, cells) for cells in _AFAR_CELLS),
+        ):
             if len(coarser.faces) <= 1.5 * faces and deviation(mesh, coarser) <= error:
                 return _shaded(coarser, None if mesh.normals is None else ShadedSurface(mesh))
     return mesh
@@ -162,7 +165,7 @@ def within(mesh: Mesh, error: float) -> Mesh:
 
 
 def _made(mesh: Mesh) -> Iterator[Level]:
-    if len(mesh.faces) <= _FEWEST_FACES:
+    if len(mesh.faces) <= _MIN_FACES:
         return
     flat = flat_rectangle(mesh)
     if flat is not None:
@@ -171,18 +174,18 @@ def _made(mesh: Mesh) -> Iterator[Level]:
     surface = None if mesh.normals is None else ShadedSurface(mesh)
     finer, faces, worst = mesh, len(mesh.faces), 0.0
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    while faces // 2 >= _FEWEST_FACES:
+    while faces // 2 >= _MIN_FACES:
         faces //= 2
         # Nearest to the surface is what is made of the exact mesh; of a very large one that takes too long.
-        source = mesh if len(mesh.faces) <= _LARGE else finer
+        source = mesh if len(mesh.faces) <= _LARGE_FACES else finer
         coarser = coarsen_mesh(source, faces)
         error = deviation(mesh, coarser)
-        if error > _LOST * extent and mesh.uvs is None:
+        if error > _LOST_PIECE_ERROR * extent and mesh.uvs is None:
             by_pieces = coarsen_mesh(source, faces, by_pieces=True)
             fewer = len(by_pieces.faces) < 0.9 * len(finer.faces)
             if fewer and (other := deviation(mesh, by_pieces)) < error:
                 coarser, error = by_pieces, other
-        if len(coarser.faces) >= 0.9 * len(finer.faces) or error > _USELESS * extent:
+        if len(coarser.faces) >= 0.9 * len(finer.faces) or error > _USELESS_ERROR * extent:
             break
         # A level that happens to be nearer than the one before it is not finer.
         finer, worst = coarser, max(worst, error)
@@ -193,7 +196,7 @@ def deviation(exact: Mesh, reduced: Mesh) -> float:
     """The distance from `reduced` within which 99 % of the surface of `exact` are, measured at points by chance."""
     random = np.random.default_rng(0)
     points = _points_on(exact, _CHECKED_POINTS, random)[0][-_CHECKED_POINTS:]
-    samples, which = _points_on(reduced, min(_SAMPLES, 20 * len(reduced.faces) + 2000), random)
+    samples, which = _points_on(reduced, min(_SEARCHED_POINTS, 20 * len(reduced.faces) + 2000), random)
     triangles = reduced.vertices[reduced.faces].astype(np.float64)
     near = np.asarray(KDTree(samples).query(points, k=min(4, len(samples)))[1]).reshape(len(points), -1)
     best = np.full(len(points), np.inf)
@@ -268,7 +271,7 @@ def _make_room() -> None:
     for path in cache_folder().glob("meshes-*/*.npz"):
         status = path.stat()
         files.append((status.st_mtime, status.st_size, path))
-    over = sum(size for _, size, _ in files) - _MOST_ON_DISK
+    over = sum(size for _, size, _ in files) - _MAX_CACHE_BYTES
     for _, size, path in sorted(files):
         if over <= 0:
             return

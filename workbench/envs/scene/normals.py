@@ -14,14 +14,14 @@ from workbench.envs.scene.shapes import Mesh
 
 _CREASE_COSINE = float(np.cos(np.deg2rad(40.0)))
 """Neighbouring faces at a smaller angle are shaded as one smooth surface."""
-_ON_EXACT = 2_000, 10, 20_000
+_EXACT_POINTS = 2_000, 10, 20_000
 """Points sampled on an exact surface by area, in addition to one on each triangle: a constant, a number per triangle,
 and the limit of both."""
-_ON_COARSE = 2_000
+_COARSE_POINTS = 2_000
 """Points sampled on a coarse surface by area, in addition to some on each triangle."""
-_NEAREST = 8
+_NEIGHBOURS = 8
 """Nearest points of the exact surface, among which one that faces the same way is chosen."""
-_ALIKE_COSINE = 0.3
+_MIN_FACING_COSINE = 0.3
 _SHARED_DEGREES = 20.0
 """Angle between normals of a coarse mesh's faces at a vertex, below which they share one normal: a seventh fewer
 vertices, for a twentieth of the shading error."""
@@ -106,7 +106,7 @@ class ShadedSurface:
     def __init__(self, mesh: Mesh) -> None:
         assert mesh.normals is not None
         triangles = mesh.vertices[mesh.faces].astype(np.float64)
-        some, of_each, most = _ON_EXACT
+        some, of_each, most = _EXACT_POINTS
         which, weights = _points(triangles, 1, min(some + of_each * len(triangles), most))
         self._tree = KDTree(np.einsum("sk,skd->sd", weights, triangles[which]))
         # A normal that is no number counts as none: one would spread over all that it is fitted to.
@@ -117,12 +117,12 @@ class ShadedSurface:
         self, points: NDArray[np.float64], facing: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """(P, 3) normals near `points` (P, 3) on the side that looks the way of `facing` (P, 3); and (P,) whether there is one."""
-        count = min(_NEAREST, self._tree.n)
+        count = min(_NEIGHBOURS, self._tree.n)
         near = np.asarray(self._tree.query(points, k=count)[1]).reshape(-1, count)
         candidates = self._normals[near]
         alike = np.einsum("skd,sd->sk", candidates, facing)
         # The nearest that agrees; on a folded face none does, and the most similar is taken.
-        agrees = alike > _ALIKE_COSINE
+        agrees = alike > _MIN_FACING_COSINE
         choice = np.where(agrees.any(axis=1), agrees.argmax(axis=1), alike.argmax(axis=1))
         every = np.arange(len(points))
         return candidates[every, choice], alike[every, choice] > 0
@@ -141,7 +141,7 @@ class ShadedSurface:
         across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         area = np.linalg.norm(across, axis=1)
         each = 6 if len(triangles) < 4_000 else 3 if len(triangles) < 20_000 else 1
-        which, weights = _points(triangles, each, _ON_COARSE)
+        which, weights = _points(triangles, each, _COARSE_POINTS)
         wanted, known = self.normals_at(
             np.einsum("sk,skd->sd", weights, triangles[which]), _unit(across)[which]
         )

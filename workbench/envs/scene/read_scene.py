@@ -26,16 +26,16 @@ from workbench.envs.simulation.hiding import shown_visibility
 
 _FLAT_FACES = 100
 """Meshes with more faces are tested for being a flat rectangle."""
-_KEPT_MESHES = 1000
-MOST_FACES = 375
+_MAX_KEPT_MESHES = 1000
+MAX_FACES = 375
 """Most faces of a visual: a Panda of 136,000 triangles becomes 9,000 and looks the same."""
-MOST_TEXELS = 1024
+MAX_SIDE_TEXELS = 1024
 """Texels on the longest side of a texture."""
 
 
-_GREY: dict[BodyKind, float] = {"link": 0.55, "dynamic": 0.32, "kinematic": 0.22, "static": 0.12}
+_LINEAR_GREY: dict[BodyKind, float] = {"link": 0.55, "dynamic": 0.32, "kinematic": 0.22, "static": 0.12}
 """Linear grey: moving bodies are lighter than static ones."""
-_PLANE_HALF_SIZE = 50.0
+_PLANE_HALF_SIZE_METRES = 50.0
 """PhysX planes are infinite; this is half the default width of ManiSkill's ground."""
 _X_FROM_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
@@ -49,7 +49,7 @@ class MeshPart:
     read: Callable[[], tuple[Mesh, Material]]
 
 
-def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_TEXELS) -> SceneGeometry:
+def read_geometry(env: Any, max_faces: int = MAX_FACES, max_texels: int = MAX_SIDE_TEXELS) -> SceneGeometry:
     """Meshes, materials and instances of all bodies of a scene.
 
     The scene is walked by cheap keys (file, scale, pose, colour), and triangles are read only for a new key: 16 envs of a
@@ -100,7 +100,7 @@ def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_
 
 def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[MeshPart]:
     body = entity.find_component_by_type(physx.PhysxRigidBaseComponent)
-    grey = _GREY[kind]
+    grey = _LINEAR_GREY[kind]
     material = Material((grey, grey, grey, 1.0), roughness=0.8)
     for shape in () if body is None else body.collision_shapes:
         place = _Placement.of(shape)
@@ -281,7 +281,7 @@ def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
         mesh = share_vertices(mesh) if len(mesh.faces) <= max_faces else reduced_mesh(mesh, max_faces)
     if source.keep:
         _kept_meshes[key] = mesh
-        if len(_kept_meshes) > _KEPT_MESHES:
+        if len(_kept_meshes) > _MAX_KEPT_MESHES:
             _kept_meshes.popitem(last=False)
     return mesh
 
@@ -298,7 +298,7 @@ def exact_part(shape: Any, part: Any, index: int) -> tuple[Mesh, tuple[float, fl
     key = (source.key, "exact")
     if key not in _kept_exact:
         _kept_exact[key] = _read_part(source)
-        if len(_kept_exact) > _KEPT_MESHES:
+        if len(_kept_exact) > _MAX_KEPT_MESHES:
             _kept_exact.popitem(last=False)
     _kept_exact.move_to_end(key)
     return _kept_exact[key], scale
@@ -384,7 +384,7 @@ def _along_x(mesh: trimesh.Trimesh) -> Mesh:
 
 
 def _plane() -> Mesh:
-    s = _PLANE_HALF_SIZE
+    s = _PLANE_HALF_SIZE_METRES
     corners = np.array([[0, -s, -s], [0, s, -s], [0, s, s], [0, -s, s]], dtype=np.float32)
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32))
 

@@ -17,7 +17,7 @@ from workbench.envs.scene.shapes import BodyKind
 from workbench.envs.simulation.cpu_system import batched_system
 
 _T = TypeVar("_T")
-_AWAY = 5e4
+_HIDDEN_METRES = 5e4
 """Metres along each axis from where an actor was hidden, if it is still hidden; ``Actor.hide_visual`` moves it by 99999."""
 
 
@@ -220,7 +220,7 @@ def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float
             now = rows_of(env.scene.px.cuda_rigid_body_data, maniskill_private.data_rows_of(actor).long())[
                 :, :3
             ]
-            away = ((now - kept[:, :3]).abs() > _AWAY).all(dim=1).cpu().numpy()
+            away = ((now - kept[:, :3]).abs() > _HIDDEN_METRES).all(dim=1).cpu().numpy()
             yield slots[away], kept.cpu().numpy()[away]
 
 

@@ -15,15 +15,15 @@ from scipy.spatial import KDTree
 from workbench.envs.scene.normals import ShadedSurface, with_normals
 from workbench.envs.scene.shapes import Mesh
 
-_DENSE = 60_000
+_DENSE_FACES = 60_000
 """A mesh with more faces is a CAD assembly, whose vertices are first snapped to a grid: quadric collapse alone takes
 seconds and gets stuck."""
 _CLUSTER_CELLS = 64
 _COARSEST_CELLS = 16
 _WELD_CELLS = 1_000_000
-_MOST_PIECES = 200
-_LEAST_FACES = 24
-_GENTLE, _USUAL = 3, 7
+_MAX_PIECES = 200
+_MIN_FACES = 24
+_SLOW_GROWTH, _USUAL_GROWTH = 3, 7
 """How fast the threshold of a collapse grows (the method's ``agg``): the slower, the more cheap edges go before dear ones."""
 
 
@@ -40,7 +40,7 @@ def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     reduced = collapse_mesh(mesh, max_faces)
     if reduced is mesh:
         return mesh
-    if mesh.normals is None or len(mesh.faces) > _DENSE:
+    if mesh.normals is None or len(mesh.faces) > _DENSE_FACES:
         return share_vertices(reduced)
     return ShadedSurface(mesh).shade(reduced)
 
@@ -49,7 +49,7 @@ def collapse_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     """`reduce_mesh`, with normals of its own faces."""
     if len(mesh.faces) <= max_faces or not np.ptp(mesh.vertices, axis=0).any():
         return mesh
-    cells = _WELD_CELLS if mesh.uvs is not None or len(mesh.faces) <= _DENSE else _CLUSTER_CELLS
+    cells = _WELD_CELLS if mesh.uvs is not None or len(mesh.faces) <= _DENSE_FACES else _CLUSTER_CELLS
     welded = _weld(mesh.vertices, mesh.faces, mesh.uvs, cells)
     while True:
         vertices, faces, uvs = welded
@@ -207,7 +207,7 @@ def _collapse(
         if how == "as a whole":
             new_points, new_faces = _collapse_whole(points, triangles, max_faces)
         else:
-            growth = _USUAL if how == "fast" else _GENTLE
+            growth = _USUAL_GROWTH if how == "fast" else _SLOW_GROWTH
             new_points, new_faces = _collapse_pieces(points, triangles, max_faces, growth)
         # The optimum of a nearly singular quadric can be anywhere: a spike out of the surface.
         distance, nearest = (np.asarray(x) for x in KDTree(points).query(new_points))
@@ -219,7 +219,7 @@ def _collapse(
         points,
         triangles,
         target_count=max_faces,
-        agg=_USUAL if how == "fast" else _GENTLE,
+        agg=_USUAL_GROWTH if how == "fast" else _SLOW_GROWTH,
         return_collapses=True,
         preserve_border=True,
     )[-1]
@@ -236,7 +236,7 @@ def _collapse_whole(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     # Losing a flat lid costs a quadric nothing, unless its border stays. Only what cannot be had so is had otherwise.
     new_points, new_faces = points, faces
-    for growth, keep_borders in ((_GENTLE, True), (_GENTLE, False), (_USUAL, False)):
+    for growth, keep_borders in ((_SLOW_GROWTH, True), (_SLOW_GROWTH, False), (_USUAL_GROWTH, False)):
         new_points, new_faces = fast_simplification.simplify(
             points, faces, target_count=max_faces, agg=growth, preserve_border=keep_borders
         )[:2]
@@ -262,14 +262,14 @@ def _collapse_pieces(
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     share = np.bincount(label, area, minlength=pieces) / max(area.sum(), 1e-20)
     new_points, new_faces, used = [], [], 0
-    for piece in np.unique(label) if pieces <= _MOST_PIECES else [None]:
+    for piece in np.unique(label) if pieces <= _MAX_PIECES else [None]:
         own = faces if piece is None else faces[label == piece]
-        target = max_faces if piece is None else max(_LEAST_FACES, int(share[piece] * max_faces))
+        target = max_faces if piece is None else max(_MIN_FACES, int(share[piece] * max_faces))
         index, flat = np.unique(own, return_inverse=True)
         vertices, triangles = points[index], flat.reshape(-1, 3).astype(np.int32)
         if len(triangles) > target:
-            simpler = fast_simplification.simplify(vertices, triangles, target_count=target, agg=_GENTLE)
-            if growth > _GENTLE and len(simpler[1]) > 1.2 * target:
+            simpler = fast_simplification.simplify(vertices, triangles, target_count=target, agg=_SLOW_GROWTH)
+            if growth > _SLOW_GROWTH and len(simpler[1]) > 1.2 * target:
                 simpler = fast_simplification.simplify(vertices, triangles, target_count=target, agg=growth)
             vertices, triangles = simpler[0], simpler[1]
         new_points.append(vertices)

@@ -35,9 +35,9 @@ TENSORS: Mapping[str, tuple[Group, ...]] = {
 }
 MOVING: tuple[Group, ...] = ("bodies", "links", "joints")
 """What a step moves; targets and joint forces stay as they were set."""
-_OF_ALL = {"config", "get_config", "get_timestep", "scene_collision_id", "get_scene_collision_id"}
+_SHARED_MEMBERS = {"config", "get_config", "get_timestep", "scene_collision_id", "get_scene_collision_id"}
 """Members of a system that give the same for each env."""
-_WRITES = {"unpack"}
+_WRITING_MEMBERS = {"unpack"}
 """Members of a CPU system that change its state."""
 
 
@@ -331,7 +331,7 @@ class BatchedCpuSystem:
         # The tensors exist from `gpu_init` on: explain an earlier access.
         if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
             raise RefusedCall(_TOO_EARLY)
-        if name in _OF_ALL:
+        if name in _SHARED_MEMBERS:
             return getattr(self.systems[0], name)
         if hasattr(physx.PhysxCpuSystem, name) and not name.startswith("_"):
             return self._of_one_env(name)
@@ -360,7 +360,7 @@ class BatchedCpuSystem:
         )
         self.packs()  # makes pending substeps, and writes pending targets
         member = getattr(self.systems[0], name)
-        if name not in _WRITES:
+        if name not in _WRITING_MEMBERS:
             return member
 
         def call(*args: Any, **kwargs: Any) -> Any:

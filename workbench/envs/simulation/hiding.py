@@ -13,7 +13,7 @@ from workbench.envs import maniskill_private
 from workbench.envs.error_notes import RefusedCall
 from workbench.envs.simulation.cpu_system import batched_system
 
-_KEPT = "_workbench_visibility"
+_VISIBILITY_ATTRIBUTE = "_workbench_visibility"
 """Attribute of a hidden actor: its render bodies and how visible they were."""
 
 
@@ -87,14 +87,14 @@ def _hide(actor: Any) -> None:
         for thing in maniskill_private.objects_of(actor)
     )
     kept = [(body, body.visibility) for body in bodies if body is not None and body.visibility > 0]
-    setattr(actor, _KEPT, kept)
+    setattr(actor, _VISIBILITY_ATTRIBUTE, kept)
     for body, _ in kept:
         body.visibility = 0.0
 
 
 def _show(actor: Any) -> None:
     actor.hidden = False
-    for body, visibility in vars(actor).pop(_KEPT, ()):
+    for body, visibility in vars(actor).pop(_VISIBILITY_ATTRIBUTE, ()):
         body.visibility = visibility
 
 
@@ -104,5 +104,5 @@ def shown_visibility(actors: Iterable[Any], body: Any) -> float:
     Args:
         actors: those that may hide it.
     """
-    hidden = (kept for actor in actors for kept in vars(actor).get(_KEPT, ()))
+    hidden = (kept for actor in actors for kept in vars(actor).get(_VISIBILITY_ATTRIBUTE, ()))
     return next((was for other, was in hidden if other is body), body.visibility) or 1.0

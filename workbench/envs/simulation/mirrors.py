@@ -18,7 +18,7 @@ GROUPS: tuple[Group, ...] = get_args(Group)
 Floats = NDArray[np.float32]
 Source = tuple[Any, Callable[[], Floats]]
 """Index into a tensor, and the function that reads those numbers from the simulation."""
-_MOVED = 1e-4
+_MOVED_TOLERANCE = 1e-4
 """Metres, radians, per second. PhysX rounds the root pose of an articulation when it is set, by about 1e-7."""
 
 
@@ -85,7 +85,7 @@ class Mirror:
     def behind(self) -> NDArray[np.bool_]:
         """(K, W), or fewer columns: what the simulation moved since the last fetch."""
         at, read = self.sources[0]
-        return np.abs(self.now[at] - read()) > _MOVED
+        return np.abs(self.now[at] - read()) > _MOVED_TOLERANCE
 
     def apply(self) -> None:
         """Write what differs to the simulation.

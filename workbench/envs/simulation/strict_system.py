@@ -75,7 +75,7 @@ class Writes:
         return ()
 
 
-ENVS_NAMED = THINGS_NAMED = 8
+MAX_NAMED_ENVS = MAX_NAMED_BODIES = 8
 
 
 class StrictCpuSystem(BatchedCpuSystem):
@@ -396,17 +396,17 @@ _STEP_ACTION = BaseEnv._step_action.__code__
 
 
 def _by_name(rows: NDArray[np.int64], names: list[str]) -> Iterator[tuple[str, NDArray[np.int64]]]:
-    """Rows by name, for at most `THINGS_NAMED` names."""
+    """Rows by name, for at most `MAX_NAMED_BODIES` names."""
     found: dict[str, list[int]] = {}
     for row in rows.tolist():
         found.setdefault(names[row], []).append(row)
-    for name in list(found)[:THINGS_NAMED]:
+    for name in list(found)[:MAX_NAMED_BODIES]:
         yield name, np.array(found[name], dtype=np.int64)
 
 
 def envs_named(envs: Any) -> str:
     """``env 3``, or ``envs 0, 1, 2``, at most eight of them."""
     numbers = sorted({int(env) for env in envs})
-    named = ", ".join(str(env) for env in numbers[:ENVS_NAMED])
-    more = f" and {len(numbers) - ENVS_NAMED} more" if len(numbers) > ENVS_NAMED else ""
+    named = ", ".join(str(env) for env in numbers[:MAX_NAMED_ENVS])
+    more = f" and {len(numbers) - MAX_NAMED_ENVS} more" if len(numbers) > MAX_NAMED_ENVS else ""
     return f"env{'s' if len(numbers) > 1 else ''} {named}{more}"

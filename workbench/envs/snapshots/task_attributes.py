@@ -22,18 +22,18 @@ from workbench.machine.versions import stored_names
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 """Immutable values, which need no copy."""
-_ENTERED = (
+_ENTERED_TYPES = (
     *PLAIN,
     *(torch.Tensor, np.ndarray, Pose, dict, list, tuple),
     *(torch.nn.Module, torch.Generator, np.random.Generator, np.random.RandomState, set, bytearray),
 )
 """Types that may hold state; those of the last row cannot be kept, and are reported."""
-_NOT_ENTERED = (
+_SKIPPED_PACKAGES = (
     *("mani_skill", "sapien", "gymnasium", "torch", "numpy", "trimesh", "transforms3d", "builtins"),
     *("_thread", "weakref", "functools", "pathlib", "workbench"),
 )
 """Packages whose objects belong to the simulation or hold no state of an episode."""
-_DEEPEST = 8
+_MAX_DEPTH = 8
 
 
 @dataclass
@@ -98,8 +98,8 @@ def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth:
     if id(value) in walk.entered:
         return
     walk.entered[id(value)] = value
-    if depth > _DEEPEST:
-        walk.omitted[path] = f"more than {_DEEPEST} containers deep"
+    if depth > _MAX_DEPTH:
+        walk.omitted[path] = f"more than {_MAX_DEPTH} containers deep"
     elif isinstance(value, Pose):
         # A Pose is frozen, so another takes its place; torch may hold on to the old one.
         _enter(walk, value.raw_pose, f"{path}.raw_pose", lambda raw: put(Pose(raw)), depth + 1)
@@ -156,16 +156,18 @@ def _has_members(cls: type, author: str) -> bool:
     if issubclass(cls, (type, torch.nn.Module)) or not cls.__dictoffset__:
         return False
     return cls.__module__ == author or (
-        dataclasses.is_dataclass(cls) and cls.__module__.split(".")[0] not in _NOT_ENTERED
+        dataclasses.is_dataclass(cls) and cls.__module__.split(".")[0] not in _SKIPPED_PACKAGES
     )
 
 
 @lru_cache(maxsize=4096)
 def _is_ignored(cls: type, author: str) -> bool:
     """Whether an object is skipped without a report: upstream's, or code."""
-    if issubclass(cls, _ENTERED) or _has_members(cls, author):
+    if issubclass(cls, _ENTERED_TYPES) or _has_members(cls, author):
         return False
-    return cls.__module__.split(".")[0] in _NOT_ENTERED or any("__call__" in vars(c) for c in cls.__mro__)
+    return cls.__module__.split(".")[0] in _SKIPPED_PACKAGES or any(
+        "__call__" in vars(c) for c in cls.__mro__
+    )
 
 
 @lru_cache(maxsize=1)

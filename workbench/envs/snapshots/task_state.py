@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from workbench.envs.scene.scene_index import once_a_scene
 from workbench.envs.snapshots.task_attributes import PLAIN, TaskValue, walk_task_values
 
-_LARGEST_OF_BATCH = 1 << 16
+_MAX_BATCH_ELEMENTS = 1 << 16
 """Elements of a tensor that holds for the whole batch; a larger one is data, not state."""
 
 
@@ -112,7 +112,7 @@ def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
         if not _changed(value, scene.values.get(leaf.path)):
             continue
         whole = isinstance(value, torch.Tensor) and not is_per_env(value, env.num_envs)
-        if whole and value.numel() > _LARGEST_OF_BATCH:
+        if whole and value.numel() > _MAX_BATCH_ELEMENTS:
             omitted[leaf.path] = f"a tensor {tuple(value.shape)} that has no row for each env"
         else:
             buffers[leaf.path] = _kept(value, env.num_envs, chosen)

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-LOWEST = 19
+LOWEST_NICENESS = 19
 """Niceness of a process that gets only the CPU time that all others leave over."""
 
 

@@ -16,18 +16,18 @@ _PATH_BENEATH = 1
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1 << 0, 1 << 1, 1 << 2, 1 << 3
 _FILE_RIGHTS = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
 """File rights that each version of Landlock adds; all but reading are given up."""
-_OF_FILES = _EXECUTE | _WRITE_FILE | _READ_FILE
+_FILE_ONLY_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE
 """Rights that apply to files that are not folders."""
 _TCP_RIGHTS = 0b11
 """Rights to bind and to connect, from version 4 on."""
 _SCOPES = 0b11
 """Scopes that keep out the abstract sockets of other processes and signals to them, from version 6 on."""
 _PR_SET_NO_NEW_PRIVS = 38
-_SYSTEM = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
+_SYSTEM_PATHS = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
            "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
-MOST_WRITTEN = 1 << 20
+MAX_WRITTEN_BYTES = 1 << 20
 """Most bytes of a written file; this limit also holds without Landlock."""
-MOST_OPEN_FILES = 512
+MAX_OPEN_FILES = 512
 
 
 def landlock_version() -> int:
@@ -50,9 +50,9 @@ def confine(reads: Iterable[Path], most_memory: int, writes: Iterable[Path] = ()
     writes = tuple(writes)
     resource.setrlimit(resource.RLIMIT_DATA, (most_memory, most_memory))
     if not writes:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_WRITTEN, MOST_WRITTEN))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_WRITTEN_BYTES, MAX_WRITTEN_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    most = min(MOST_OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
+    most = min(MAX_OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     ctypes.CDLL(None).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
     if landlock_version():
@@ -71,7 +71,7 @@ def _restrict(reads: tuple[Path, ...], writes: tuple[Path, ...]) -> None:
         raise OSError(ctypes.get_errno(), "Landlock gives no ruleset")
     try:
         read = _READ_FILE | _READ_DIR
-        for path in (*_SYSTEM, *_python()):
+        for path in (*_SYSTEM_PATHS, *_python()):
             _allow(ruleset, path, read | _EXECUTE)
         for path in reads:
             _allow(ruleset, os.fspath(path), read)
@@ -97,7 +97,7 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
         return  # not on this system
     try:
         if not os.path.isdir(path):
-            rights &= _OF_FILES
+            rights &= _FILE_ONLY_RIGHTS
         rule = rights.to_bytes(8, sys.byteorder) + place.to_bytes(4, sys.byteorder, signed=True)
         if _call(_ADD_RULE, ruleset, _PATH_BENEATH, rule, 0) < 0:
             raise OSError(ctypes.get_errno(), f"Landlock takes no rule for {path}")

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-USUAL_PORT = 5678
+DEFAULT_PORT = 5678
 """Default port of editors."""
 HOST = "127.0.0.1"
 """Address of this machine only: a client that attaches can run any code."""
@@ -120,7 +120,7 @@ def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., N
 
 
 def port_for_debugger(wanted: int | None) -> int:
-    """A free port of this machine: `wanted`, or where that is None `USUAL_PORT` or any other.
+    """A free port of this machine: `wanted`, or where that is None `DEFAULT_PORT` or any other.
 
     Raises:
         ValueError: debugpy is not installed, or `wanted` is taken or no port.
@@ -129,7 +129,7 @@ def port_for_debugger(wanted: int | None) -> int:
         raise ValueError("--debug needs debugpy, which is not installed: pip install debugpy")
     if wanted is not None and not 0 <= wanted < 2**16:
         raise ValueError(f"--debug-port must be from 0 to {2**16 - 1}, not {wanted}")
-    for port in (USUAL_PORT, 0) if wanted is None else (wanted,):
+    for port in (DEFAULT_PORT, 0) if wanted is None else (wanted,):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:

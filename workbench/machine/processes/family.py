@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, NoReturn, Protocol
 
-_PAGE = os.sysconf("SC_PAGE_SIZE")
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 def children(pid: int) -> list[int]:
@@ -44,7 +44,7 @@ def family(pid: int) -> list[int]:
 def resident_memory(pid: int) -> int:
     """Resident bytes of the process, including shared ones; 0 if the process is gone."""
     try:
-        return int(_read(f"/proc/{pid}/statm").split()[1]) * _PAGE
+        return int(_read(f"/proc/{pid}/statm").split()[1]) * _PAGE_BYTES
     except (OSError, IndexError):
         return 0
 
@@ -54,7 +54,7 @@ def allocated_memory(pid: int) -> int:
     while something else is allocated."""
     try:
         _, resident, shared, *_ = _read(f"/proc/{pid}/statm").split()
-        return (int(resident) - int(shared)) * _PAGE
+        return (int(resident) - int(shared)) * _PAGE_BYTES
     except (OSError, ValueError):
         return 0
 
@@ -110,7 +110,7 @@ def _read(path: str) -> bytes:
 
 
 _PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_CHILD_SUBREAPER = 1, 4, 36
-_LONGEST_END = 5.0
+_END_TIMEOUT_SECONDS = 5.0
 """Longest wait in seconds for killed processes to end; a process that waits for a disk may take longer."""
 _SIGNALS = {signal.SIGCHLD, signal.SIGTERM}
 
@@ -189,7 +189,7 @@ def end_family(keeper: Keeper) -> None:
     """End a process that called `begin_family` and all that it started; returns when all have ended."""
     keeper.terminate()
     try:
-        keeper.wait(timeout=2 * _LONGEST_END)
+        keeper.wait(timeout=2 * _END_TIMEOUT_SECONDS)
     except subprocess.TimeoutExpired:
         # The keeper is stopped. The worker ends with it; what was detached does not.
         keeper.kill()
@@ -229,7 +229,7 @@ def _keep(worker: int) -> NoReturn:
 def _end_all() -> dict[int, int]:
     """Kill all children, and the processes that become children by that; returns exit statuses."""
     ended: dict[int, int] = {}
-    deadline = time.monotonic() + _LONGEST_END
+    deadline = time.monotonic() + _END_TIMEOUT_SECONDS
     while (ours := children(os.getpid())) and time.monotonic() < deadline:
         for pid in ours:
             os.kill(pid, signal.SIGKILL)  # its number is not reused before we reap it

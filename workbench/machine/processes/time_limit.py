@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 PICTURE_SECONDS = 180.0
 """Time limit of one picture, in seconds. The first picture of a process takes seconds, in which shaders are compiled."""
-_MOST_BYTES = 2000
+_MAX_MESSAGE_BYTES = 2000
 """Most bytes of a message: a pipe takes these in one piece."""
 
 
@@ -63,7 +63,7 @@ def limited(message: str) -> Iterator[None]:
         return
     if watcher.process is None:
         _start(watcher)
-    _tell(watcher, " ".join(message.split()).encode()[:_MOST_BYTES])
+    _tell(watcher, " ".join(message.split()).encode()[:_MAX_MESSAGE_BYTES])
     watcher.within = True
     try:
         yield

@@ -11,9 +11,9 @@ from contextlib import contextmanager, suppress
 
 logger = logging.getLogger(__name__)
 
-FIRST_PAUSE, LONGEST_PAUSE = 0.05, 5.0
+FIRST_BACKOFF_SECONDS, MAX_BACKOFF_SECONDS = 0.05, 5.0
 """Seconds before a thread starts again; doubled at each failure."""
-_LOOK = 0.05
+_POLL_SECONDS = 0.05
 """Seconds between two checks whether somebody waits."""
 
 _listeners: list[Callable[[str], None]] = []
@@ -27,14 +27,14 @@ def watched_thread(name: str, work: Callable[[], None]) -> threading.Thread:
     """
 
     def keep_at_it() -> None:
-        pause = FIRST_PAUSE
+        pause = FIRST_BACKOFF_SECONDS
         while True:
             try:
                 return work()
             except Exception as error:
                 report_failure(f"The thread '{name}' failed and is started again", error)
             threading.Event().wait(pause)
-            pause = min(2 * pause, LONGEST_PAUSE)
+            pause = min(2 * pause, MAX_BACKOFF_SECONDS)
 
     return threading.Thread(target=keep_at_it, name=name, daemon=True)
 
@@ -85,7 +85,7 @@ def on_free_cores(wanted: Callable[[], bool]) -> Iterator[None]:
     low = {int(thread) for thread in os.listdir("/proc/self/task")}
 
     def watch() -> None:
-        while not done.wait(_LOOK) and not wanted():
+        while not done.wait(_POLL_SECONDS) and not wanted():
             pass
         _schedule(os.SCHED_OTHER, {int(thread) for thread in os.listdir("/proc/self/task")})
 

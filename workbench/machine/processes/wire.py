@@ -19,16 +19,16 @@ from typing import Any, ClassVar, ForwardRef, Generic, TypeVar, get_args, get_or
 import msgspec
 import numpy as np
 
-MOST_BYTES = 1 << 30
+MAX_MESSAGE_BYTES = 1 << 30
 """Most bytes of one message. The largest of a working task, its meshes and the pictures of all envs, are some 100 MB."""
-_PIECE, _SMALL = 1 << 18, 1 << 14
+_READ_BYTES, _COPIED_BYTES = 1 << 18, 1 << 14
 """Bytes of one read, more than a socket's buffer; and bytes below which a message is copied and sent at once."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
 """msgpack extensions: the next array, or a repeated one."""
-_NUMBERS = "biufcSU"
+_ARRAY_KINDS = "biufcSU"
 """Kinds of arrays that may be sent; arrays of objects may not."""
-_LONGEST = 500
+_MAX_DESCRIPTION_BYTES = 500
 """Most bytes of the description of one array."""
 _Head = tuple[str, int | None, msgspec.Raw]
 Value = TypeVar("Value", covariant=True)
@@ -105,7 +105,7 @@ class MessageSocket:
         self.end = end
         self._unpacker = Unpacker(kinds, questions)
         self._poll = _poll(end)
-        self._came, self._piece = bytearray(), memoryview(bytearray(_PIECE))
+        self._came, self._piece = bytearray(), memoryview(bytearray(_READ_BYTES))
         self._at = 0
         """Offset of the next message in `_came`."""
 
@@ -116,7 +116,7 @@ class MessageSocket:
     def send_bytes(self, raw: bytes) -> None:
         """Send a packed message. Raises as `send`."""
         head = _LENGTH.pack(len(raw))
-        for piece in (head + raw,) if len(raw) < _SMALL else (head, raw):  # no copy of what is large
+        for piece in (head + raw,) if len(raw) < _COPIED_BYTES else (head, raw):  # no copy of what is large
             self.end.sendall(piece)
 
     def waits(self) -> bool:
@@ -153,7 +153,7 @@ class MessageSocket:
         if len(self._came) < begin:
             return None
         length = _LENGTH.unpack_from(self._came, self._at)[0]
-        if length > MOST_BYTES:
+        if length > MAX_MESSAGE_BYTES:
             raise Unreadable(f"it says that it is {length} bytes long")
         came, end = self._came, begin + length
         if len(came) < end:
@@ -298,7 +298,7 @@ class _Read:
     def take(self, code: int, data: memoryview) -> np.ndarray:
         if code == _AGAIN:
             return self._taken[int(bytes(data))] if bytes(data).isdigit() else _refuse_array()
-        if code != _ARRAY or len(data) > _LONGEST:
+        if code != _ARRAY or len(data) > _MAX_DESCRIPTION_BYTES:
             _refuse_array()
         dtype, shape, size = _described(bytes(data))
         if size > len(self._rest):
@@ -319,7 +319,7 @@ def _refuse_array() -> Any:
 
 @functools.lru_cache(1000)
 def _array_description(dtype: np.dtype, shape: tuple[int, ...]) -> msgspec.msgpack.Ext:
-    if dtype.kind not in _NUMBERS:
+    if dtype.kind not in _ARRAY_KINDS:
         raise TypeError(f"an array of {dtype} cannot be sent")
     return msgspec.msgpack.Ext(_ARRAY, msgspec.msgpack.encode((dtype.str, shape)))
 
@@ -328,7 +328,7 @@ def _array_description(dtype: np.dtype, shape: tuple[int, ...]) -> msgspec.msgpa
 def _described(data: bytes) -> tuple[np.dtype, tuple[int, ...], int]:
     name, shape = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...]])
     # Only as numpy writes them ("<f4"): it also reads records, and old aliases with a warning.
-    if re.fullmatch(rf"[<>|][{_NUMBERS}]\d+", name) is None:
+    if re.fullmatch(rf"[<>|][{_ARRAY_KINDS}]\d+", name) is None:
         _refuse_array()
     dtype = np.dtype(name)
     if dtype.itemsize == 0 or min(shape, default=0) < 0:
