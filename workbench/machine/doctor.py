@@ -46,9 +46,9 @@ print(json.dumps({"built": torch.version.cuda, "cuda": cuda,
 
 VERSION_SCRIPT = """
 import json
-from workbench.core import maniskill_private
+from workbench.envs import maniskill_private
 from workbench.machine.versions import moved_text
-from workbench.ui.server import viser_private
+from workbench.page.door import viser_private
 print(json.dumps({"moved": moved_text(maniskill_private.moved_names()), "viser": viser_private.missing_names()}))
 """
 
