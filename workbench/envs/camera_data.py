@@ -115,17 +115,17 @@ def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
 
 
 def _value(settings: CameraSettings, what: str) -> object:
-    """The setting that `differences` calls so."""
+    """The setting with this name in `differences`."""
     return getattr(settings, "quaternion" if what == "orientation" else what)
 
 
 NOT_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 MAX_SIDE_PIXELS = 4096
-"""Limit of pixels per side; a digit too many would take the memory of all envs."""
+"""Limit of pixels per side; one digit too many would use up the memory of all envs."""
 
 
 _MAX_DISTANCE_METRES = 1e6
-"""Metres."""
+"""Largest coordinate of a camera's pose, and largest near and far."""
 
 
 def why_no_camera(settings: CameraSettings) -> str | None:
@@ -221,7 +221,7 @@ class Picture:
     albedo: NDArray[np.uint8] | None = None
     """(H, W, 3) colour without light."""
     degree: PictureDegree | None = "exact"
-    """None for a recorded one that is not known to be fast: it may be from elsewhere."""
+    """None for a recorded picture of unknown degree: another program may have recorded it."""
 
     @property
     def nbytes(self) -> int:

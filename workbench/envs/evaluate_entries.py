@@ -17,22 +17,22 @@ from workbench.envs.step_result import OtherEntry
 
 FLAGS = ("success", "fail")
 MAX_TEXT_CHARACTERS = 400
-"""Longest text of a value."""
+"""Maximum length of a value's text."""
 MAX_KEPT_NUMBERS = 1024
-"""Largest value of the whole batch that is kept as numbers; of a larger one only type and shape."""
+"""Largest whole-batch value that is kept as numbers; of a larger one only type and shape are kept."""
 MAX_ENTRIES = 1000
-"""Most leaves; of the others only the count."""
+"""Maximum number of leaves; the others are only counted."""
 _MAX_NAME_CHARACTERS = 200
 _MAX_READ_NUMBERS = 1 << 26
-"""Numbers of one value; a sparse tensor's shape may exceed the memory."""
+"""Largest value that is read: a sparse tensor's shape may exceed the memory."""
 _NOT_EVALUATED = ("elapsed_steps", "reconfigure")
 """ManiSkill's own entries of ``info``."""
 _REAL_KINDS = "biuf"
 _NUMPY_DTYPES = {torch.bool, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8}
-"""Types that numpy also has."""
+"""torch's dtypes that numpy also has."""
 _MAX_DEPTH = 16
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Control characters and surrogates, which no file and no browser takes."""
+"""Control characters and surrogates, which neither files nor browsers accept."""
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 """Memory address in a default repr: differs in every run."""
 
@@ -44,11 +44,11 @@ _short.maxstring = _short.maxlong = _short.maxother = MAX_TEXT_CHARACTERS
 
 
 def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDArray], dict[str, OtherEntry]]:
-    """The entries of `info` that are real numbers with a row for each env, (N, ...) each; and the others. All are copies.
+    """Split `info` into entries of real numbers with a row for each env, (N, ...) each, and the others. All are copies.
 
-    ManiSkill reads ``success`` and ``fail`` alone and passes the rest on: None, a string, ``progress.mean()``, an object. A
-    tensor, array or list has rows if its first dimension is N: with one env, shape (1,) has and () has not, except for
-    ``success`` and ``fail``, as in ManiSkill. A nested dict is split into its leaves, named by their keys.
+    ManiSkill reads only ``success`` and ``fail`` and passes the rest on: None, a string, ``progress.mean()``, an object. A
+    tensor, array or list has rows if its first dimension is N. With one env, shape (1,) has a row and () has none, except
+    for ``success`` and ``fail``, as in ManiSkill. A nested dict is split into its leaves, named by their keys.
     """
     columns: dict[str, NDArray] = {}
     others: dict[str, OtherEntry] = {}
@@ -62,7 +62,7 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
         name = _name(path, columns, others)
         array = _array(value)
         if name in FLAGS and array is not None:
-            # ManiSkill takes a single one for all envs, and numbers for bools; the page needs a row each.
+            # ManiSkill accepts one value for all envs, and numbers as bools; the page needs a bool for each env.
             one_each = array.reshape(-1) if array.size == num_envs else array
             columns[name] = np.broadcast_to(one_each.astype(bool), (num_envs, *one_each.shape[1:])).copy()
         elif array is None:
@@ -91,7 +91,7 @@ def leaves(value: Any, path: str = "", above: tuple[int, ...] = ()) -> Iterator[
 
 
 def flat_entries(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """The `leaves` that are no dicts; a value that is no dict is one leaf named `path`."""
+    """The `leaves` that are not dicts; a value that is not a dict is one leaf named `path`."""
     return ((name, held) for name, held in leaves(value, path) if not isinstance(held, Mapping))
 
 
@@ -116,7 +116,7 @@ def _clean_name(path: str) -> str:
 
 
 def _array(value: Any) -> NDArray | None:
-    """`value` as booleans or real numbers; None if it is none or cannot be read."""
+    """`value` as booleans or real numbers; None if it holds neither or cannot be read."""
     if isinstance(value, torch.Tensor):
         return _of_tensor(value)
     if isinstance(value, np.ndarray):
@@ -133,7 +133,7 @@ def _array(value: Any) -> NDArray | None:
 
 def _of_tensor(value: torch.Tensor) -> NDArray | None:
     if value.dtype in _NUMPY_DTYPES and value.layout is torch.strided and value.device.type == "cpu":
-        # The common case; the general way takes three times as long.
+        # Fast path for the common case; the general one takes three times as long.
         found = value.detach().numpy() if value.requires_grad else value.numpy()
         return found.copy()
     if value.is_complex() or value.numel() > _MAX_READ_NUMBERS:
@@ -181,7 +181,7 @@ def _other(value: Any, num_envs: int) -> OtherEntry:
 
 
 def _rows_of(value: Any) -> list[Any] | tuple[Any, ...] | NDArray | None:
-    """The items of a value that may have one for each env."""
+    """The value as a sequence whose items may be one for each env; None if it is not a sequence."""
     if isinstance(value, (list, tuple)):
         return value
     if isinstance(value, torch.Tensor) and value.is_complex():
@@ -200,7 +200,7 @@ def type_text(value: Any) -> str:
 
 
 def _text(value: Any) -> tuple[str, bool]:
-    """`value` as text, and whether that is all of it."""
+    """`value` as text, and whether the text is complete."""
     if isinstance(value, np.generic):
         value = str(value)  # its repr names numpy, and Python's number would have more digits
     if isinstance(value, str):
@@ -249,7 +249,7 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
 
 
 def wrong_flags(evaluate: object) -> str | None:
-    """Which of ``success`` and ``fail`` is a tensor of another type than bool, or None: ManiSkill's step takes it, and its
+    """What is wrong if ``success`` or ``fail`` is a tensor that is not bool, or None. ManiSkill's step accepts it, its
     wrappers do not."""
     for name in FLAGS:
         value = evaluate.get(name) if isinstance(evaluate, Mapping) else None
@@ -271,7 +271,7 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
 
 
 def no_reward(reward: object, num_envs: int) -> str | None:
-    """What is wrong with a reward that is no real number (or bool) for each env: it cannot be drawn or recorded."""
+    """What is wrong with a reward that cannot be drawn or recorded, or None: a real number (or bool) for each env."""
     if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs) or reward.dtype.is_complex:
         return f"returned {describe(reward)}; {_floating(num_envs)}"
     return None
@@ -282,7 +282,7 @@ def _floating(num_envs: int) -> str:
 
 
 def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:
-    # Tasks written for one env return other shapes of one number, which ManiSkill's step takes.
+    # Tasks written for one env return one number in other shapes, which ManiSkill's step accepts.
     return value.shape == (num_envs,) or num_envs == value.numel() == 1
 
 
@@ -304,7 +304,7 @@ def without_rows(value: object, num_envs: int) -> Iterator[tuple[str, str]]:
     """Name and description of each tensor or array in nested dicts that has no row for each env."""
     for name, held in flat_entries(value):
         if isinstance(held, torch.Tensor | np.ndarray) and held.shape[:1] != (num_envs,):
-            if num_envs > 1 or held.ndim:  # ManiSkill takes shape () for a single env
+            if num_envs > 1 or held.ndim:  # ManiSkill accepts shape () for a single env
                 yield name, type_text(held)
 
 

@@ -27,14 +27,14 @@ from workbench.envs.snapshots.task_state import is_per_env, version_of
 from workbench.machine.library_files import is_installed
 
 MAX_TRACED_LINES = 2000
-"""Lines of the author's code after which values are compared, in one reset."""
+"""Maximum lines of the author's code after which values are compared, in one reset."""
 _ROUNDING_TOLERANCE = 1e-5
-"""Tolerance for values computed again from the same poses: 1e-7 of a rotation was seen."""
+"""Tolerance for values computed again from the same poses; rotations were seen to differ by 1e-7."""
 _ITEM = re.compile(r"\[(\d+)\]")
 
 
 class KeptRows:
-    """What a task keeps for each env, as it is when this is made.
+    """Copy of what a task keeps for each env, to find rows that a partial reset changed for other envs.
 
     A partial reset must change the rows of ``env_idx`` only, in tensors, arrays, lists and Poses on the task, in dicts and in
     objects of its own. Nothing raises when it does not: ``self.target = torch.rand((self.num_envs, 2))`` gives every env
@@ -54,8 +54,8 @@ class KeptRows:
         self.before = {path: _copy(value) for path, value in self._read(walk).items()}
 
     def changed_envs(self) -> dict[str, tuple[int, ...]]:
-        """Paths (without ``self.``) whose rows of other envs changed, and in which envs; empty if only the rows of the envs
-        being reset are left, and the others are lost."""
+        """Paths (without ``self.``) whose rows of other envs changed, each with these envs; no envs where only the rows of
+        the envs being reset are left."""
         now = self._read(walk_task_values(self.env))
         found = {path: self._difference(before, now.get(path)) for path, before in self.before.items()}
         return {path: envs for path, envs in found.items() if envs is not None}
@@ -64,7 +64,7 @@ class KeptRows:
         """The paths whose rows of other envs changed.
 
         Args:
-            seen: values at the last call, updated here: a tensor that was not written since is not compared again.
+            seen: values at the last call, updated here, so that a tensor is compared only if it was written since.
         """
         now = self._read(walk_task_values(self.env))
         for path, before in self.before.items():
@@ -77,7 +77,7 @@ class KeptRows:
         return {path for path, (_, _, differs) in seen.items() if differs}
 
     def _read(self, walk: Walk) -> dict[str, Any]:
-        """The values at the paths; a list where each env has its own."""
+        """The values at the paths; a list where each env has its own value."""
         now = {leaf.path: leaf.value for leaf in walk.leaves}
         read = {path: now[path] for path in self._single if path in now}
         for path, each in self._groups.items():
@@ -229,14 +229,14 @@ class _Lines:
 
 
 _MAX_TRACED_RESETS = 3
-"""Partial resets of a class in which lines are traced."""
+"""Maximum number of partial resets of a class in which lines are traced."""
 
 
 class ResetWatch:
     """Watches the partial resets of one env, from `start` to `report` or `stop`.
 
     Args:
-        rules: Receives what is found.
+        rules: Receives the breaches.
     """
 
     def __init__(self, rules: BrokenRules) -> None:
@@ -287,7 +287,7 @@ class ResetWatch:
         self.stop()
         found = lines.rows.changed_envs()
         if over or found:
-            # Tracing slows a reset down: only if a line is missing.
+            # Tracing slows a reset down, so trace only if a line is missing.
             self._tries -= self._seeks
             self._seeks = self._tries > 0 and not found.keys() <= lines.found.keys()
         for path, envs in found.items():

@@ -1,4 +1,4 @@
-"""The keyword arguments that make an env: described in the worker, and read from text in the server. Imports no torch."""
+"""Keyword arguments that make an env: described in the worker, parsed from text in the server. Imports no torch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 KeywordKind = Literal["bool", "int", "float", "str", "choice", "json"]
 MAX_TEXT_CHARACTERS = 2000
-"""Characters of a value's text."""
+"""Maximum length of a value's text."""
 MAX_CHOICES = 200
 MAX_KEYWORDS = 40
 MODES = ("robot_uids", "control_mode", "obs_mode", "reward_mode")
@@ -26,7 +26,7 @@ _BASE_PARAMETERS = frozenset(
         "render_device", "parallel_in_single_scene", "enhanced_determinism", "backend", "device",
     }
 )  # fmt: skip
-"""Parameters that tasks hand on to `BaseEnv`."""
+"""Parameters that tasks pass on to `BaseEnv`."""
 _ABSENT: Any = object()
 _ANY_TEXTURES = "any_textures"
 """ManiSkill's word for every combination of pictures."""
@@ -69,8 +69,8 @@ def describe_keywords(
 
     Args:
         cls: the author's class.
-        given: keywords that a person gave.
-        registered: keywords of the registration.
+        given: the user's keywords.
+        registered: the keywords of the registration.
         stop: `BaseEnv`, whose parameters are no keywords of the task itself.
     """
     parameters = dict(parameters_of(cls, stop))
@@ -92,16 +92,15 @@ def _agents_of(env: Any) -> Sequence[Any]:
 
 
 def control_mode_of(env: Any) -> str | None:
-    """The control mode as ``gym.make`` takes it: of several robots the one that all have. None if they differ, and where there
-    is no robot."""
+    """The control mode as ``gym.make`` takes it; None if several robots have different ones, or there is no robot."""
     if getattr(env, "agent", None) is None:
         return None
-    # ManiSkill has a dict of several robots, which it does not take.
+    # With several robots this is a dict, which ``gym.make`` does not take.
     return one_mode(env.control_mode)
 
 
 def one_mode(mode: object) -> str | None:
-    """The control mode in a text, or of all robots in a dict; None for anything else."""
+    """The control mode from a string, or the one that all robots in a dict share; None for anything else."""
     modes = set(mode.values()) if isinstance(mode, dict) else {mode}
     (first, *others) = modes or {None}
     return first if isinstance(first, str) and not others else None
@@ -132,10 +131,10 @@ def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
 
 
 def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parameter]]:
-    """Named parameters of the class's ``__init__``, and of its base classes' as long as each hands keywords on.
+    """Named parameters of the class's ``__init__``, and of its base classes' as long as each passes keywords on.
 
     Args:
-        stop: the base class whose own are left out, with those of its bases.
+        stop: the base class at which to stop: its parameters and those of its bases are left out.
     """
     seen: set[str] = set()
     for owner in cls.__mro__:
@@ -159,7 +158,7 @@ def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Paramete
 
 
 def _annotation(parameter: inspect.Parameter, init: Any) -> Any:
-    """The type; one of a module with ``from __future__ import annotations`` is a text, which may name what is not there."""
+    """The annotated type. With ``from __future__ import annotations`` it is a string, which may contain undefined names."""
     if not isinstance(parameter.annotation, str):
         return parameter.annotation
     names = getattr(inspect.unwrap(init), "__globals__", {})
@@ -184,7 +183,7 @@ def _describe(name: str, parameter: inspect.Parameter, given: Any, registered: A
 
 
 def _plain(value: Any) -> Any:
-    """The name of a member of an Enum, as it is written on a command line."""
+    """The value of a member of an Enum, as a command line gives it; anything else as it is."""
     return value.value if isinstance(value, enum.Enum) else value
 
 
@@ -211,7 +210,7 @@ def _kind_of(annotation: Any, default: Any) -> tuple[KeywordKind, tuple[str, ...
 
 
 def as_json(value: Any) -> str | None:
-    """The value in JSON; None if JSON cannot hold it, or only something else that equals it not."""
+    """The value in JSON; None if JSON cannot hold it, or it would be read back as something else."""
     try:
         text = json.dumps(value, allow_nan=False)
         back = json.loads(text)
@@ -233,14 +232,14 @@ def _short(text: str) -> str:
 
 
 def constructor_arguments(cls: type, given: Mapping[str, Any], stop: type) -> dict[str, Any]:
-    """What was given in JSON, as the class takes it: several robots as a tuple, members of an Enum.
+    """Arguments given in JSON, as the class takes them: several robots as a tuple, and members of an Enum.
 
     Args:
         stop: as in `describe_keywords`.
     """
     taken = dict(given)
     if isinstance(robots := taken.get("robot_uids"), list):
-        taken["robot_uids"] = tuple(robots)  # a list would be the name of one robot
+        taken["robot_uids"] = tuple(robots)  # ManiSkill would take a list for the name of one robot
     for name, parameter in parameters_of(cls, stop):
         kind = parameter.annotation
         if name in taken and isinstance(kind, type) and issubclass(kind, enum.Enum):
@@ -265,10 +264,10 @@ def shown(text: str) -> str:
 
 
 def read_value(keyword: Keyword, text: str) -> Any:
-    """The value that a person wrote for a keyword.
+    """Parse the text that a person wrote for a keyword.
 
     Raises:
-        ValueError: it is none of this kind; the message names the keyword and says what it takes.
+        ValueError: the text is no value of this kind; the message has the keyword and what it takes.
     """
     text = text.strip()
     if len(text) > MAX_TEXT_CHARACTERS:

@@ -24,12 +24,12 @@ class OtherEntry:
     """False if `texts` is shortened."""
 
     def of_env(self, env: int) -> OtherEntry:
-        """The part of one env; all of it if it is not per env."""
+        """The part of one env; the whole entry if it is not per env."""
         return replace(self, texts=(self.texts[env],)) if self.per_env else self
 
     @property
     def nbytes(self) -> int:
-        """Roughly what it takes in memory."""
+        """Approximate memory in bytes."""
         return 200 + sum(map(len, self.texts)) + (0 if self.numbers is None else self.numbers.nbytes)
 
 
@@ -60,7 +60,7 @@ class StepResult:
 
     @property
     def nbytes(self) -> int:
-        """Roughly what it takes in memory."""
+        """Approximate memory in bytes."""
         return sum(map(_nbytes, vars(self).values()))
 
 
