@@ -24,18 +24,19 @@ _WELD_CELLS = 1_000_000
 _MAX_PIECES = 200
 _MIN_FACES = 24
 _SLOW_GROWTH, _USUAL_GROWTH = 3, 7
-"""How fast the threshold of a collapse grows (the method's ``agg``): the slower, the more cheap edges go before dear ones."""
+"""Growth of the collapse threshold (the method's ``agg``): the slower, the more cheap edges go before costly ones."""
 
 
 def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
-    """`mesh` with about `max_faces` triangles; as it is when it has no more than that.
+    """`mesh` with about `max_faces` triangles; unchanged if it has no more than that.
 
     ManiSkill's Panda has 136,000 triangles and its wrist camera 425,000; a browser that draws in software manages some
     200,000 in all. Quadric edge collapse (fast_simplification, Garland and Heckbert) does not move borders, and exporters give
-    every triangle its own three vertices. So vertices at one place are welded first (with a texture only where the uv agrees), and
-    normals are made again, sharp at edges and smooth elsewhere.
+    every triangle its own three vertices. So vertices at one place are welded first (with a texture only where the uv agrees),
+    and normals are computed again, sharp at edges and smooth elsewhere.
 
-    A mesh of many loose pieces may keep up to twice as many, and a textured one more: edges of its texture pieces stay.
+    A mesh of many loose pieces may keep up to twice as many triangles, and a textured one more, since edges of its texture
+    pieces stay.
     """
     reduced = collapse_mesh(mesh, max_faces)
     if reduced is mesh:
@@ -70,7 +71,7 @@ def coarsen_mesh(mesh: Mesh, max_faces: int, by_pieces: bool = False) -> Mesh:
     nearer to the surface, and with normals of its own faces.
 
     Args:
-        by_pieces: each connected piece by itself: small ones stay, where a whole one would otherwise be lost.
+        by_pieces: collapse each connected piece by itself, so that small pieces are not lost.
     """
     vertices, faces, uvs = _weld(mesh.vertices, mesh.faces, mesh.uvs, _WELD_CELLS)
     if len(faces) > max_faces:
@@ -82,13 +83,13 @@ def coarsen_mesh(mesh: Mesh, max_faces: int, by_pieces: bool = False) -> Mesh:
 
 
 def cluster_mesh(mesh: Mesh, max_faces: int, cells: int) -> Mesh:
-    """`mesh`, without texture, with about `max_faces` triangles after the vertices in each cell of a grid have become one, and
+    """`mesh`, without texture, with about `max_faces` triangles after the vertices in each cell of a grid are merged, and
     with normals of its own faces.
 
-    Loose pieces grow together, and what is smaller than a cell is gone: for what is seen from afar.
+    Loose pieces grow together, and details smaller than a cell are lost: for objects that are seen from afar.
 
     Args:
-        cells: of the grid along the longest axis.
+        cells: number of grid cells along the longest axis.
     """
     vertices, faces, _ = _weld(mesh.vertices, mesh.faces, None, cells)
     if len(faces) > max_faces:
@@ -99,7 +100,7 @@ def cluster_mesh(mesh: Mesh, max_faces: int, cells: int) -> Mesh:
 
 
 def share_vertices(mesh: Mesh) -> Mesh:
-    """`mesh` with equal vertices only once: exporters give every triangle its own three. Normals that differ by half a
+    """`mesh` with equal vertices merged: exporters give every triangle its own three. Normals that differ by up to half a
     degree count as equal."""
     rows = [np.ascontiguousarray(mesh.vertices)]
     if mesh.normals is not None:
@@ -125,7 +126,7 @@ def rounded(mesh: Mesh) -> Mesh:
     extent = np.ptp(mesh.vertices, axis=0)
     cell = np.exp2(np.floor(np.log2(np.where(extent > 0, extent, 1.0) / 4096)))
     on_grid = (np.round(mesh.vertices / cell) * cell).astype(np.float32)
-    # Flat along an axis, it stays where it is.
+    # Keep the positions along an axis on which the mesh is flat.
     vertices = np.where(extent > 0, on_grid, mesh.vertices)
     normals = None if mesh.normals is None else (np.round(mesh.normals * 48) / 48).astype(np.float32)
     return replace(mesh, vertices=vertices, normals=normals)
@@ -186,7 +187,7 @@ def _weld(
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     welded = inverse.reshape(-1)[faces]
     if cells < _WELD_CELLS:
-        # Surfaces that a coarse grid makes coincide would flicker.
+        # Drop duplicates: surfaces that coincide on a coarse grid would flicker.
         welded = welded[np.sort(np.unique(np.sort(welded, axis=1), axis=0, return_index=True)[1])]
     whole = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
     return vertices[first], welded[whole], None if uvs is None else uvs[first]
@@ -209,7 +210,7 @@ def _collapse(
         else:
             growth = _USUAL_GROWTH if how == "fast" else _SLOW_GROWTH
             new_points, new_faces = _collapse_pieces(points, triangles, max_faces, growth)
-        # The optimum of a nearly singular quadric can be anywhere: a spike out of the surface.
+        # The optimum of a nearly singular quadric can be anywhere, and would be a spike out of the surface.
         distance, nearest = (np.asarray(x) for x in KDTree(points).query(new_points))
         spike = distance > 0.04
         new_points[spike] = points[nearest[spike]]
@@ -234,7 +235,8 @@ def _collapse(
 def _collapse_whole(
     points: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    # Losing a flat lid costs a quadric nothing, unless its border stays. Only what cannot be had so is had otherwise.
+    # Losing a flat lid costs a quadric nothing unless its border is kept. So borders go only if it is the only way to get
+    # few enough faces.
     new_points, new_faces = points, faces
     for growth, keep_borders in ((_SLOW_GROWTH, True), (_SLOW_GROWTH, False), (_USUAL_GROWTH, False)):
         new_points, new_faces = fast_simplification.simplify(
@@ -250,7 +252,7 @@ def _collapse_pieces(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Collapse each connected piece by itself, with a share of the triangles by its area.
 
-    Losing a flat disc costs a quadric nothing: together with a round housing, its lid goes first.
+    Losing a flat disc costs a quadric nothing: collapsed together with a round housing, its lid would go first.
     """
     count = len(points)
     edges = coo_matrix(
