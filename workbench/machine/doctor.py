@@ -1,4 +1,4 @@
-"""Checks what this machine can do for the workbench, and advises on what is missing."""
+"""Checks whether this machine can run the workbench, and advises on what is missing."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from workbench.machine.software_vulkan import ensure_render_device
 
 DEFAULT_PORT = 8080
 MIN_MEMORY_GIB = 6.0
-"""Least available memory, in GiB: one worker with 16 envs and cameras on a software driver, its warm spare, the
-server and a browser."""
+"""Minimum available memory: one worker with 16 envs and cameras on a software driver, its warm spare, the server and a
+browser."""
 CHILD_TIMEOUT_SECONDS = 120
 
 GPU_SCRIPT = """
@@ -70,10 +70,10 @@ class _TookTooLong(Exception):
 
 
 def diagnose() -> list[DoctorFinding]:
-    """Check everything. Never raises: a check that fails is a finding with the failure in it.
+    """Run all checks. Never raises: a check that fails becomes a finding with its error.
 
-    A broken driver crashes or hangs its process, so SAPIEN's renderer and torch's CUDA are asked in child processes with a
-    time limit. PhysX's GPU library is looked for on disk, since SAPIEN would fetch it from the network.
+    A broken driver crashes or hangs its process, so SAPIEN's renderer and torch's CUDA are probed in child processes with a
+    timeout. PhysX's GPU library is looked for on disk, since SAPIEN would fetch it from the network.
     """
     questions: list[tuple[str, Callable[[], list[DoctorFinding]]]] = [
         ("Python", _python),
@@ -97,7 +97,7 @@ def diagnose() -> list[DoctorFinding]:
             advice = "The machine is busy, or a driver hangs: run workbench doctor again."
             findings.append(DoctorFinding(topic, None, f"not known: {failure}", advice))
         else:
-            advice = "This question should not fail: please report it."
+            advice = "This check should not fail: please report it."
             findings.append(
                 DoctorFinding(topic, None, f"not known: {type(failure).__name__}: {failure}", advice)
             )
@@ -158,8 +158,8 @@ def _packages() -> list[DoctorFinding]:
 
 
 def _maniskill() -> list[DoctorFinding]:
-    """Check ManiSkill: its release, a nightly build, or both, of which one has overwritten the other; and whether it
-    and the packages beside it have the private names that are used."""
+    """Check ManiSkill (its release, a nightly build, or both, of which one has overwritten the other), and that it and
+    the related packages have the private names that the workbench uses."""
     topic = "ManiSkill"
     if (lacking := lines_if_lacking("A task")) is not None:
         return [DoctorFinding(topic, False, *lacking)]
@@ -189,8 +189,8 @@ def _maniskill() -> list[DoctorFinding]:
     what = f"{found[1]}, its release: tested with the workbench"
     if found[0] == "mani_skill-nightly":
         what = (
-            f"{found[1]}, a nightly build: tested with the workbench. Of another build every private name that the "
-            "workbench uses is looked for at start, and what has moved is named."
+            f"{found[1]}, a nightly build: tested with the workbench. For another build, every private name that the "
+            "workbench uses is looked up at start, and missing ones are reported."
         )
     return [DoctorFinding(topic, True, what)]
 
@@ -222,13 +222,13 @@ def _gpu() -> list[DoctorFinding]:
     cuda: list[str] = answer["cuda"]
     if cuda:
         found = f"{', '.join(cuda)} (torch for CUDA {answer['built']})"
-        what = "on the CPU core, unless you say --backend gpu"
+        what = "on the CPU core, unless you pass --backend gpu"
         advice = f"For --backend gpu: {answer['why_not']}"
         if answer["why_not"] is None:
             what += f" (PhysX GPU library {answer['library']})"
             advice = (
-                "GPU simulation has passed its tests on no machine so far, so --backend auto does not take it. In a clone, "
-                "make test-gpu says whether they pass on this one."
+                "GPU simulation has passed its tests on no machine so far, so --backend auto does not use it. In a clone, "
+                "make test-gpu runs them on this one."
             )
         return [DoctorFinding("CUDA", True, found), DoctorFinding("GPU physics", None, what, advice)]
     nvidia = Path("/proc/driver/nvidia/version").is_file()
@@ -252,7 +252,7 @@ def _gpu() -> list[DoctorFinding]:
 
 
 def _ask_child(code: str) -> Any:
-    """What `code` prints last, read as JSON; if `code` fails, the last line of its error."""
+    """Run `code` in a child process; returns its last line as JSON, or the last line of its error if it fails."""
     try:
         child = subprocess.run(
             python_command("-c", code),
@@ -263,7 +263,7 @@ def _ask_child(code: str) -> Any:
             timeout=CHILD_TIMEOUT_SECONDS,
         )
     except subprocess.TimeoutExpired:
-        # Its own text is the whole program that was asked.
+        # The text of TimeoutExpired would contain the whole script.
         raise _TookTooLong(f"it took more than {CHILD_TIMEOUT_SECONDS} s") from None
     if child.returncode != 0:
         return (child.stderr.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
@@ -293,8 +293,8 @@ def _reading() -> list[DoctorFinding]:
         DoctorFinding(
             "reading",
             None,
-            "recordings are read in processes of their own, with limits on memory and time alone: this kernel has no Landlock",
-            "Linux 5.13 has it, where it is not turned off. Without it, open recordings of people you trust.",
+            "recordings are read in separate processes, with limits on memory and time only: this kernel has no Landlock",
+            "Linux 5.13 and newer have it, unless it is turned off. Without it, open only recordings of people you trust.",
         )
     ]
 
@@ -340,9 +340,9 @@ def find_chromium() -> str | None:
 
 
 def chromium_version(path: str) -> str | None:
-    """What ``PATH --version`` prints, None if it does not run or is not a Chromium.
+    """Output of ``PATH --version``; None if it does not run or is not a Chromium.
 
-    Ubuntu's ``chromium-browser`` may be a script that only says "install the snap": a name on PATH proves nothing.
+    A name on PATH proves nothing: Ubuntu's ``chromium-browser`` may be a script that only prints "install the snap".
     """
     try:
         done = subprocess.run(

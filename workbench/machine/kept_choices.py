@@ -1,4 +1,4 @@
-"""Choices that a person made on the page, kept for the next run in the user's own folder."""
+"""Stores choices that a person made on the page, for the next run, in the user's own folder."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class KeptChoices(msgspec.Struct, frozen=True):
 
 
 def kept_choices() -> KeptChoices:
-    """The choices so far; the defaults, with a warning, if the file cannot be read."""
+    """The stored choices; the defaults, with a warning, if the file cannot be read."""
     try:
         content = read_private(FILE)
         return KeptChoices() if content is None else msgspec.json.decode(content, type=KeptChoices)
@@ -52,7 +52,7 @@ def used_policies(folder: Path) -> tuple[str, ...]:
 
 
 def keep_policy(folder: Path, reference: str) -> None:
-    """Keep a policy that was used in this folder."""
+    """Store a policy that was used in this folder."""
 
     def change(kept: KeptChoices) -> KeptChoices:
         known = [one for one in kept.policies.get(str(folder), ()) if one != reference]
@@ -69,5 +69,5 @@ def _change(change: Callable[[KeptChoices], KeptChoices]) -> None:
         with locked(FILE):
             write_private(FILE, msgspec.json.encode(change(kept_choices())))
     except OSError as error:
-        # The page works without: it is a convenience.
+        # The page works without stored choices.
         log.warning("What is chosen on this page is not kept for the next run: %s", error)

@@ -1,4 +1,4 @@
-"""Text for people: numbers, lengths, and text from elsewhere made safe for a terminal."""
+"""Formats numbers and lengths for people, and makes text from other sources safe for a terminal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def number_text(value: float, form: str = ".4g") -> str:
 
 
 def rate_text(value: float) -> str:
-    """A rate of zero or more, with two digits also where it is small: ``5 125``, ``240``, ``9.6``, ``0.93``, ``0.045``."""
+    """A rate of zero or more, with two digits if it is small: ``5 125``, ``240``, ``9.6``, ``0.93``, ``0.045``."""
     return f"{value:,.0f}".replace(",", " ") if value >= 9.95 else f"{value:.2g}"
 
 
@@ -152,7 +152,7 @@ class SafeStream:
 def guard_terminal() -> None:
     """Let this process print only text and colours to its terminal.
 
-    Not undone, since a traceback that ends the process is printed last. Does not cover native code and other programs.
+    Never undone, since a traceback that ends the process is printed last. Does not cover native code and other programs.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -164,7 +164,7 @@ def guard_terminal() -> None:
 
 
 MAX_TRACEBACK_LINES = 80
-"""Most lines of a traceback."""
+"""Maximum lines of a traceback."""
 MAX_LINE_CHARACTERS = 500
 
 

@@ -42,19 +42,19 @@ from workbench.pictures.visibility import (
 )
 
 WIDE_MARGIN_SHARE = 0.1
-"""Share of the picture's shorter side that is enough between an object and the border."""
+"""Sufficient distance between an object and the border, as a share of the picture's shorter side."""
 FREE_METRES = 0.1
-"""Metres that must be free in front of the lens: the camera's own body is there."""
+"""Distance that must be free in front of the lens, for the camera's own body."""
 ROBOT_DISTANCE_METRES = 0.2
-"""Least distance in metres of an eye from the origin of every robot link, in the searched envs."""
+"""Least distance of an eye from the origin of every robot link, in the searched envs."""
 MOUNT_DISTANCE_METRES = 0.05
-"""Least distance in metres of an eye on a mount from the origin of every robot link; it is meant to be near one."""
+"""Least distance of an eye on a mount from the origin of every robot link; such an eye is meant to be near one."""
 SUFFICIENT_SCORE = 0.995
 """Score at which no further round is sampled."""
 ROUNDS = 2
-"""Rounds of samples around the best candidates."""
+"""Number of rounds of samples around the best candidates."""
 MAX_EYE_ATTEMPTS = 50
-"""Attempts to sample an eye clear of the robot; a box within the robot is searched anyway."""
+"""Maximum attempts to sample an eye clear of the robot; a box within the robot is searched anyway."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
 
@@ -67,13 +67,13 @@ def suggest_cameras(
     progress: Callable[[int, int], None] = lambda done, total: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[OfferedPlacement, ...]:
-    """The best placements found, best first, for envs that are already reset; the envs stay as they are.
+    """Search placements for envs that are already reset, and return the best first; the envs stay unchanged.
 
-    Placements at a distance from each other are returned, since five neighbours are one suggestion; fewer than `SearchSpace.best` if
-    there are not more, or if the search is cancelled. The same seed gives the same result.
+    Returned placements keep a distance from each other, since five neighbours would be one suggestion. They are fewer than
+    `SearchSpace.best` if no more are found, or if the search is cancelled. The same seed gives the same result.
 
     Args:
-        progress: called after each picture with the number made and the most that will be made; keep it cheap.
+        progress: called after each picture with the number made and the maximum that will be made; keep it cheap.
         cancelled: called before each picture.
 
     Raises:
@@ -163,7 +163,7 @@ class _Search:
             yield self._suggestion(score, candidate, report)
 
     def _measure_best_of(self, candidates: list[_Candidate], keep: int) -> None:
-        """Score all without the robot, which bounds the score from above, then the best `keep` with it."""
+        """Score all candidates without the robot, which bounds the score from above, then the best `keep` with it."""
         bare = self._measure(candidates)
         scores = [score_of(join_reports(row), self.space.objects) for row in bare]
         order = np.argsort([-score for score in scores], kind="stable").tolist()
@@ -202,7 +202,7 @@ class _Search:
         return measured
 
     def _chosen(self) -> list[tuple[float, _Candidate, CameraReport]]:
-        """The best that are not close to each other."""
+        """The best candidates that are not close to each other."""
         chosen: list[tuple[float, _Candidate, CameraReport]] = []
         for entry in sorted(self.found, key=lambda entry: -entry[0]):
             if entry[0] > 0 and not any(self._near(entry[1], other[1]) for other in chosen):
@@ -264,7 +264,7 @@ class _Search:
         return mounts
 
     def _pose(self, candidate: _Candidate) -> NDArray[np.float64]:
-        """(7,) of a candidate, in the mount's or the env's frame."""
+        """(7,) pose of a candidate, in the mount's or the env's frame."""
         if self.mounts is None:
             return pose_from_look_at(LookAt(triple(candidate[0]), triple(candidate[1])))
         # "Up" in a link's frame means nothing: the picture keeps its present orientation.

@@ -1,4 +1,4 @@
-"""Confines a process that reads files of others (Landlock and resource limits)."""
+"""Confines a process that reads untrusted files (Landlock and resource limits)."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ _ASK_VERSION = 1
 _PATH_BENEATH = 1
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1 << 0, 1 << 1, 1 << 2, 1 << 3
 _FILE_RIGHTS = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
-"""File rights that each version of Landlock adds; all but reading are given up."""
+"""File rights that each version of Landlock adds; all except reading are given up."""
 _FILE_ONLY_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE
 """Rights that apply to files that are not folders."""
 _TCP_RIGHTS = 0b11
 """Rights to bind and to connect, from version 4 on."""
 _SCOPES = 0b11
-"""Scopes that keep out the abstract sockets of other processes and signals to them, from version 6 on."""
+"""Scopes that forbid abstract sockets of, and signals to, other processes, from version 6 on."""
 _PR_SET_NO_NEW_PRIVS = 38
 _SYSTEM_PATHS = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
            "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
 MAX_WRITTEN_BYTES = 1 << 20
-"""Most bytes of a written file; this limit also holds without Landlock."""
+"""Maximum size of a written file; this limit also holds without Landlock."""
 MAX_OPEN_FILES = 512
 
 
 def landlock_version() -> int:
     """Version of Landlock in this kernel; 0 if the kernel has none, or Landlock is turned off.
 
-    Asked by system calls, since libc has no names for Landlock (``include/uapi/linux/landlock.h``).
+    Uses system calls, since libc has no functions for Landlock (``include/uapi/linux/landlock.h``).
     """
     return max(_call(_CREATE_RULESET, None, 0, _ASK_VERSION), 0)
 
 
 def confine(reads: Iterable[Path], most_memory: int, writes: Iterable[Path] = ()) -> None:
-    """Restrict this process and its children: they read only below `reads`, and programs and libraries.
+    """Restrict this process and its children: they can read only below `reads`, programs and libraries.
 
-    They write only below `writes`, open no TCP connection, signal no outside process, and gain no rights by what they
-    start.
+    They can write only below `writes`, open no TCP connection, signal no outside process, and gain no rights from programs
+    that they start.
 
     Args:
-        most_memory: bytes that may be allocated.
+        most_memory: maximum bytes that may be allocated.
     """
     writes = tuple(writes)
     resource.setrlimit(resource.RLIMIT_DATA, (most_memory, most_memory))
