@@ -30,7 +30,7 @@ _GENERAL_CODE = ("workbench.", "mani_skill.utils.", "mani_skill.envs.s")
 """``mani_skill.envs.sapien_env`` and ``.scene`` among them: they write what a task passes."""
 _FRAMES_KEPT = 12
 _BASE_ENV, _OUTERMOST = "mani_skill.envs.sapien_env", ("step", "reset")
-"""Where the frames of an error end: the traceback has the ones above anyway."""
+"""Outermost frames that an error gets: the traceback has those above anyway."""
 
 Frame = tuple[FrameType, int, int]
 """A frame with its last instruction and its line at the time."""

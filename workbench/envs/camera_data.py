@@ -60,7 +60,7 @@ config keeps its pose in single precision."""
 
 
 def differences(a: CameraSettings, b: CameraSettings, close: float = SETTING_TOLERANCE) -> tuple[str, ...]:
-    """Which of ``position orientation fov intrinsic width height near far shader_pack`` are not the same."""
+    """Names of the settings that differ: ``position orientation fov intrinsic width height near far shader_pack``."""
     turned = tuple(-x for x in b.quaternion)
     found = []
     for name in [f.name for f in fields(a) if f.compare]:
@@ -102,7 +102,7 @@ class MovedCamera:
 
 def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
     """``base_camera: position (0.3, 0, 0.6), in the file (0.3, 0, 0.5)``; empty if none was moved."""
-    said = []
+    texts = []
     for one in moved:
         from_step = f" from step {one.state} on" if one.state else ""
         values = [
@@ -110,8 +110,8 @@ def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
             for what in differences(one.used, one.in_file)
             for mine, file in [(_value(one.used, what), _value(one.in_file, what))]
         ]
-        said.append(f"{one.name}{from_step}: {'; '.join(values) or 'as in the file'}")
-    return ". ".join(said)
+        texts.append(f"{one.name}{from_step}: {'; '.join(values) or 'as in the file'}")
+    return ". ".join(texts)
 
 
 def _value(settings: CameraSettings, what: str) -> object:
@@ -179,7 +179,7 @@ class CameraInfo:
     mount: str | None
     """Name of the body that the camera is mounted on; None if it is fixed."""
     modalities: tuple[str, ...]
-    """What its shader gives, of ``rgb depth segmentation position normal albedo``."""
+    """Modalities of its shader, among ``rgb depth segmentation position normal albedo``."""
     settings: CameraSettings | None = None
     """Settings of the task's own config, even if the camera was moved since; env 0's where they differ. None if
     `CameraSettings` cannot express it (a lens that differs between envs)."""

@@ -199,7 +199,7 @@ class BatchedCpuScene(ManiSkillScene):
             camera.take_picture()
             return camera
         shapes, cameras = self._fast_parts()
-        drawing = camera if textures is None else cameras.beside(camera, textures)
+        drawing = camera if textures is None else cameras.camera_for(camera, textures)
         with shown(shapes.bodies(key, env)):
             drawing.take_picture()
         return drawing
@@ -450,12 +450,12 @@ class BatchedCpuMixin:
         """Ignore the device that BaseEnv parsed from the backend: the CPU, as requested in __init__."""
 
     def step(self, action: Any) -> Any:
-        among = self.scene.px.resetting
+        resetting = self.scene.px.resetting
         before = self._elapsed_steps.clone()
         with self._in_turn("step"), AuthorCall():
             result = super().step(action)  # type: ignore[misc]
-        if among is not None:  # a hook of a reset steps the envs that are being reset
-            self._elapsed_steps[~among] = before[~among]
+        if resetting is not None:  # a hook of a reset steps the envs that are being reset
+            self._elapsed_steps[~resetting] = before[~resetting]
         return result
 
     @contextmanager

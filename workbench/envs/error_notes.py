@@ -82,9 +82,9 @@ class AuthorCall:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> Literal[False]:
         _running.depth -= 1
         if error is not None:
-            told = [*chain_of(error, suppressed=True)]
+            known = [*chain_of(error, suppressed=True)]
             for refusal in _running.refusals[self._first :]:
-                note = None if refusal in told else _caught_note(refusal)
+                note = None if refusal in known else _caught_note(refusal)
                 if note is not None and note not in notes_of(error):
                     error.add_note(note)
         if _running.depth == 0:

@@ -233,7 +233,7 @@ def clean_text(text: str) -> str:
 
 
 def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
-    """What is wrong with ``evaluate()``'s return value, or None: a dict in which ``success`` and ``fail`` are tensors (N,).
+    """What is wrong with ``evaluate()``'s return value, or None. It must be a dict whose ``success`` and ``fail`` are (N,).
 
     Other entries may be anything, as in ManiSkill (`split_entries`).
     """
@@ -259,7 +259,7 @@ def wrong_flags(evaluate: object) -> str | None:
 
 
 def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> str | None:
-    """What is wrong with a reward, or None: a floating tensor (N,). A NaN is a value, shown in that env's row."""
+    """What is wrong with a reward, or None. It must be a floating tensor (N,); NaN is allowed, and shown in the env's row."""
     problem = no_reward(reward, num_envs)
     if problem is not None or not isinstance(reward, torch.Tensor) or reward.dtype.is_floating_point:
         return problem
@@ -271,7 +271,7 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
 
 
 def no_reward(reward: object, num_envs: int) -> str | None:
-    """What is wrong with a reward that cannot be drawn or recorded, or None: a real number (or bool) for each env."""
+    """What is wrong with a reward, or None. To be drawn and recorded it must be a real number (or bool) for each env."""
     if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs) or reward.dtype.is_complex:
         return f"returned {describe(reward)}; {_floating(num_envs)}"
     return None
@@ -287,7 +287,7 @@ def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:
 
 
 def wrong_observation(obs: object, num_envs: int) -> str | None:
-    """What is wrong with an observation hook's return value, or None: a dict of arrays (N, ...)."""
+    """What is wrong with an observation hook's return value, or None. It must be a dict of arrays (N, ...)."""
     if not isinstance(obs, Mapping):
         return f"returned {describe(obs)}; it must return a dict ({{}} where there is nothing to observe)"
     for name, value in flat_entries(obs):

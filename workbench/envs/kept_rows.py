@@ -145,7 +145,7 @@ def _array(value: torch.Tensor | np.ndarray) -> np.ndarray:
 
 
 def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Where they differ; NaN equals NaN."""
+    """Mask of the numbers in which two arrays differ; NaN equals NaN."""
     if a.dtype.kind in "fc" and b.dtype.kind in "fc":
         return ~np.isclose(a, b, rtol=_ROUNDING_TOLERANCE, atol=_ROUNDING_TOLERANCE, equal_nan=True)
     return np.asarray((a != b) & ~((a != a) & (b != b)))

@@ -52,7 +52,7 @@ class StepResult:
     action: NDArray[np.float32] | None = None
     """(N, A) that led here; None right after a reset."""
     sound_obs: NDArray[np.bool_] | None = None
-    """(N,) whether the env's observation is finite, pictures left out; None if unknown."""
+    """(N,) whether the env's observation, without pictures, is finite; None if unknown."""
     qpos: NDArray[np.float32] | None = None
     """(N, J) positions of the joints of `envs.scene.scene_index.joint_names`, in rad or m; None if there are none."""
     others: dict[str, OtherEntry] = field(default_factory=dict)

@@ -82,7 +82,7 @@ def _unknown(
     cameras: Collection[str] | None,
     control_modes: Collection[str],
 ) -> Iterator[tuple[str, str, Collection[str]]]:
-    """What is wrong, the unknown name or value, and the known ones."""
+    """For each problem: its text, the unknown name or value, and the known ones."""
     if name in _CAMERAS and isinstance(value, Mapping):
         yield from _unknown_of_cameras(name, value, cameras)
     elif name == "sim_config" and isinstance(value, Mapping):

@@ -62,7 +62,7 @@ class DoctorFinding:
     """True: works. None: the workbench runs with limitations. False: the workbench cannot run."""
     what: str
     advice: str | None = None
-    """What to do; None if all is well."""
+    """Advice on what to do; None if all is well."""
 
 
 class _TookTooLong(Exception):

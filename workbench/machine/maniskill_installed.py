@@ -61,11 +61,11 @@ def lines_if_mixed() -> tuple[str, str, str] | None:
     if len(found) < 2:
         return None
     release, nightly = (f"{name}=={version}" for name, version in found.items())
-    away = pip_command("uninstall", *found)
+    uninstall = pip_command("uninstall", *found)
     return (
         f"{release} and {nightly} are both installed, and one has written over files of the other: keep one of them.",
-        f"To keep the release, type: {away} && {pip_command('install', release)}",
-        f"To keep the nightly build, type: {away} && {pip_command('install', nightly)}",
+        f"To keep the release, type: {uninstall} && {pip_command('install', release)}",
+        f"To keep the nightly build, type: {uninstall} && {pip_command('install', nightly)}",
     )
 
 

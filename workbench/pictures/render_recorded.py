@@ -40,14 +40,14 @@ class RecordedScene:
         self._scene.set_ambient_light([0.45, 0.45, 0.47])
         self._scene.add_directional_light([-0.5, 0.35, -1.0], [1.05, 1.03, 1.0])
         self._scene.add_directional_light([0.6, -0.2, -0.5], [0.3, 0.31, 0.34])
-        worn: dict[int, sapien.render.RenderBodyComponent] = {}
+        components: dict[int, sapien.render.RenderBodyComponent] = {}
         for visual in geometry.visuals:
             if len(visual.mesh.faces):
                 for body in visual.bodies[visual.envs == env].tolist():
                     # Each body needs its own shape: SAPIEN keeps a shape only in the last body that got it.
-                    worn.setdefault(body, sapien.render.RenderBodyComponent()).attach(_shape(visual))
+                    components.setdefault(body, sapien.render.RenderBodyComponent()).attach(_shape(visual))
         self._bodies: dict[int, sapien.Entity] = {}
-        for body, shapes in worn.items():
+        for body, shapes in components.items():
             self._bodies[body] = entity = sapien.Entity()
             entity.add_component(shapes)
             self._scene.add_entity(entity)

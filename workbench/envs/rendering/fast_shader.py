@@ -156,14 +156,14 @@ class FastCameras:
         fast = self._made.get((id(exact), chosen))
         if fast is None:
             with selected(MINIMAL, folder):
-                fast = self._made[id(exact), chosen] = _beside(exact, system)
+                fast = self._made[id(exact), chosen] = _make_fast(exact, system)
         fast.component.local_pose = exact.get_global_pose()
         k = exact.get_intrinsic_matrix()
         fast.component.set_perspective_parameters(
             exact.near, exact.far, k[0, 0], k[1, 1], k[0, 2], k[1, 2], k[0, 1]
         )
 
-    def beside(
+    def camera_for(
         self, exact: sapien.render.RenderCameraComponent, textures: Collection[str]
     ) -> sapien.render.RenderCameraComponent:
         """The camera with which to draw these textures; `exact` itself where no fast one follows it."""
@@ -175,7 +175,7 @@ def _smallest(textures: Collection[str]) -> frozenset[str]:
     return COLOR if COLOR.issuperset(textures) else ALL
 
 
-def _beside(exact: sapien.render.RenderCameraComponent, system: Any) -> _Fast:
+def _make_fast(exact: sapien.render.RenderCameraComponent, system: Any) -> _Fast:
     scene, entity = sapien.Scene([system]), sapien.Entity()
     component = sapien.render.RenderCameraComponent(exact.width, exact.height)
     entity.add_component(component)

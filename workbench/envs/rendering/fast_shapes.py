@@ -254,7 +254,7 @@ def _lean_bodies(sub_scenes: Sequence[sapien.Scene]) -> list[list[tuple[Any, Lea
     materials, found = LeanMaterials(), []
     for sub_scene in sub_scenes:
         light = [body for body in _bodies(sub_scene) if not _is_heavy(body)]
-        made = [(body, lean) for body in light if (lean := materials.beside(body)) is not None]
+        made = [(body, lean) for body in light if (lean := materials.lean_copy(body)) is not None]
         for body, lean in made:
             _add_hidden(lean.component, body)
         found.append(made)

@@ -92,10 +92,10 @@ def fixed_to(entity: sapien.Entity) -> set[int]:
     found, left = {id(entity)}, [] if link is None else [link]
     while left:
         link = left.pop()
-        beside = [child for child in link.children if child.joint.type == "fixed"]
+        neighbours = [child for child in link.children if child.joint.type == "fixed"]
         if link.parent is not None and link.joint.type == "fixed":
-            beside.append(link.parent)
-        for other in beside:
+            neighbours.append(link.parent)
+        for other in neighbours:
             if id(other.entity) not in found:
                 found.add(id(other.entity))
                 left.append(other)

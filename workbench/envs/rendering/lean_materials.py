@@ -51,7 +51,7 @@ class LeanMaterials:
         self._texels = 0
         """Number of texels read so far."""
 
-    def beside(self, body: Any) -> LeanBody | None:
+    def lean_copy(self, body: Any) -> LeanBody | None:
         """A lean copy of a body; None if no texture is constant, or not all of its meshes are from files: SAPIEN shares the
         materials of other meshes with their copies, and makes the tangents of normal maps only from files."""
         parts = [part for shape in body.render_shapes for part in shape.parts]

@@ -544,14 +544,14 @@ def _system_of(owner: Any) -> tuple[BatchedCpuSystem | None, int]:
 def _may_write(system: BatchedCpuSystem, env: int, owner: Any, called: str, instead: str) -> bool:
     """Report a setter of SAPIEN's; False if the env is not being reset, and others are."""
     name = owner.name if isinstance(owner, physx.PhysxArticulation) else _entity(owner).name
-    among = system.resetting is None or bool(system.resetting[env])
-    is_left = "" if among else "; the env is not being reset, and left alone here"
+    may_write = system.resetting is None or bool(system.resetting[env])
+    is_left = "" if may_write else "; the env is not being reset, and left alone here"
     system.report(
         "behind-the-tensors",
         f"{called} on '{name}' (env {env}) goes behind the tensors: on the GPU it does nothing{is_left}. Use {instead} "
         "of ManiSkill's object, which sets all envs, or those that are being reset.",
     )
-    return among
+    return may_write
 
 
 def _entity(owner: Any) -> Any:

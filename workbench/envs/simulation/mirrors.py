@@ -123,7 +123,7 @@ class Mirror:
 
 
 def differ(a: Floats, b: Floats) -> NDArray[np.bool_]:
-    """Where two arrays differ; NaN equals NaN, which the simulation itself may hold."""
+    """Mask of the numbers in which two arrays differ; NaN equals NaN, which the simulation itself may hold."""
     differs = a != b
     if differs.any():
         differs &= ~(np.isnan(a) & np.isnan(b))

@@ -33,7 +33,7 @@ class Buffer(NamedTuple):
 
 
 class TaskState(NamedTuple):
-    """What a task, its robots and their controllers remembered; ManiSkill's ``get_state_dict`` has none of it.
+    """State that a task, its robots and their controllers keep, and that ManiSkill's ``get_state_dict`` lacks.
 
     *Rows*: a tensor, array or list of plain values whose first dimension is N has a row per env, and the rows of chosen envs
     are copied. Everything else (a counter, a threshold) holds for the whole batch, and is restored only when all envs are.
@@ -58,14 +58,14 @@ class TaskState(NamedTuple):
 
 @dataclass(frozen=True)
 class _BuiltValue:
-    """A value as it was when the scene was built."""
+    """A value at the time when the scene was built."""
 
     value: Any
     """The object, for comparison by identity."""
     version: int
     """torch's count of writes to a tensor."""
     kept: Buffer
-    """Its content."""
+    """Copy of the value's content."""
 
 
 @dataclass
