@@ -46,7 +46,7 @@ def test_what_is_kept_is_bounded() -> None:
 def test_a_broken_file_is_no_choice_and_is_told(content: bytes, caplog: pytest.LogCaptureFixture) -> None:
     write_private(FILE, content)
     assert not kept_choices().hints_closed
-    assert "What was chosen on earlier pages is not known" in caplog.text
+    assert "Stored choices cannot be read" in caplog.text
     close_hints()
     assert kept_choices().hints_closed
 
@@ -56,6 +56,6 @@ def test_where_nothing_can_be_kept_the_page_goes_on(caplog: pytest.LogCaptureFix
     user_folder().chmod(0o777)
     before = (user_folder() / FILE).read_bytes()
     keep_policy(Path("/lab"), "a.py:act")
-    assert "is not kept for the next run" in caplog.text
+    assert "cannot be stored for the next run" in caplog.text
     user_folder().chmod(0o700)
     assert read_private(FILE) == before

@@ -136,7 +136,7 @@ def unused_gpu_text(wanted: Backend) -> str | None:
         return None
     return (
         "The envs are simulated in a batch on the CPU, although there is a GPU: GPU simulation has passed its tests on no "
-        "machine so far. --backend gpu takes it."
+        "machine so far. --backend gpu uses it."
     )
 
 

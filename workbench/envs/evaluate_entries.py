@@ -238,7 +238,7 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
     Other entries may be anything, as in ManiSkill (`split_entries`).
     """
     if not isinstance(evaluate, Mapping):
-        return f"returned {describe(evaluate)}; it must return a dict ({{}} where there is nothing to say)"
+        return f"returned {describe(evaluate)}; it must return a dict ({{}} if there is nothing to report)"
     for name in FLAGS:
         value = evaluate.get(name)
         if name in evaluate and not (
@@ -289,7 +289,7 @@ def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:
 def wrong_observation(obs: object, num_envs: int) -> str | None:
     """What is wrong with an observation hook's return value, or None. It must be a dict of arrays (N, ...)."""
     if not isinstance(obs, Mapping):
-        return f"returned {describe(obs)}; it must return a dict ({{}} where there is nothing to observe)"
+        return f"returned {describe(obs)}; it must return a dict ({{}} if there is nothing to observe)"
     for name, value in flat_entries(obs):
         shape = getattr(value, "shape", None)
         if shape is None or len(shape) == 0 or shape[0] != num_envs:

@@ -32,7 +32,7 @@ def kept_choices() -> KeptChoices:
         content = read_private(FILE)
         return KeptChoices() if content is None else msgspec.json.decode(content, type=KeptChoices)
     except (OSError, msgspec.MsgspecError, RecursionError) as error:
-        log.warning("What was chosen on earlier pages is not known: %s", error)
+        log.warning("Stored choices cannot be read, so defaults are used: %s", error)
         return KeptChoices()
 
 
@@ -70,4 +70,4 @@ def _change(change: Callable[[KeptChoices], KeptChoices]) -> None:
             write_private(FILE, msgspec.json.encode(change(kept_choices())))
     except OSError as error:
         # The page works without stored choices.
-        log.warning("What is chosen on this page is not kept for the next run: %s", error)
+        log.warning("Choices of this page cannot be stored for the next run: %s", error)

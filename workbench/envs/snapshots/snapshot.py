@@ -238,8 +238,8 @@ def _pairs(
         raise ValueError("source needs env_idx: the envs that get the state")
     if env_idx is None and max(snapshot.env_idx) >= env.num_envs:
         raise IndexError(
-            f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: name with env_idx the "
-            "envs to restore, and with source whose state they get"
+            f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: name the envs to "
+            "restore with env_idx, and the envs whose state they get with source"
         )
     targets = envs_of_batch(snapshot.env_idx if env_idx is None else env_idx, env.num_envs)
     if source is None:

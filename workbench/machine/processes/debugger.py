@@ -111,7 +111,7 @@ def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., N
         place = caller.f_code.co_filename, caller.f_lineno
         if place not in passed:
             passed.add(place)
-            message = f"{place[0]}:{place[1]}: a breakpoint was passed, since no debugger is attached to {HOST}:{port}"
+            message = f"{place[0]}:{place[1]}: a breakpoint was skipped, since no debugger is attached to {HOST}:{port}"
             print(message, file=sys.stderr)
 
     if os.environ.get("PYTHONBREAKPOINT") != "0":
