@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.cameras.report_panel import env_words, headline, object_rows
-from workbench.pictures.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
+from workbench.pictures.camera_report import DEPTH_EDGES_METRES, CameraReport, DepthReport, ObjectSeen
 
 
 def seen(
@@ -36,7 +36,7 @@ def seen(
 
 def depth_of(counts: dict[int, int], envs: int, farthest_object: float = 1.5) -> DepthReport:
     """All pixels in these bins, and the objects end at a distance."""
-    rows = np.zeros((envs, len(DEPTH_EDGES) - 1), np.int64)
+    rows = np.zeros((envs, len(DEPTH_EDGES_METRES) - 1), np.int64)
     for place, count in counts.items():
         rows[:, place] = count
     share = np.full(envs, 0.25, np.float32)

@@ -18,7 +18,7 @@ import workbench
 from tests.drive.entries import ENTRIES, Mute
 from tests.drive.envs import CPU, batched
 from tests.live.odd_entries import write_task
-from workbench.envs.evaluate_entries import MOST_ENTRIES, MOST_LETTERS, split_entries
+from workbench.envs.evaluate_entries import MAX_ENTRIES, MAX_TEXT_CHARACTERS, split_entries
 from workbench.envs.maniskill_private import open_env
 from workbench.envs.task_env import TaskEnv
 from workbench.task.load import load_task
@@ -90,11 +90,11 @@ def test_what_is_huge_is_bounded() -> None:
     _, others = split_entries(entries, N)
     assert max(map(len, others)) <= 200
     for entry in others.values():
-        assert len(entry.texts[0]) <= MOST_LETTERS and not entry.whole
+        assert len(entry.texts[0]) <= MAX_TEXT_CHARACTERS and not entry.whole
     _, named = split_entries({"n" * 200: None, "m" * 201: None}, N)
     assert list(named) == ["n" * 200, "m" * 199 + "…"]
-    many, rest = split_entries({str(i): EACH for i in range(MOST_ENTRIES + 7)}, N)
-    assert len(many) == MOST_ENTRIES and rest["…"].texts == ("7 more",)
+    many, rest = split_entries({str(i): EACH for i in range(MAX_ENTRIES + 7)}, N)
+    assert len(many) == MAX_ENTRIES and rest["…"].texts == ("7 more",)
 
 
 def test_columns_are_copies_that_the_next_step_does_not_change() -> None:

@@ -15,7 +15,7 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import CPU, PICK_CUBE, batched
-from workbench.envs.broken_rule import MOST_ROWS, BrokenRule, BrokenRules, RuleWarning
+from workbench.envs.broken_rule import MAX_PLACES, BrokenRule, BrokenRules, RuleWarning
 from workbench.envs.gpu_rules import Finding, degrees_of
 
 N = 3
@@ -76,11 +76,11 @@ def test_steps_are_counted_from_where_the_task_begins() -> None:
 
 def test_rows_are_bounded_and_the_rest_is_counted() -> None:
     rules, serial = a_rule(), 0
-    for line in range(3 * MOST_ROWS):
+    for line in range(3 * MAX_PLACES):
         rules.report_breach("not-applied", "lost", None, ("task.py", line, "lift"))
         assert rules.serial > serial
         serial = rules.serial
-    assert len(rules.rows) == MOST_ROWS and rules.more == 2 * MOST_ROWS
+    assert len(rules.rows) == MAX_PLACES and rules.more == 2 * MAX_PLACES
 
 
 def test_what_is_not_broken_again_at_the_same_occasion_leaves() -> None:

@@ -42,8 +42,8 @@ def test_what_fails_or_takes_too_long_is_told_and_the_others_are_answered(
         raise OSError("no such thing")
 
     monkeypatch.setattr(doctor, "_cores_and_memory", fail)
-    monkeypatch.setattr(doctor, "CHILD_TIMEOUT_S", 0.1)
-    for questions in ("GPU_QUESTIONS", "VERSION_QUESTIONS"):
+    monkeypatch.setattr(doctor, "CHILD_TIMEOUT_SECONDS", 0.1)
+    for questions in ("GPU_SCRIPT", "VERSION_SCRIPT"):
         monkeypatch.setattr(doctor, questions, "import time; time.sleep(60)")
     monkeypatch.setattr(
         versions.importlib.metadata, "requires", lambda name: ["viser<1", "no-such-package>=2"]
@@ -68,8 +68,8 @@ def test_what_fails_or_takes_too_long_is_told_and_the_others_are_answered(
 
 def test_a_gpu_that_works_is_not_taken_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
     answer = '{"built": "12.8", "cuda": ["A card"], "why_not": null, "library": "/lib/PhysXGpu.so"}'
-    monkeypatch.setattr(doctor, "GPU_QUESTIONS", f"print('{answer}')")
-    monkeypatch.setattr(doctor, "VERSION_QUESTIONS", "print('{}')")
+    monkeypatch.setattr(doctor, "GPU_SCRIPT", f"print('{answer}')")
+    monkeypatch.setattr(doctor, "VERSION_SCRIPT", "print('{}')")
     findings = found()
     assert findings["CUDA"].ok and "A card" in findings["CUDA"].what
     assert "--backend gpu" in findings["GPU physics"].what

@@ -15,7 +15,7 @@ import pytest
 
 from workbench.machine import folders as module
 from workbench.machine.folders import (
-    MOST_BYTES,
+    MAX_FILE_BYTES,
     NoUserFolder,
     create_private,
     locked,
@@ -159,7 +159,7 @@ def test_what_belongs_to_another_user_is_not_read(folder: Path, monkeypatch: pyt
 
 def test_what_is_no_ordinary_file_is_not_read(folder: Path) -> None:
     write_private("large", b"")
-    os.truncate(folder / "large", MOST_BYTES + 1)
+    os.truncate(folder / "large", MAX_FILE_BYTES + 1)
     os.mkfifo(folder / "pipe", 0o600)
     (folder / "folder").mkdir(0o700)
     for name in ("large", "pipe", "folder"):
@@ -167,5 +167,5 @@ def test_what_is_no_ordinary_file_is_not_read(folder: Path) -> None:
         with pytest.raises(NoUserFolder, match="no ordinary file"):
             read_private(name)
         assert psutil.Process().num_fds() == before
-    os.truncate(folder / "large", MOST_BYTES)
-    assert len(read_private("large") or b"") == MOST_BYTES
+    os.truncate(folder / "large", MAX_FILE_BYTES)
+    assert len(read_private("large") or b"") == MAX_FILE_BYTES

@@ -9,8 +9,8 @@ import pytest
 from workbench.machine.folders import read_private, user_folder, write_private
 from workbench.machine.kept_choices import (
     FILE,
-    MOST_FOLDERS,
-    MOST_POLICIES,
+    MAX_FOLDERS,
+    MAX_POLICIES,
     close_hints,
     keep_policy,
     kept_choices,
@@ -33,20 +33,20 @@ def test_policies_are_kept_by_folder_the_newest_first() -> None:
 
 
 def test_what_is_kept_is_bounded() -> None:
-    for number in range(MOST_FOLDERS + 5):
+    for number in range(MAX_FOLDERS + 5):
         keep_policy(Path(f"/{number}"), "a.py:act")
-    for number in range(MOST_POLICIES + 5):
+    for number in range(MAX_POLICIES + 5):
         keep_policy(Path("/last"), f"{number}.py:act")
     kept = kept_choices().policies
-    assert len(kept) == MOST_FOLDERS and "/0" not in kept
-    assert len(kept["/last"]) == MOST_POLICIES and kept["/last"][0] == f"{MOST_POLICIES + 4}.py:act"
+    assert len(kept) == MAX_FOLDERS and "/0" not in kept
+    assert len(kept["/last"]) == MAX_POLICIES and kept["/last"][0] == f"{MAX_POLICIES + 4}.py:act"
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b'{"hints_closed": 3}', b"\xff", b"[" * 100_000])
 def test_a_broken_file_is_no_choice_and_is_told(content: bytes, caplog: pytest.LogCaptureFixture) -> None:
     write_private(FILE, content)
     assert not kept_choices().hints_closed
-    assert "What was chosen on earlier pages is not known" in caplog.text
+    assert "Stored choices cannot be read" in caplog.text
     close_hints()
     assert kept_choices().hints_closed
 
@@ -56,6 +56,6 @@ def test_where_nothing_can_be_kept_the_page_goes_on(caplog: pytest.LogCaptureFix
     user_folder().chmod(0o777)
     before = (user_folder() / FILE).read_bytes()
     keep_policy(Path("/lab"), "a.py:act")
-    assert "is not kept for the next run" in caplog.text
+    assert "cannot be stored for the next run" in caplog.text
     user_folder().chmod(0o700)
     assert read_private(FILE) == before

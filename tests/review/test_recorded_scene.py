@@ -100,4 +100,4 @@ def test_what_the_process_sends_and_cannot_be_read_is_told(recorded: Any, tmp_pa
     )
     ended = make({0: read_maniskill(recorded[0], "traj_0")}, (file,))
     assert isinstance(ended[0], SceneError)
-    assert "sent unreadable data (it says that it is 1886546286 bytes long)" in str(ended[0])
+    assert "sent unreadable data (its stated length is 1886546286 bytes)" in str(ended[0])

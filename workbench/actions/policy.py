@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from workbench.envs.error_notes import WrongAction
-from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file
+from workbench.machine.files import MAX_SOURCE_BYTES, read_regular_file
 from workbench.machine.parse_python import parse_python
 from workbench.task.library_names import (
     files_named_like_libraries,
@@ -111,7 +111,7 @@ class _PolicyLoader(importlib.machinery.SourceFileLoader):
     """Reads only regular files of limited size; see `read_regular_file`."""
 
     def get_data(self, path: str) -> bytes:
-        return read_regular_file(path, MOST_SOURCE_BYTES)
+        return read_regular_file(path, MAX_SOURCE_BYTES)
 
     def path_stats(self, path: str) -> Mapping[str, Any]:
         # Python's bytecode cache compares size and whole seconds, so it would miss a second save.

@@ -34,7 +34,13 @@ from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Visitor
-from workbench.pictures.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, size_text
+from workbench.pictures.camera_report import (
+    DEPTH_EDGES_METRES,
+    CameraReport,
+    DepthReport,
+    ObjectSeen,
+    size_text,
+)
 
 OVERS: dict[str, Measured] = {
     "all envs now": "envs",
@@ -381,18 +387,20 @@ def histogram(depth: DepthReport, near: float, far: float) -> Histogram | None:
     first, last = max(0, int(filled[0]) - 1), min(len(counts), int(filled[-1]) + 2)
     ends = depth.farthest_object[np.isfinite(depth.farthest_object)]
     end = float(ends.max()) if len(ends) else math.inf
-    part, middles = counts[first:last], np.sqrt(DEPTH_EDGES[:-1] * DEPTH_EDGES[1:])
+    part, middles = counts[first:last], np.sqrt(DEPTH_EDGES_METRES[:-1] * DEPTH_EDGES_METRES[1:])
     bars = tuple(
         (float(count) / float(part.max()), bool(middles[first + i] >= end)) for i, count in enumerate(part)
     )
 
     def place(plane: float) -> float | None:
-        if not DEPTH_EDGES[first] <= plane <= DEPTH_EDGES[last]:
+        if not DEPTH_EDGES_METRES[first] <= plane <= DEPTH_EDGES_METRES[last]:
             return None
-        at = np.interp(math.log(plane), np.log(DEPTH_EDGES), np.arange(len(DEPTH_EDGES)))
+        at = np.interp(math.log(plane), np.log(DEPTH_EDGES_METRES), np.arange(len(DEPTH_EDGES_METRES)))
         return float(at) - first
 
-    return Histogram(bars, float(DEPTH_EDGES[first]), float(DEPTH_EDGES[last]), place(near), place(far))
+    return Histogram(
+        bars, float(DEPTH_EDGES_METRES[first]), float(DEPTH_EDGES_METRES[last]), place(near), place(far)
+    )
 
 
 def _mood(thing: ObjectSeen, position: int) -> str:

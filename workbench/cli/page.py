@@ -21,7 +21,7 @@ from workbench.app.pages import Which
 from workbench.app.server import App
 from workbench.app.session import HISTORY_BYTES, KeptWork, Session
 from workbench.cli.output import out, print_addresses, print_event, print_line, print_text, refuse, warn
-from workbench.envs.recorded_run import HOW_IT_IS_RUN
+from workbench.envs.recorded_run import RUN_KEYWORDS
 from workbench.episodes.reader.reading import start_reading
 from workbench.live.messages import Event, Loaded, TaskFailed
 from workbench.live.process.supervisor import WorkerOptions
@@ -207,8 +207,8 @@ class _HowToOpen:
 
 
 def _for_others(options: TaskOptions) -> TaskOptions:
-    """Options without the keyword arguments, which are specific to one task."""
-    kwargs = {name: value for name, value in options.env_kwargs.items() if name in HOW_IT_IS_RUN}
+    """Options of one task for another, without its own keyword arguments."""
+    kwargs = {name: value for name, value in options.env_kwargs.items() if name in RUN_KEYWORDS}
     return replace(options, env_kwargs=kwargs)
 
 

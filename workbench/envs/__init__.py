@@ -1,1 +1,1 @@
-"""The batched env core: N envs of one ManiSkill task, on the CPU or a GPU. Knows no page, no file format and no process."""
+"""The batched env core: N envs of one ManiSkill task, on the CPU or a GPU. Independent of page, file formats and processes."""

@@ -102,11 +102,14 @@ def random_action(
 
 
 def hold_action(parts: tuple[ActionPart, ...], num_envs: int) -> NDArray[np.float32]:
-    """(N, A) the action that leaves every joint where it is, as far as the controllers can say.
+    """(N, A) the action that leaves every joint where it is, as far as the controllers allow.
 
-    Zero is not that: it is a half-open gripper, and in absolute joint control the middle of the limits. Delta and velocity controllers: zero. Absolute joint position: the present qpos, through the
-    inverse of ManiSkill's ``clip_and_scale_action``. Absolute end-effector pose: zero, since its
-    inverse would need the controller's frame; hold such a robot with ``step(None)``.
+    Zero does not: it opens a gripper by half, and in absolute joint control moves to the middle of the limits.
+
+    * Delta and velocity controllers: zero.
+    * Absolute joint position: the present qpos, through the inverse of ManiSkill's ``clip_and_scale_action``.
+    * Absolute end-effector pose: zero, since its inverse would need the controller's frame; hold such a robot with
+      ``step(None)``.
     """
     columns = [_hold(part, num_envs) for part in parts]
     return np.concatenate(columns, axis=1) if columns else np.zeros((num_envs, 0), np.float32)
@@ -121,7 +124,7 @@ def to_env_action(env: BaseEnv, parts: tuple[ActionPart, ...], flat: NDArray[np.
 
 
 def by_robot(parts: tuple[ActionPart, ...], action: torch.Tensor) -> Any:
-    """The argument of ``env.step`` of a flat action (N, A): itself, a dict of parts for several robots, None without a robot."""
+    """The argument of ``env.step`` for a flat action (N, A): the same, a dict of parts for several robots, None without a robot."""
     if not parts:
         return None
     split = torch.split(action, [len(p.names) for p in parts], dim=1)
@@ -134,10 +137,10 @@ def by_robot(parts: tuple[ActionPart, ...], action: torch.Tensor) -> Any:
 
 
 def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> NDArray[np.float32]:
-    """(N, A) from a policy's action: array or tensor, (A,) or (N, A), or a dict of the robots with one such for each.
+    """(N, A) from a policy's action: an array or tensor (A,) or (N, A), or a dict with one for each robot.
 
     Raises:
-        WrongAction: it is something else, its shape does not fit, or a value is not finite.
+        WrongAction: the action is something else, its shape does not fit, or a value is not finite.
     """
     count, of_robots = env.num_envs, _columns_of_robots(parts)
     if isinstance(action, Mapping):
@@ -146,7 +149,7 @@ def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> 
         flat = np.concatenate(each, axis=1)
     else:
         flat = _rows(action, count, sum(of_robots.values()), "", of_robots, env.control_mode)
-    # The sum is quick, but may overflow.
+    # The sum is a fast test, but may overflow: then every number is tested.
     if not math.isfinite(np.add.reduce(flat, axis=None)) and not (finite := np.isfinite(flat)).all():
         row, column = np.argwhere(~finite)[0].tolist()
         name = [name for part in parts for name in part.names][column]
@@ -169,7 +172,7 @@ def _refuse_other_robots(action: Mapping[Any, Any], of_robots: Mapping[str | Non
     if None in of_robots or not of_robots:
         what = f"an array ({of_robots[None]} wide)" if of_robots else "no action"
         raise WrongAction(
-            f"is a dict of {listed([*action])}; this task has no several robots and takes {what}"
+            f"is a dict of {listed([*action])}; this task does not have several robots and takes {what}"
         )
     missing = [robot for robot in of_robots if robot not in action]
     unknown = [name for name in action if name not in of_robots]
@@ -177,7 +180,7 @@ def _refuse_other_robots(action: Mapping[Any, Any], of_robots: Mapping[str | Non
         return
     robots = ", ".join(f"{robot} ({wide} wide)" for robot, wide in of_robots.items())
     lacks = [f"has no action for {listed(missing)}"] if missing else []
-    lacks += [f"names {listed(unknown)}, which the task has not"] if unknown else []
+    lacks += [f"names {listed(unknown)}, which the task does not have"] if unknown else []
     raise WrongAction(f"{' and '.join(lacks)}; its robots are {robots}")
 
 
@@ -200,7 +203,7 @@ def _rows(
         text += f": it is {values.shape[-1]} wide"
         if None in of_robots:
             text += (
-                f", and the control mode {mode} takes {wide}. Name the one that it is written for with "
+                f", and the control mode {mode} takes {wide}. Choose the policy's own mode with "
                 "--env control_mode=..., or return as many"
             )
         else:
@@ -236,7 +239,7 @@ def _dimension_names(controller: Any) -> list[str]:
 
 
 def is_target(parts: tuple[ActionPart, ...]) -> NDArray[np.bool_]:
-    """(A,) whether it is a position of a joint, which stays its target until the next action."""
+    """(A,) True where a number is a joint position, which stays the joint's target until the next action."""
     columns = [np.full(len(part.names), _is_absolute(part.controller)) for part in parts]
     return np.concatenate(columns) if columns else np.zeros(0, bool)
 

@@ -1,4 +1,4 @@
-"""Assets that a task needs and that are not downloaded: named, never fetched."""
+"""Names the assets that a task needs and this machine lacks; never downloads them."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class MissingAssets(CoreRefusal, RuntimeError):
 
 
 def require_assets(task: str, asset_ids: Sequence[str], robot_uids: Any = None) -> None:
-    """Raise MissingAssets unless all that the task and its robots declare is on this machine.
+    """Raise MissingAssets unless every asset that the task and its robots declare is on this machine.
 
     Args:
         asset_ids: the ``asset_download_ids`` that the task was registered with.
-        robot_uids: as the task class takes them: an uid, an agent class, or a tuple of them; see `robots_of`.
+        robot_uids: as the task class takes them: a uid, an agent class, or a tuple of them; see `robots_of`.
     """
     names = [name for name in asset_ids if _sources_to_fetch(name)]
     names += [name for uid in _uids(robot_uids) for name in _missing_for_robot(uid)]
@@ -77,9 +77,9 @@ def assets_at(path: str | Path) -> list[str]:
 
 @contextmanager
 def refuse_downloads(task: str) -> Iterator[None]:
-    """Within this, an asset that `task` still needs raises MissingAssets.
+    """Context in which an asset that `task` lacks raises MissingAssets.
 
-    Some tasks declare nothing and fail on a missing file while they build. Where ManiSkill notices, it asks "download now?
+    Some tasks declare no assets and fail on a missing file while they build. Where ManiSkill notices, it asks "download now?
     (y|n)" on standard input, calls ``exit()`` on a no, and takes MS_SKIP_ASSET_DOWNLOAD_PROMPT for a yes. Here nothing is
     asked or downloaded. An exception about a missing file that a download would provide becomes the cause of a
     MissingAssets; other exceptions pass.
@@ -118,7 +118,7 @@ def refuse_downloads(task: str) -> Iterator[None]:
 def _missing(task: str, names: Iterable[str], instead: str = "") -> MissingAssets:
     names = list(dict.fromkeys(names))
     if not names:
-        return MissingAssets(f"{task}: {instead} Nothing is downloaded by itself. Type: {_COMMAND} NAME")
+        return MissingAssets(f"{task}: {instead} Nothing is downloaded automatically. Type: {_COMMAND} NAME")
     commands = "\n".join(f"  {_COMMAND} {name}" for name in names)
     are = "is" if len(names) == 1 else "are"
     return MissingAssets(
@@ -166,14 +166,14 @@ def _no_robot_file(task: str, robot: type, path: Path | None) -> MissingAssets:
 
 
 def _how_to_name(path: Path | None) -> str:
-    """What to do about a robot's file that is not there. A relative path begins where the program was started."""
+    """Advice for a missing robot file. A relative path starts at the working directory."""
     if path is None or path.is_absolute():
         return "Put it there, or name the file that you have."
-    return f"A relative path is looked for where the program was started: there is no {path.absolute()}. Name the whole path."
+    return f"A relative path starts at the working directory: there is no {path.absolute()}. Give the absolute path."
 
 
 def _named_by(error: Exception) -> list[str]:
-    """The downloads that contain the file that the exception misses."""
+    """The downloads that contain the file whose absence raised the exception."""
     text = str(error)
     advised = re.search(r"mani_skill\.utils\.download_asset\s+([\w/\-]+)", text)
     if advised is not None and advised[1] in {*assets.DATA_GROUPS, *assets.DATA_SOURCES}:

@@ -64,7 +64,7 @@ def find_renderer() -> Renderer | None:
     Cached: a process can have one render device only, and a second one under another name raises.
 
     Raises:
-        BackendUnavailable: there is one, held under another name by a material that was made before it was asked for.
+        BackendUnavailable: a material that was made earlier holds the device under another name.
     """
     for device in ("cuda", "cpu") if torch.cuda.is_available() else ("cpu",):
         try:
@@ -81,9 +81,10 @@ def find_renderer() -> Renderer | None:
 
 
 def _render_system(device: str) -> sapien.render.RenderSystem:
-    """One on a device that is called ``cpu``, ``cuda`` or ``cuda:1``; RuntimeError if there is no such device.
+    """A render system on device ``cpu``, ``cuda`` or ``cuda:1``; RuntimeError if there is no such device.
 
-    While a material is alive that was made without one, of a build that failed say, SAPIEN refuses the device by its name.
+    SAPIEN refuses a device by its name while a material is alive that was made without a render system, for example by
+    a failed build: hence the garbage collection.
     """
     try:
         return sapien.render.RenderSystem(sapien.Device(device))
@@ -135,7 +136,7 @@ def unused_gpu_text(wanted: Backend) -> str | None:
         return None
     return (
         "The envs are simulated in a batch on the CPU, although there is a GPU: GPU simulation has passed its tests on no "
-        "machine so far. --backend gpu takes it."
+        "machine so far. --backend gpu uses it."
     )
 
 
@@ -144,9 +145,9 @@ def unused_gpu_text(wanted: Backend) -> str | None:
 
 @lru_cache(maxsize=1)
 def _brdf_table() -> sapien.render.RenderTexture:
-    """SAPIEN's own, read out of it by ``tests/envs/test_brdf_table.py``: (512, 512, 2), scale and bias.
+    """SAPIEN's BRDF table, as read by ``tests/envs/test_brdf_table.py``: (512, 512, 2), scale and bias.
 
-    The file holds (2, 512, 512) float16 as the steps of their bits along a row, which takes a quarter of the bytes.
+    The file holds (2, 512, 512) float16 as differences of their bits along a row, which takes a quarter of the bytes.
     """
     steps = np.load(Path(__file__).parent / "brdf_table.npz")["steps"]
     table = np.moveaxis(np.cumsum(steps, axis=2, dtype=np.uint16).view(np.float16), 0, 2)
@@ -156,12 +157,12 @@ def _brdf_table() -> sapien.render.RenderTexture:
 
 
 def give_brdf_table(camera: sapien.render.RenderCameraComponent) -> None:
-    """Give a camera, which is in a scene, the table that its shader looks reflections of the environment up in.
+    """Give a camera in a scene the BRDF table with which its shader looks up reflections of the environment.
 
-    A camera without one takes its process's, which SAPIEN computes for the first picture, from 268 million samples: 5 to
-    19 s on a software driver, and 0.1 s are left of the first picture with this one. The pictures are the same to the bit.
-    The table is that of the split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN's own
-    takes no time and is left.
+    Otherwise SAPIEN computes the table for the first picture of the process, from 268 million samples: 5 to 19 s on a
+    software driver. With this table the first picture takes 0.1 s, and is the same to the bit. The table is that of the
+    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU, SAPIEN's own takes no time and is
+    left.
     """
     scene = camera.entity.scene
     if not scene.render_system.device.is_cuda():

@@ -22,15 +22,15 @@ from workbench.envs.gpu_rules import Degree, Finding, Silence, silence_of
 from workbench.machine.library_files import is_installed
 from workbench.machine.parse_python import parse_python
 
-MOST_ROWS = 64
-"""Places that are kept; breaches at further places are only counted."""
+MAX_PLACES = 64
+"""Maximum number of places that are kept; breaches at further places are only counted."""
 OWN_CODE = ("workbench.envs.", "workbench.pictures.")
 """Prefixes of the core's own modules."""
 _GENERAL_CODE = ("workbench.", "mani_skill.utils.", "mani_skill.envs.s")
 """``mani_skill.envs.sapien_env`` and ``.scene`` among them: they write what a task passes."""
 _FRAMES_KEPT = 12
 _BASE_ENV, _OUTERMOST = "mani_skill.envs.sapien_env", ("step", "reset")
-"""Where the frames of an error end: the traceback has the ones above anyway."""
+"""Outermost frames that an error gets: the traceback has those above anyway."""
 
 Frame = tuple[FrameType, int, int]
 """A frame with its last instruction and its line at the time."""
@@ -58,7 +58,7 @@ class WrongReturn(BrokenRule):
 
 
 class NeedsOneEnv(CoreRefusal, RuntimeError):
-    """The task does what exists for one env only: the tools open it with one."""
+    """The task uses something that exists for a single env only; the tools then open it with one env."""
 
     def __init__(self, reason: str, instead: str, place: Place | None) -> None:
         """
@@ -92,7 +92,7 @@ class _KeptFinding:
     occasion: Occasion
     """When it was last broken."""
     exact: bool
-    """False where the line is only likely."""
+    """False where the line is only probably the right one."""
     confirmed: bool = True
     """False for a row of the previous version that the present one has not broken yet."""
 
@@ -100,8 +100,8 @@ class _KeptFinding:
 class BrokenRules:
     """The rules that one env checks, and where its task broke them.
 
-    A lost write shows at the fetch that follows: callers keep the frames of the write, and the error carries them as the
-    innermost of its traceback.
+    A lost write is noticed only at the next fetch. So callers keep the frames of the write, and the error carries them
+    as the innermost frames of its traceback.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class BrokenRules:
     ) -> None:
         """
         Args:
-            degrees: of each rule; see `rules.degrees_of`.
+            degrees: degree of each rule; see `gpu_rules.degrees_of`.
             on_finding: called once for each place where a rule that does not stop is broken.
         """
         self._degrees, self._on_finding = degrees, on_finding
@@ -117,7 +117,7 @@ class BrokenRules:
         self._silenced: dict[_Key, tuple[Finding, Silence]] = {}
         self._now: Occasion = "reset"
         self.more = 0
-        """Breaches at places beyond `MOST_ROWS`."""
+        """Breaches at places beyond `MAX_PLACES`."""
         self.serial = 0
         """Increases with every change."""
         self.step: int = 0
@@ -129,7 +129,7 @@ class BrokenRules:
 
     @property
     def silenced(self) -> tuple[tuple[Finding, Silence], ...]:
-        """What a comment silences, with the comment; its breaches are not counted."""
+        """Findings that a comment silences, each with its comment; their breaches are not counted."""
         return tuple(self._silenced.values())
 
     def degree(self, rule: str) -> Degree:
@@ -146,9 +146,9 @@ class BrokenRules:
         """Raise or note a breach, by the rule's degree.
 
         Args:
-            frames: at fault, to become the innermost of the traceback; empty for those of the present call, None where
-                no line is at fault or only `place` is known.
-            subject: what gets one row, instead of the line.
+            frames: frames at fault, which become the innermost of the traceback; empty for those of the present call,
+                None where no line is at fault or only `place` is known.
+            subject: breaches with the same subject share a row; None: breaches at the same line do.
         """
         degree = self._degrees[rule]
         if degree == "off":
@@ -163,7 +163,7 @@ class BrokenRules:
         self._note(rule, message, place, subject, exact=frames is not None)
 
     def begin(self) -> None:
-        """Count steps from here: the task was tried, and begins now."""
+        """Set the step count to zero: the trial steps of the task are over."""
         self.step = 0
         self._rows = {
             key: replace(row, finding=replace(row.finding, first_step=0)) for key, row in self._rows.items()
@@ -190,7 +190,7 @@ class BrokenRules:
         self.serial += 1
         key = rule, place or message if subject is None else subject
         row = self._rows.get(key)
-        if row is None and len(self._rows) >= MOST_ROWS:
+        if row is None and len(self._rows) >= MAX_PLACES:
             self.more += 1
             return
         if row is None:
@@ -371,11 +371,11 @@ def _lines_that_assign(function: Any, wanted: str) -> Iterator[int]:
 
 
 def _nodes(function: Any) -> Iterator[tuple[ast.AST, int]]:
-    """The nodes of a function's text that have a line, with it."""
+    """The nodes of a function's source that have a line, each with its line."""
     try:
         lines, first = inspect.getsourcelines(function)
         tree = parse_python(textwrap.dedent("".join(lines)))
-    except (OSError, SyntaxError):  # made without a text, or a lambda in the middle of a line
+    except (OSError, SyntaxError):  # made without source, or a lambda in the middle of a line
         return
     for node in ast.walk(tree):
         if (line := getattr(node, "lineno", None)) is not None:

@@ -54,13 +54,13 @@ class CallSite:
     """Qualified name of the code that it is in, as Python has it: ``PushCubeEnv._default_sensor_configs``."""
 
 
-CLOSE = 1e-6
+SETTING_TOLERANCE = 1e-6
 """Largest difference of equal cameras: metres, quaternion components, radians; relative for pixels, near and far. A
 config keeps its pose in single precision."""
 
 
-def differences(a: CameraSettings, b: CameraSettings, close: float = CLOSE) -> tuple[str, ...]:
-    """Which of ``position orientation fov intrinsic width height near far shader_pack`` are not the same."""
+def differences(a: CameraSettings, b: CameraSettings, close: float = SETTING_TOLERANCE) -> tuple[str, ...]:
+    """Names of the settings that differ: ``position orientation fov intrinsic width height near far shader_pack``."""
     turned = tuple(-x for x in b.quaternion)
     found = []
     for name in [f.name for f in fields(a) if f.compare]:
@@ -102,7 +102,7 @@ class MovedCamera:
 
 def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
     """``base_camera: position (0.3, 0, 0.6), in the file (0.3, 0, 0.5)``; empty if none was moved."""
-    said = []
+    texts = []
     for one in moved:
         from_step = f" from step {one.state} on" if one.state else ""
         values = [
@@ -110,37 +110,37 @@ def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
             for what in differences(one.used, one.in_file)
             for mine, file in [(_value(one.used, what), _value(one.in_file, what))]
         ]
-        said.append(f"{one.name}{from_step}: {'; '.join(values) or 'as in the file'}")
-    return ". ".join(said)
+        texts.append(f"{one.name}{from_step}: {'; '.join(values) or 'as in the file'}")
+    return ". ".join(texts)
 
 
 def _value(settings: CameraSettings, what: str) -> object:
-    """The setting that `differences` calls so."""
+    """The setting with this name in `differences`."""
     return getattr(settings, "quaternion" if what == "orientation" else what)
 
 
 NOT_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
-MOST_PIXELS = 4096
-"""Limit of pixels per side; a digit too many would take the memory of all envs."""
+MAX_SIDE_PIXELS = 4096
+"""Limit of pixels per side; one digit too many would use up the memory of all envs."""
 
 
-_FURTHEST = 1e6
-"""Metres."""
+_MAX_DISTANCE_METRES = 1e6
+"""Largest coordinate of a camera's pose, and largest near and far."""
 
 
 def why_no_camera(settings: CameraSettings) -> str | None:
     """Why these settings are invalid, as a sentence without its full stop; None if they are valid."""
     numbers = (*settings.position, *settings.quaternion, settings.near, settings.far)
-    if not all(abs(number) <= _FURTHEST for number in numbers):
+    if not all(abs(number) <= _MAX_DISTANCE_METRES for number in numbers):
         return "the camera's pose, near and far must be finite numbers"
     if abs(math.hypot(*settings.quaternion) - 1.0) > 1e-3:
         return "the camera's quaternion must be of unit length"
     if not 0 < settings.near < settings.far:
         return f"near must be above 0 and below far, not {settings.near:g} and {settings.far:g} metres"
     if not all(
-        isinstance(size, int) and 1 <= size <= MOST_PIXELS for size in (settings.width, settings.height)
+        isinstance(size, int) and 1 <= size <= MAX_SIDE_PIXELS for size in (settings.width, settings.height)
     ):
-        return f"width and height must be 1 to {MOST_PIXELS}, not {settings.width} x {settings.height}"
+        return f"width and height must be 1 to {MAX_SIDE_PIXELS}, not {settings.width} x {settings.height}"
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,60}", settings.shader_pack):
         return f"{settings.shader_pack!r} is no shader pack"
     if (settings.fov is None) == (settings.intrinsic is None):
@@ -179,7 +179,7 @@ class CameraInfo:
     mount: str | None
     """Name of the body that the camera is mounted on; None if it is fixed."""
     modalities: tuple[str, ...]
-    """What its shader gives, of ``rgb depth segmentation position normal albedo``."""
+    """Modalities of its shader, among ``rgb depth segmentation position normal albedo``."""
     settings: CameraSettings | None = None
     """Settings of the task's own config, even if the camera was moved since; env 0's where they differ. None if
     `CameraSettings` cannot express it (a lens that differs between envs)."""
@@ -221,7 +221,7 @@ class Picture:
     albedo: NDArray[np.uint8] | None = None
     """(H, W, 3) colour without light."""
     degree: PictureDegree | None = "exact"
-    """None for a recorded one that is not known to be fast: it may be from elsewhere."""
+    """None for a recorded picture of unknown degree: another program may have recorded it."""
 
     @property
     def nbytes(self) -> int:

@@ -77,7 +77,7 @@ from workbench.envs.snapshots.snapshot import begin_anew
 from workbench.envs.snapshots.task_state import note_constructed, note_scene
 from workbench.envs.strict import StrictMixin
 
-_UNIT = 1e-3
+_UNIT_TOLERANCE = 1e-3
 """Largest difference of a quaternion's length from 1."""
 SIM_BACKEND = "physx_cpu_batched"
 """Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
@@ -88,14 +88,14 @@ _NO_WINDOW = (
     "`workbench open` with this task's file or id shows all envs in the browser. For pictures "
     'use render_mode="rgb_array", "sensors" or "all" and render().'
 )
-_MOST_NESTED = 16
-"""Calls of `step` or `reset` within each other; a hook that steps in each step would do so until Python's recursion ends."""
+_MAX_NESTED_CALLS = 16
+"""Limit of nested calls of `step` and `reset`: a hook that steps in each step would otherwise end in a RecursionError."""
 
 
 class BatchedSimDevice:
-    """Stands for ``sapien.Device("cpu")`` where ManiSkill asks ``_sim_device.is_cuda()``.
+    """Stand-in for ``sapien.Device("cpu")`` where ManiSkill asks ``_sim_device.is_cuda()``.
 
-    ManiSkill then applies drive targets after an action, as is needed here.
+    The answer True makes ManiSkill apply drive targets after an action, which the batched simulation needs.
     """
 
     def is_cuda(self) -> bool:
@@ -116,14 +116,14 @@ class CpuCameraGroup:
     ) -> None:
         """
         Args:
-            key: None for a camera that the task added to the scene: it is no sensor, and always exact.
+            key: None for a camera that the task added to the scene; it is not a sensor, and always exact.
         """
         self._cameras, self._scene, self.key = cameras, scene, key
 
         self.textures = {"Color"}
-        """Textures of a fast picture: all that were ever read."""
+        """Textures of a fast picture: every texture that was read so far."""
         self._drawn = cameras
-        """Cameras that drew the last picture (`take_picture`), with textures `_has`."""
+        """Cameras that drew the last picture (`take_picture`), with the textures in `_has`."""
         self._has: set[str] = set()
 
     def take_picture(self) -> None:
@@ -146,7 +146,7 @@ class CpuCameraGroup:
         """(N, H, W, C) texture `name` of every env, on the CPU."""
         self.textures.add(name)
         if self.key is not None and name not in self._has and self._drawn != self._cameras:
-            # For this once by the exact cameras, which the last `update_render` has moved too.
+            # The fast picture lacks this texture: draw once with the exact cameras, which `update_render` has also moved.
             with self._drawing():
                 for env, camera in enumerate(self._cameras):
                     self._scene.take_picture(env, self.key, camera, None)
@@ -188,18 +188,18 @@ class BatchedCpuScene(ManiSkillScene):
         textures: Collection[str] | None,
         degree: PictureDegree | None = None,
     ) -> sapien.render.RenderCameraComponent:
-        """Begin to draw; returns what the textures are to be read from.
+        """Start drawing a picture; returns the camera from which to read its textures.
 
         Args:
-            camera: the one of this key in this env.
-            textures: those that a fast picture needs; None for all of `camera`'s own, by `camera` itself.
-            degree: None for the scene's own. A fast one needs `prepare_fast` before ``update_render``.
+            camera: the camera with this key in this env.
+            textures: textures that a fast picture needs; None: `camera` itself draws all of its textures.
+            degree: None for the scene's own. A fast picture needs `prepare_fast` before ``update_render``.
         """
         if self.degree_of(camera, degree) == "exact":
             camera.take_picture()
             return camera
         shapes, cameras = self._fast_parts()
-        drawing = camera if textures is None else cameras.beside(camera, textures)
+        drawing = camera if textures is None else cameras.camera_for(camera, textures)
         with shown(shapes.bodies(key, env)):
             drawing.take_picture()
         return drawing
@@ -207,22 +207,24 @@ class BatchedCpuScene(ManiSkillScene):
     def degree_of(
         self, camera: sapien.render.RenderCameraComponent, asked: PictureDegree | None = None
     ) -> PictureDegree:
-        """The degree of a picture for which this degree is asked, or the scene's own.
+        """The degree in which a picture is drawn if `asked` (None: the scene's own) is requested.
 
         Always exact where the camera's quaternion is not of unit length (``look_at`` straight down): SAPIEN turns and zooms
-        its picture, and what is out of its view is not known.
+        such a picture, so it is unknown what is out of view.
         """
-        if (asked or self.pictures) == "exact" or abs(float(np.linalg.norm(camera.local_pose.q)) - 1) > _UNIT:
+        if (asked or self.pictures) == "exact" or abs(
+            float(np.linalg.norm(camera.local_pose.q)) - 1
+        ) > _UNIT_TOLERANCE:
             return "exact"
         return "fast"
 
     def prepare_fast(
         self, env: int, key: CameraKey, textures: Collection[str], places: Places = NOWHERE_ELSE
     ) -> None:
-        """Make what a fast picture of this camera draws, once, and move it to where the camera is now.
+        """Make the shapes and the camera of a fast picture, if they are missing, and move them to where this camera is now.
 
         Args:
-            places: where bodies of the env are drawn instead.
+            places: poses at which bodies of the env are drawn in place of their own.
         """
         sensor = self.camera(key)
         components = camera_components(sensor)
@@ -249,7 +251,7 @@ class BatchedCpuScene(ManiSkillScene):
         return (self.sensors if kind == "sensor" else self.human_render_cameras)[name]
 
     def create_actor_builder(self) -> Any:
-        # ManiSkill adds a plane once a builder, since all envs of a GPU share one physics scene: here every env but
+        # ManiSkill adds a plane once per builder, since all envs on a GPU share one physics scene. Here every env but
         # the first would lack its ground.
         return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
 
@@ -296,15 +298,15 @@ class BatchedCpuScene(ManiSkillScene):
 
     @property
     def _gpu_sim_initialized(self) -> bool:
-        """For ManiSkill's own code: what it allows before a GPU simulation runs is allowed here, see `allowed_on_the_cpu`."""
+        """Read by ManiSkill; False where it allows something only before a GPU simulation runs, see `allowed_on_the_cpu`."""
         return not allowed_on_the_cpu(sys._getframe(1), self._system.laid_out)
 
     @_gpu_sim_initialized.setter
     def _gpu_sim_initialized(self, value: bool) -> None:
-        """ManiSkill's constructor sets it."""
+        """Ignore the value that ManiSkill's constructor sets."""
 
     def _setup(self, enable_gpu: bool) -> None:
-        # As on a stock CPU env, what was set while the scene was built stays, but for the poses.
+        # As on a stock CPU env, what was set while the scene was built stays, except for the poses.
         self._system.gpu_init()
         super()._setup(enable_gpu=False)
         self._gpu_apply_all()
@@ -348,7 +350,7 @@ class BatchedCpuScene(ManiSkillScene):
 
 
 class BatchedCpuMixin:
-    """Batched CPU simulation of a task class, as the first of its bases.
+    """Mixin for batched CPU simulation; the first base of a task class.
 
     ManiSkill 3.0.1 refuses ``num_envs > 1`` on the CPU in four places: the name of the simulation backend, one
     ``is_cuda()``, the scene that ``_setup_scene`` builds, and the groups of cameras. This mixin answers those four; the
@@ -389,7 +391,7 @@ class BatchedCpuMixin:
             _require_display()
         _refuse_frequencies(kwargs.get("sim_config"))
         wanted = kwargs.get("num_envs", 1)
-        # Before ManiSkill makes generators for each.
+        # Check first: ManiSkill would make random generators for each env.
         require_scenes(wanted)
         with base_arguments(self, self._workbench_task, kwargs) as passed_on, AuthorCall():
             super().__init__(*args, **passed_on)
@@ -445,23 +447,23 @@ class BatchedCpuMixin:
 
     @_sim_device.setter
     def _sim_device(self, value: sapien.Device) -> None:
-        """BaseEnv sets the device that it parsed from the backend: the CPU, as asked in __init__."""
+        """Ignore the device that BaseEnv parsed from the backend: the CPU, as requested in __init__."""
 
     def step(self, action: Any) -> Any:
-        among = self.scene.px.resetting
+        resetting = self.scene.px.resetting
         before = self._elapsed_steps.clone()
         with self._in_turn("step"), AuthorCall():
             result = super().step(action)  # type: ignore[misc]
-        if among is not None:  # a hook of a reset steps the envs that are being reset
-            self._elapsed_steps[~among] = before[~among]
+        if resetting is not None:  # a hook of a reset steps the envs that are being reset
+            self._elapsed_steps[~resetting] = before[~resetting]
         return result
 
     @contextmanager
     def _in_turn(self, what: str) -> Iterator[None]:
         """Context in which the env is stepped or reset."""
-        if self._nested >= _MOST_NESTED:
+        if self._nested >= _MAX_NESTED_CALLS:
             raise RefusedCall(
-                f"{what}() was called {_MOST_NESTED} times within itself: a hook that it runs calls it again."
+                f"{what}() was called {_MAX_NESTED_CALLS} times within itself: a hook that it runs calls it again."
             )
         self._nested += 1
         try:
@@ -477,7 +479,7 @@ class BatchedCpuMixin:
     def _reset_in_turn(self, seed: Any, options: dict[str, Any] | None) -> Any:
         untouched = untouched_envs(self, options)
         options, seeds = in_ascending_order(options or {}, seed, self)
-        # ManiSkill takes a list of seeds for those of the whole batch.
+        # ManiSkill takes a list of seeds as the seeds of the whole batch.
         if not untouched or seeds is None or len(seeds) == 1:
             given: Any = nullcontext()
         else:
@@ -532,7 +534,7 @@ class BatchedCpuMixin:
         unwatched = substeps_are_unwatched(self, self._workbench_task)
         for controller in without_target_flags(self):
             for flag in TARGET_FLAGS:
-                # Only what was changed is applied, so a controller that sets none loses nothing.
+                # True is safe: only targets that changed are applied, so a controller that sets none changes nothing.
                 setattr(controller, flag, getattr(controller, flag, True))
         try:
             with px.merging(self._sim_steps_per_control if unwatched else 1):
@@ -543,14 +545,14 @@ class BatchedCpuMixin:
 
     def drop_writes(self) -> None:
         """Discard writes to the simulation's tensors that were not applied."""
-        # Else every later reset would apply what a hook that raised had written (a NaN, say), and what it had applied
-        # and not fetched would make the next reset raise.
+        # Without this, every later reset would apply what a failed hook had written (a NaN, for example), and what it
+        # had applied but not fetched would make the next reset raise.
         if scene_of(self) is not None and self.scene.px.laid_out:
             self.scene.px.drop_writes()
             self.scene._gpu_fetch_all()
 
     def _make_scene(self) -> None:
-        """What ``BaseEnv._setup_scene`` does for this env; a task may have its own, which calls that."""
+        """Build the scene in place of ``BaseEnv._setup_scene``, which a task's own ``_setup_scene`` may call."""
         require_scenes(self.num_envs)
         self._set_scene_config()
         sub_scenes = []
@@ -586,9 +588,9 @@ def batched_class(
     """A subclass of `task` with the batched CPU simulation; `task` itself stays as it is.
 
     Args:
-        rules: the degree of all rules of GPU simulation, or None for each rule's own; see `rules`.
+        rules: the degree of all rules of GPU simulation, or None for each rule's own; see `gpu_rules`.
         on_finding: called once for each place where a rule that does not stop the task is broken.
-        pictures: of which degree what the env itself draws is.
+        pictures: degree of the pictures that the env itself draws.
     """
     install_row_lookups(batched_system)
     install_struct_access()
@@ -613,22 +615,22 @@ def batched_class(
 # --- how many scenes a process can hold --------------------------------------------------------------
 
 
-_SPARE = 8
-"""Thread-local keys kept free: for threads, drivers and libraries that start later, and the second scene during a
-restore."""
+_SPARE_KEYS = 8
+"""Number of thread-local keys kept free: for threads, drivers and libraries that start later, and the second scene
+during a restore."""
 
 
 def require_scenes(count: int) -> None:
     """Check that this process can hold `count` more PhysX scenes.
 
     Raises:
-        ValueError: with the number that it can.
+        ValueError: it cannot; the message has the number that it can hold.
     """
     free = free_thread_keys()
-    if free is not None and count > free - _SPARE:
+    if free is not None and count > free - _SPARE_KEYS:
         raise RefusedValue(
             f"num_envs={count} is more than this process has room for: PhysX takes one of Linux's 1024 thread-local "
-            f"keys for each env, and {max(free - _SPARE, 0)} are left here. Use fewer envs, close envs that "
+            f"keys for each env, and {max(free - _SPARE_KEYS, 0)} are left here. Use fewer envs, close envs that "
             "are not needed, or divide the envs among processes."
         )
 
@@ -636,9 +638,9 @@ def require_scenes(count: int) -> None:
 def free_thread_keys() -> int | None:
     """How many more thread-local keys this process can take; None where no limit is known.
 
-    Each PhysX scene takes one (``PxTlsAlloc`` in PhysX's NpScene). Linux has 1024 (``PTHREAD_KEYS_MAX``), some twenty are
-    taken once SAPIEN and torch are imported. Without a free one the process dies in native code: "Couldn't create
-    autoTSSkey mapping". They are counted by taking all and giving them back.
+    Each PhysX scene takes one (``PxTlsAlloc`` in PhysX's NpScene). Linux has 1024 (``PTHREAD_KEYS_MAX``), of which SAPIEN
+    and torch take some twenty at import. Without a free key the process dies in native code: "Couldn't create autoTSSkey
+    mapping". The keys are counted by taking all and giving them back.
     """
     if not sys.platform.startswith("linux"):
         return None
@@ -651,7 +653,7 @@ def free_thread_keys() -> int | None:
     return len(taken)
 
 
-# --- what cannot go on -------------------------------------------------------------------------------
+# --- calls and options that are refused ---------------------------------------------------------------
 
 
 class EnvClosed(AttributeError):
@@ -674,12 +676,12 @@ def _refuse_frequencies(config: Any) -> None:
 
 
 _drawing: dict[int, str] = {}
-"""Threads that step or reset an env now."""
+"""Names of the threads that are stepping or resetting an env, by thread id."""
 
 
 @contextmanager
 def drawing_alone() -> Iterator[None]:
-    """Within this, warn if another thread steps or resets an env at the same time."""
+    """Context that warns if another thread steps or resets an env at the same time."""
     me, outermost = threading.get_ident(), threading.get_ident() not in _drawing
     if _drawing.keys() - {me}:
         warnings.warn(_SHARED_GENERATOR, RuntimeWarning, stacklevel=5)
@@ -722,8 +724,8 @@ def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None
     if env.num_envs != num_envs:
         cls, place = _culprit(task, BaseEnv, silent=False)
         raise NeedsOneEnv(
-            f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not hand num_envs on",
-            " Or give its keyword arguments to super().__init__(*args, **kwargs).",
+            f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not pass num_envs on",
+            " Or pass its keyword arguments to super().__init__(*args, **kwargs).",
             place,
         )
 

@@ -1,4 +1,4 @@
-"""Facts that the core knows about an error, added to it as notes, and its refusals that a task has caught."""
+"""Notes that the core adds to errors, and refusals of the core that a task has caught."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from workbench.machine.library_files import is_installed
 
 Place = tuple[str, int, str]
 """File, line, and the name of the function."""
-_MOST_REFUSALS = 3
-"""Remembered in one call: each keeps its frames alive."""
-_MOST_LETTERS = 400
+_MAX_REFUSALS = 3
+"""Maximum number of refusals that are remembered in one call: each keeps its frames alive."""
+_MAX_CHARACTERS = 400
 
 
 class ErrorNote(str):
     """A fact about an error. Python prints it below the error.
 
-    ``before``: it tells of an earlier error. ``place``: the line at fault where no line of the author's is on the traceback.
+    ``before``: the note is about an earlier error. ``place``: the line at fault where the traceback has no line of the
+    author's.
     """
 
     before: bool
@@ -33,15 +34,15 @@ class ErrorNote(str):
 
 
 def notes_of(error: BaseException) -> list[str]:
-    """Its notes, of the core and of others."""
+    """The notes of an error, the core's and others."""
     return [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
 
 
 class CoreRefusal(Exception):
-    """The batched core refuses what a task asks for. The running `AuthorCall` remembers it: the task may catch it, and fail
-    later for want of what was refused.
+    """The batched core refuses what a task asks for.
 
-    `place` is the line at fault, where it is known better than from the traceback.
+    The running `AuthorCall` remembers the refusal, since the task may catch it and fail later because of it. `place` is
+    the line at fault where the traceback does not show it.
     """
 
     def __init__(self, *args: object, place: Place | None = None) -> None:
@@ -63,7 +64,7 @@ class RefusedMember(CoreRefusal, NotImplementedError):
 
 
 class WrongAction(ValueError):
-    """An action that does not fit the task. `problem` goes on from the name of what gave it."""
+    """An action that does not fit the task. `problem` continues a sentence that starts with the action's source."""
 
     def __init__(self, problem: str) -> None:
         super().__init__(f"the action {problem}")
@@ -71,8 +72,8 @@ class WrongAction(ValueError):
 
 
 class AuthorCall:
-    """A context around a call of the author's code: an error that leaves it is given a note for each refusal of the core
-    that was caught before. Nests."""
+    """Context around a call of the author's code; adds to an error that leaves it a note for each refusal of the core
+    that the task caught. Can be nested."""
 
     def __enter__(self) -> None:
         self._first = len(_running.refusals)
@@ -81,9 +82,9 @@ class AuthorCall:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> Literal[False]:
         _running.depth -= 1
         if error is not None:
-            told = [*chain_of(error, suppressed=True)]
+            known = [*chain_of(error, suppressed=True)]
             for refusal in _running.refusals[self._first :]:
-                note = None if refusal in told else _caught_note(refusal)
+                note = None if refusal in known else _caught_note(refusal)
                 if note is not None and note not in notes_of(error):
                     error.add_note(note)
         if _running.depth == 0:
@@ -99,7 +100,7 @@ class _Running(threading.local):
         self.refusals: list[CoreRefusal] = []
 
     def remember(self, refusal: CoreRefusal) -> None:
-        if self.depth and len(self.refusals) < _MOST_REFUSALS:
+        if self.depth and len(self.refusals) < _MAX_REFUSALS:
             self.refusals.append(refusal)
 
 
@@ -107,7 +108,7 @@ _running = _Running()
 
 
 def chain_of(error: BaseException, suppressed: bool = False) -> Iterator[BaseException]:
-    """The error, what caused it, and so on. A refusal of the core ends it: its text explains its cause.
+    """The error, its cause, and so on. A refusal of the core ends the chain: its text explains its cause.
 
     Args:
         suppressed: include what ``raise ... from None`` hides.
@@ -124,14 +125,14 @@ def chain_of(error: BaseException, suppressed: bool = False) -> Iterator[BaseExc
 
 
 def _caught_note(refusal: CoreRefusal) -> ErrorNote | None:
-    """None for one that was never raised."""
+    """Note about a caught refusal; None if the refusal was never raised."""
     frames = [(frame.filename, frame.lineno or 1, frame.name) for frame in extract_tb(refusal.__traceback__)]
     if not frames:
         return None
     caught = frames[0]
     at = refusal.place or next((place for place in reversed(frames) if not is_installed(place[0])), caught)
     text = " ".join(str(refusal).split())
-    text = text if len(text) <= _MOST_LETTERS else text[: _MOST_LETTERS - 1] + "…"
+    text = text if len(text) <= _MAX_CHARACTERS else text[: _MAX_CHARACTERS - 1] + "…"
     where = "there" if at[:2] == caught[:2] else f"at {_text_of(caught)}"
     return ErrorNote(f"Before this, {_text_of(at)} was refused, and caught {where}: {text}", at, before=True)
 

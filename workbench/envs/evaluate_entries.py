@@ -16,23 +16,23 @@ from numpy.typing import NDArray
 from workbench.envs.step_result import OtherEntry
 
 FLAGS = ("success", "fail")
-MOST_LETTERS = 400
-"""Longest text of a value."""
-MOST_NUMBERS = 1024
-"""Largest value of the whole batch that is kept as numbers; of a larger one only type and shape."""
-MOST_ENTRIES = 1000
-"""Most leaves; of the others only the count."""
-_MOST_NAME = 200
-_MOST_READ = 1 << 26
-"""Numbers of one value; a sparse tensor's shape may exceed the memory."""
+MAX_TEXT_CHARACTERS = 400
+"""Maximum length of a value's text."""
+MAX_KEPT_NUMBERS = 1024
+"""Largest whole-batch value that is kept as numbers; of a larger one only type and shape are kept."""
+MAX_ENTRIES = 1000
+"""Maximum number of leaves; the others are only counted."""
+_MAX_NAME_CHARACTERS = 200
+_MAX_READ_NUMBERS = 1 << 26
+"""Largest value that is read: a sparse tensor's shape may exceed the memory."""
 _NOT_EVALUATED = ("elapsed_steps", "reconfigure")
 """ManiSkill's own entries of ``info``."""
-_REAL = "biuf"
-_PLAIN = {torch.bool, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8}
-"""Types that numpy also has."""
-_DEEPEST = 16
-_NOT_SHOWN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Control characters and surrogates, which no file and no browser takes."""
+_REAL_KINDS = "biuf"
+_NUMPY_DTYPES = {torch.bool, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8}
+"""torch's dtypes that numpy also has."""
+_MAX_DEPTH = 16
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+"""Control characters and surrogates, which neither files nor browsers accept."""
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 """Memory address in a default repr: differs in every run."""
 
@@ -40,15 +40,15 @@ _short = reprlib.Repr()
 _short.maxlevel = 4
 _short.maxdict = _short.maxlist = _short.maxtuple = _short.maxset = _short.maxfrozenset = 20
 _short.maxdeque = _short.maxarray = 20
-_short.maxstring = _short.maxlong = _short.maxother = MOST_LETTERS
+_short.maxstring = _short.maxlong = _short.maxother = MAX_TEXT_CHARACTERS
 
 
 def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDArray], dict[str, OtherEntry]]:
-    """The entries of `info` that are real numbers with a row for each env, (N, ...) each; and the others. All are copies.
+    """Split `info` into entries of real numbers with a row for each env, (N, ...) each, and the others. All are copies.
 
-    ManiSkill reads ``success`` and ``fail`` alone and passes the rest on: None, a string, ``progress.mean()``, an object. A
-    tensor, array or list has rows if its first dimension is N: with one env, shape (1,) has and () has not, except for
-    ``success`` and ``fail``, as in ManiSkill. A nested dict is split into its leaves, named by their keys.
+    ManiSkill reads only ``success`` and ``fail`` and passes the rest on: None, a string, ``progress.mean()``, an object. A
+    tensor, array or list has rows if its first dimension is N. With one env, shape (1,) has a row and () has none, except
+    for ``success`` and ``fail``, as in ManiSkill. A nested dict is split into its leaves, named by their keys.
     """
     columns: dict[str, NDArray] = {}
     others: dict[str, OtherEntry] = {}
@@ -56,13 +56,13 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
     for path, value in leaves(info):
         if path in _NOT_EVALUATED:
             continue
-        if len(columns) + len(others) >= MOST_ENTRIES:
+        if len(columns) + len(others) >= MAX_ENTRIES:
             left_out += 1
             continue
         name = _name(path, columns, others)
         array = _array(value)
         if name in FLAGS and array is not None:
-            # ManiSkill takes a single one for all envs, and numbers for bools; the page needs a row each.
+            # ManiSkill accepts one value for all envs, and numbers as bools; the page needs a bool for each env.
             one_each = array.reshape(-1) if array.size == num_envs else array
             columns[name] = np.broadcast_to(one_each.astype(bool), (num_envs, *one_each.shape[1:])).copy()
         elif array is None:
@@ -80,7 +80,7 @@ def leaves(value: Any, path: str = "", above: tuple[int, ...] = ()) -> Iterator[
     """Leaves of nested dicts, each with its keys joined by ``/``. An empty dict, or one that contains itself, is a leaf."""
     if (
         not isinstance(value, Mapping)
-        or len(above) > _DEEPEST
+        or len(above) > _MAX_DEPTH
         or id(value) in above[1:]
         or (above and not value)
     ):
@@ -91,7 +91,7 @@ def leaves(value: Any, path: str = "", above: tuple[int, ...] = ()) -> Iterator[
 
 
 def flat_entries(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """The `leaves` that are no dicts; a value that is no dict is one leaf named `path`."""
+    """The `leaves` that are not dicts; a value that is not a dict is one leaf named `path`."""
     return ((name, held) for name, held in leaves(value, path) if not isinstance(held, Mapping))
 
 
@@ -112,18 +112,18 @@ def _name(path: str, columns: Mapping[str, Any], others: Mapping[str, Any]) -> s
 @lru_cache(maxsize=4096)
 def _clean_name(path: str) -> str:
     name = clean_text(path)
-    return name if len(name) <= _MOST_NAME else name[: _MOST_NAME - 1] + "…"
+    return name if len(name) <= _MAX_NAME_CHARACTERS else name[: _MAX_NAME_CHARACTERS - 1] + "…"
 
 
 def _array(value: Any) -> NDArray | None:
-    """`value` as booleans or real numbers; None if it is none or cannot be read."""
+    """`value` as booleans or real numbers; None if it holds neither or cannot be read."""
     if isinstance(value, torch.Tensor):
         return _of_tensor(value)
     if isinstance(value, np.ndarray):
-        return value.copy() if value.dtype.kind in _REAL else None
+        return value.copy() if value.dtype.kind in _REAL_KINDS else None
     if isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating)):
         found = np.asarray(value)
-        return found if found.dtype.kind in _REAL else None  # an int of more than 64 bits is an object
+        return found if found.dtype.kind in _REAL_KINDS else None  # an int of more than 64 bits is an object
     if isinstance(value, (list, tuple)) and value:
         return _of_list(value)
     if isinstance(value, Pose):
@@ -132,11 +132,11 @@ def _array(value: Any) -> NDArray | None:
 
 
 def _of_tensor(value: torch.Tensor) -> NDArray | None:
-    if value.dtype in _PLAIN and value.layout is torch.strided and value.device.type == "cpu":
-        # The common case; the general way takes three times as long.
+    if value.dtype in _NUMPY_DTYPES and value.layout is torch.strided and value.device.type == "cpu":
+        # Fast path for the common case; the general one takes three times as long.
         found = value.detach().numpy() if value.requires_grad else value.numpy()
         return found.copy()
-    if value.is_complex() or value.numel() > _MOST_READ:
+    if value.is_complex() or value.numel() > _MAX_READ_NUMBERS:
         return None
     try:
         if value.layout is not torch.strided:
@@ -150,7 +150,7 @@ def _of_tensor(value: torch.Tensor) -> NDArray | None:
 
 
 def _of_list(value: list[Any] | tuple[Any, ...]) -> NDArray | None:
-    if len(value) > _MOST_READ or any(isinstance(item, (str, bytes, Mapping)) for item in value):
+    if len(value) > _MAX_READ_NUMBERS or any(isinstance(item, (str, bytes, Mapping)) for item in value):
         return None
     rows: list[Any] = [_of_tensor(item) if isinstance(item, torch.Tensor) else item for item in value]
     if any(row is None for row in rows):
@@ -159,14 +159,14 @@ def _of_list(value: list[Any] | tuple[Any, ...]) -> NDArray | None:
         found = np.array(rows)
     except (ValueError, TypeError, OverflowError):  # rows of several lengths
         return None
-    return found if found.dtype.kind in _REAL else None
+    return found if found.dtype.kind in _REAL_KINDS else None
 
 
 def _numbers(value: Any, array: NDArray) -> OtherEntry:
     what = type_text(value)
     if array.size == 0:
         return OtherEntry(what, ("[]",))
-    if array.size > MOST_NUMBERS:
+    if array.size > MAX_KEPT_NUMBERS:
         return OtherEntry(what, (f"{array.size:,} numbers",), whole=False)
     return OtherEntry(what, numbers=array if array.flags.owndata else array.copy())
 
@@ -181,7 +181,7 @@ def _other(value: Any, num_envs: int) -> OtherEntry:
 
 
 def _rows_of(value: Any) -> list[Any] | tuple[Any, ...] | NDArray | None:
-    """The items of a value that may have one for each env."""
+    """The value as a sequence whose items may be one for each env; None if it is not a sequence."""
     if isinstance(value, (list, tuple)):
         return value
     if isinstance(value, torch.Tensor) and value.is_complex():
@@ -200,15 +200,15 @@ def type_text(value: Any) -> str:
 
 
 def _text(value: Any) -> tuple[str, bool]:
-    """`value` as text, and whether that is all of it."""
+    """`value` as text, and whether the text is complete."""
     if isinstance(value, np.generic):
         value = str(value)  # its repr names numpy, and Python's number would have more digits
     if isinstance(value, str):
         text = str.__str__(value)
     else:
         text = safe_repr(value)
-    if len(text) > MOST_LETTERS:
-        return clean_text(text[: MOST_LETTERS - 1]) + "…", False
+    if len(text) > MAX_TEXT_CHARACTERS:
+        return clean_text(text[: MAX_TEXT_CHARACTERS - 1]) + "…", False
     return clean_text(text), isinstance(value, str) or "..." not in text
 
 
@@ -226,19 +226,19 @@ def safe_repr(value: object) -> str:
 
 def clean_text(text: str) -> str:
     """`text` with what files and browsers refuse replaced."""
-    return _NOT_SHOWN.sub("\ufffd", text)
+    return _UNPRINTABLE.sub("\ufffd", text)
 
 
 # --- what is wrong with them -------------------------------------------------------------------------
 
 
 def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
-    """What is wrong with ``evaluate()``'s return value, or None: a dict in which ``success`` and ``fail`` are tensors (N,).
+    """What is wrong with ``evaluate()``'s return value, or None. It must be a dict whose ``success`` and ``fail`` are (N,).
 
     Other entries may be anything, as in ManiSkill (`split_entries`).
     """
     if not isinstance(evaluate, Mapping):
-        return f"returned {describe(evaluate)}; it must return a dict ({{}} where there is nothing to say)"
+        return f"returned {describe(evaluate)}; it must return a dict ({{}} if there is nothing to report)"
     for name in FLAGS:
         value = evaluate.get(name)
         if name in evaluate and not (
@@ -249,7 +249,7 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
 
 
 def wrong_flags(evaluate: object) -> str | None:
-    """Which of ``success`` and ``fail`` is a tensor of another type than bool, or None: ManiSkill's step takes it, and its
+    """What is wrong if ``success`` or ``fail`` is a tensor that is not bool, or None. ManiSkill's step accepts it, its
     wrappers do not."""
     for name in FLAGS:
         value = evaluate.get(name) if isinstance(evaluate, Mapping) else None
@@ -259,7 +259,7 @@ def wrong_flags(evaluate: object) -> str | None:
 
 
 def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> str | None:
-    """What is wrong with a reward, or None: a floating tensor (N,). A NaN is a value, shown in that env's row."""
+    """What is wrong with a reward, or None. It must be a floating tensor (N,); NaN is allowed, and shown in the env's row."""
     problem = no_reward(reward, num_envs)
     if problem is not None or not isinstance(reward, torch.Tensor) or reward.dtype.is_floating_point:
         return problem
@@ -271,7 +271,7 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
 
 
 def no_reward(reward: object, num_envs: int) -> str | None:
-    """What is wrong with a reward that is no real number (or bool) for each env: it cannot be drawn or recorded."""
+    """What is wrong with a reward, or None. To be drawn and recorded it must be a real number (or bool) for each env."""
     if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs) or reward.dtype.is_complex:
         return f"returned {describe(reward)}; {_floating(num_envs)}"
     return None
@@ -282,14 +282,14 @@ def _floating(num_envs: int) -> str:
 
 
 def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:
-    # Tasks written for one env return other shapes of one number, which ManiSkill's step takes.
+    # Tasks written for one env return one number in other shapes, which ManiSkill's step accepts.
     return value.shape == (num_envs,) or num_envs == value.numel() == 1
 
 
 def wrong_observation(obs: object, num_envs: int) -> str | None:
-    """What is wrong with an observation hook's return value, or None: a dict of arrays (N, ...)."""
+    """What is wrong with an observation hook's return value, or None. It must be a dict of arrays (N, ...)."""
     if not isinstance(obs, Mapping):
-        return f"returned {describe(obs)}; it must return a dict ({{}} where there is nothing to observe)"
+        return f"returned {describe(obs)}; it must return a dict ({{}} if there is nothing to observe)"
     for name, value in flat_entries(obs):
         shape = getattr(value, "shape", None)
         if shape is None or len(shape) == 0 or shape[0] != num_envs:
@@ -304,7 +304,7 @@ def without_rows(value: object, num_envs: int) -> Iterator[tuple[str, str]]:
     """Name and description of each tensor or array in nested dicts that has no row for each env."""
     for name, held in flat_entries(value):
         if isinstance(held, torch.Tensor | np.ndarray) and held.shape[:1] != (num_envs,):
-            if num_envs > 1 or held.ndim:  # ManiSkill takes shape () for a single env
+            if num_envs > 1 or held.ndim:  # ManiSkill accepts shape () for a single env
                 yield name, type_text(held)
 
 

@@ -22,7 +22,7 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
 
     Args:
         env: an unwrapped env, batched on the CPU or on the GPU.
-        task: the author's class. The caller makes sure that it builds the same scene (`task.reload_level`).
+        task: the author's class. The caller ensures that it builds the same scene (`workbench.task.reload_level`).
     """
     own: Any = type(env)
     if not issubclass(own, BatchedCpuMixin):
@@ -38,8 +38,8 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
 
 
 def can_exchange_cameras(env: BaseEnv) -> bool:
-    """Whether `exchange_cameras` is possible: not in GPU simulation, whose camera groups cannot be undone, nor where
-    ManiSkill has no name for it any more."""
+    """Whether `exchange_cameras` is possible: not in GPU simulation, whose camera groups cannot be undone, nor with a
+    ManiSkill that lacks a private name for it."""
     if maniskill_private.why_not(maniskill_private.EXCHANGING):
         return False
     plain = all(
@@ -55,7 +55,7 @@ def exchange_cameras(env: BaseEnv) -> None:
     """
     if not env.scene.can_render():
         return
-    env.scene.forget_fast_shapes()  # type: ignore[attr-defined]  # only a batched scene comes here
+    env.scene.forget_fast_shapes()  # type: ignore[attr-defined]  # always a batched scene
     for camera in maniskill_private.cameras(env).values():
         for component in maniskill_private.camera_components(camera):
             # The entity stays, empty: with one fewer, SAPIEN would renumber the others in the scene of a restored
@@ -118,6 +118,6 @@ def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
 
 
 def keep_observation_space(env: BaseEnv, obs: Any) -> None:
-    """Set the env's observation space by this observation: an edited hook may return another shape."""
+    """Set the env's observation space from this observation, since an edited hook may return another shape."""
     if env.obs_mode != "none":
         env.update_obs_space(common.to_cpu_tensor(obs))

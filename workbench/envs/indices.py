@@ -13,7 +13,7 @@ def env_numbers(env_idx: Any) -> list[int]:
     """The numbers in `env_idx`, one or several, in the order given.
 
     Raises:
-        TypeError: they are no integers, or a mask.
+        TypeError: `env_idx` does not consist of integers, or is a mask.
     """
     try:
         each = [env_idx] if np.ndim(env_idx) == 0 else list(env_idx)

@@ -22,8 +22,8 @@ from workbench.envs.simulation.cpu_system import batched_system
 from workbench.envs.state_columns import env_states, flat_names, split_flat
 from workbench.envs.task_env import TaskEnv, to_numpy
 
-MOST_VALUES = 64
-"""Numbers of one array that are sent; a joint vector has fewer, a picture more."""
+MAX_VALUES = 64
+"""Maximum numbers of one array that are sent; a joint vector has fewer, a picture more."""
 
 
 def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspection:
@@ -53,7 +53,7 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
         except NotImplementedError as error:
             refused.append((section, str(error)))
         except Exception as error:
-            # The author's own get_state_dict or observation hook: the others are still worth seeing.
+            # The author's get_state_dict or observation hook failed: still show the other sections.
             refused.append((section, f"reading it raised {type(error).__name__}: {error}"))
     return Inspection(
         env=env,
@@ -177,7 +177,7 @@ def _row(value: Any, env: int, num_envs: int) -> NDArray:
 def _leaf(name: str, value: NDArray, dtype: str | None = None) -> Leaf:
     numeric = value.dtype.kind in "fiub" and value.size > 0
     low, high = (float(value.min()), float(value.max())) if numeric else (np.nan, np.nan)
-    values = value.reshape(-1)[:MOST_VALUES].copy()
+    values = value.reshape(-1)[:MAX_VALUES].copy()
     return Leaf(name, tuple(value.shape), dtype or str(value.dtype), values, low, high)
 
 
@@ -185,7 +185,7 @@ def _floats(value: torch.Tensor) -> NDArray[np.float32]:
     return to_numpy(value).astype(np.float32)
 
 
-# --- Which bodies of an env touch, where, and how hard: for people who look, not for rewards ---
+# --- contacts of one env: for people, not for rewards -------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -26,15 +26,15 @@ from workbench.envs.snapshots.task_attributes import Walk, walk_task_values
 from workbench.envs.snapshots.task_state import is_per_env, version_of
 from workbench.machine.library_files import is_installed
 
-MOST_LINES = 2000
-"""Lines of the author's code after which values are compared, in one reset."""
-_ROUNDED = 1e-5
-"""Tolerance for values computed again from the same poses: 1e-7 of a rotation was seen."""
+MAX_TRACED_LINES = 2000
+"""Maximum lines of the author's code after which values are compared, in one reset."""
+_ROUNDING_TOLERANCE = 1e-5
+"""Tolerance for values computed again from the same poses; rotations were seen to differ by 1e-7."""
 _ITEM = re.compile(r"\[(\d+)\]")
 
 
 class KeptRows:
-    """What a task keeps for each env, as it is when this is made.
+    """Copy of what a task keeps for each env, to find rows that a partial reset changed for other envs.
 
     A partial reset must change the rows of ``env_idx`` only, in tensors, arrays, lists and Poses on the task, in dicts and in
     objects of its own. Nothing raises when it does not: ``self.target = torch.rand((self.num_envs, 2))`` gives every env
@@ -54,8 +54,8 @@ class KeptRows:
         self.before = {path: _copy(value) for path, value in self._read(walk).items()}
 
     def changed_envs(self) -> dict[str, tuple[int, ...]]:
-        """Paths (without ``self.``) whose rows of other envs changed, and in which envs; empty if only the rows of the envs
-        being reset are left, and the others are lost."""
+        """Paths (without ``self.``) whose rows of other envs changed, each with these envs; no envs where only the rows of
+        the envs being reset are left."""
         now = self._read(walk_task_values(self.env))
         found = {path: self._difference(before, now.get(path)) for path, before in self.before.items()}
         return {path: envs for path, envs in found.items() if envs is not None}
@@ -64,7 +64,7 @@ class KeptRows:
         """The paths whose rows of other envs changed.
 
         Args:
-            seen: values at the last call, updated here: a tensor that was not written since is not compared again.
+            seen: values at the last call, updated here, so that a tensor is compared only if it was written since.
         """
         now = self._read(walk_task_values(self.env))
         for path, before in self.before.items():
@@ -77,7 +77,7 @@ class KeptRows:
         return {path for path, (_, _, differs) in seen.items() if differs}
 
     def _read(self, walk: Walk) -> dict[str, Any]:
-        """The values at the paths; a list where each env has its own."""
+        """The values at the paths; a list where each env has its own value."""
         now = {leaf.path: leaf.value for leaf in walk.leaves}
         read = {path: now[path] for path in self._single if path in now}
         for path, each in self._groups.items():
@@ -145,9 +145,9 @@ def _array(value: torch.Tensor | np.ndarray) -> np.ndarray:
 
 
 def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Where they differ; NaN equals NaN."""
+    """Mask of the numbers in which two arrays differ; NaN equals NaN."""
     if a.dtype.kind in "fc" and b.dtype.kind in "fc":
-        return ~np.isclose(a, b, rtol=_ROUNDED, atol=_ROUNDED, equal_nan=True)
+        return ~np.isclose(a, b, rtol=_ROUNDING_TOLERANCE, atol=_ROUNDING_TOLERANCE, equal_nan=True)
     return np.asarray((a != b) & ~((a != a) & (b != b)))
 
 
@@ -171,7 +171,7 @@ class _Lines:
     def __init__(self, rows: KeptRows) -> None:
         self.rows = rows
         self._files: Collection[str] = ()
-        self._left = MOST_LINES
+        self._left = MAX_TRACED_LINES
         self._seen: dict[str, tuple[Any, int, bool]] = {}
         self._at: Frame | None = None
         """The running line."""
@@ -228,15 +228,15 @@ class _Lines:
 # --- reports -----------------------------------------------------------------------------------------
 
 
-_TRIES = 3
-"""Partial resets of a class in which lines are traced."""
+_MAX_TRACED_RESETS = 3
+"""Maximum number of partial resets of a class in which lines are traced."""
 
 
 class ResetWatch:
     """Watches the partial resets of one env, from `start` to `report` or `stop`.
 
     Args:
-        rules: Receives what is found.
+        rules: Receives the breaches.
     """
 
     def __init__(self, rules: BrokenRules) -> None:
@@ -245,7 +245,7 @@ class ResetWatch:
         self._chosen: tuple[int, ...] = ()
         self._task: type | None = None
         self._tries = 0
-        """Remaining attempts of `_TRIES`."""
+        """Remaining attempts of `_MAX_TRACED_RESETS`."""
         self._seeks = False
         """Trace lines in the next reset."""
         self.whole = False
@@ -258,7 +258,7 @@ class ResetWatch:
     def start(self, env: BaseEnv, task: type, chosen: Sequence[int]) -> None:
         """Envs `chosen` are about to be reset."""
         if self._task is not task:
-            self._task, self._tries, self._seeks = task, _TRIES, True
+            self._task, self._tries, self._seeks = task, _MAX_TRACED_RESETS, True
         self._chosen = tuple(chosen)
         self._lines = _Lines(KeptRows(env, chosen))
         if self._seeks:
@@ -287,7 +287,7 @@ class ResetWatch:
         self.stop()
         found = lines.rows.changed_envs()
         if over or found:
-            # Tracing slows a reset down: only if a line is missing.
+            # Tracing slows a reset down, so trace only if a line is missing.
             self._tries -= self._seeks
             self._seeks = self._tries > 0 and not found.keys() <= lines.found.keys()
         for path, envs in found.items():

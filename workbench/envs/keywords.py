@@ -1,4 +1,4 @@
-"""The keyword arguments that make an env: described in the worker, and read from text in the server. Imports no torch."""
+"""Keyword arguments that make an env: described in the worker, parsed from text in the server. Imports no torch."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 KeywordKind = Literal["bool", "int", "float", "str", "choice", "json"]
-LONGEST_TEXT = 2000
-"""Characters of a value's text."""
-MOST_CHOICES = 200
-MOST_KEYWORDS = 40
+MAX_TEXT_CHARACTERS = 2000
+"""Maximum length of a value's text."""
+MAX_CHOICES = 200
+MAX_KEYWORDS = 40
 MODES = ("robot_uids", "control_mode", "obs_mode", "reward_mode")
 """Keywords that every task of ManiSkill has and that a person chooses."""
-_NOT_ITS_OWN = frozenset(
+_BASE_PARAMETERS = frozenset(
     {
         *MODES, "num_envs", "render_mode", "shader_dir", "enable_shadow", "sensor_configs", "sim_config", "sim_backend",
         "human_render_camera_configs", "viewer_camera_configs", "reconfiguration_freq", "render_backend",
         "render_device", "parallel_in_single_scene", "enhanced_determinism", "backend", "device",
     }
 )  # fmt: skip
-"""Parameters that tasks hand on to `BaseEnv`."""
+"""Parameters that tasks pass on to `BaseEnv`."""
 _ABSENT: Any = object()
 _ANY_TEXTURES = "any_textures"
 """ManiSkill's word for every combination of pictures."""
@@ -69,16 +69,16 @@ def describe_keywords(
 
     Args:
         cls: the author's class.
-        given: keywords that a person gave.
-        registered: keywords of the registration.
+        given: the user's keywords.
+        registered: the keywords of the registration.
         stop: `BaseEnv`, whose parameters are no keywords of the task itself.
     """
     parameters = dict(parameters_of(cls, stop))
     effective = {**registered, **given}
     own = [
         _describe(name, parameter, effective.get(name, _ABSENT), registered.get(name, _ABSENT))
-        for name, parameter in list(parameters.items())[:MOST_KEYWORDS]
-        if name not in _NOT_ITS_OWN
+        for name, parameter in list(parameters.items())[:MAX_KEYWORDS]
+        if name not in _BASE_PARAMETERS
     ]
     robots = [str(getattr(agent, "uid", type(agent).__name__)) for agent in _agents_of(env)]
     return HowMade(", ".join(robots), tuple(_modes(cls, env)), tuple(own))
@@ -92,16 +92,15 @@ def _agents_of(env: Any) -> Sequence[Any]:
 
 
 def control_mode_of(env: Any) -> str | None:
-    """The control mode as ``gym.make`` takes it: of several robots the one that all have. None if they differ, and where there
-    is no robot."""
+    """The control mode as ``gym.make`` takes it; None if several robots have different ones, or there is no robot."""
     if getattr(env, "agent", None) is None:
         return None
-    # ManiSkill has a dict of several robots, which it does not take.
+    # With several robots this is a dict, which ``gym.make`` does not take.
     return one_mode(env.control_mode)
 
 
 def one_mode(mode: object) -> str | None:
-    """The control mode in a text, or of all robots in a dict; None for anything else."""
+    """The control mode from a string, or the one that all robots in a dict share; None for anything else."""
     modes = set(mode.values()) if isinstance(mode, dict) else {mode}
     (first, *others) = modes or {None}
     return first if isinstance(first, str) and not others else None
@@ -128,14 +127,14 @@ def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
     texts = dict.fromkeys(text for one in choices if (text := as_json(one)) is not None)
     if now is None:
         return Keyword(name, "json", _in_words(value), fixed="its value is an object of Python")
-    return Keyword(name, "choice", now, choices=tuple(dict.fromkeys((*texts, now)))[:MOST_CHOICES])
+    return Keyword(name, "choice", now, choices=tuple(dict.fromkeys((*texts, now)))[:MAX_CHOICES])
 
 
 def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parameter]]:
-    """Named parameters of the class's ``__init__``, and of its base classes' as long as each hands keywords on.
+    """Named parameters of the class's ``__init__``, and of its base classes' as long as each passes keywords on.
 
     Args:
-        stop: the base class whose own are left out, with those of its bases.
+        stop: the base class at which to stop: its parameters and those of its bases are left out.
     """
     seen: set[str] = set()
     for owner in cls.__mro__:
@@ -159,7 +158,7 @@ def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Paramete
 
 
 def _annotation(parameter: inspect.Parameter, init: Any) -> Any:
-    """The type; one of a module with ``from __future__ import annotations`` is a text, which may name what is not there."""
+    """The annotated type. With ``from __future__ import annotations`` it is a string, which may contain undefined names."""
     if not isinstance(parameter.annotation, str):
         return parameter.annotation
     names = getattr(inspect.unwrap(init), "__globals__", {})
@@ -180,11 +179,11 @@ def _describe(name: str, parameter: inspect.Parameter, given: Any, registered: A
         return Keyword(name, "json", _in_words(value), fixed="its value is an object of Python")
     if choices and text not in choices and text != "null":
         choices = (*choices, text)
-    return Keyword(name, kind, text, usual or "", choices[:MOST_CHOICES], optional)
+    return Keyword(name, kind, text, usual or "", choices[:MAX_CHOICES], optional)
 
 
 def _plain(value: Any) -> Any:
-    """The name of a member of an Enum, as it is written on a command line."""
+    """The value of a member of an Enum, as a command line gives it; anything else as it is."""
     return value.value if isinstance(value, enum.Enum) else value
 
 
@@ -211,14 +210,14 @@ def _kind_of(annotation: Any, default: Any) -> tuple[KeywordKind, tuple[str, ...
 
 
 def as_json(value: Any) -> str | None:
-    """The value in JSON; None if JSON cannot hold it, or only something else that equals it not."""
+    """The value in JSON; None if JSON cannot hold it, or it would be read back as something else."""
     try:
         text = json.dumps(value, allow_nan=False)
         back = json.loads(text)
     except (TypeError, ValueError, RecursionError):
         return None
     same = back == value or (isinstance(value, tuple) and back == list(value))
-    return text if same and len(text) <= LONGEST_TEXT else None
+    return text if same and len(text) <= MAX_TEXT_CHARACTERS else None
 
 
 def _in_words(value: Any) -> str:
@@ -233,14 +232,14 @@ def _short(text: str) -> str:
 
 
 def constructor_arguments(cls: type, given: Mapping[str, Any], stop: type) -> dict[str, Any]:
-    """What was given in JSON, as the class takes it: several robots as a tuple, members of an Enum.
+    """Arguments given in JSON, as the class takes them: several robots as a tuple, and members of an Enum.
 
     Args:
         stop: as in `describe_keywords`.
     """
     taken = dict(given)
     if isinstance(robots := taken.get("robot_uids"), list):
-        taken["robot_uids"] = tuple(robots)  # a list would be the name of one robot
+        taken["robot_uids"] = tuple(robots)  # ManiSkill would take a list for the name of one robot
     for name, parameter in parameters_of(cls, stop):
         kind = parameter.annotation
         if name in taken and isinstance(kind, type) and issubclass(kind, enum.Enum):
@@ -265,14 +264,14 @@ def shown(text: str) -> str:
 
 
 def read_value(keyword: Keyword, text: str) -> Any:
-    """The value that a person wrote for a keyword.
+    """Parse the text that a person wrote for a keyword.
 
     Raises:
-        ValueError: it is none of this kind; the message names the keyword and says what it takes.
+        ValueError: the text is no value of this kind; the message has the keyword and what it takes.
     """
     text = text.strip()
-    if len(text) > LONGEST_TEXT:
-        raise ValueError(f"{keyword.name} takes at most {LONGEST_TEXT} characters.")
+    if len(text) > MAX_TEXT_CHARACTERS:
+        raise ValueError(f"{keyword.name} takes at most {MAX_TEXT_CHARACTERS} characters.")
     if keyword.optional and text in ("", "null", "None"):
         return None
     if keyword.kind == "str":
@@ -294,14 +293,14 @@ _TAKES: dict[KeywordKind, str] = {
     "choice": "one of its choices",
     "json": 'a value in JSON, such as 0.5, [1, 2] or "text"',
 }
-LARGEST_INT = 2**63
+MAX_INT = 2**63
 
 
 def _fits(keyword: Keyword, value: Any) -> bool:
     if keyword.kind == "bool":
         return isinstance(value, bool)
     if keyword.kind == "int":
-        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < LARGEST_INT
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_INT
     if keyword.kind == "float":
         return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     if keyword.kind == "choice":

@@ -130,7 +130,7 @@ def draw_at(drawn: Any, pose: NDArray[np.float32]) -> None:
 parse_cameras: Callable[[Any], dict[str, Any]] = (
     getattr(camera_module, "parse_camera_configs", None) or camera_module.parse_sensor_configs  # pyright: ignore
 )
-"""What a camera hook returns as a dict: 3.0.1 has the first name, the nightly builds of 2026 the second."""
+"""Turns the return value of a camera hook into a dict. 3.0.1 has the first name, the nightly builds of 2026 the second."""
 
 
 _TARGETS_OF = "_workbench_targets_of"
@@ -138,11 +138,14 @@ _TARGETS_OF = "_workbench_targets_of"
 
 @cache
 def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
-    """Let ManiSkill's structs find their rows in a batched CPU system: `batched_system(scene)`, None for any other scene.
+    """Let ManiSkill's structs find their rows in a batched CPU system.
 
-    Structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``, on which bodies of a CPU system raise.
-    ManiSkill's builders make the structs, so the cached properties that ask are replaced, once a process; a stock scene gets
-    the original code. Safe to call again.
+    Structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``, which raise for a CPU system. ManiSkill's
+    builders make the structs, so the cached properties that ask are replaced, once per process; a stock scene gets the
+    original code. Safe to call again.
+
+    Args:
+        batched_system: returns the system of a batched scene, None for any other scene.
     """
     stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
     stock_set_ee_action = PDEEPosController.set_action
@@ -150,8 +153,8 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
 
     @wraps(stock_body_data)
     def link_data(self: Any) -> torch.Tensor:
-        # Only velocities are read this way (`Link.pose` reads the tensor itself), and a root's are fetched with
-        # every step: reading a root alone must not fetch all links.
+        # Only velocities are read this way (`Link.pose` reads the tensor itself). Velocities of roots are fetched with
+        # every step, so reading only a root must not fetch all links.
         system = batched_system(self.scene)
         if system is not None and not self.is_root.all():
             system.fetch_link_velocities()
@@ -165,7 +168,8 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
             _set_ee_action_of_each_env(self, action)
 
     def check_frame(stock: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Nightly builds refuse the frames that GPU simulation lacks by ``scene.gpu_sim_enabled``, 3.0.1 by the device."""
+        """Skip the check that refuses frames which GPU simulation lacks: nightly builds ask ``scene.gpu_sim_enabled`` for it,
+        3.0.1 the device."""
 
         @wraps(stock)
         def check(self: Any) -> None:
@@ -198,7 +202,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
                 each = [place(thing) for thing in getattr(self, things)]
                 if (
                     version != system.layout_version
-                ):  # a body that was not known made it lay out the scene again
+                ):  # an unknown body made the system lay out the scene again
                     each = [place(thing) for thing in getattr(self, things)]
                 found = system.layout_version, torch.tensor(each, device=self.device, dtype=dtype)
             self.__dict__[name] = found
@@ -246,7 +250,7 @@ def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
     goal = controller._target_pose = controller.compute_target_pose(before, action)
     solver, qpos = controller.kinematics, controller.articulation.get_qpos()
     solved = [solver.compute_ik(pose=goal[i : i + 1], q0=qpos[i : i + 1]) for i in range(len(qpos))]
-    # For a pose that cannot be reached the arm stays, as in stock.
+    # The arm stays if the pose cannot be reached, as in stock.
     target = torch.cat([start[i : i + 1] if row is None else row for i, row in enumerate(solved)])
     controller._target_qpos = target.to(start.dtype)
     if controller.config.interpolate:
@@ -284,14 +288,14 @@ def substeps_are_unwatched(env: Any, task: type) -> bool:
 
 @cache
 def install_base_env_hooks() -> None:
-    """Let ``BaseEnv``'s own constructor and ``_setup_scene`` ask an env of the batched CPU simulation, once a process.
+    """Let ``BaseEnv``'s constructor and ``_setup_scene`` ask an env of the batched CPU simulation, once per process.
 
-    Not by overriding them in a subclass: a task's own ones call these, and would be left out or given arguments that they do
-    not take.
+    Overriding them in a subclass does not work: a task's own versions call these, and would be skipped or get arguments
+    that they do not take.
     """
     stock_init, stock_setup = BaseEnv.__init__, BaseEnv._setup_scene
 
-    # Named as the stock one: by this name of a frame an error is not put to a call of super().__init__().
+    # Named like the stock one: the name of this frame keeps an error from being attributed to a call of super().__init__().
     @wraps(stock_init)
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
         defaults, fixed = self.__dict__.pop(_BASE_ARGUMENTS, ({}, {}))
@@ -307,22 +311,22 @@ def install_base_env_hooks() -> None:
 
 
 _BASE_ARGUMENTS = "_workbench_base_arguments"
-_TECHNICAL = ("num_envs", "render_backend", "reward_mode")
-"""Arguments that the workbench gives on its own."""
+_WORKBENCH_ARGUMENTS = ("num_envs", "render_backend", "reward_mode")
+"""Arguments that the workbench adds itself."""
 
 
 @contextmanager
 def base_arguments(env: Any, task: type, kwargs: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Within this ``BaseEnv``'s constructor takes the CPU as its simulation, whatever the task's constructor hands on.
+    """Context in which ``BaseEnv``'s constructor simulates on the CPU, whatever the task's constructor passes on.
 
-    Yields the arguments for the task's constructor: those of `kwargs` but for what the workbench gave and it does not take.
+    Yields the arguments for the task's constructor: `kwargs` without the workbench's own arguments that it does not take.
     """
     taken = inspect.signature(task.__init__).parameters
     any_name = any(each.kind is each.VAR_KEYWORD for each in taken.values())
     left = (
         {}
         if any_name
-        else {name: kwargs[name] for name in _TECHNICAL if name in kwargs.keys() - taken.keys()}
+        else {name: kwargs[name] for name in _WORKBENCH_ARGUMENTS if name in kwargs.keys() - taken.keys()}
     )
     defaults = {name: value for name, value in left.items() if name != "render_backend"}
     fixed = {"sim_backend": "physx_cpu", **{k: v for k, v in left.items() if k == "render_backend"}}
@@ -339,7 +343,7 @@ def clears_scene(caller: FrameType) -> bool:
 
 
 def hook_of_base_env(env: Any, caller: FrameType) -> str:
-    """The outermost method of ``BaseEnv`` but ``close`` that is under way for `env`; empty if none is."""
+    """The outermost method of ``BaseEnv`` other than ``close`` that is running for `env`; empty if none is."""
     found, frame = "", caller
     while frame is not None:
         code = frame.f_code
@@ -351,10 +355,10 @@ def hook_of_base_env(env: Any, caller: FrameType) -> str:
 
 
 def allowed_on_the_cpu(caller: FrameType, laid_out: bool) -> bool:
-    """Whether to answer ManiSkill's question for an initialised GPU simulation by no.
+    """Whether ManiSkill is to see a GPU simulation that is not initialised yet.
 
-    ``before_gpu_init`` refuses setters by it, which a stock CPU env has at any time; meshes of articulations need link poses,
-    which are there at any time.
+    ``before_gpu_init`` refuses setters after initialisation, but a stock CPU env allows them at any time. Meshes of
+    articulations need link poses, which exist at any time.
     """
     if caller.f_code in _NEED_LINK_POSES:
         return False
@@ -371,8 +375,8 @@ _NEED_LINK_POSES = {
 def asks_for_a_gpu(caller: FrameType) -> bool:
     """Whether the caller of ``env.gpu_sim_enabled`` asks for a GPU, not for the code path to take.
 
-    Only ``CPUGymWrapper`` does: it refuses GPU simulation, and works on a batched CPU env of one. All other callers
-    decide by the answer whether to apply and fetch.
+    Only ``CPUGymWrapper`` does: it refuses GPU simulation, but works on a batched CPU env of one. All other callers use
+    the answer to decide whether to apply and fetch.
     """
     return caller.f_code is CPUGymWrapper.__init__.__code__
 
@@ -399,10 +403,10 @@ def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> Non
 
 @contextmanager
 def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
-    """Within this ``_episode_rng``, from which the robot's first joints are drawn, is the generator of that env.
+    """Context in which ``_episode_rng``, from which the robot's initial joints are drawn, is the generator of env `index`.
 
-    In ManiSkill it is always env 0's: a partial reset of env 3 would draw from env 0's generator, ignoring its own seed. Also
-    stops ``enhanced_determinism`` from drawing new seeds, as it does in a reset without a seed.
+    In ManiSkill it is always env 0's: a partial reset of env 3 would draw from env 0's generator and ignore the seed of env
+    3. Also stops ``enhanced_determinism`` from drawing new seeds, as it does in a reset without a seed.
     """
     env._episode_rng = env._batched_episode_rng[index]
     draws_seeds, env._enhanced_determinism = env._enhanced_determinism, False
@@ -421,7 +425,7 @@ def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: Any) -> None:
 
 
 def set_reset_mask(env: BaseEnv, env_idx: list[int]) -> None:
-    """Set ``scene._reset_mask``, the envs that ManiSkill's setters write; all of them between resets."""
+    """Set ``scene._reset_mask``, the envs that ManiSkill's setters write; between resets it holds all envs."""
     mask = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     mask[env_idx] = True
     env.scene._reset_mask = mask
@@ -446,8 +450,8 @@ def open_env(env: Any) -> BaseEnv:
     """The env under its wrappers: ``base_env`` of ManiSkillVectorEnv, ``unwrapped`` of all others.
 
     Raises:
-        TypeError: it is no ManiSkill env.
-        RuntimeError: it was closed.
+        TypeError: `env` is not a ManiSkill env.
+        RuntimeError: the env was closed.
     """
     env = getattr(getattr(env, "base_env", env), "unwrapped", env)
     if not isinstance(env, BaseEnv):
@@ -475,7 +479,7 @@ def fetch(env: BaseEnv) -> None:
 
 
 def episode_generators(env: BaseEnv) -> dict[str, list[np.random.RandomState]]:
-    """Each env's numpy generators: of its episodes, and of its episode seeds."""
+    """Each env's numpy generators: one for its episodes, one for its episode seeds."""
     return {"episode": env._batched_episode_rng.rngs, "main": env._batched_main_rng.rngs}
 
 
@@ -483,7 +487,7 @@ def episode_generators(env: BaseEnv) -> dict[str, list[np.random.RandomState]]:
 
 
 def objects_of(struct: Any) -> list[Any]:
-    """The SAPIEN objects behind an Actor, Link or Articulation: ``_objs``, one an env that has it.
+    """The SAPIEN objects behind an Actor, Link or Articulation: ``_objs``, one for each env that has it.
 
     An Actor's are entities, a Link's are link components, an Articulation's are physx articulations.
     """
@@ -498,28 +502,28 @@ def envs_of(struct: Any) -> NDArray[np.int64]:
 def data_rows_of(struct: Any) -> torch.Tensor:
     """The row of each of `objects_of` in ``px.cuda_rigid_body_data``: ``_body_data_index``.
 
-    Only where ``scene.gpu_sim_enabled``, for what is not static, and after ``gpu_init``.
+    Exists only where ``scene.gpu_sim_enabled``, after ``gpu_init``, and not for static bodies.
     """
     return struct._body_data_index
 
 
 def agents(env: Any) -> list[Any]:
-    """One for each robot of ``env.agent``; none without a robot."""
+    """The agent of each robot in ``env.agent``; empty without a robot."""
     agent = env.agent
     return agent.agents if isinstance(agent, MultiAgent) else [] if agent is None else [agent]
 
 
 def tool_of(agent: Any) -> Link | None:
-    """The link of a robot's tool centre point, ``tcp``; None if its class has none, or one that is no link."""
+    """The link of a robot's tool centre point, ``tcp``; None if its class has none, or it is not a link."""
     try:
         tool = getattr(agent, "tcp", None)
-    except Exception:  # a property of the author's, which nothing of ManiSkill's reads
+    except Exception:  # a property of the author's, which ManiSkill itself never reads
         return None
     return tool if isinstance(tool, Link) else None
 
 
 def data_rows_of_articulation(articulation: Any) -> torch.Tensor:
-    """Its row of each env in the joint tensors, such as ``px.cuda_articulation_qpos``: ``_data_index``."""
+    """The articulation's row for each env in the joint tensors, such as ``px.cuda_articulation_qpos``: ``_data_index``."""
     return articulation._data_index
 
 
@@ -529,7 +533,7 @@ def joints_of(struct: Any) -> int:
 
 
 def named_to_hide(env: Any) -> list[Any]:
-    """``_hidden_objects``; none if `why_not` of `HIDDEN`."""
+    """``_hidden_objects``; empty if the installed ManiSkill lacks a name of `HIDDEN`."""
     return [] if why_not(HIDDEN) else env._hidden_objects
 
 
@@ -598,7 +602,7 @@ _note_camera: Callable[[Any, FrameType], None] | None = None
 
 @contextmanager
 def noting_cameras(note: Callable[[Any, FrameType], None]) -> Iterator[None]:
-    """Within this, call `note` with each new ``CameraConfig`` and the frame that makes it."""
+    """Context in which `note` is called with each new ``CameraConfig`` and the frame that makes it."""
     global _note_camera
     mark_camera_configs()
     before, _note_camera = _note_camera, note
@@ -620,7 +624,7 @@ def camera_configs(env: Any) -> dict[CameraKey, Any]:
 
 
 def sensor_configs_of_hooks(env: Any) -> tuple[list[Any], list[Any]]:
-    """Configs that the task's and the robot's sensor hooks return now, also those that one of the same name replaces."""
+    """Configs that the task's and the robot's sensor hooks return now, including those that a namesake replaces."""
     of_robot = [] if env.agent is None else env.agent._sensor_configs
     return _listed(env._default_sensor_configs), _listed(of_robot)
 
@@ -639,7 +643,7 @@ def mark_camera_configs() -> None:
         return
     stock_look_at = sapien_utils.look_at
     looked: deque[tuple[Pose, Any]] = deque(maxlen=64)
-    """The last poses of ``look_at`` with their targets; tensors are read only when a camera is made, since a GPU waits."""
+    """The last poses of ``look_at`` with their targets; tensors are read only when a camera is made, since a read waits for the GPU."""
 
     @wraps(stock)
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
@@ -675,7 +679,7 @@ def camera_site(config: Any) -> CallSite | None:
 
 
 def camera_target(config: Any) -> Any:
-    """The target of the ``look_at`` that made the config's pose; None if none did."""
+    """The target of the ``look_at`` that made the config's pose; None without ``look_at``."""
     return getattr(config, "_workbench_target", None)
 
 
@@ -690,7 +694,7 @@ def set_up_camera(env: Any, key: CameraKey, camera: Any, config: Any, components
     inner: RenderCamera = camera.camera
     if inner._render_cameras is not components:
         inner._render_cameras = components
-        # Made again, by name, when the scene is next drawn for all envs.
+        # The scene makes the group again when it is next drawn for all envs.
         inner.camera_group = None  # type: ignore[assignment]
         env.scene.camera_groups.pop(name, None)
     inner._cached_model_matrix = None  # type: ignore[assignment]

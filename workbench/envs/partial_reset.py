@@ -20,11 +20,11 @@ from workbench.envs.maniskill_private import agents, drawing_from, set_episode_s
 
 
 class KeptControllers:
-    """What the active controllers remember of some envs: start, target and all else with a row an env.
+    """Copy of the active controllers' state for some envs: start, target and everything else with a row per env.
 
     ManiSkill 3.0.1 resets the controllers of every env in a partial reset: it sets the reset mask back to all ones before
     ``controller.reset()``, which reads that mask. A controller with ``use_target`` then takes the present joints as its
-    target in envs that are not reset. So their values are kept and put back before the first observation.
+    target in envs that are not reset. So these values are kept and put back before the first observation.
     """
 
     def __init__(self, env: Any, kept_envs: list[int]) -> None:
@@ -52,11 +52,11 @@ def active_controllers(env: Any) -> list[BaseController]:
 
 
 TARGET_FLAGS = ("sets_target_qpos", "sets_target_qvel")
-"""What ManiSkill asks a controller in each step, on the GPU alone: which drive targets it sets."""
+"""Attributes that ManiSkill reads from a controller in each step, on the GPU only: which drive targets it sets."""
 
 
 def without_target_flags(env: Any) -> list[BaseController]:
-    """The controllers of robots that do not say what `TARGET_FLAGS` asks, as ``BaseController`` does not."""
+    """The robots' controllers that lack an attribute of `TARGET_FLAGS`, as ``BaseController`` does."""
     controllers = [agent.controller for agent in agents(env)]
     return [one for one in controllers if not all(hasattr(one, flag) for flag in TARGET_FLAGS)]
 
@@ -89,7 +89,7 @@ def in_ascending_order(
     ascending order both mean the same.
 
     Args:
-        seeds: what ``reset`` is given.
+        seeds: the ``seed`` argument of ``reset``.
 
     Returns:
         The options, and the seeds if there is one for each env of a partial reset.
@@ -146,7 +146,7 @@ def note_what_was_reset(env: Any, untouched: list[int]) -> Iterator[None]:
     try:
         yield
     except CoreRefusal:
-        raise  # its text says what it is about
+        raise  # its message needs no note
     except Exception as error:
         error.add_note(ErrorNote(f"Envs {chosen} of {env.num_envs} were being reset."))
         for path in (path for path, envs in rows.changed_envs().items() if not envs):

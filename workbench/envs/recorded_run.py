@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from workbench.envs.keywords import control_mode_of
 
 if TYPE_CHECKING:
-    from mani_skill.envs.sapien_env import BaseEnv  # the server reads what is below, and loads no torch
+    from mani_skill.envs.sapien_env import BaseEnv  # the server imports this module and must not load torch
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class RecordedRun:
     seed: int
     """Episode seed; negative if unknown."""
     reset_options: dict[str, Any]
-    """``options`` of the reset that began it."""
+    """``options`` of the reset that began the episode."""
     action: NDArray[np.float32]
     """(T, A)"""
     env_states: dict[str, NDArray]
@@ -69,8 +69,8 @@ def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray
     lacks = ~np.isfinite(a).all(-1), ~np.isfinite(b).all(-1)
     with np.errstate(invalid="ignore"):
         metres = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
-        # From the chord between the quaternions: the arc cosine of their product cannot distinguish angles below 3e-4 from
-        # none in single precision. q and -q are the same rotation.
+        # From the chord between the quaternions: in single precision, the arc cosine of their product cannot tell angles
+        # below 3e-4 from zero. q and -q are the same rotation.
         p, q = a[..., 3:], b[..., 3:]
         chord = np.minimum(np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1))
         radians = 4 * np.arcsin(np.clip(chord / 2, 0, 1))
@@ -87,7 +87,7 @@ STATE, OBS = "state/", "obs/"
 
 
 def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
-    """One env's states, without those of what it lacks (NaN in the columns)."""
+    """One env's states, without bodies that it lacks (NaN in the columns)."""
     rows = {name[len(STATE) :]: column[env] for name, column in columns.items() if name.startswith(STATE)}
     return {name: row for name, row in rows.items() if not np.isnan(row).all()}
 
@@ -95,20 +95,20 @@ def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
 # --- keywords of ``gym.make`` that make an env again ------------------------------------------------
 
 
-HOW_IT_IS_RUN = frozenset({"num_envs", "sim_backend", "render_backend", "render_device", "render_mode"})
+RUN_KEYWORDS = frozenset({"num_envs", "sim_backend", "render_backend", "render_device", "render_mode"})
 """Keywords that change how an env is run, not what it is."""
 
 
 def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
     """Keywords of ``gym.make`` that make `env` again: those `given` and the modes it took, as far as JSON holds them.
 
-    ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. The replay chooses `HOW_IT_IS_RUN`.
+    ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. The replay chooses `RUN_KEYWORDS`.
     """
     modes: dict[str, Any] = {"obs_mode": env.obs_mode, "reward_mode": env.reward_mode}
     if (mode := control_mode_of(env)) is not None:
         modes["control_mode"] = mode
     every = {**given, **modes}
-    return {name: every[name] for name in every if name not in HOW_IT_IS_RUN and _is_json(every[name])}
+    return {name: every[name] for name in every if name not in RUN_KEYWORDS and _is_json(every[name])}
 
 
 def _is_json(value: Any) -> bool:

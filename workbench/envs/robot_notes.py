@@ -1,4 +1,4 @@
-"""Notes to errors of loading a robot: its file, the line and link there, and the line of its class that names them."""
+"""Adds notes to robot-loading errors: the robot's file, the line and link in it, and the line of the class that names it."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _FILE_ARGUMENTS = ("urdf_file", "mjcf_file", "asset_path")
 """Names of the robot's file in the loaders and in ``BaseAgent._load_articulation``."""
 _ELEMENTS = ("origin_node", "node", "geom", "mesh", "texture", "material", "body")
 """Names of an element of the file in the functions that read one."""
-_OF_A_LOOP = ("mimic", "joint", "x", "link")
-"""Names that may be of an earlier turn where a function called others."""
+_LOOP_NAMES = ("mimic", "joint", "x", "link")
+"""Names of loop variables, which are read only in the innermost frame: further out, they may be stale."""
 
 
 @contextmanager
 def note_robot_errors() -> Iterator[None]:
-    """Within this, an exception of a robot's loader or controller gets a note with the place."""
+    """Context in which an exception of a robot's loader or controller gets a note with the place at fault."""
     try:
         yield
     except CoreRefusal:
@@ -64,7 +64,7 @@ def _note(error: BaseException) -> ErrorNote | None:
     frames = [frame for frame, _ in walk_tb(error.__traceback__)][::-1]
     robot = next((agent for frame in frames if (agent := _self(frame, BaseAgent)) is not None), None)
     if isinstance(robot, MultiAgent) and not robot.agents:
-        # ManiSkill's own error is an index of its list of robots.
+        # ManiSkill's own error is an IndexError of its empty list of robots.
         return ErrorNote(
             'The task names no robot: give `robot_uids` a default in its __init__, such as "panda".'
         )
@@ -111,21 +111,22 @@ class _Part:
 
     tag: str
     name: str
-    """Its own, or that of one around it; empty if none has one."""
+    """The element's own name, or that of an element around it; empty if none has a name."""
     line: int | None = None
     attributes: Mapping[str, str] | None = None
-    """All of its own, where the line is not known."""
+    """All attributes of the element, where the line is not known."""
 
 
 def _part_at_fault(frames: list[FrameType]) -> _Part | None:
-    """
+    """The element that a loader was reading when it failed.
+
     Args:
-        frames: of the loaders, innermost first.
+        frames: frames of the loaders, innermost first.
     """
     found: _Part | None = None
     for frame in frames:
         values = frame.f_locals
-        names = (*_ELEMENTS, *_OF_A_LOOP) if frame is frames[0] else _ELEMENTS
+        names = (*_ELEMENTS, *_LOOP_NAMES) if frame is frames[0] else _ELEMENTS
         if frame.f_code.co_name == "_build_link":
             names = (*names, "link")
         parts = [_part_of(values[name]) for name in names if values.get(name) is not None]
@@ -133,7 +134,7 @@ def _part_at_fault(frames: list[FrameType]) -> _Part | None:
         if hasattr(builder, "joint_record"):
             parts.append(_Part("link", str(getattr(builder, "name", ""))))
         for part in filter(None, parts):
-            # An element of MJCF need not have a name: that of the body around it is in a frame further out.
+            # An MJCF element may lack a name: use that of the body around it, which is in a frame further out.
             found = part if found is None else replace(found, name=part.name)
             if found.name:
                 return found
@@ -147,7 +148,7 @@ def _part_of(value: Any) -> _Part | None:
             return None
         around = (
             value.iterancestors() if hasattr(value, "iterancestors") else ()
-        )  # lxml's know more than Python's own
+        )  # lxml's elements know their parents, Python's own do not
         named = next((one for one in (value, *around) if one.get("name")), value)
         line = getattr(value, "sourceline", None)
         return _Part(named.tag, named.get("name") or "", line, None if line else dict(value.attrib))
@@ -181,7 +182,7 @@ def _line_of(error: BaseException, part: _Part | None, path: Path) -> int | None
         parser.Parse(path.read_bytes(), True)
     except (OSError, ExpatError):
         return None
-    # Of two with one name the last is the one too many.
+    # If two elements have the same name, the last is the duplicate.
     return lines[-1] if lines else None
 
 
@@ -222,14 +223,14 @@ def _gives(node: ast.AST, name: str) -> bool:
 
 
 def _find_line(cls: type, fits: Callable[[ast.AST], bool]) -> Place | None:
-    """The first fitting node in the text of a class or of one that it inherits."""
+    """The first fitting node in the source of a class or of its base classes."""
     for owner in cls.__mro__:
         if owner is BaseAgent or not issubclass(owner, BaseAgent):
             continue
         try:
             file, (lines, first) = inspect.getfile(owner), inspect.getsourcelines(owner)
             tree = parse_python(textwrap.dedent("".join(lines)))
-        except (OSError, TypeError, SyntaxError):  # made without a text
+        except (OSError, TypeError, SyntaxError):  # made without source
             continue
         found = [node for node in ast.walk(tree) if fits(node)]
         if found:

@@ -28,7 +28,7 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
     """The columns of the present moment, (N, ...) each; copies. About 0.1 ms for 16 PickCube envs.
 
     ``state/actors/cube`` (N, 13) and ``state/articulations/panda`` (N, 13 + 2 * joints) as ``get_state_dict`` lays them
-    out, ``obs/agent/qpos`` (N, ...) by the task's names. Other than in ManiSkill: what an env lacks is NaN (ManiSkill's
+    out, ``obs/agent/qpos`` (N, ...) by the task's names. Unlike in ManiSkill, what an env lacks is NaN (ManiSkill's
     tensor has fewer rows, and ``RecordEpisode`` records no state); a flattened observation is split by its names, or is
     one column ``obs/`` where they are not known; pictures are left out, since a recording has its own.
 
@@ -106,7 +106,7 @@ def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
 def _fetched(values: Mapping[str, Any], count: int, device: torch.device) -> dict[str, NDArray]:
     """Values on the host, in one copy per dtype: on a GPU each single fetch waits for the device."""
     if device.type == "cpu":
-        # Arrays are copies already.
+        # On the CPU these are arrays, and copies already.
         return {
             name: value if isinstance(value, np.ndarray) else to_numpy(value)
             for name, value in values.items()
@@ -174,7 +174,7 @@ def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], s
     for name, value in flat_entries(obs):
         if isinstance(value, torch.Tensor) and value.nelement():
             parts.append((name, tuple(value.shape[1:]) or (1,), _dtype(value)))
-    # A task may flatten in its own way: wrong names would be worse than none.
+    # A task may flatten in its own way; wrong names would be worse than none.
     return parts if sum(int(np.prod(shape, dtype=int)) for _, shape, _ in parts) == width else None
 
 

@@ -24,12 +24,12 @@ class OtherEntry:
     """False if `texts` is shortened."""
 
     def of_env(self, env: int) -> OtherEntry:
-        """The part of one env; all of it if it is not per env."""
+        """The part of one env; the whole entry if it is not per env."""
         return replace(self, texts=(self.texts[env],)) if self.per_env else self
 
     @property
     def nbytes(self) -> int:
-        """Roughly what it takes in memory."""
+        """Approximate memory in bytes."""
         return 200 + sum(map(len, self.texts)) + (0 if self.numbers is None else self.numbers.nbytes)
 
 
@@ -52,7 +52,7 @@ class StepResult:
     action: NDArray[np.float32] | None = None
     """(N, A) that led here; None right after a reset."""
     sound_obs: NDArray[np.bool_] | None = None
-    """(N,) whether the env's observation is finite, pictures left out; None if unknown."""
+    """(N,) whether the env's observation, without pictures, is finite; None if unknown."""
     qpos: NDArray[np.float32] | None = None
     """(N, J) positions of the joints of `envs.scene.scene_index.joint_names`, in rad or m; None if there are none."""
     others: dict[str, OtherEntry] = field(default_factory=dict)
@@ -60,7 +60,7 @@ class StepResult:
 
     @property
     def nbytes(self) -> int:
-        """Roughly what it takes in memory."""
+        """Approximate memory in bytes."""
         return sum(map(_nbytes, vars(self).values()))
 
 

@@ -41,9 +41,9 @@ _REWARD_HOOK = {
 
 
 class StrictMixin:
-    """Checks of the rules for a batched task class, as the first of its bases.
+    """Mixin that checks the rules of GPU simulation; the first base of a batched task class.
 
-    The batched CPU core does what a stock CPU env does. Where a GPU does otherwise is reported at the author's line:
+    The batched CPU core does what a stock CPU env does. Where a GPU behaves differently is reported at the author's line:
 
     * state set and not applied, applied or read without a fetch after a step, links read before their articulation's new
       qpos reached them (`strict_system`);
@@ -53,8 +53,8 @@ class StrictMixin:
       and `kept_rows`);
     * returns of ``evaluate``, the reward and the observation hooks without a row for each env (`evaluate_entries`).
 
-    Values are compared, so only what goes wrong is reported; ``tests/envs/test_strict.py`` lists the ManiSkill tasks that
-    break a rule.
+    Values are compared, so only actual differences are reported; ``tests/envs/test_strict.py`` lists the ManiSkill tasks
+    that break a rule.
     """
 
     num_envs: int
@@ -69,7 +69,7 @@ class StrictMixin:
 
     @cached_property
     def broken_rules(self) -> BrokenRules:
-        """Breaches so far; belongs to the env, and outlives its scene and class."""
+        """Breaches so far. The object belongs to the env, and outlives its scene and class."""
         return BrokenRules(degrees_of(self._rule_choice), self._on_finding)
 
     def _make_scene(self) -> None:
@@ -187,13 +187,13 @@ class StrictMixin:
         finally:
             self._wrong_obs = None
         if self._watch.whole and not self._watch.looks:
-            # `evaluate` may store values of all envs, which is not the reset's fault: compare from here.
+            # `evaluate` may store values of all envs, which is not the reset's fault: compare only what happens from here on.
             self._watch.go_on(self)  # type: ignore[arg-type]
         return obs
 
     @contextmanager
     def _noting_rows(self, info: Any, obs: Any = None) -> Iterator[None]:
-        """Note what has no row for each env in what ``evaluate`` and ``_get_obs_extra`` returned to a hook that fails with it."""
+        """Add notes to the error of a hook: entries of ``evaluate`` and ``_get_obs_extra`` that have no row for each env."""
         try:
             yield
         except CoreRefusal:

@@ -52,7 +52,7 @@ class EnvOptions:
     pictures: PictureDegree = "exact"
     """Degree of the pictures that the env itself draws: observations and ``render``."""
     rules: Degree | None = None
-    """The degree of all rules of GPU simulation (on the CPU); None for each rule's own, see `rules`."""
+    """The degree of all rules of GPU simulation (on the CPU); None for each rule's own, see `gpu_rules`."""
     on_finding: Callable[[Finding], None] = warn_of
     """Called once for each place where a rule that does not stop the task is broken."""
     kwargs: Mapping[str, Any] = field(default_factory=dict)
@@ -76,11 +76,11 @@ class EnvOptions:
 def given_arguments(
     task: type[BaseEnv], env_kwargs: Mapping[str, Any], default_kwargs: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The keyword arguments that the task class is made with, apart from those of `EnvOptions`.
+    """The keyword arguments with which the task class is made, without those of `EnvOptions`.
 
     Args:
-        env_kwargs: as a person gave them, in JSON.
-        default_kwargs: those that it was registered with, for which a person's stand in.
+        env_kwargs: the user's arguments, in JSON.
+        default_kwargs: the arguments of the registration, which the user's replace.
     """
     return {**default_kwargs, **constructor_arguments(task, env_kwargs, BaseEnv)}
 
@@ -92,11 +92,11 @@ def make_env(
     asset_ids: Sequence[str] = (),
     default_kwargs: Mapping[str, Any] | None = None,
 ) -> BaseEnv:
-    """The task class with N envs, unwrapped, with the best reward mode that it implements.
+    """Make the task class with N envs, unwrapped, with the best reward mode that it implements.
 
     Raises:
-        MissingAssets: the task or its robot needs a download; names it and the command.
-        BackendUnavailable: ``backend="gpu"`` on a machine that cannot, or a ManiSkill that lacks names which are needed.
+        MissingAssets: the task or its robot needs a download; the message has its name and the command.
+        BackendUnavailable: this machine cannot simulate on a GPU, or the installed ManiSkill lacks private names.
         WrongOption: a keyword argument of `options` does not exist, or has an unknown value.
         Exception: raised by the author's class while it builds.
     """
@@ -111,7 +111,7 @@ def build_env(
     asset_ids: Sequence[str] = (),
     default_kwargs: Mapping[str, Any] | None = None,
 ) -> BaseEnv:
-    """The task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` would give it; raises as `make_env`.
+    """Make the task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` does; raises like `make_env`.
 
     The class decides what the keyword arguments do not: the reward mode is then the first of
     ``SUPPORTED_REWARD_MODES``, implemented or not.
@@ -145,7 +145,7 @@ def build_env(
 
 _NO_FAST_PICTURES = (
     "Fast pictures are for envs that are simulated on the CPU: a GPU draws exact ones as fast. Leave pictures out with "
-    "GPU simulation, or take the backend cpu."
+    "GPU simulation, or use the backend cpu."
 )
 
 
@@ -210,10 +210,10 @@ class TaskEnv:
     ) -> StepResult:
         """Start new episodes in all envs, or in those of `env_idx`.
 
-        All at once is ManiSkill's own ``reset(seed=[...])``. For a subset ManiSkill seeds torch with the seed of env 0, so
-        a seed given for env 3 means nothing. Here a partial reset draws from the seed of the lowest env:
-        ``reset(seed=7, env_idx=[3])`` starts the episode of a single stock env's ``reset(seed=7)``. The order in which envs
-        and their seeds are named makes no difference.
+        A reset of all envs is ManiSkill's own ``reset(seed=[...])``. For a subset ManiSkill seeds torch with the seed of env
+        0, so a seed given for env 3 has no effect. Here a partial reset draws from the seed of the lowest env:
+        ``reset(seed=7, env_idx=[3])`` starts the episode of a single stock env's ``reset(seed=7)``. The order of envs and
+        their seeds makes no difference.
 
         Args:
             seed: one seed (the i-th env that is reset gets ``seed + i``), or one for each env that is reset; None
@@ -244,7 +244,7 @@ class TaskEnv:
     def step(self, action: NDArray[np.float32] | None) -> StepResult:
         """One control step of all envs with a flat action (N, A), or None to leave the targets alone.
 
-        A task without a controller gets none.
+        A task without a controller gets no action.
         """
         action = action if self.parts else None
         env_action = None if action is None else actions.to_env_action(self.env, self.parts, action)
@@ -315,7 +315,7 @@ class TaskEnv:
         truncated: Any = None,
         look: bool = True,
     ) -> StepResult:
-        """The result of a step or (without an action) a reset, also of one made on `env` itself.
+        """The result of a step or (without an action) of a reset, even one that was made on `env` directly.
 
         Args:
             terminated, truncated: None to take them from `info` and the time limit.
@@ -353,10 +353,10 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
 
 
 def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
-    """`StepResult.sound_obs`; a value that is no batch of floats counts as finite."""
+    """`StepResult.sound_obs`; a value that is not a batch of floats counts as finite."""
     sound = np.ones(num_envs, bool)
     for name, value in flat_entries(obs):
-        # Pictures are large, and the simulator's own.
+        # Skip pictures: they are large, and the simulator's own.
         if name.startswith("sensor_data/") or not isinstance(value, torch.Tensor):
             continue
         if value.is_floating_point() and value.ndim and len(value) == num_envs:

@@ -1,4 +1,4 @@
-"""Finds the keyword argument of a task that ManiSkill refused, as one of ``--env``: a name that is none, or an unknown value."""
+"""Finds the keyword argument (``--env``) that ManiSkill refused: one with an unknown name or an unknown value."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _OBS_PARTS = (
     *("state", "state_dict", "none", "sensor_data", "pointcloud"),
     *("rgb", "depth", "segmentation", "position", "normal", "albedo"),
 )
-_CORE = f"{Path(__file__).parent}{os.sep}"
+_CORE_FOLDER = f"{Path(__file__).parent}{os.sep}"
 """The folder of the core, which wraps constructors."""
-_MOST_NAMES = 12
-"""Most names that a message lists where none is similar."""
+_MAX_NAMES = 12
+"""Maximum names that a message lists where none is similar."""
 
 
 class WrongOption(CoreRefusal, ValueError):
@@ -37,11 +37,11 @@ class WrongOption(CoreRefusal, ValueError):
 
 
 def wrong_option(task: type[BaseEnv], given: Mapping[str, Any], error: BaseException) -> WrongOption | None:
-    """The argument among `given` which does not exist or has an unknown value; None if `error` is not ManiSkill's own, or
+    """The argument in `given` that does not exist or has an unknown value; None if `error` is not ManiSkill's own, or
     each argument is known.
 
     Args:
-        given: beside what the task is registered with.
+        given: the user's arguments, without those of the registration.
     """
     first = [*chain_of(error)][-1]
     frames = [frame for frame, _ in walk_tb(first.__traceback__)]
@@ -49,7 +49,7 @@ def wrong_option(task: type[BaseEnv], given: Mapping[str, Any], error: BaseExcep
         return None
     raised_in = frames[-1].f_code
     if isinstance(first, TypeError) and (
-        raised_in.co_name == "__init__" or raised_in.co_filename.startswith(_CORE)
+        raised_in.co_name == "__init__" or raised_in.co_filename.startswith(_CORE_FOLDER)
     ):
         # An unknown name fails in the frame of the call.
         known, popped = {name for name, _ in parameters_of(task, object)}, _taken_by_name(task)
@@ -58,19 +58,19 @@ def wrong_option(task: type[BaseEnv], given: Mapping[str, Any], error: BaseExcep
                 return WrongOption(
                     f"{task.__name__} takes no keyword argument {name!r}.{_instead(name, known)}"
                 )
-    if not is_installed(raised_in.co_filename):  # a task may take values of its own: its error is another
+    if not is_installed(raised_in.co_filename):  # the task's own error about a value of its own
         return None
     cameras = _local(first, update_camera_configs_from_dict, "camera_configs")
     agent = _local(first, BaseAgent.set_control_mode, "self")
     modes = agent.supported_control_modes if agent is not None else ()
     for name, value in given.items():
-        for said, wrong, names in _unknown(task, name, value, cameras, modes):
-            return WrongOption(f"{said}.{_instead(wrong, names)}")
+        for problem, wrong, names in _unknown(task, name, value, cameras, modes):
+            return WrongOption(f"{problem}.{_instead(wrong, names)}")
     return None
 
 
 def _taken_by_name(task: type[BaseEnv]) -> set[str]:
-    """Texts in constructors: ``kwargs.pop("size")`` takes a keyword too."""
+    """Strings in the constructors, since ``kwargs.pop("size")`` takes a keyword too."""
     codes = [getattr(vars(owner).get("__init__"), "__code__", None) for owner in task.__mro__]
     return {text for code in codes if code is not None for text in code.co_consts if isinstance(text, str)}
 
@@ -82,7 +82,7 @@ def _unknown(
     cameras: Collection[str] | None,
     control_modes: Collection[str],
 ) -> Iterator[tuple[str, str, Collection[str]]]:
-    """What is wrong, the unknown name or value, and the known ones."""
+    """For each problem: its text, the unknown name or value, and the known ones."""
     if name in _CAMERAS and isinstance(value, Mapping):
         yield from _unknown_of_cameras(name, value, cameras)
     elif name == "sim_config" and isinstance(value, Mapping):
@@ -125,7 +125,7 @@ def _unknown_of_cameras(
 def _unknown_fields(
     path: str, value: Mapping[str, Any], cls: type
 ) -> Iterator[tuple[str, str, Collection[str]]]:
-    """The keys of nested dicts that the dataclass has not."""
+    """The keys of nested dicts that the dataclass does not have."""
     fields = {field.name: field for field in dataclasses.fields(cls)}
     for key, inner in value.items():
         if key not in fields:
@@ -146,7 +146,7 @@ def _instead(wrong: str, names: Collection[str]) -> str:
     near = difflib.get_close_matches(wrong, names, n=3, cutoff=0.6)
     if near:
         return f" Did you mean {' or '.join(near)}?"
-    return f" There is {', '.join(sorted(names)[:_MOST_NAMES])}{', ...' if len(names) > _MOST_NAMES else ''}."
+    return f" There are: {', '.join(sorted(names)[:_MAX_NAMES])}{', ...' if len(names) > _MAX_NAMES else ''}."
 
 
 def _local(error: BaseException, function: Any, name: str) -> Any:

@@ -35,7 +35,7 @@ from workbench.episodes.episode import (
 )
 from workbench.episodes.row import clean_note, clean_tags
 from workbench.machine.files import (
-    MOST_SOURCE_BYTES,
+    MAX_SOURCE_BYTES,
     FileTooLarge,
     NotARegularFile,
     open_regular_file,
@@ -405,7 +405,7 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
         for begin in range(len(parts)):
             candidate = place.joinpath(*parts[begin:])
             try:
-                if task.encode(errors="surrogatepass") in read_regular_file(candidate, MOST_SOURCE_BYTES):
+                if task.encode(errors="surrogatepass") in read_regular_file(candidate, MAX_SOURCE_BYTES):
                     return os.fspath(candidate.resolve())
             except (OSError, ValueError):  # a null byte
                 continue

@@ -13,7 +13,7 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from workbench.envs.recorded_run import HOW_IT_IS_RUN, RecordedRun
+from workbench.envs.recorded_run import RUN_KEYWORDS, RecordedRun
 from workbench.episodes.episode import Episode, EpisodeInfo
 from workbench.episodes.side_files import folder_of, side_file_path
 from workbench.machine.library_files import is_installed
@@ -198,7 +198,7 @@ def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None
     # Earlier recordings of several robots have the text of a dict there.
     if info.control_mode is not None and info.control_mode.isidentifier():
         kwargs.setdefault("control_mode", info.control_mode)
-    for name in (*HOW_IT_IS_RUN, "human_render_camera_configs"):
+    for name in (*RUN_KEYWORDS, "human_render_camera_configs"):
         kwargs.pop(name, None)
     base = base or TaskOptions()
     return replace(base, num_envs=num_envs, seed=max(info.seed, 0), env_kwargs=kwargs, pictures=info.pictures)

@@ -1,3 +1,3 @@
-"""What this machine has: installed versions, files, text, a browser, something to render with."""
+"""Access to this machine: installed versions, files, processes, text, a browser, a render device."""
 
 DISTRIBUTION = "maniskill-workbench"

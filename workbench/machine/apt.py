@@ -1,4 +1,4 @@
-"""Debian packages: installs them where that is allowed, and reads the sources that they come from."""
+"""Installs Debian packages where that is allowed, and reads apt's sources."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from email.parser import HeaderParser
 from pathlib import Path
 
-LOCK_WAIT_S = 180
+LOCK_TIMEOUT_SECONDS = 180
 
 
 class AptFailed(RuntimeError):
@@ -51,7 +51,15 @@ def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: fl
     Raises:
         AptFailed: it is missing, failed, or took longer than `timeout_s`.
     """
-    command = ["apt-get", "-q", "-y", "-o", f"DPkg::Lock::Timeout={LOCK_WAIT_S}", *options, *arguments]
+    command = [
+        "apt-get",
+        "-q",
+        "-y",
+        "-o",
+        f"DPkg::Lock::Timeout={LOCK_TIMEOUT_SECONDS}",
+        *options,
+        *arguments,
+    ]
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C.UTF-8"}
     print("+ " + " ".join(["apt-get", *arguments]), file=sys.stderr, flush=True)
     try:
@@ -106,8 +114,8 @@ ONE_LINE_NAMES = {"signed-by": "Signed-By", "trusted": "Trusted", "arch": "Archi
 class AptSource:
     """One binary ("deb") source, in either format of sources.list(5).
 
-    One line a source, ``deb [options] uri suite component...``, or deb822 paragraphs with ``Types:``, ``URIs:``, ``Suites:``,
-    ``Components:``.
+    Either one line per source, ``deb [options] uri suite component...``, or deb822 paragraphs with ``Types:``, ``URIs:``,
+    ``Suites:``, ``Components:``.
     """
 
     uris: tuple[str, ...]
@@ -146,7 +154,7 @@ def parse_deb822_format(text: str) -> list[AptSource]:
             tuple(fields.get(name, "").split()) for name in ("Types", "URIs", "Suites", "Components")
         )
         if "deb" in types and uris and suites and fields.get("Enabled", "yes").strip().lower() != "no":
-            # A value of several lines (an inline key) keeps them.
+            # A value of several lines (an inline key) keeps its line ends.
             options = {name: fields[name].strip(" ") for name in CARRIED_OPTIONS if name in fields}
             sources.append(AptSource(uris, suites, components, options))
     return sources
@@ -168,9 +176,9 @@ def read_apt_sources(folder: Path = Path("/etc/apt")) -> list[AptSource]:
 def backports_source(sources: list[AptSource], codename: str) -> str | None:
     """A deb822 source for ``CODENAME-backports`` on the mirror that ``CODENAME`` itself comes from.
 
-    That mirror may be the only one that the machine reaches; its trust options (``Signed-By``, ``Trusted``) are taken over,
-    or apt refuses the source. None if no source gives that release's ``main``. apt holds backports back by itself (their
-    Release file says ``NotAutomatic``): adding them upgrades nothing.
+    That mirror may be the only one that the machine reaches; its trust options (``Signed-By``, ``Trusted``) are copied,
+    since apt would refuse the source without them. None if no source has that release's ``main``. Adding backports upgrades
+    nothing: their Release file has ``NotAutomatic``.
     """
     for source in sources:
         if codename in source.suites and "main" in source.components:

@@ -1,4 +1,4 @@
-"""Checks what this machine can do for the workbench, and advises on what is missing."""
+"""Checks whether this machine can run the workbench, and advises on what is missing."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from workbench.machine.render_probe import driver_files
 from workbench.machine.software_vulkan import ensure_render_device
 
 DEFAULT_PORT = 8080
-LEAST_MEMORY_GIB = 6.0
-"""Least available memory, in GiB: one worker with 16 envs and cameras on a software driver, its warm spare, the
-server and a browser."""
-CHILD_TIMEOUT_S = 120
+MIN_MEMORY_GIB = 6.0
+"""Minimum available memory: one worker with 16 envs and cameras on a software driver, its warm spare, the server and a
+browser."""
+CHILD_TIMEOUT_SECONDS = 120
 
-GPU_QUESTIONS = """
+GPU_SCRIPT = """
 import json, torch
 from workbench.envs.backends import gpu_library_path, why_no_gpu_simulation
 cuda = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
@@ -44,11 +44,11 @@ print(json.dumps({"built": torch.version.cuda, "cuda": cuda,
                   "why_not": why_no_gpu_simulation(), "library": str(gpu_library_path())}))
 """
 
-VERSION_QUESTIONS = """
+VERSION_SCRIPT = """
 import json
-from workbench.core import maniskill_private
+from workbench.envs import maniskill_private
 from workbench.machine.versions import moved_text
-from workbench.ui.server import viser_private
+from workbench.page.door import viser_private
 print(json.dumps({"moved": moved_text(maniskill_private.moved_names()), "viser": viser_private.missing_names()}))
 """
 
@@ -62,7 +62,7 @@ class DoctorFinding:
     """True: works. None: the workbench runs with limitations. False: the workbench cannot run."""
     what: str
     advice: str | None = None
-    """What to do; None if all is well."""
+    """Advice on what to do; None if all is well."""
 
 
 class _TookTooLong(Exception):
@@ -70,10 +70,10 @@ class _TookTooLong(Exception):
 
 
 def diagnose() -> list[DoctorFinding]:
-    """Check everything. Never raises: a check that fails is a finding with the failure in it.
+    """Run all checks. Never raises: a check that fails becomes a finding with its error.
 
-    A broken driver crashes or hangs its process, so SAPIEN's renderer and torch's CUDA are asked in child processes with a
-    time limit. PhysX's GPU library is looked for on disk, since SAPIEN would fetch it from the network.
+    A broken driver crashes or hangs its process, so SAPIEN's renderer and torch's CUDA are probed in child processes with a
+    timeout. PhysX's GPU library is looked for on disk, since SAPIEN would fetch it from the network.
     """
     questions: list[tuple[str, Callable[[], list[DoctorFinding]]]] = [
         ("Python", _python),
@@ -97,7 +97,7 @@ def diagnose() -> list[DoctorFinding]:
             advice = "The machine is busy, or a driver hangs: run workbench doctor again."
             findings.append(DoctorFinding(topic, None, f"not known: {failure}", advice))
         else:
-            advice = "This question should not fail: please report it."
+            advice = "This check should not fail: please report it."
             findings.append(
                 DoctorFinding(topic, None, f"not known: {type(failure).__name__}: {failure}", advice)
             )
@@ -158,14 +158,14 @@ def _packages() -> list[DoctorFinding]:
 
 
 def _maniskill() -> list[DoctorFinding]:
-    """Check ManiSkill: its release, a nightly build, or both, of which one has overwritten the other; and whether it
-    and the packages beside it have the private names that are used."""
+    """Check ManiSkill (its release, a nightly build, or both, of which one has overwritten the other), and that it and
+    the related packages have the private names that the workbench uses."""
     topic = "ManiSkill"
     if (lacking := lines_if_lacking("A task")) is not None:
         return [DoctorFinding(topic, False, *lacking)]
     if (mixed := lines_if_mixed()) is not None:
         return [DoctorFinding(topic, None, mixed[0], "\n".join(mixed[1:]))]
-    answer = _ask_child(VERSION_QUESTIONS)
+    answer = _ask_child(VERSION_SCRIPT)
     if isinstance(answer, str):
         return [
             DoctorFinding(
@@ -189,8 +189,8 @@ def _maniskill() -> list[DoctorFinding]:
     what = f"{found[1]}, its release: tested with the workbench"
     if found[0] == "mani_skill-nightly":
         what = (
-            f"{found[1]}, a nightly build: tested with the workbench. Of another build every private name that the "
-            "workbench uses is looked for at start, and what has moved is named."
+            f"{found[1]}, a nightly build: tested with the workbench. For another build, every private name that the "
+            "workbench uses is looked up at start, and missing ones are reported."
         )
     return [DoctorFinding(topic, True, what)]
 
@@ -214,7 +214,7 @@ def _render_device() -> list[DoctorFinding]:
 
 def _gpu() -> list[DoctorFinding]:
     """Check CUDA through torch, then PhysX on it, without a download by SAPIEN."""
-    answer = _ask_child(GPU_QUESTIONS)
+    answer = _ask_child(GPU_SCRIPT)
     if isinstance(answer, str):
         return [
             DoctorFinding("CUDA", False, f"torch or SAPIEN does not load: {answer}", "See the lines above.")
@@ -222,13 +222,13 @@ def _gpu() -> list[DoctorFinding]:
     cuda: list[str] = answer["cuda"]
     if cuda:
         found = f"{', '.join(cuda)} (torch for CUDA {answer['built']})"
-        what = "on the CPU core, unless you say --backend gpu"
+        what = "on the CPU core, unless you pass --backend gpu"
         advice = f"For --backend gpu: {answer['why_not']}"
         if answer["why_not"] is None:
             what += f" (PhysX GPU library {answer['library']})"
             advice = (
-                "GPU simulation has passed its tests on no machine so far, so --backend auto does not take it. In a clone, "
-                "make test-gpu says whether they pass on this one."
+                "GPU simulation has passed its tests on no machine so far, so --backend auto does not use it. In a clone, "
+                "make test-gpu runs them on this one."
             )
         return [DoctorFinding("CUDA", True, found), DoctorFinding("GPU physics", None, what, advice)]
     nvidia = Path("/proc/driver/nvidia/version").is_file()
@@ -252,7 +252,7 @@ def _gpu() -> list[DoctorFinding]:
 
 
 def _ask_child(code: str) -> Any:
-    """What `code` prints last, read as JSON; if `code` fails, the last line of its error."""
+    """Run `code` in a child process; returns its last line as JSON, or the last line of its error if it fails."""
     try:
         child = subprocess.run(
             python_command("-c", code),
@@ -260,11 +260,11 @@ def _ask_child(code: str) -> Any:
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
-            timeout=CHILD_TIMEOUT_S,
+            timeout=CHILD_TIMEOUT_SECONDS,
         )
     except subprocess.TimeoutExpired:
-        # Its own text is the whole program that was asked.
-        raise _TookTooLong(f"it took more than {CHILD_TIMEOUT_S} s") from None
+        # The text of TimeoutExpired would contain the whole script.
+        raise _TookTooLong(f"it took more than {CHILD_TIMEOUT_SECONDS} s") from None
     if child.returncode != 0:
         return (child.stderr.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
     return json.loads(child.stdout.strip().splitlines()[-1])
@@ -275,9 +275,9 @@ def _cores_and_memory() -> list[DoctorFinding]:
     memory = psutil.virtual_memory()
     total, free = memory.total / 2**30, memory.available / 2**30
     what = f"{cores} cores, {total:.1f} GiB of memory, {free:.1f} GiB of it available"
-    if free < LEAST_MEMORY_GIB:
+    if free < MIN_MEMORY_GIB:
         advice = (
-            f"Less than {LEAST_MEMORY_GIB:.0f} GiB available: close something, or use a smaller --num-envs."
+            f"Less than {MIN_MEMORY_GIB:.0f} GiB available: close something, or use a smaller --num-envs."
         )
         return [DoctorFinding("cores, memory", None, what, advice)]
     return [DoctorFinding("cores, memory", True, what)]
@@ -293,8 +293,8 @@ def _reading() -> list[DoctorFinding]:
         DoctorFinding(
             "reading",
             None,
-            "recordings are read in processes of their own, with limits on memory and time alone: this kernel has no Landlock",
-            "Linux 5.13 has it, where it is not turned off. Without it, open recordings of people you trust.",
+            "recordings are read in separate processes, with limits on memory and time only: this kernel has no Landlock",
+            "Linux 5.13 and newer have it, unless it is turned off. Without it, open only recordings of people you trust.",
         )
     ]
 
@@ -340,9 +340,9 @@ def find_chromium() -> str | None:
 
 
 def chromium_version(path: str) -> str | None:
-    """What ``PATH --version`` prints, None if it does not run or is not a Chromium.
+    """Output of ``PATH --version``; None if it does not run or is not a Chromium.
 
-    Ubuntu's ``chromium-browser`` may be a script that only says "install the snap": a name on PATH proves nothing.
+    A name on PATH proves nothing: Ubuntu's ``chromium-browser`` may be a script that only prints "install the snap".
     """
     try:
         done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Reads and writes files safely: whole or not at all, and regular files only."""
+"""Reads and writes files safely: writes are atomic, and only regular files are read."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-MOST_BYTES = 64 << 20
-"""Most bytes of a file that is compared before it is replaced."""
+MAX_COMPARED_BYTES = 64 << 20
+"""Maximum size of a file that is compared before it is replaced."""
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
 
 
 @contextmanager
 def written_beside(path: Path, content: bytes, mode: int = 0o666) -> Iterator[Path]:
-    """A temporary file with `content` in the folder of `path`, synced to disk; removed after the block.
+    """Context with a temporary file with `content` in the folder of `path`, synced to disk; removed after the block.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     temporary = path.with_name(f".{uuid.uuid4().hex}{path.suffix}.part")
     try:
@@ -71,8 +71,8 @@ def create_file(path: Path, content: bytes, mode: int = 0o666) -> bool:
 
 
 def real_path(path: Path) -> Path:
-    """The absolute path behind links. Where links lead in a circle, the path itself: before Python 3.13 ``Path.resolve``
-    raises RuntimeError there."""
+    """The absolute path with links resolved; `path` itself where links form a cycle, for which ``Path.resolve`` raises
+    RuntimeError before Python 3.13."""
     return Path(os.path.realpath(path))
 
 
@@ -82,7 +82,7 @@ def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> b
     A link stays a link; mode and owner stay.
 
     Raises:
-        OSError: it cannot be written; its content is unchanged.
+        OSError: the file cannot be written; its content is unchanged.
     """
     path = real_path(path)
     with written_beside(path, content) as temporary:
@@ -92,7 +92,7 @@ def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> b
                 os.chown(temporary, status.st_uid, status.st_gid)
             with contextlib.suppress(PermissionError):  # a drive without modes
                 os.chmod(temporary, stat.S_IMODE(status.st_mode))
-        if expected is not None and read_regular_file(path, MOST_BYTES) != expected:
+        if expected is not None and read_regular_file(path, MAX_COMPARED_BYTES) != expected:
             return False
         os.replace(temporary, path)
     return True
@@ -100,7 +100,7 @@ def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> b
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """A temporary name to write to in the folder of `path`; after the block the file is `path`, unless the block raised.
+    """Context with a temporary file name in the folder of `path`; after the block the file becomes `path`, unless it raised.
 
     Raises:
         FileExistsError: `path` exists; the message says what to do.
@@ -144,9 +144,9 @@ def _taken(path: Path) -> FileExistsError:
 # --- reading files that others may have replaced: regular files of limited size ---------------------
 
 
-MOST_SOURCE_BYTES = 16 << 20
-"""Most bytes of one Python file; 50 times the largest file of the standard library."""
-_PIECE = 1 << 20
+MAX_SOURCE_BYTES = 16 << 20
+"""Maximum size of a Python file; 50 times the largest file of the standard library."""
+_READ_BYTES = 1 << 20
 _KINDS = (
     (stat.S_ISDIR, "folder"),
     (stat.S_ISFIFO, "named pipe"),
@@ -173,14 +173,14 @@ def read_regular_file(path: str | os.PathLike[str], most_bytes: int) -> bytes:
     """The content of a regular file of at most `most_bytes`.
 
     Raises:
-        NotARegularFile: ``path`` is, or links to, something else, from which nothing was read.
-        FileTooLarge: it has more, even if it states a smaller size or grows meanwhile.
-        OSError: it cannot be opened or read.
+        NotARegularFile: `path` is, or links to, something else; nothing was read.
+        FileTooLarge: the file has more bytes, even if its stated size is smaller or it grows meanwhile.
+        OSError: the file cannot be opened or read.
     """
     with open_regular_file(path, most_bytes) as file:
         pieces, size = [], 0
-        # In pieces: one read of `most_bytes` would allocate them all for a file of ten bytes.
-        while piece := file.read(min(_PIECE, most_bytes + 1 - size)):
+        # In pieces, since one read of `most_bytes` would allocate them all even for a file of ten bytes.
+        while piece := file.read(min(_READ_BYTES, most_bytes + 1 - size)):
             pieces.append(piece)
             size += len(piece)
             if size > most_bytes:
@@ -192,15 +192,15 @@ def open_regular_file(path: str | os.PathLike[str], most_bytes: int | None = Non
     """Open a regular file for reading without blocking; links are followed.
 
     Args:
-        most_bytes: largest size; None for any. A file that grows afterwards, or one of ``/proc`` that has no size, can
-            give more.
+        most_bytes: maximum size; None for any. A file that grows afterwards, or one in ``/proc``, which has no size, may
+            contain more.
 
     Raises:
         NotARegularFile, FileTooLarge, OSError: as `read_regular_file`.
     """
-    # Checked before opening: opening some devices has an effect (a watchdog, a tape).
+    # Check before opening, since opening some devices has an effect (a watchdog, a tape).
     _must_be_regular(path, os.stat(path).st_mode)
-    # Checked again: it may have been replaced. O_NONBLOCK: opening a pipe without a writer would wait for ever.
+    # Check again, since the file may have been replaced. O_NONBLOCK: opening a pipe without a writer would block for ever.
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     try:
         found = os.fstat(fd)

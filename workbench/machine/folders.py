@@ -14,7 +14,7 @@ import platformdirs
 
 from workbench.machine.files import create_file, written_beside
 
-MOST_BYTES = 16 << 20
+MAX_FILE_BYTES = 16 << 20
 
 
 class NoUserFolder(OSError):
@@ -31,7 +31,7 @@ def user_folder() -> Path:
 
 
 def state_folder() -> Path:
-    """Path of the folder for what was done last, such as ``~/.local/state/workbench``; it may not exist.
+    """Path of the folder for the state of the last runs, such as ``~/.local/state/workbench``; it may not exist.
 
     Raises:
         NoUserFolder: this user has no home folder.
@@ -51,19 +51,19 @@ def _absolute(found: Callable[..., Path]) -> Path:
 
 
 def cache_folder() -> Path:
-    """Folder for files that can be made again, such as ``~/.cache/workbench``; it may not exist."""
+    """Folder for caches, such as ``~/.cache/workbench``; it may not exist."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "workbench"
 
 
 def read_private(name: str, folder: Path | None = None) -> bytes | None:
-    """The content of a file of the folder; None if it does not exist.
+    """Read a file of the user folder; None if it does not exist.
 
     Args:
         folder: in place of `user_folder`.
 
     Raises:
         NoUserFolder: the folder or the file belongs to another user, or others may write to it.
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     path = (folder or user_folder()) / name
     try:
@@ -73,23 +73,23 @@ def read_private(name: str, folder: Path | None = None) -> bytes | None:
     try:
         _check_private(path.parent, path.parent.stat())
         _check_private(path, status := os.fstat(descriptor))
-        if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
-            raise NoUserFolder(f"{path} is no ordinary file of at most {MOST_BYTES >> 20} MB")
-        # After the checks: for a folder fdopen raises, and leaves the descriptor open.
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:
+            raise NoUserFolder(f"{path} is no ordinary file of at most {MAX_FILE_BYTES >> 20} MB")
+        # After the checks, since fdopen raises for a folder and leaves the descriptor open.
         with os.fdopen(descriptor, "rb", closefd=False) as file:
-            return file.read(MOST_BYTES)
+            return file.read(MAX_FILE_BYTES)
     finally:
         os.close(descriptor)
 
 
 def write_private(name: str, content: bytes, folder: Path | None = None) -> None:
-    """Write a file of the folder, readable by this user alone; makes the folder if it is missing.
+    """Write a file of the user folder, readable only by this user; makes the folder if it is missing.
 
     Args:
         folder: in place of `user_folder`.
 
     Raises:
-        OSError: it cannot be written; the file is unchanged.
+        OSError: the file cannot be written; it is unchanged.
     """
     path = _made(folder) / name
     with written_beside(path, content, 0o600) as temporary:
@@ -97,20 +97,20 @@ def write_private(name: str, content: bytes, folder: Path | None = None) -> None
 
 
 def create_private(name: str, content: bytes) -> bool:
-    """Write a new file of the folder, readable by this user alone; returns False, and changes nothing, if the file
+    """Write a new file of the user folder, readable only by this user; returns False, and changes nothing, if the file
     exists.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     return create_file(_made() / name, content, 0o600)
 
 
 def set_aside(name: str) -> Path:
-    """Rename a broken file of the folder; returns its new path.
+    """Rename a broken file of the user folder; returns its new path.
 
     Raises:
-        OSError: it cannot be renamed.
+        OSError: the file cannot be renamed.
     """
     path = user_folder() / name
     broken = path.with_name(f"{name}.broken")
@@ -120,7 +120,7 @@ def set_aside(name: str) -> Path:
 
 @contextmanager
 def locked(name: str, folder: Path | None = None) -> Iterator[None]:
-    """Hold a lock of this name against other processes and threads.
+    """Context that holds a lock of this name against other processes and threads.
 
     Args:
         folder: in place of `user_folder`.
@@ -145,7 +145,7 @@ def _made(folder: Path | None = None) -> Path:
 
 
 def _check_private(path: Path, status: os.stat_result) -> None:
-    """Raise if another user can write there: the trust store must be the user's own."""
+    """Raise NoUserFolder if another user can write there: the trust store must be the user's own."""
     if os.geteuid() != 0 and status.st_uid not in (os.geteuid(), 0):
         raise NoUserFolder(f"{path} belongs to another user")
     if status.st_mode & 0o022:
@@ -158,12 +158,12 @@ def _check_private(path: Path, status: os.stat_result) -> None:
 def web_assets_folder() -> Path:
     """Folder with the files for the browser: ``web_assets/`` of a checkout, ``workbench/_web_assets`` of a wheel.
 
-    The wheel's copy is asked first: an installed package must not use a folder next to it in site-packages.
+    The wheel's copy has precedence: an installed package must not use a folder next to it in site-packages.
 
     Raises:
         FileNotFoundError: neither the wheel's copy nor the checkout's folder is there.
     """
-    from importlib import resources  # late: 10 ms that most commands do not need
+    from importlib import resources  # imported late: takes 10 ms, and few commands need it
 
     package = Path(str(resources.files("workbench")))
     for folder in (package / "_web_assets", package.parent / "web_assets"):
@@ -176,7 +176,7 @@ def web_assets_folder() -> Path:
 
 
 def example_tasks() -> tuple[Path, ...]:
-    """The example tasks: of the wheel, or of a checkout; none where neither is there."""
+    """The example tasks of the wheel or of a checkout; empty if there is neither."""
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "_tasks", package.parent / "tasks"):
         if (folder / "push_cube.py").is_file():
@@ -191,7 +191,7 @@ _AT_FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
 
 
 class CurrentFolder:
-    """The current folder at construction, by descriptor, so that it may be renamed."""
+    """The current folder at construction, held by descriptor, so that it may be renamed."""
 
     def __init__(self) -> None:
         self._fd = os.open(".", _AT_FOLDER)
@@ -199,7 +199,7 @@ class CurrentFolder:
 
     @contextmanager
     def again(self, *, stay: bool = False) -> Iterator[None]:
-        """Make it the current folder within this; afterwards the previous folder is current again.
+        """Context in which this is the current folder; afterwards the previous folder is current again.
 
         Args:
             stay: keep the folder in which the block ends, unless it raises.

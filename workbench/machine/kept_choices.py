@@ -1,4 +1,4 @@
-"""Choices that a person made on the page, kept for the next run in the user's own folder."""
+"""Stores choices that a person made on the page, for the next run, in the user's own folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import msgspec
 from workbench.machine.folders import locked, read_private, write_private
 
 FILE = "choices.json"
-MOST_FOLDERS, MOST_POLICIES = 100, 10
+MAX_FOLDERS, MAX_POLICIES = 100, 10
 log = logging.getLogger(__name__)
 
 
@@ -27,12 +27,12 @@ class KeptChoices(msgspec.Struct, frozen=True):
 
 
 def kept_choices() -> KeptChoices:
-    """The choices so far; the defaults, with a warning, if the file cannot be read."""
+    """The stored choices; the defaults, with a warning, if the file cannot be read."""
     try:
         content = read_private(FILE)
         return KeptChoices() if content is None else msgspec.json.decode(content, type=KeptChoices)
     except (OSError, msgspec.MsgspecError, RecursionError) as error:
-        log.warning("What was chosen on earlier pages is not known: %s", error)
+        log.warning("Stored choices cannot be read, so defaults are used: %s", error)
         return KeptChoices()
 
 
@@ -52,13 +52,13 @@ def used_policies(folder: Path) -> tuple[str, ...]:
 
 
 def keep_policy(folder: Path, reference: str) -> None:
-    """Keep a policy that was used in this folder."""
+    """Store a policy that was used in this folder."""
 
     def change(kept: KeptChoices) -> KeptChoices:
         known = [one for one in kept.policies.get(str(folder), ()) if one != reference]
         others = {place: used for place, used in kept.policies.items() if place != str(folder)}
-        newest = dict([*others.items()][-(MOST_FOLDERS - 1) :])
-        policies = {**newest, str(folder): [reference, *known][:MOST_POLICIES]}
+        newest = dict([*others.items()][-(MAX_FOLDERS - 1) :])
+        policies = {**newest, str(folder): [reference, *known][:MAX_POLICIES]}
         return msgspec.structs.replace(kept, policies=policies)
 
     _change(change)
@@ -69,5 +69,5 @@ def _change(change: Callable[[KeptChoices], KeptChoices]) -> None:
         with locked(FILE):
             write_private(FILE, msgspec.json.encode(change(kept_choices())))
     except OSError as error:
-        # The page works without: it is a convenience.
-        log.warning("What is chosen on this page is not kept for the next run: %s", error)
+        # The page works without stored choices.
+        log.warning("Choices of this page cannot be stored for the next run: %s", error)

@@ -13,7 +13,7 @@ from pathlib import Path
 def is_installed(file: str) -> bool:
     """Whether a source file belongs to Python, to an installed package or to the workbench.
 
-    So does what has no path of this machine: text that was executed, and compiled code, which names its sources.
+    Also True for a name that is not an absolute path: executed strings, and compiled code, which names its sources.
     """
     if not os.path.isabs(file) or file.startswith(_roots()):
         return True

@@ -1,9 +1,9 @@
-"""The one thread on which the state of sessions changes: an asyncio loop.
+"""The asyncio loop on whose thread all state of sessions changes.
 
-What pages ask for, what a worker says and what jobs come to are changes, made one after the other, each whole. So no lock
-guards what they change, and what is read is of one moment. Nothing on the loop blocks: what does (a disk, another process)
-is awaited, or done by an `BlockingPool`. Commands that serve pages run the loop in the main thread (`loop_in_main`); elsewhere a
-daemon thread runs it from the first use on, as long as the process lasts.
+Requests of pages, events of workers and results of jobs are *changes*, which run one after the other, each to its end. So the
+state needs no lock, and every read sees one moment. Nothing may block the loop: blocking calls (a disk, another process) are
+awaited, or run in a `BlockingPool`. Commands that serve pages run the loop in the main thread (`loop_in_main`); elsewhere a
+daemon thread runs it, from the first use until the process ends.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from typing import Any, ParamSpec, TypeVar
 
 from workbench.machine.processes.watched_thread import report_failure
 
-_LOOK = 0.05
-"""Seconds between two checks whether a result is still wanted."""
+_POLL_SECONDS = 0.05
+"""Interval between checks whether a result is still wanted."""
 _tasks: set[asyncio.Task[Any]] = set()
 Value = TypeVar("Value")
 Args = ParamSpec("Args")
@@ -52,8 +52,10 @@ def _run(run: Callable[[], Value]) -> Value:
 
 
 def loop_in_main(command: Callable[Args, Value]) -> Callable[Args, Value]:
-    """Make a command run on a thread of its own, where it may block, and the loop on the calling thread meanwhile. That is
-    the main thread of a process that has not used the loop before and does not use it after the command.
+    """Wrap a command to run on its own thread, where it may block, while the loop runs on the calling thread.
+
+    The calling thread must be the main thread of a process that has not used the loop before and does not use it after the
+    command.
 
     Raises:
         KeyboardInterrupt: on Ctrl-C, until the command calls `on_signal`. The command's thread is left behind.
@@ -67,7 +69,7 @@ def loop_in_main(command: Callable[Args, Value]) -> Callable[Args, Value]:
             loop = _begun = _new_loop()
         work = functools.partial(command, *args, **kwargs)
         task = loop.create_task(BlockingPool("command").run(work))
-        # Else Python raises it in whatever change the loop is making.
+        # Without a handler, Python raises KeyboardInterrupt in whatever change is running.
         loop.add_signal_handler(signal.SIGINT, task.cancel)
         try:
             return _run(lambda: loop.run_until_complete(task))
@@ -78,12 +80,12 @@ def loop_in_main(command: Callable[Args, Value]) -> Callable[Args, Value]:
 
 
 def on_signal(number: signal.Signals, change: Callable[[], object]) -> None:
-    """Make a change at each signal of this number. The loop must run in the main thread."""
+    """Run a change at each signal of this number. The loop must run in the main thread."""
     do(lambda: _loop().add_signal_handler(number, change))
 
 
 def _report(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Report what a task raised that nobody awaits."""
+    """Report the exception of a task that is not awaited."""
     report_failure(context["message"], context.get("exception") or RuntimeError("of unknown cause"))
 
 
@@ -93,7 +95,7 @@ def is_here() -> bool:
 
 
 def do(change: Callable[[], Value]) -> Value:
-    """Make a change on the loop, and wait for it; returns what it returns, and raises what it raises."""
+    """Run a change on the loop and wait for it; returns its result, or raises its exception."""
     if is_here():
         return change()
     made: futures.Future[Value] = futures.Future()
@@ -109,7 +111,7 @@ def do(change: Callable[[], Value]) -> Value:
 
 
 def post(change: Callable[[], object]) -> None:
-    """Make a change on the loop soon. What it raises is reported."""
+    """Schedule a change on the loop. Its exception is reported."""
 
     def make() -> None:
         try:
@@ -121,7 +123,7 @@ def post(change: Callable[[], object]) -> None:
 
 
 def on_loop(method: Callable[Args, Value]) -> Callable[Args, Value]:
-    """Make a method run on the loop, from any calling thread."""
+    """Wrap a method to run on the loop, from any calling thread."""
 
     @functools.wraps(method)
     def called(*args: Args.args, **kwargs: Args.kwargs) -> Value:
@@ -131,7 +133,7 @@ def on_loop(method: Callable[Args, Value]) -> Callable[Args, Value]:
 
 
 def begin(work: Coroutine[Any, Any, Value]) -> asyncio.Task[Value]:
-    """Begin work on the loop; called there."""
+    """Start a coroutine on the loop. Call it on the loop."""
     task = _loop().create_task(work)
     _tasks.add(task)  # asyncio itself holds tasks weakly
     task.add_done_callback(_tasks.discard)
@@ -139,24 +141,24 @@ def begin(work: Coroutine[Any, Any, Value]) -> asyncio.Task[Value]:
 
 
 def later(seconds: float, change: Callable[[], object]) -> asyncio.TimerHandle:
-    """Make a change after some seconds, unless it is cancelled; called on the loop."""
+    """Schedule a change after `seconds`; the returned handle cancels it. Call it on the loop."""
     return _loop().call_later(seconds, change)
 
 
 def submit(work: Coroutine[Any, Any, Value]) -> futures.Future[Value]:
-    """Begin work on the loop, from another thread."""
+    """Start a coroutine on the loop, from another thread."""
     return asyncio.run_coroutine_threadsafe(work, _loop())
 
 
 def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lambda: None) -> Value:
-    """Wait for work on the loop; called on another thread than the loop.
+    """Run a coroutine on the loop and wait for its result. Call it on another thread than the loop.
 
     Args:
-        check: called often meanwhile; what it raises cancels the work, and is raised.
+        check: polled while waiting; its exception cancels the work, and is raised.
     """
     future = submit(work)
     while True:
-        done, _ = futures.wait([future], _LOOK)
+        done, _ = futures.wait([future], _POLL_SECONDS)
         if done:
             return future.result()
         try:
@@ -167,13 +169,13 @@ def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lamb
 
 
 def wait_for_disk(done: futures.Future[Any] | None) -> None:
-    """Wait for the result of an `BlockingPool`, at most one second: a disk may hang. Called on another thread than the loop."""
+    """Wait for a result of a `BlockingPool`, at most one second, since a disk may hang. Returns at once on the loop."""
     if done is not None and not is_here():
         futures.wait([done], timeout=1.0)
 
 
 class ChangeCounter:
-    """Counts the changes of something, for pages that wait for the next. Thread-safe."""
+    """Counts changes, for pages that wait for the next one. Thread-safe."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -181,7 +183,7 @@ class ChangeCounter:
         self._closing = False
 
     def notify(self) -> None:
-        """There was a change."""
+        """Count a change and wake all waiters."""
         with self._changed:
             self.count += 1
             self._changed.notify_all()
@@ -193,15 +195,15 @@ class ChangeCounter:
             return self.count
 
     def close(self) -> None:
-        """Wake all that wait; `wait` returns at once from now on."""
+        """Wake all waiters; from now on `wait` returns at once."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
 
 
 class BlockingPool:
-    """A thread that runs blocking calls one after the other. It begins with the first use, and the end of the process
-    does not wait for it: a call into a disk that hangs cannot be ended."""
+    """A thread that runs blocking calls one after the other. It starts at the first use, and the process does not wait for
+    it at exit: a call that hangs on a disk cannot be ended."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -212,7 +214,7 @@ class BlockingPool:
         self._ended = False
 
     def begin(self, work: Callable[[], Value]) -> futures.Future[Value]:
-        """Queue `work` behind the work begun before; it is cancelled if the thread has ended. Called on the loop."""
+        """Queue `work` behind earlier work; cancelled at once if the thread has ended. Call it on the loop."""
         made: futures.Future[Value] = futures.Future()
         if self._ended:
             made.cancel()
@@ -233,8 +235,8 @@ class BlockingPool:
         self._work.put(None)
 
     def close(self, within: float | None = None) -> None:
-        """End the thread when all queued work is done, and wait for that, at most so many seconds; called on another thread
-        than the loop."""
+        """End the thread when all queued work is done, and wait for that up to `within` seconds (None: for ever). Call it on
+        another thread than the loop."""
         self.end()
         if self._thread is not None:
             self._thread.join(within)
@@ -242,7 +244,7 @@ class BlockingPool:
     def _run(self) -> None:
         while (next_work := self._work.get()) is not None:
             work, made = next_work
-            # A future that was cancelled before it began is left out.
+            # Skip a future that was cancelled before it began.
             if not made.set_running_or_notify_cancel():
                 continue
             try:

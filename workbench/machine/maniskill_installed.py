@@ -1,4 +1,4 @@
-"""Which ManiSkill is installed, and what to type where that is none, or both of its distributions. Imports nothing of it."""
+"""Finds which ManiSkill is installed, and the command to type if none or both distributions are. Does not import it."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from packaging.utils import canonicalize_name
 from workbench.machine import DISTRIBUTION
 
 EXTRAS: Mapping[str, str] = {"mani_skill": "maniskill", "mani_skill-nightly": "nightly"}
-"""ManiSkill's distributions, which write the same files, each with the extra of the workbench that asks for it."""
+"""ManiSkill's distributions, which write the same files, each with the extra of the workbench that requires it."""
 
 
 def lacks_maniskill() -> bool:
-    """Whether ``import mani_skill`` would find nothing. A folder of that name without code, as assets leave one, is nothing."""
+    """Whether ``import mani_skill`` would find no code. Assets may leave a folder of that name, which does not count."""
     spec = find_spec("mani_skill")
     return spec is None or spec.origin is None
 
 
 def installed_maniskills() -> dict[str, str]:
-    """Distribution to version. Empty also for a clone of ManiSkill that is only on the path."""
+    """Installed version by distribution. Also empty for a clone of ManiSkill that is only on the path."""
     found = {}
     for name in EXTRAS:
         try:
@@ -40,7 +40,7 @@ def lines_if_lacking(what: str, arguments: Sequence[str] | None = None) -> tuple
     """Two lines if ManiSkill is not installed: that `what` needs it, and the command to type. None if it is installed.
 
     Args:
-        arguments: of ``workbench``, as they were typed; None if it was not started by its command.
+        arguments: arguments of the ``workbench`` command, as typed; None if it was not started by the command.
     """
     if not lacks_maniskill():
         return None
@@ -56,37 +56,36 @@ def lines_if_lacking(what: str, arguments: Sequence[str] | None = None) -> tuple
 
 
 def lines_if_mixed() -> tuple[str, str, str] | None:
-    """Three lines where both distributions are installed: what that means, and the command that keeps each. Else None."""
+    """Three lines if both distributions are installed: what that means, and the commands that keep one of them. Else None."""
     found = installed_maniskills()
     if len(found) < 2:
         return None
     release, nightly = (f"{name}=={version}" for name, version in found.items())
-    away = pip_command("uninstall", *found)
+    uninstall = pip_command("uninstall", *found)
     return (
         f"{release} and {nightly} are both installed, and one has written over files of the other: keep one of them.",
-        f"To keep the release, type: {away} && {pip_command('install', release)}",
-        f"To keep the nightly build, type: {away} && {pip_command('install', nightly)}",
+        f"To keep the release, type: {uninstall} && {pip_command('install', release)}",
+        f"To keep the nightly build, type: {uninstall} && {pip_command('install', nightly)}",
     )
 
 
 def command_to_install(name: str, arguments: Sequence[str] | None = None) -> str:
-    """What installs this distribution of ManiSkill's into the environment of this process: by uv where uv has made it, else pip.
-
-    An environment of a uv tool is not added to, but rebuilt.
+    """The command that installs this distribution of ManiSkill into the environment of this process: with uv if uv made it,
+    else with pip. The environment of a uv tool is rebuilt, not extended.
     """
     kind = _uv_environment()
     ours = shlex.quote(f"{DISTRIBUTION}[{EXTRAS[name]}]{_came_from()}")
     if kind == "tool":
         return f"uv tool install --force {ours}"
     if kind == "uvx":
-        # What was given to uvx before --from is not known here.
+        # The options that uvx got before --from are not known here.
         rest = "..." if arguments is None else shlex.join(arguments)
         return f"uvx --from {ours} workbench {rest}  # with the -c and --find-links that you gave uvx"
     return pip_command("install", _requirement(name))
 
 
 def pip_command(verb: str, *requirements: str) -> str:
-    """The command that installs or uninstalls these in the environment of this process: uv where uv has made it, else
+    """The command that installs or uninstalls these in the environment of this process: with uv if uv made it, else with
     pip."""
     python = shlex.quote(sys.executable)
     if _uv_environment() is not None:
@@ -110,7 +109,7 @@ def _requirement(name: str) -> str:
 
 
 def _uv_environment() -> str | None:
-    """``uvx`` (in uv's cache), ``tool`` (of ``uv tool install``) or ``venv`` where uv has made this environment; else None."""
+    """``uvx`` (in uv's cache), ``tool`` (of ``uv tool install``) or ``venv`` if uv made this environment; else None."""
     prefix = Path(sys.prefix)
     try:
         keys = {line.partition("=")[0].strip() for line in (prefix / "pyvenv.cfg").read_text().splitlines()}
@@ -124,7 +123,7 @@ def _uv_environment() -> str | None:
 
 
 def _is_in_uv_cache(prefix: Path) -> bool:
-    # Wherever the cache lies, uv keeps what it made in folders of these names.
+    # Wherever the cache is, uv keeps environments in folders with these names.
     return any(parent.name.startswith(("archive-v", "builds-v")) for parent in prefix.resolve().parents)
 
 

@@ -11,9 +11,9 @@ _lock = threading.Lock()
 def parse_python(text: str | bytes, file: str = "<unknown>") -> ast.Module:
     """Parse Python text as ``ast.parse`` does, safely in several threads.
 
-    Before Python 3.12, and in some releases of 3.11 (seen in 3.11.7), all threads count the depth of the tree that they
-    build in one place. Where a finalizer lets another thread go on meanwhile, ``ast.parse`` raises SystemError over text
-    without a fault (github.com/python/cpython, issue 106905).
+    Before Python 3.12, and in some releases of 3.11 (seen in 3.11.7), all threads share one counter for the depth of the
+    tree that they build. If a finalizer lets another thread run meanwhile, ``ast.parse`` raises SystemError for valid text
+    (github.com/python/cpython, issue 106905).
 
     Raises:
         SyntaxError, ValueError: as ``ast.parse``.

@@ -1,4 +1,4 @@
-"""Asks SAPIEN, in a child process, whether it can render. Run as a module this is that child."""
+"""Probes in a child process whether SAPIEN can render. Run as a module, this is that child."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ class RenderProbe:
 
 
 def probe_render_device(env: Mapping[str, str] | None = None, timeout_s: float = 60) -> RenderProbe:
-    """Ask a child process, started with this process's environment and `env` on top.
+    """Probe rendering in a child process, with the environment of this process and `env` on top.
 
-    A driver file (ICD) proves nothing: Debian 12's Mesa 22.3 is there and SAPIEN refuses it, and an NVIDIA ICD without the
-    kernel module crashes or hangs in native code. So the child builds a `sapien.render.RenderSystem` on the device that
-    ManiSkill would ask for.
+    A driver file (ICD) proves nothing: SAPIEN refuses Debian 12's Mesa 22.3, and an NVIDIA ICD without the kernel module
+    crashes or hangs in native code. So the child builds a `sapien.render.RenderSystem` on the device that ManiSkill would
+    request.
 
-    A crash, a hang of `timeout_s` or a missing library of the child gives ``ok=False``, never an exception.
+    If the child crashes, takes longer than `timeout_s` or lacks a library, the result is ``ok=False``, never an exception.
     """
     added = dict(env or {})
     try:
@@ -113,7 +113,7 @@ def _look() -> RenderProbe:
     import sapien.render
 
     refusals: list[str] = []
-    # CUDA first, as ManiSkill's "gpu" render backend. A process can have one render device: the first that works.
+    # CUDA first, like ManiSkill's "gpu" render backend. A process can have only one render device: the first that works.
     for device in ("cuda", "cpu"):
         try:
             system = sapien.render.RenderSystem(device)
@@ -140,7 +140,7 @@ def _look() -> RenderProbe:
 
 def _why_no_ray_tracing(name: str, has_extension: bool, driver: _Driver | None) -> str | None:
     """Why this device cannot draw ray traced pictures, as a clause; None if it can. Lavapipe has the extension too,
-    and takes 10 s a picture with 2 samples a pixel (``rt-fast``, 512 x 512), 20 s to compile for each camera, and
+    but takes 10 s per picture with 2 samples per pixel (``rt-fast``, 512 x 512), 20 s to compile for each camera, and
     more than 9 minutes with 32 samples (``rt``)."""
     if not has_extension:
         return f"the driver of {name} has none"
@@ -175,8 +175,9 @@ class _Driver:
 def _vulkan_drivers() -> dict[str, _Driver]:
     """Driver of every device that Vulkan lists, by device name; SAPIEN has the device's name only.
 
-    From ``VkPhysicalDeviceDriverProperties`` (core since 1.2). Written against the C layout of Vulkan 1.2 on 64 bits: VkApplicationInfo is 48 bytes with apiVersion
-    at 44; VkInstanceCreateInfo is 64 bytes with the application info's address at 24;
+    From ``VkPhysicalDeviceDriverProperties`` (core since 1.2). Uses the C layout of Vulkan 1.2 on 64 bits:
+    VkApplicationInfo is 48 bytes with apiVersion at 44; VkInstanceCreateInfo is 64 bytes with the application info's
+    address at 24;
     VkPhysicalDeviceDriverProperties has driverName (256 characters) at 20 and driverInfo at 276;
     VkPhysicalDeviceProperties2 has pNext at 8 and the properties at 16, their deviceType at 16 and deviceName at 20.
     """

@@ -43,12 +43,12 @@ from workbench.machine.versions import installed
 
 
 def private_mesa_folder() -> Path:
-    """Folder of the user's cache where the packages are unpacked."""
+    """Folder in the user's cache where the packages are unpacked."""
     return cache_folder() / "mesa"
 
 
 def private_mesa_env() -> dict[str, str] | None:
-    """Variables with which a new process uses what `unpack_private_mesa` left; None if there is nothing."""
+    """Environment variables with which a new process uses the driver of `unpack_private_mesa`; None without such a driver."""
     return _env_of(private_mesa_folder())
 
 
@@ -57,17 +57,17 @@ def unpack_private_mesa(
 ) -> dict[str, str]:
     """Fetch `package` with the libraries that this machine lacks and unpack them into the user's cache.
 
-    apt needs root for dpkg's database, not for fetching: with lists and cache in a folder of our own it resolves, checks
-    the same signatures and downloads; `dpkg-deb` unpacks. VK_DRIVER_FILES and LD_LIBRARY_PATH then name driver and libraries
-    to the process that renders. Deleting the folder undoes all of it.
+    apt needs root for dpkg's database, not for fetching: with lists and cache in a separate folder it resolves, checks the
+    same signatures and downloads; `dpkg-deb` unpacks. VK_DRIVER_FILES and LD_LIBRARY_PATH then point the process that
+    renders to driver and libraries. Deleting the folder undoes everything.
 
     Args:
         package: the package with lavapipe.
         extra_source: a deb822 source in addition to the machine's, or None.
-        choose: picks one of the versions on offer, None if none will do.
+        choose: picks one of the available versions; returns None if none is suitable.
 
     Returns:
-        The variables with which a process renders with it.
+        The environment variables with which a process renders with this driver.
 
     Raises:
         AptFailed: no suitable version is offered, or fetching or unpacking failed.
@@ -168,7 +168,7 @@ def _env_of(root: Path) -> dict[str, str] | None:
 
 MESA = "mesa-vulkan-drivers"
 OLDEST_MESA = (24, 3)
-"""SAPIEN 3.0.3 refuses lavapipe 22.3 and renders on 25.0.7; 24.3 is the first with what it needs."""
+"""SAPIEN 3.0.3 refuses lavapipe 22.3 and renders on 25.0.7; 24.3 is the first version with what SAPIEN needs."""
 BACKPORTS_FILE = Path("/etc/apt/sources.list.d/workbench-backports.sources")
 
 
@@ -205,9 +205,9 @@ def plan_mesa() -> MesaPlan | None:
 def ensure_render_device(install: bool) -> RenderProbe:
     """Find a render device, and with `install` provide what is missing. Slow only where it installs.
 
-    A machine whose driver works is left alone. Else Mesa's lavapipe does, from 24.3 on, from the distribution or from
-    Debian's backports: installed with apt for root, unpacked into the user's cache for others, who start the process that
-    renders with `RenderProbe.env` (``python -m workbench.machine.software_vulkan --export`` prints it for a shell).
+    A working driver is left alone. Without one, Mesa's lavapipe (24.3 or newer) is used, from the distribution or from
+    Debian's backports. For root it is installed with apt. For other users it is unpacked into the user's cache; the process
+    that renders then needs `RenderProbe.env` (``python -m workbench.machine.software_vulkan --export`` prints it for a shell).
 
     Returns:
         The last probe. If ``ok``, start the process that renders with ``probe.env`` added; else ``error`` ends with what
@@ -222,7 +222,7 @@ def ensure_render_device(install: bool) -> RenderProbe:
         packages = " ".join(SYSTEM_LIBRARIES[library] for library in probe.missing_libraries)
         return _with_advice(probe, f"Type: sudo apt-get install {packages}")
     if any(os.environ.get(variable) for variable in DRIVER_VARIABLES):
-        # A driver was chosen: another one, even if installed, would not be used.
+        # The environment names a driver: another one, even if installed, would not be used.
         return probe
     return _bring_mesa(probe, install)
 
@@ -233,12 +233,12 @@ def use_private_driver() -> None:
 
 
 def known_render_device(install: bool) -> RenderProbe:
-    """The result of `ensure_render_device`; the last one if nothing that decides it has changed since.
+    """The result of `ensure_render_device`, cached on disk until something that determines it changes.
 
-    A probe imports SAPIEN and makes a Vulkan device, and `make open` asks twice before the worker starts. A device that
-    fails although nothing changed is reported by the worker, which is a process of its own too.
+    A probe imports SAPIEN and makes a Vulkan device, and `make open` asks twice before the worker starts. If a device fails
+    although nothing changed, the worker, a separate process, reports it.
     """
-    # One file for each answer: with a driver of the user's own, `make open` asks with its variables the second time.
+    # One file per answer: with a driver of the user's own, `make open` asks a second time with its variables.
     name = f"render-device-{hashlib.blake2b(repr(_what_decides()).encode(), digest_size=8).hexdigest()}.json"
     with contextlib.suppress(OSError, msgspec.MsgspecError):
         if (kept := read_private(name, cache_folder())) is not None:
@@ -252,7 +252,7 @@ def known_render_device(install: bool) -> RenderProbe:
 
 
 def _what_decides() -> list[str]:
-    """All that decides the result: versions, environment variables, driver files with their age, the machine's
+    """Everything that determines the result: versions, environment variables, driver files with their age, the machine's
     devices, and the request."""
     named = (*DRIVER_VARIABLES, "LD_LIBRARY_PATH", "SAPIEN_VULKAN_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES")
     files = [*driver_files(), *_manifests(private_mesa_folder())]
@@ -353,7 +353,7 @@ def main() -> None:
         for name, value in probe.env.items():
             print(f"export {name}={shlex.quote(value)}")
     else:
-        # Not an error for the shell: without a renderer everything but the camera pictures still works.
+        # Not an error for the shell: without a renderer everything except camera pictures works.
         print(f"SAPIEN cannot render here, so there are no camera pictures: {probe.error}", file=sys.stderr)
 
 

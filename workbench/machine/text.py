@@ -1,4 +1,4 @@
-"""Text for people: numbers, lengths, and text from elsewhere made safe for a terminal."""
+"""Formats numbers and lengths for people, and makes text from other sources safe for a terminal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def number_text(value: float, form: str = ".4g") -> str:
 
 
 def rate_text(value: float) -> str:
-    """A rate of zero or more, with two digits also where it is small: ``5 125``, ``240``, ``9.6``, ``0.93``, ``0.045``."""
+    """A rate of zero or more, with two digits if it is small: ``5 125``, ``240``, ``9.6``, ``0.93``, ``0.045``."""
     return f"{value:,.0f}".replace(",", " ") if value >= 9.95 else f"{value:.2g}"
 
 
@@ -152,7 +152,7 @@ class SafeStream:
 def guard_terminal() -> None:
     """Let this process print only text and colours to its terminal.
 
-    Not undone, since a traceback that ends the process is printed last. Does not cover native code and other programs.
+    Never undone, since a traceback that ends the process is printed last. Does not cover native code and other programs.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -163,9 +163,9 @@ def guard_terminal() -> None:
         logging.lastResort.setFormatter(_OneLine())
 
 
-MOST_LINES = 80
-"""Most lines of a traceback."""
-LONGEST_LINE = 500
+MAX_TRACEBACK_LINES = 80
+"""Maximum lines of a traceback."""
+MAX_LINE_CHARACTERS = 500
 
 
 class _OneLine(logging.Formatter):
@@ -176,9 +176,9 @@ class _OneLine(logging.Formatter):
 
     def formatException(self, ei: Any) -> str:
         # An error's text may be as long as what a recording or a page sent.
-        lines = [line[:LONGEST_LINE] for line in super().formatException(ei).splitlines()]
-        if len(lines) > MOST_LINES:
-            lines = [*lines[: MOST_LINES // 2], "    ...", *lines[-MOST_LINES // 2 :]]
+        lines = [line[:MAX_LINE_CHARACTERS] for line in super().formatException(ei).splitlines()]
+        if len(lines) > MAX_TRACEBACK_LINES:
+            lines = [*lines[: MAX_TRACEBACK_LINES // 2], "    ...", *lines[-MAX_TRACEBACK_LINES // 2 :]]
         return plain_text("\n".join(lines), "\n\t")
 
 

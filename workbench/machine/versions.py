@@ -1,4 +1,4 @@
-"""Installed versions of the packages whose private names the workbench uses, and what has moved in them."""
+"""Installed versions of packages whose private names the workbench uses, and which of these names have moved."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from workbench.machine.maniskill_installed import EXTRAS, installed_maniskills, 
 
 MANISKILL = tuple(EXTRAS)
 """Two distributions with the same files: the release, and the nightly build."""
-_OF_AN_EPISODE = (DISTRIBUTION, *MANISKILL, "sapien", "torch", "rerun-sdk")
+_EPISODE_PACKAGES = (DISTRIBUTION, *MANISKILL, "sapien", "torch", "rerun-sdk")
 TESTED = {
     "mani_skill": ("3.0.1",),
     "mani_skill-nightly": ("2026.8.2.400",),
@@ -31,10 +31,10 @@ TESTED = {
 
 @dataclass(frozen=True)
 class PrivateName:
-    """A name of another package that the workbench uses and that package does not promise."""
+    """A private name of another package that the workbench uses."""
 
     owner: str
-    """Owner of the name: a module, or module and class: ``package.module:Class``."""
+    """Owner of the name: a module, or a module and class as ``package.module:Class``."""
     name: str
     """Attribute of the owner; for a class, also a field that is annotated or that its methods assign."""
     disables: str = ""
@@ -60,7 +60,7 @@ class PrivateName:
 
 @cache
 def _names_of(cls: type) -> frozenset[str]:
-    """Annotated fields of a class, and attributes that its methods assign on anything."""
+    """Annotated fields of a class, and attributes that its methods assign on any object."""
     found = set(cls.__dict__.get("__annotations__", ()))
     for member in vars(cls).values():
         accessors = (member.fget, member.fset) if isinstance(member, property) else (member,)
@@ -74,9 +74,9 @@ _STORE, _LOADS = dis.opmap["STORE_ATTR"], (dis.opmap["LOAD_FAST"], dis.opmap["LO
 
 
 def stored_names(code: CodeType, of: str | None = None) -> set[str]:
-    """Attributes that a function, and those within it, assign on anything; with `of`, on the variable of this name.
+    """Attributes that a function and its inner functions assign on any object, or only on the variable `of`.
 
-    Read off the bytes of the code: `dis` and sources take a third of a second for ManiSkill's BaseEnv, at each start.
+    Read from the bytecode: `dis` and sources would take a third of a second for ManiSkill's BaseEnv, at each start.
     """
     found: set[str] = set()
     for each in _codes(code):
@@ -116,7 +116,7 @@ def installed(distribution: str) -> str | None:
 @cache
 def package_versions() -> Mapping[str, str]:
     """Versions of the packages that an episode depends on, as this process has them."""
-    versions = {name: installed(name) for name in _OF_AN_EPISODE}
+    versions = {name: installed(name) for name in _EPISODE_PACKAGES}
     return {name: version for name, version in versions.items() if version is not None}
 
 
@@ -126,13 +126,13 @@ def maniskill() -> tuple[str, str] | None:
 
 
 def untested(distributions: Iterable[str] = TESTED) -> dict[str, str]:
-    """Installed versions of these distributions with which no test was run."""
+    """Installed versions of these distributions that are not tested."""
     found = {name: installed(name) for name in distributions}
     return {name: v for name, v in found.items() if v is not None and v not in TESTED[name]}
 
 
 def command_for_tested_versions() -> str:
-    """The command that installs the tested versions of what is installed."""
+    """The command that installs the tested versions of the installed packages."""
     wanted = [f"{name}=={TESTED[name][0]}" for name in TESTED if installed(name) is not None]
     return pip_command("install", *wanted)
 
@@ -167,7 +167,7 @@ def unmet_lines() -> tuple[str, str] | None:
 
 
 def untested_text() -> str:
-    """The installed versions that no test was run with, and the command for the tested ones; empty if all are tested."""
+    """The installed versions that are not tested, and the command for the tested ones; empty if all are tested."""
     names = ", ".join(f"{name} {version}" for name, version in untested().items())
     return (
         f"Not tested with the workbench: {names}. The tested versions: {command_for_tested_versions()}"
@@ -177,7 +177,7 @@ def untested_text() -> str:
 
 
 def moved_text(moved: Iterable[PrivateName]) -> str:
-    """What does not work, by which names that have moved; empty if none has moved."""
+    """Features that do not work, each with the names that have moved; empty if none has."""
     lacking: dict[str, list[str]] = {}
     for each in moved:
         lacking.setdefault(each.disables or "opening a task", []).append(each.dotted)
@@ -186,7 +186,7 @@ def moved_text(moved: Iterable[PrivateName]) -> str:
 
 
 def rerun_notice() -> str:
-    """Notice of what a rerun version without tests does not allow; empty if nothing."""
+    """Notice that an untested version of rerun cannot record; empty if it can."""
     if not untested(["rerun-sdk"]):
         return ""  # rerun is not imported to open a task: it takes 0.3 s
     try:

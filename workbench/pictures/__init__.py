@@ -1,1 +1,1 @@
-"""Cameras of a running env: placed, rendered, measured and searched for."""
+"""Places, renders, measures and searches cameras of a running env."""

@@ -1,4 +1,4 @@
-"""Conversions between conventions for camera poses and lenses, without a simulator."""
+"""Converts camera poses and lenses between conventions; needs no simulator."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from workbench.envs.camera_data import CameraSettings, Matrix3
 
 Floats = NDArray[np.float64]
 Convention = Literal["maniskill", "opencv", "opengl"]
-"""What the camera's own axes are.
+"""Convention of the camera's own axes.
 
 * ``maniskill`` (also SAPIEN, ROS's body frames): x forward, y left, z up;
 * ``opencv`` (also ROS's optical frames, COLMAP): x right, y down, z forward;
@@ -32,10 +32,10 @@ _AXES: dict[str, Floats] = {
     "opencv": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
     "opengl": np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
 }
-VERTICAL = 1e-6
-"""Sine of the angle to the vertical below which a camera looks straight down or up, and "upright" says nothing."""
+VERTICAL_SINE = 1e-6
+"""Sine of the angle to the vertical below which a camera looks straight down or up, so that "upright" is undefined."""
 ROTATION_TOLERANCE = 1e-3
-"""How far a matrix may be from a rotation: calibrations are printed with four digits."""
+"""Largest deviation of a matrix from a rotation: calibrations are printed with four digits."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,10 @@ def normalised(quaternion: ArrayLike) -> Floats:
     """(4,) wxyz of unit length with w >= 0, so that q and -q compare equal.
 
     Raises:
-        ValueError: it is no rotation (all zero, or not finite).
+        ValueError: the quaternion is not a rotation (all zero, or not finite).
     """
     q = _vector(quaternion, 4, "a quaternion")
-    # Divided by the largest first: the squares of tiny numbers are zero.
+    # Divide by the largest first: the squares of tiny numbers are zero.
     largest = np.abs(q).max()
     if largest == 0:
         raise ValueError("a quaternion of zeros is no rotation; 1, 0, 0, 0 (w first) is the identity")
@@ -73,7 +73,7 @@ def normalised(quaternion: ArrayLike) -> Floats:
 
 
 def rotation_matrix(quaternion: ArrayLike) -> Floats:
-    """(3, 3) of a wxyz quaternion of any length."""
+    """(3, 3) rotation matrix of a wxyz quaternion of any length."""
     return quat2mat(normalised(quaternion))
 
 
@@ -81,7 +81,7 @@ def quaternion_of(rotation: ArrayLike) -> Floats:
     """(4,) wxyz of the rotation nearest to a matrix (3, 3).
 
     Raises:
-        ValueError: the matrix is no rotation, and why.
+        ValueError: the matrix is not a rotation; the message has the reason.
     """
     return normalised(mat2quat(nearest_rotation(rotation)))
 
@@ -90,8 +90,8 @@ def nearest_rotation(matrix: ArrayLike) -> Floats:
     """(3, 3) the rotation nearest to a matrix.
 
     Raises:
-        ValueError: it is farther from any rotation than `ROTATION_TOLERANCE`: a mirror image, scaled, skewed,
-            singular, or not of three rows and columns.
+        ValueError: the matrix is farther from any rotation than `ROTATION_TOLERANCE`: a mirror image, scaled, skewed,
+            singular, or not 3 x 3.
     """
     m = np.asarray(matrix, np.float64)
     if m.shape != (3, 3):
@@ -128,7 +128,7 @@ def axes_of(quaternion: ArrayLike) -> tuple[Floats, Floats, Floats]:
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> float:
     """Radians of the rotation from one orientation (4,) wxyz to the other; q and -q are the same one."""
-    # By the vector part, which keeps its digits where the angle is small.
+    # From the vector part, which keeps its precision where the angle is small.
     w, *vector = qmult(normalised(a), qconjugate(normalised(b)))
     return 2 * math.atan2(math.hypot(*vector), abs(w))
 
@@ -136,15 +136,15 @@ def angle_between(a: ArrayLike, b: ArrayLike) -> float:
 def quaternion_from_axes(forward: ArrayLike, up: ArrayLike) -> Floats:
     """(4,) wxyz of the camera that looks along `forward` with its top towards `up`.
 
-    `forward` is kept exactly; of `up`, what is at a right angle to it.
+    `forward` is kept exactly; only the part of `up` at a right angle to it counts.
 
     Raises:
         ValueError: one of them has no length, or both point the same way.
     """
     ahead = _direction(forward, "forward")
     left = np.cross(_direction(up, "up"), ahead)
-    if np.linalg.norm(left) < VERTICAL:
-        raise ValueError("up must not point along forward: which way the camera is turned stays open")
+    if np.linalg.norm(left) < VERTICAL_SINE:
+        raise ValueError("up must not point along forward: the camera's roll would be undefined")
     left /= np.linalg.norm(left)
     return quaternion_of(np.stack([ahead, left, np.cross(ahead, left)], axis=1))
 
@@ -154,12 +154,12 @@ def rpy_of(quaternion: ArrayLike) -> tuple[float, float, float]:
 
     URDF's and ROS's fixed-axis convention, transforms3d's ``sxyz``. For a camera in ManiSkill's frame: yaw turns
     it to the left, a positive pitch looks down, roll turns it clockwise as seen from behind. Straight down or up, roll
-    and yaw are one rotation, and all of it is given as yaw.
+    and yaw are the same rotation, which is returned as yaw.
     """
     r = rotation_matrix(quaternion)
     flat = math.hypot(r[0, 0], r[1, 0])
     pitch = math.atan2(-r[2, 0], flat)
-    if flat < VERTICAL:
+    if flat < VERTICAL_SINE:
         roll, yaw = 0.0, math.atan2(-r[0, 1], r[1, 1])
     else:
         roll, yaw = math.atan2(r[2, 1], r[2, 2]), math.atan2(r[1, 0], r[0, 0])
@@ -192,7 +192,7 @@ def with_pose(settings: CameraSettings, pose: ArrayLike) -> CameraSettings:
 
 
 def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Floats:
-    """(7,) of a position (3,) and a quaternion (4,) wxyz of any length."""
+    """(7,) pose from a position (3,) and a quaternion (4,) wxyz of any length."""
     return np.concatenate([_vector(position, 3, "a position"), normalised(quaternion)])
 
 
@@ -220,7 +220,8 @@ def relative_to(mount: ArrayLike, world: ArrayLike) -> Floats:
 
 
 def pose_from_look_at(look_at: LookAt) -> Floats:
-    """(7,) of eye, target and roll. Equals ManiSkill's ``look_at``, whose quaternion straight down and up is not of unit length.
+    """(7,) pose from eye, target and roll. Equals ManiSkill's ``look_at``, except that the latter's quaternion is not of unit
+    length straight down and up.
 
     Raises:
         ValueError: eye and target are one point.
@@ -250,7 +251,7 @@ def upright(forward: ArrayLike) -> Floats:
     """(3, 3) rotation of the camera that looks along `forward` and is level; see `LookAt.roll` for the vertical."""
     ahead = _direction(forward, "forward")
     flat = math.hypot(ahead[0], ahead[1])
-    left = np.array([0.0, 1.0, 0.0]) if flat < VERTICAL else np.array([-ahead[1], ahead[0], 0.0]) / flat
+    left = np.array([0.0, 1.0, 0.0]) if flat < VERTICAL_SINE else np.array([-ahead[1], ahead[0], 0.0]) / flat
     left = left - ahead * (ahead @ left)
     left /= np.linalg.norm(left)
     return np.stack([ahead, left, np.cross(ahead, left)], axis=1)
@@ -260,7 +261,7 @@ def upright(forward: ArrayLike) -> Floats:
 
 
 def matrix_of(pose: ArrayLike, convention: Convention, direction: Direction) -> Floats:
-    """(4, 4) of a pose (7,). OpenCV's extrinsic is ``("opencv", "world_to_camera")`` without its last row; the
+    """(4, 4) matrix of a pose (7,). OpenCV's extrinsic is ``("opencv", "world_to_camera")`` without its last row; the
     model matrix of ManiSkill's ``cam2world_gl`` is ``("opengl", "camera_to_world")``.
     """
     p = _vector(pose, 7, "a pose")
@@ -274,10 +275,10 @@ def matrix_of(pose: ArrayLike, convention: Convention, direction: Direction) -> 
 
 
 def pose_from_matrix(matrix: ArrayLike, convention: Convention, direction: Direction) -> Floats:
-    """(7,) of a matrix (4, 4) or (3, 4) in this convention and direction.
+    """(7,) pose from a matrix (4, 4) or (3, 4) in this convention and direction.
 
     Raises:
-        ValueError: it is of another shape, its last row is not 0 0 0 1, or its 3 x 3 part is no rotation.
+        ValueError: the matrix has another shape, its last row is not 0 0 0 1, or its 3 x 3 part is not a rotation.
     """
     m = np.asarray(matrix, np.float64)
     if m.shape not in ((4, 4), (3, 4)):
@@ -299,12 +300,12 @@ def pose_from_matrix(matrix: ArrayLike, convention: Convention, direction: Direc
 
 
 def opencv_extrinsic(pose: ArrayLike) -> Floats:
-    """(3, 4) world to camera, the camera with x right, y down, z forward."""
+    """(3, 4) matrix from world to camera; the camera's x is right, y down, z forward."""
     return matrix_of(pose, "opencv", "world_to_camera")[:3]
 
 
 def opengl_model_matrix(pose: ArrayLike) -> Floats:
-    """(4, 4) camera to world, the camera with x right, y up, z backward."""
+    """(4, 4) matrix from camera to world; the camera's x is right, y up, z backward."""
     return matrix_of(pose, "opengl", "camera_to_world")
 
 
@@ -312,7 +313,7 @@ def opengl_model_matrix(pose: ArrayLike) -> Floats:
 
 
 def intrinsic_from_fov(fov: float, width: int, height: int) -> Floats:
-    """(3, 3) of a vertical field of view in radians: square pixels, the axis through the picture's middle.
+    """(3, 3) intrinsic matrix of a vertical field of view in radians: square pixels, principal point in the middle.
 
     OpenCV's pinhole, (u, v, 1) z = K (x, y, z), with pixels counted from the outer edge of the top left pixel, as in
     SAPIEN: the middle of a picture is W / 2, H / 2.
@@ -325,10 +326,10 @@ def intrinsic_from_fov(fov: float, width: int, height: int) -> Floats:
 
 
 def intrinsic_of(settings: CameraSettings) -> Floats:
-    """(3, 3) in pixels, from the intrinsic or the fov of the settings.
+    """(3, 3) intrinsic matrix in pixels, from the intrinsic or the fov of the settings.
 
     Raises:
-        ValueError: they have neither, or an impossible one.
+        ValueError: the settings have neither, or an impossible one.
     """
     if settings.intrinsic is not None:
         return checked_intrinsic(settings.intrinsic)
@@ -341,8 +342,8 @@ def checked_intrinsic(matrix: ArrayLike) -> Floats:
     """(3, 3) an intrinsic matrix that ManiSkill can render.
 
     Raises:
-        ValueError: it is no pinhole's: another shape or last row, focal lengths that are not positive, or a skew, which
-            ManiSkill silently ignores.
+        ValueError: the matrix is not that of a pinhole camera: another shape or last row, focal lengths that are not
+            positive, or a skew, which ManiSkill silently ignores.
     """
     k = np.asarray(matrix, np.float64)
     if k.shape != (3, 3) or not np.isfinite(k).all():
@@ -357,17 +358,17 @@ def checked_intrinsic(matrix: ArrayLike) -> Floats:
 
 
 def vertical_fov(intrinsic: ArrayLike, height: int) -> float:
-    """Radians from the picture's upper to its lower border, as if the axis went through its middle."""
+    """Radians from the picture's upper to its lower border, as if the principal point were in the middle."""
     return 2 * math.atan(height / 2 / float(checked_intrinsic(intrinsic)[1, 1]))
 
 
 def horizontal_fov(intrinsic: ArrayLike, width: int) -> float:
-    """Radians from the picture's left to its right border, as if the axis went through its middle."""
+    """Radians from the picture's left to its right border, as if the principal point were in the middle."""
     return 2 * math.atan(width / 2 / float(checked_intrinsic(intrinsic)[0, 0]))
 
 
 def scaled_intrinsic(intrinsic: ArrayLike, size: Sequence[int], new_size: Sequence[int]) -> Floats:
-    """(3, 3) that shows the same view in a picture of another (width, height); pixels need not stay square."""
+    """(3, 3) intrinsic matrix for the same view in a picture of another (width, height); pixels need not stay square."""
     _check_size(*size)
     _check_size(*new_size)
     scale = np.diag([new_size[0] / size[0], new_size[1] / size[1], 1.0])

@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 from workbench.envs.camera_data import CameraKey, CameraKind, CameraSettings, Picture
 from workbench.pictures.camera_conventions import intrinsic_of
 
-DEPTH_EDGES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
-"""Metres, (41,). Ten bins a decade, the same for every camera, so that histograms can be compared; values outside count
-in the first or last bin."""
-ENOUGH_PIXELS = 100.0
-"""An object of fewer pixels counts as small: a cube of ten by ten still shows its rotation."""
+DEPTH_EDGES_METRES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
+"""(41,) ten bins per decade, the same for every camera, so that histograms can be compared; values outside count in the
+first or last bin."""
+LARGE_ENOUGH_PIXELS = 100.0
+"""Pixels below which an object counts as small: a cube of ten by ten pixels still shows its rotation."""
 
 
 @dataclass(frozen=True)
 class ObjectToSee:
-    """One object that a search can name: of the task, or a robot, whose single links can be named too."""
+    """One object that a search can name: an object of the task, or a robot, whose single links can be named too."""
 
     name: str
-    """An actor's or an articulation's."""
+    """Name of an actor or an articulation."""
     hidden: bool
     """The task hides it from the sensors (a goal marker): only human cameras see it."""
     links: tuple[str, ...] = ()
-    """Names of an articulation's bodies, if it has several. Of a robot those that are drawn, its hand first."""
+    """Names of an articulation's bodies, if it has several; for a robot its drawn links, the hand first."""
     robot: bool = False
 
 
@@ -39,16 +39,16 @@ class ObjectSummary:
     present: int
     """Envs that have the object."""
     seen: float
-    """Share of them in which at least one of its pixels is in the picture."""
+    """Share of these envs in which at least one pixel of the object is in the picture."""
     median_pixels: float
     cut: float
-    """Share of them in which the border of the picture cuts it."""
+    """Share of these envs in which the border of the picture cuts the object."""
     hidden: float
-    """Share of it that the robot covers, averaged over the envs where it would be seen without the robot."""
+    """Share of the object that the robot covers, averaged over the envs where it would be seen without the robot."""
     wholly_hidden: float
-    """Share of the envs that have it in which only the robot hides it."""
+    """Share of these envs in which the robot alone hides the object."""
     covered: float
-    """Share of it that other things than the robot cover, averaged over the envs where it is in the picture."""
+    """Share of the object that other things than the robot cover, averaged over the envs where it is in the picture."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,13 @@ class ObjectSeen:
     """One object of the task in the pictures of E envs."""
 
     name: str
-    """An actor's or an articulation's."""
+    """Name of an actor or an articulation."""
     never_drawn: bool
     """The task hides it from this kind of camera (a goal marker from the sensors)."""
     scenery: bool
     """Part of the room (a table, a static body), which a policy need not find."""
     present: NDArray[np.bool_]
-    """(E,) whether the env has it at all."""
+    """(E,) whether the env has the object at all."""
     pixels: NDArray[np.float32]
     """(E,) visible pixels, at the camera's own size, even if smaller pictures were measured."""
     unhindered: NDArray[np.float32]
@@ -70,9 +70,10 @@ class ObjectSeen:
     alone: NDArray[np.float32]
     """(E,) pixels with nothing else drawn; `unhindered` for scenery, which is not measured alone."""
     cut: NDArray[np.bool_]
-    """(E,) whether it reaches the border of the picture, drawn alone."""
+    """(E,) whether the object, drawn alone, reaches the border of the picture."""
     margin: NDArray[np.float32]
-    """(E,) from it to the nearest border, as a share of the picture's shorter side; 0 where it is cut or not seen."""
+    """(E,) distance from the object to the nearest border, as a share of the picture's shorter side; 0 where it is cut or
+    not seen."""
 
     @property
     def hidden_share(self) -> NDArray[np.float32]:
@@ -90,7 +91,7 @@ class ObjectSeen:
         Product of the share that nothing covers, one half if the border cuts it, and for small objects the square root of
         their pixels (a length: twice as far away is half as good).
         """
-        size = np.sqrt(np.clip(self.alone / ENOUGH_PIXELS, 0, 1))
+        size = np.sqrt(np.clip(self.alone / LARGE_ENOUGH_PIXELS, 0, 1))
         open_share = np.clip(self.pixels / np.maximum(self.alone, 1e-6), 0, 1)
         marks = np.where(self.pixels > 0, size * open_share * np.where(self.cut, 0.5, 1.0), 0.0)
         return np.where(self.present, marks, np.nan).astype(np.float32)
@@ -114,10 +115,10 @@ class ObjectSeen:
 
 @dataclass(frozen=True)
 class DepthReport:
-    """Depth of all that the camera sees, the robot included."""
+    """Depth of everything that the camera sees, including the robot."""
 
     counts: NDArray[np.int64]
-    """(E, 40) pixels of the measured pictures between `DEPTH_EDGES`, without background."""
+    """(E, 40) pixels of the measured pictures between `DEPTH_EDGES_METRES`, without background."""
     background: NDArray[np.float32]
     """(E,) share of the picture where a ray meets nothing (depth 0)."""
     beyond: NDArray[np.float32]
@@ -150,7 +151,7 @@ class CameraReport:
     measured_size: tuple[int, int]
     """Width and height of the measured pictures. In smaller ones, anything below a pixel is not seen."""
     envs: tuple[int, ...]
-    """(E,) an env may come several times: at several moments, or with several seeds."""
+    """(E,) an env may occur several times: at several moments, or with several seeds."""
     objects: tuple[ObjectSeen, ...]
     depth: DepthReport
     pictures: int
@@ -173,7 +174,7 @@ class CameraReport:
         return np.where(np.isinf(worst), np.nan, worst).astype(np.float32)
 
     def worst_first(self, wanted: Collection[str] | None = None) -> tuple[int, ...]:
-        """Positions in `envs`, the worst mark first; equal marks as they come, envs with nothing to see last."""
+        """Positions in `envs`, the worst mark first; equal marks in their order, envs with nothing to see last."""
         return tuple(
             int(i) for i in np.argsort(np.nan_to_num(self.env_marks(wanted), nan=2.0), kind="stable")
         )
@@ -199,12 +200,12 @@ class SearchSpace:
     """Lower corner of the box for the eye, metres in the frame of the mount, or the env's if there is none."""
     high: tuple[float, float, float]
     lens: CameraSettings
-    """The camera without its pose; on a mount, the pose gives which way the picture is up."""
+    """Settings of the camera. The pose is not used, except on a mount, where it decides which way the picture is up."""
     kind: CameraKind = "sensor"
     candidates: int = 100
     """Placements that the first round draws."""
     best: int = 5
-    """Placements that are offered at most."""
+    """Maximum number of placements that are offered."""
     apart: float | None = None
     """Least distance between two offered eyes, metres; None for a seventh of the box's diagonal."""
     seed: int = 0
@@ -212,7 +213,7 @@ class SearchSpace:
     """Name of the body that the camera is mounted on."""
 
     def check(self) -> None:
-        """Raises ValueError for a space that cannot be searched."""
+        """Raise ValueError if the space cannot be searched."""
         box = np.array([self.low, self.high], np.float64)
         if not np.isfinite(box).all() or (box[0] > box[1]).any():
             raise ValueError(
@@ -234,9 +235,9 @@ class OfferedPlacement:
     target: tuple[float, float, float]
     """A point on its line of sight, for a look-at."""
     score: float
-    """0..1, higher is better; see `search.score_of`."""
+    """0..1, higher is better; see `camera_search.score_of`."""
     words: str
-    """What it sees, in a sentence."""
+    """What the camera sees, in a sentence."""
     report: CameraReport
     picture: Picture
     """Picture from the placement, in its worst env."""

@@ -41,20 +41,20 @@ from workbench.pictures.visibility import (
     small_size,
 )
 
-WIDE_MARGIN = 0.1
-"""Share of the picture's shorter side that is enough between an object and the border."""
-ROOM = 0.1
-"""Metres that must be free in front of the lens: the camera's own body is there."""
-FROM_THE_ROBOT = 0.2
-"""Least distance in metres of an eye from the origin of every robot link, in the searched envs."""
-FROM_ITS_MOUNT = 0.05
-"""Least distance in metres of an eye on a mount from the origin of every robot link; it is meant to be near one."""
-GOOD_ENOUGH = 0.995
+WIDE_MARGIN_SHARE = 0.1
+"""Sufficient distance between an object and the border, as a share of the picture's shorter side."""
+FREE_METRES = 0.1
+"""Distance that must be free in front of the lens, for the camera's own body."""
+ROBOT_DISTANCE_METRES = 0.2
+"""Least distance of an eye from the origin of every robot link, in the searched envs."""
+MOUNT_DISTANCE_METRES = 0.05
+"""Least distance of an eye on a mount from the origin of every robot link; such an eye is meant to be near one."""
+SUFFICIENT_SCORE = 0.995
 """Score at which no further round is sampled."""
 ROUNDS = 2
-"""Rounds of samples around the best candidates."""
-TRIES = 50
-"""Attempts to sample an eye clear of the robot; a box within the robot is searched anyway."""
+"""Number of rounds of samples around the best candidates."""
+MAX_EYE_ATTEMPTS = 50
+"""Maximum attempts to sample an eye clear of the robot; a box within the robot is searched anyway."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
 
@@ -67,13 +67,13 @@ def suggest_cameras(
     progress: Callable[[int, int], None] = lambda done, total: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[OfferedPlacement, ...]:
-    """The best placements found, best first, for envs that are already reset; the envs stay as they are.
+    """Search placements for envs that are already reset, and return the best first; the envs stay unchanged.
 
-    Placements at a distance from each other are returned, since five neighbours are one suggestion; fewer than `SearchSpace.best` if
-    there are not more, or if the search is cancelled. The same seed gives the same result.
+    Returned placements keep a distance from each other, since five neighbours would be one suggestion. They are fewer than
+    `SearchSpace.best` if no more are found, or if the search is cancelled. The same seed gives the same result.
 
     Args:
-        progress: called after each picture with the number made and the most that will be made; keep it cheap.
+        progress: called after each picture with the number made and the maximum that will be made; keep it cheap.
         cancelled: called before each picture.
 
     Raises:
@@ -93,10 +93,10 @@ def score_of(report: CameraReport, objects: Sequence[str]) -> float:
     """
     marks = []
     for thing in report.wanted_objects(objects):
-        inside = 0.8 + 0.2 * np.clip(thing.margin / WIDE_MARGIN, 0, 1)
+        inside = 0.8 + 0.2 * np.clip(thing.margin / WIDE_MARGIN_SHARE, 0, 1)
         marks.append(np.where(thing.present, thing.marks() * inside, np.nan))
     worst = np.min(np.nan_to_num(marks, nan=np.inf), axis=0)
-    room = np.clip(np.nan_to_num(report.depth.nearest) / ROOM, 0, 1)
+    room = np.clip(np.nan_to_num(report.depth.nearest) / FREE_METRES, 0, 1)
     there = np.isfinite(worst)
     known = worst[there] * room[there]
     return float((known.mean() + known.min()) / 2) if len(known) else 0.0
@@ -152,7 +152,7 @@ class _Search:
         self._measure_best_of(drawn, self.keep)
         for round_ in range(ROUNDS):
             chosen = self._chosen()
-            if len(chosen) == self.space.best and chosen[-1][0] >= GOOD_ENOUGH:
+            if len(chosen) == self.space.best and chosen[-1][0] >= SUFFICIENT_SCORE:
                 break
             centres = [candidate for _, candidate, _ in chosen]
             reach = 0.12 / (round_ + 1)
@@ -163,7 +163,7 @@ class _Search:
             yield self._suggestion(score, candidate, report)
 
     def _measure_best_of(self, candidates: list[_Candidate], keep: int) -> None:
-        """Score all without the robot, which bounds the score from above, then the best `keep` with it."""
+        """Score all candidates without the robot, which bounds the score from above, then the best `keep` with it."""
         bare = self._measure(candidates)
         scores = [score_of(join_reports(row), self.space.objects) for row in bare]
         order = np.argsort([-score for score in scores], kind="stable").tolist()
@@ -202,7 +202,7 @@ class _Search:
         return measured
 
     def _chosen(self) -> list[tuple[float, _Candidate, CameraReport]]:
-        """The best that are not close to each other."""
+        """The best candidates that are not close to each other."""
         chosen: list[tuple[float, _Candidate, CameraReport]] = []
         for entry in sorted(self.found, key=lambda entry: -entry[0]):
             if entry[0] > 0 and not any(self._near(entry[1], other[1]) for other in chosen):
@@ -213,7 +213,7 @@ class _Search:
 
     def _draw(self) -> _Candidate:
         eye = self.rng.uniform(self.low, self.high)
-        for _ in range(TRIES):
+        for _ in range(MAX_EYE_ATTEMPTS):
             if self._is_clear(eye):
                 break
             eye = self.rng.uniform(self.low, self.high)
@@ -225,7 +225,7 @@ class _Search:
         return eye, self._apart_from(eye, centre[1] + self.rng.normal(0, 0.5, 3) * reach * self.spread)
 
     def _is_clear(self, eye: NDArray[np.float64]) -> bool:
-        least = FROM_THE_ROBOT if self.mounts is None else FROM_ITS_MOUNT
+        least = ROBOT_DISTANCE_METRES if self.mounts is None else MOUNT_DISTANCE_METRES
         return not len(self.links) or np.linalg.norm(self.links - eye, axis=1).min() >= least
 
     def _apart_from(self, eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -264,7 +264,7 @@ class _Search:
         return mounts
 
     def _pose(self, candidate: _Candidate) -> NDArray[np.float64]:
-        """(7,) of a candidate, in the mount's or the env's frame."""
+        """(7,) pose of a candidate, in the mount's or the env's frame."""
         if self.mounts is None:
             return pose_from_look_at(LookAt(triple(candidate[0]), triple(candidate[1])))
         # "Up" in a link's frame means nothing: the picture keeps its present orientation.

@@ -1,4 +1,4 @@
-"""Placement of a live camera in all envs: pose, lens, size and shader."""
+"""Places live cameras in all envs: pose, lens, size and shader."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class _PlacedCamera:
     config: Any
     """The task's own config."""
     poses: list[sapien.Pose]
-    """Local poses of the envs' components before: the task's code may have moved them."""
+    """Local poses of the envs' components before the placement, since the task's code may have moved them."""
     settings: CameraSettings
 
 
@@ -38,9 +38,9 @@ class PlacedCameras:
 
     Pose and lens are set on SAPIEN's camera components. Size and shader are fixed when a component is made, so a new
     component takes its place on the same entity. Bodies and physics are untouched. ManiSkill's objects around the
-    components follow (config, cached matrices, camera group): observations and ``get_params`` are those of an env that
-    was built with such a config. Resets and snapshots keep a placement; a reset that rebuilds the scene does not: call
-    `put_back` after it.
+    components are updated (config, cached matrices, camera group): observations and ``get_params`` are those of an env
+    that was built with such a config. Resets and snapshots keep a placement, but a reset that rebuilds the scene does not:
+    call `put_back` after it.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class PlacedCameras:
         return {key: placed.settings for key, placed in self._placed.items()}
 
     def settings(self, key: CameraKey) -> CameraSettings | None:
-        """Settings of a placed camera; None if it is as the task has it."""
+        """Settings of a placed camera; None if the camera is not placed."""
         placed = self._placed.get(key)
         return None if placed is None else placed.settings
 
@@ -106,7 +106,7 @@ def _camera(env: Any, key: CameraKey) -> Any:
     if moved := maniskill_private.why_not(maniskill_private.PLACING):
         raise ValueError(moved)
     if not maniskill_private.camera_components(camera):
-        raise ValueError(f"{name!r} is no plain camera, and only those can be placed")
+        raise ValueError(f"{name!r} is not a plain camera, and only those can be placed")
     if env.scene.gpu_sim_enabled and batched_system(env.scene) is None:
         raise ValueError(NOT_ON_THE_GPU)
     return camera
@@ -225,7 +225,7 @@ def _numbers(value: Any) -> np.ndarray:
 
 
 def _one(value: Any, *shape: int) -> Any:
-    """The number, or matrix of this shape, that all envs share; None where they differ."""
+    """The number, or matrix of this shape, that all envs share; None if they differ."""
     numbers = np.zeros(0) if value is None else _numbers(value)
     if not numbers.size or numbers.shape[numbers.ndim - len(shape) :] != shape:
         return None

@@ -1,4 +1,4 @@
-"""Pictures of chosen cameras of one env."""
+"""Renders chosen cameras of one env."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from workbench.envs.task_env import TaskEnv
 from workbench.pictures.placed_cameras import rows_of_pose, settings_of
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
-_INT16_END = 32.767
-"""Metres. The minimal shader writes positions as int16 millimetres."""
+_MAX_INT16_METRES = 32.767
+"""Largest position of the minimal shader, which writes int16 millimetres."""
 
 KINDS: tuple[CameraKind, ...] = ("sensor", "human")
 Request = tuple[str, CameraKind, Sequence[str]]
@@ -40,7 +40,7 @@ Request = tuple[str, CameraKind, Sequence[str]]
 def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
     """All cameras of a ManiSkill env: its sensors (the robot's too), then its human render cameras.
 
-    Empty without a render device. Sensors that are no plain cameras are left out.
+    Empty without a render device. Sensors that are not plain cameras are left out.
     """
     infos = []
     for (kind, name), camera in cameras_of(env).items():
@@ -69,7 +69,7 @@ def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
 
 
 def findings_of_shaders(cameras: Iterable[CameraInfo]) -> list[Finding]:
-    """For each camera whose shader is replaced, where its config is made."""
+    """One finding for each camera whose shader is replaced, at the line where its config is made."""
     found = []
     for camera in cameras:
         if not camera.replaced_shader:
@@ -95,10 +95,10 @@ def here_without_ray_tracing() -> str:
 
 
 def segmentation_names(env: Any) -> dict[int, str]:
-    """Body name of every id in a segmentation picture; 0, the background, is not among them.
+    """Body name of every id in a segmentation picture, without 0, the background.
 
     Ids count the entities of a sub-scene, so they are the same in all envs that are built from the same parts.
-    Where envs differ an id that means two things is called ``a | b``.
+    Where envs differ, an id that means two bodies is called ``a | b``.
     """
     index = scene_index(env)
     names: dict[int, list[str]] = {}
@@ -124,10 +124,10 @@ def take_pictures(
     ones are rendered, from the env's own sub-scene, with ManiSkill's shaders and texture transforms.
 
     Args:
-        poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where they
-            are. Only what is drawn moves, so a past moment can be
-            rendered without changing the simulation. A camera moves with its mount; colours and lights are today's.
-        degree: None for the one that the env was made with. Only a batch on the CPU has fast ones, others are exact.
+        poses: (B, 7) where to draw the env's bodies, as `read_poses` returns them; None for where they are. Only the
+            drawn bodies move, so a past moment can be rendered without changing the simulation. A camera moves with its
+            mount; colours and lights are the present ones.
+        degree: None for the degree that the env was made with. Fast pictures need a batch on the CPU; all others are exact.
 
     Raises:
         IndexError: there is no such env.
@@ -151,7 +151,7 @@ class PendingPictures:
     ]
 
     def finish(self) -> tuple[Picture, ...]:
-        """The pictures, in the order asked; waits until the renderer is done."""
+        """Wait until the renderer is done; returns the pictures in the order of the requests."""
         return tuple(_read(*taken) for taken in self._taken)
 
 
@@ -164,10 +164,10 @@ def begin_pictures(
 ) -> PendingPictures:
     """Start rendering the requested cameras, and return at once.
 
-    SAPIEN hands a picture to the driver in 0.05 ms and waits for it only when it is read: a GPU, or the
+    SAPIEN submits a picture to the driver in 0.05 ms and waits for it only when it is read: a GPU, or the
     threads of a software driver, draw while the simulation steps on (measured on two cores with
     lavapipe: 26 control steps of 16 envs in 151 ms during a picture that takes 51 ms alone). The scene is
-    drawn as it is now; do not close it or render another camera before `finish`.
+    drawn in its present state; do not close it or render another camera before `finish`.
 
     Args:
         requests: all of one kind, since sensors and human cameras see different objects.
@@ -179,7 +179,7 @@ def begin_pictures(
     require_env(env_index, env.num_envs)
     kinds = {kind for _, kind, _ in requests}
     if len(kinds) > 1:
-        raise ValueError("pictures of sensors and of human cameras cannot be begun together")
+        raise ValueError("pictures of sensors and of human cameras cannot be started together")
     cameras = cameras_of(env)
     for name, kind, modalities in requests:
         _check(name, kind, modalities, cameras)
@@ -223,7 +223,7 @@ def begin_pictures(
 
 
 def _degree_of(scene: Any, component: Any, asked: PictureDegree | None = None) -> PictureDegree:
-    """Degree of a picture for which `asked` is requested: only a batch on the CPU has fast ones."""
+    """Degree in which a picture is drawn if `asked` is requested: fast pictures need a batch on the CPU."""
     return scene.degree_of(component, asked) if isinstance(scene, BatchedCpuScene) else "exact"
 
 
@@ -234,7 +234,7 @@ def _textures(camera: Any, modalities: Sequence[str]) -> set[str]:
 
 
 def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) -> Places:
-    """Entities of an env to draw elsewhere than they are; call it before objects are shown or hidden.
+    """Entities of an env to draw at other poses than their own; call it before objects are shown or hidden.
 
     Args:
         poses: as in `take_pictures`.
@@ -286,9 +286,9 @@ def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]
     """Context in which the task's hidden objects are drawn in this env, or are not.
 
     ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by visibility, in GPU
-    simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back
-    while human cameras look. One that something else has moved back meanwhile stays in sight of sensors, as for the policy.
-    Both are undone, so a picture leaves no trace in the simulation.
+    simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back for
+    pictures of human cameras. If something else has moved an object back meanwhile, sensors see it, as the policy does.
+    Both are undone, so a picture does not change the simulation.
     """
     slot_of = scene_index(env).slot_of
     true = (
@@ -356,8 +356,8 @@ def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component
     """(H, W) metres, 0 for background, from the texture `data` and ManiSkill's own reading of it.
 
     ManiSkill's standard is int16 millimetres. Where the texture holds float positions in metres, as
-    in the default and ray tracing shaders, they are used as they are. The minimal shader's texture is
-    int16 itself: what is beyond 32.767 m is clamped to -32768 (measured on lavapipe; a driver may
+    in the default and ray tracing shaders, they are used directly. The minimal shader's texture is
+    int16 itself: depth beyond 32.767 m is clamped to -32768 (measured on lavapipe; a driver may
     also wrap around) and read from the depth buffer instead.
     """
     if texture == "Position" and np.issubdtype(data.dtype, np.floating):
@@ -366,7 +366,7 @@ def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component
     if np.issubdtype(transformed.dtype, np.floating):
         return transformed.astype(np.float32)
     depth = transformed.astype(np.float32) / np.float32(1000.0)
-    beyond = (depth < 0.0) | (depth >= _INT16_END)
+    beyond = (depth < 0.0) | (depth >= _MAX_INT16_METRES)
     if beyond.any():
         # Vulkan's depth in 0..1 of a perspective camera: z = f (1 - n / d) / (f - n).
         buffer = component.get_picture("GbufferDepth")
@@ -376,7 +376,7 @@ def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component
     return depth
 
 
-# --- of a step ---------------------------------------------------------------------------------------
+# --- pictures of a step ------------------------------------------------------------------------------
 
 
 def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[Request, ...]:
@@ -392,9 +392,9 @@ def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[Request, ...]:
 def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Request]) -> list[Picture]:
     """Pictures of the requested cameras, of the last observed state, env by env.
 
-    A picture takes 25 to 50 ms on a software renderer, so what the observation holds is taken from there: the same
-    picture (tested), with depth and segmentation as ManiSkill's int16 millimetres and ids. Rendered are the others, depth
-    beyond 32.767 m, and shaders that give more than millimetres. Raises as `take_pictures`.
+    A picture takes 25 to 50 ms on a software renderer, so pictures in the observation are reused: they are the same
+    (tested), with depth and segmentation as ManiSkill's int16 millimetres and ids. Rendered are only other pictures, depth
+    beyond 32.767 m, and shaders with more precision than millimetres. Raises as `take_pictures`.
     """
     if not requests:
         return []
@@ -408,7 +408,7 @@ def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Requ
 
 
 def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[Picture] | None:
-    """Pictures of each env from its last observation; None where they must be drawn."""
+    """Pictures of each env from its last observation; None if they must be rendered."""
     name, kind, modalities = request
     seen: Any = task.obs.get("sensor_data", {}) if isinstance(task.obs, Mapping) else {}
     images = seen.get(name) if kind == "sensor" else None

@@ -1,4 +1,4 @@
-"""Pictures of a recorded scene, from its shapes and poses alone."""
+"""Renders a recorded scene from its shapes and poses."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from workbench.envs.rendering.drawing import drawing
 from workbench.envs.scene.normals import with_normals
 from workbench.envs.scene.shapes import Material, SceneGeometry, Visual
 
-NEAR, FAR = 0.01, 300.0
+NEAR_METRES, FAR_METRES = 0.01, 300.0
 
 
 class RecordedScene:
     """The recorded bodies of one env, as a SAPIEN scene with one camera. Needs no env, task file or physics.
 
     Args:
-        geometry: What they look like.
-        env: Which env of it.
-        width: Pixels.
-        height: Pixels.
+        geometry: Shapes of the bodies.
+        env: Index of the env in `geometry`.
+        width: Width of the pictures in pixels.
+        height: Height of the pictures in pixels.
         fovy: Vertical field of view in radians.
 
     Raises:
@@ -40,21 +40,21 @@ class RecordedScene:
         self._scene.set_ambient_light([0.45, 0.45, 0.47])
         self._scene.add_directional_light([-0.5, 0.35, -1.0], [1.05, 1.03, 1.0])
         self._scene.add_directional_light([0.6, -0.2, -0.5], [0.3, 0.31, 0.34])
-        worn: dict[int, sapien.render.RenderBodyComponent] = {}
+        components: dict[int, sapien.render.RenderBodyComponent] = {}
         for visual in geometry.visuals:
             if len(visual.mesh.faces):
                 for body in visual.bodies[visual.envs == env].tolist():
-                    # A shape of its own for each body: SAPIEN keeps it with the last body that got it.
-                    worn.setdefault(body, sapien.render.RenderBodyComponent()).attach(_shape(visual))
+                    # Each body needs its own shape: SAPIEN keeps a shape only in the last body that got it.
+                    components.setdefault(body, sapien.render.RenderBodyComponent()).attach(_shape(visual))
         self._bodies: dict[int, sapien.Entity] = {}
-        for body, shapes in worn.items():
+        for body, shapes in components.items():
             self._bodies[body] = entity = sapien.Entity()
             entity.add_component(shapes)
             self._scene.add_entity(entity)
         self._eye = sapien.Entity()
         camera: Any = sapien.render.RenderCameraComponent(width, height)
         camera.set_fovy(fovy)
-        camera.near, camera.far = NEAR, FAR
+        camera.near, camera.far = NEAR_METRES, FAR_METRES
         self._eye.add_component(camera)
         with selected(DEFAULT):
             self._scene.add_entity(self._eye)
@@ -62,11 +62,11 @@ class RecordedScene:
         self._camera = camera
 
     def picture(self, poses: NDArray[np.float32], eye: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """What is seen: (H, W, 3).
+        """Render an RGB picture (H, W, 3).
 
         Args:
-            poses: (B, 7) of the bodies, position and wxyz; NaN for an absent body.
-            eye: (7,) of the camera, x forward, y left, z up.
+            poses: (B, 7) poses of the bodies, position and wxyz; NaN for an absent body.
+            eye: (7,) pose of the camera, x forward, y left, z up.
         """
         for body, entity in self._bodies.items():
             pose = poses[body]
@@ -99,7 +99,7 @@ def _material(material: Material) -> sapien.render.RenderMaterial:
     made.metallic = float(material.metallic)
     made.roughness = float(material.roughness)
     if material.texture is not None:
-        # SAPIEN asks whether the dtype is that very object of numpy's; of an array that crossed a pipe it is another.
+        # SAPIEN compares the dtype by identity; an array that was received from another process has another dtype object.
         pixels = np.empty(material.texture.shape, np.uint8)
         pixels[...] = material.texture
         made.base_color_texture = sapien.render.RenderTexture2D(
@@ -109,5 +109,5 @@ def _material(material: Material) -> sapien.render.RenderMaterial:
 
 
 def _levels(pixels: NDArray[np.uint8]) -> int:
-    """Mipmap levels, down to some pixels: without them a distant wooden table is noise."""
+    """Number of mipmap levels, down to some pixels: without them a distant wooden table is noise."""
     return max(1, int(np.log2(min(pixels.shape[:2]))) - 2)

@@ -1,4 +1,4 @@
-"""A camera at any pose of one env, for the time of a few pictures."""
+"""A temporary camera at any pose in one env."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _TEXTURE = "PositionSegmentation"
 
 @dataclass
 class TemporaryCamera:
-    """A camera that gives depth and segmentation, of what its kind of camera sees."""
+    """A camera for depth and segmentation of the objects that its kind of camera sees."""
 
     _key: CameraKey
     _sub_scene: Any
@@ -61,9 +61,9 @@ def temporary_camera(
     size: tuple[int, int] | None = None,
     poses: NDArray[np.float32] | None = None,
 ) -> Iterator[TemporaryCamera]:
-    """A camera in one env. While it exists, change nothing in the env and take no other picture.
+    """Context with a camera in one env. Within it, change nothing in the env and take no other picture.
 
-    It lives in a second, empty ``sapien.Scene`` that shares the sub-scene's render system. An entity in the sub-scene
+    The camera is in a second, empty ``sapien.Scene`` that shares the sub-scene's render system. An entity in the sub-scene
     would change the order on which tables, snapshots and PhysX's packed state rely, and use up a segmentation id.
     (Measured with sapien 3.0.3: entities, packed poses, ids and pictures of the other cameras are equal before and after.)
 

@@ -19,12 +19,18 @@ from workbench.envs.camera_data import CameraKey, CameraKind, CameraSettings, Pi
 from workbench.envs.indices import require_env
 from workbench.envs.scene.scene_index import SceneIndex, read_poses, scene_index
 from workbench.pictures.camera_conventions import compose, matrix3, pose_of, triple
-from workbench.pictures.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, ObjectToSee
+from workbench.pictures.camera_report import (
+    DEPTH_EDGES_METRES,
+    CameraReport,
+    DepthReport,
+    ObjectSeen,
+    ObjectToSee,
+)
 from workbench.pictures.render import cameras_of, mount_of
 from workbench.pictures.temporary_camera import TemporaryCamera, temporary_camera, undrawn
 
-SMALL = 64
-"""Pixels of the shorter side, enough to compare placements."""
+MEASURED_SIDE_PIXELS = 64
+"""Shorter side of the measured pictures, which is enough to compare placements."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +38,9 @@ class SceneObject:
     """One object of the task, with its bodies."""
 
     name: str
-    """An actor's or an articulation's."""
+    """Name of an actor or an articulation."""
     bodies: tuple[int, ...]
-    """Columns of the scene's index: one of an actor, all links of an articulation."""
+    """Columns of the scene's index: one for an actor, one for each link of an articulation."""
     robot: bool
     scenery: bool
     """The ground, a static body, or a kinematic one of ManiSkill's scene builders (its table)."""
@@ -72,7 +78,7 @@ def list_objects(env: Any) -> tuple[SceneObject, ...]:
                 robot=linked and name in robots,
                 scenery=name == "ground"
                 or kinds == {"static"}
-                # Scene builders also put things there that are to be picked up.
+                # Scene builders also place objects that are to be picked up, so only kinematic and static ones count.
                 or (kinds <= {"kinematic", "static"} and all(id(entity) in built for entity in entities)),
                 hidden=all(index.hidden[body] for body in bodies),
             )
@@ -205,7 +211,7 @@ def present_settings(camera: Any, env_index: int) -> CameraSettings:
     )
 
 
-def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]:
+def small_size(width: int, height: int, shorter: int = MEASURED_SIDE_PIXELS) -> tuple[int, int]:
     """Width and height with about the same aspect, the shorter side at most `shorter`."""
     scale = min(1.0, shorter / min(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
@@ -217,9 +223,9 @@ def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]
 def placement_pose(
     placement: Placement, bodies: NDArray[np.float32], index: SceneIndex
 ) -> NDArray[np.float64]:
-    """(7,) of a placement in the env's frame, with bodies at `bodies` (B, 7)."""
+    """(7,) pose of a placement in the env's frame, with bodies at `bodies` (B, 7)."""
     if placement.mount is None:
-        # As it is: a quaternion that is not of unit length gives another picture.
+        # Not normalised: a quaternion that is not of unit length gives another picture.
         return np.array([*placement.settings.position, *placement.settings.quaternion])
     mount = bodies[mount_column(index, placement.mount)]
     if not np.isfinite(mount).all():
@@ -244,7 +250,7 @@ def measure(
     settings: CameraSettings,
     bare: CameraReport | None = None,
 ) -> CameraReport:
-    """Render and count pixels: a report of one env.
+    """Render pictures and count pixels; returns the report of one env.
 
     Boxes and frustums ignore what is in front of an object, so it is rendered. The segmentation gives each pixel's object; a
     second picture without the robot gives what the robot covers; one of each object alone gives what the border cuts and
@@ -318,11 +324,13 @@ def _depths(
     """Depth report of one picture (H, W), from masks `something` (no background) and `counts` (robot or object)."""
     far, of_objects = depth[something], depth[counts]
     limit = float(of_objects.max()) if len(of_objects) else np.nan
-    histogram, _ = np.histogram(np.clip(far, DEPTH_EDGES[0], DEPTH_EDGES[-1]), DEPTH_EDGES)
+    histogram, _ = np.histogram(
+        np.clip(far, DEPTH_EDGES_METRES[0], DEPTH_EDGES_METRES[-1]), DEPTH_EDGES_METRES
+    )
     return DepthReport(
         counts=histogram.astype(np.int64)[None],
         background=_one(1 - something.mean()),
-        # Without robot and objects in view all of it is beyond.
+        # If neither robot nor objects are in view, everything is beyond.
         beyond=_one((far > np.nan_to_num(limit, nan=-1.0)).sum() / depth.size),
         nearest=_one(far.min() if len(far) else np.nan),
         farthest_object=_one(limit),

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from workbench.envs.recorded_run import HOW_IT_IS_RUN
+from workbench.envs.recorded_run import RUN_KEYWORDS
 from workbench.episodes.episode import Episode
 from workbench.live.process.ask import Background, OnProgress
 from workbench.live.process.background_jobs import JobFailed, ProcessDied
@@ -14,7 +14,7 @@ from workbench.live.questions import MakeScene, SceneMade
 from workbench.machine.loop import result_of
 from workbench.trust.clearance import paths_in_arguments
 
-_NOT_PASSED_ON = HOW_IT_IS_RUN | {
+_NOT_PASSED_ON = RUN_KEYWORDS | {
     "obs_mode", "reward_mode", "backend", "parallel_in_single_scene", "sensor_configs",
     "human_render_camera_configs", "viewer_camera_configs", "enable_shadow", "max_episode_steps",
 }  # fmt: skip

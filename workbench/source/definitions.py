@@ -1,4 +1,4 @@
-"""Finds the definition of a name and its other readers, from the text of the author's files."""
+"""Finds the definition of a name and its other readers in the text of the author's files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Project:
     """The author's files, parsed on demand.
 
     Branches depend on the running task, so a definition in one may or may not hold. Readers are over-counted rather than
-    missed: any file that has the name counts, and too many readers only mean that a value is written elsewhere.
+    missed: any file that has the name counts, and too many readers only mean that a value is written in another place.
     """
 
     def __init__(self, texts: Mapping[str, str]) -> None:
@@ -45,7 +45,7 @@ class Project:
         self._bindings: dict[ast.AST, dict[str, list[Binding]]] = {}
 
     def file(self, path: str) -> SourceFile:
-        # Kept here too: nodes are compared by identity, and `parse_file` keeps only the last files.
+        # Cached here too, since nodes are compared by identity and `parse_file` caches only the last files.
         if path not in self._files:
             self._files[path] = parse_file(path, self.texts[path])
         return self._files[path]
@@ -96,11 +96,11 @@ class Project:
         read: ast.AST,
         concerns: Callable[[str, str], bool] = lambda path, owner: True,
     ) -> str | None:
-        """The place of another reader of a binding than `read` in the file `reader`, as text; None if there is none.
+        """The place of a reader of a binding other than `read` in the file `reader`, as text; None if there is none.
 
         Args:
-            concerns: whether an object of a class (its file, and its name) may have the binding as an attribute. On other
-                objects than ``self`` every attribute counts.
+            concerns: returns whether an object of a class (file and name) may have the binding as an attribute. On other
+                objects than ``self`` every attribute of that name counts.
         """
         home, name = binding.file, binding.name
         scope = home.scopes(binding.node)[0]
@@ -184,7 +184,7 @@ def _bound_in(file: SourceFile, scope: Scope) -> Iterator[Binding]:
 
 def _bound_name(file: SourceFile, node: ast.Name) -> Iterator[Binding]:
     if any(isinstance(outer, ast.comprehension) for outer in file.ancestors(node)):
-        return  # of the comprehension's own scope
+        return  # it belongs to the comprehension's own scope
     statement, value = _statement(file, node), _assigned(file, node)
     if isinstance(statement, ast.AnnAssign) and statement.value is None:
         return
@@ -283,7 +283,7 @@ def _blocks(file: SourceFile, use: ast.AST | None, scope: Scope) -> list[tuple[a
 
 
 def _exclusive(file: SourceFile, a: ast.AST, b: ast.AST) -> bool:
-    """True if they are in two branches of one ``if``."""
+    """Whether two nodes are in different branches of one ``if``."""
     above = dict(_blocks(file, a, file.module))
     return any(
         isinstance(outer, ast.If) and above.get(outer, part) != part
@@ -292,7 +292,7 @@ def _exclusive(file: SourceFile, a: ast.AST, b: ast.AST) -> bool:
 
 
 def _other_element(file: SourceFile, node: ast.AST, mine: ast.AST) -> bool:
-    """True for ``CAMERA["fov"]`` where mine is the name in ``CAMERA["eye"]``."""
+    """Whether `node` reads another element than `mine`: ``CAMERA["fov"]`` where mine is the name in ``CAMERA["eye"]``."""
     keys = []
     for name in (node, mine):
         outer = file.parents.get(name)

@@ -22,7 +22,7 @@ Span = tuple[int, int]
 LOOPS = (ast.For, ast.AsyncFor, ast.While, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 _LINE_END = re.compile(r"\r\n?|\n")
-"""Pattern of Python's line ends; str.splitlines splits at more characters."""
+"""Python's line ends; str.splitlines would split at more characters."""
 _BLANK = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -80,7 +80,7 @@ class SourceFile:
         )
 
     def _offset(self, line: int, column: int) -> int:
-        """Offset of a column that is counted in bytes of UTF-8, as Python's nodes do."""
+        """Offset of a column in bytes of UTF-8, as Python's nodes count it."""
         start = self._starts[line - 1]
         if self.text.isascii():
             return start + column
@@ -101,7 +101,7 @@ class SourceFile:
             start, end = opens, closes
 
     def _room(self, node: ast.AST) -> Span:
-        """The span that may hold the parentheses of a node: those of the call around it are not its own."""
+        """The span that may hold the parentheses of a node, without those of a call around it."""
         outer = self.parents.get(node)
         if isinstance(outer, ast.keyword):
             node, outer = outer, self.parents[outer]
@@ -254,13 +254,13 @@ class SourceFile:
         for change in sorted(replacements, key=lambda change: (change.start, change.end)):
             if change.start < at:
                 raise RefusedEdit("two changes fall on the same place of the file")
-            # With the file's own line ends.
+            # Use the file's own line ends.
             parts += [self.text[at : change.start], plain_line_ends(change.text).replace("\n", newline)]
             at = change.end
         return "".join([*parts, self.text[at:]])
 
     def added_arguments(self, call: ast.Call, texts: Sequence[str]) -> list[Replacement]:
-        """Adds `texts` (``near=0.01``) after the last argument, on lines of their own if the others have."""
+        """Add `texts` (``near=0.01``) after the last argument, on separate lines if the other arguments are."""
         start, close = self.content_span(call)
         items = self.items(call)
         if not texts or not items:
@@ -279,7 +279,7 @@ class SourceFile:
         return [Replacement(end, end, "".join(f", {text}" for text in texts))]
 
     def added_item(self, node: ast.AST, indent: str, text: Callable[[str], str]) -> list[Replacement]:
-        """Adds the item `text(indent)` between the brackets, on lines of its own; `indent` is the statement's."""
+        """Add the item `text(indent)` between the brackets, on its own lines; `indent` is the statement's."""
         start, close = self.content_span(node)
         items = self.items(node)
         own = indent + "    "
@@ -296,7 +296,7 @@ class SourceFile:
             return found if comma else [Replacement(end, end, ","), *found]
         found = []
         if one_line:
-            # Each item gets its own line, else the first would share one with the bracket.
+            # Each item gets its own line: otherwise, the first would share a line with the bracket.
             gaps = [start, *(self.after_comma(item[1]) or item[1] for item in items[:-1])]
             found = [Replacement(gap, item[0], f"\n{own}") for gap, item in zip(gaps, items, strict=True)]
         return [
@@ -305,7 +305,7 @@ class SourceFile:
         ]
 
     def without_item(self, node: ast.AST, index: int) -> Replacement:
-        """Removes one item between the brackets, with its line and comment if it is alone on the line."""
+        """Remove one item between the brackets, with its line and comment if it is alone on the line."""
         items = self.items(node)
         start, end = items[index]
         end = self.after_comma(end) or end
@@ -360,7 +360,7 @@ def walk(node: ast.AST) -> Iterator[ast.AST]:
 
 @lru_cache(maxsize=8)
 def parse_file(path: str, text: str) -> SourceFile:
-    """A cached `SourceFile`, which is never modified: successive edits are of the same few files."""
+    """A cached `SourceFile`, which is never modified: successive edits concern the same few files."""
     return SourceFile(path, text)
 
 
@@ -380,7 +380,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Read:
-    """A name (``EYE``, ``self.eye``, ``EYES[0]``) that was followed to the assignment of its value."""
+    """A name (``EYE``, ``self.eye``, ``EYES[0]``) that was resolved to the assignment of its value."""
 
     at: Place
     others: str | None
@@ -407,12 +407,12 @@ class TracedValue:
     """Name (`KnownFunction.name`) of the called function; empty for other expressions."""
     parts: Mapping[str, TracedValue] = field(default_factory=dict)
     """Elements of a list by index; arguments of a call by parameter; ``of``: the number within an expression that may be
-    edited instead of it."""
+    edited in place of the expression."""
     slope: float = 1.0
     offset: float = 0.0
     """value = slope * `parts["of"].value` + offset"""
     literal: bool = False
-    """Whether it is written as a plain number, perhaps with a sign, or as a list of its items."""
+    """Whether the value is written as a plain number, perhaps with a sign, or as a list of its items."""
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -428,7 +428,7 @@ class TracedValue:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """A call, with its arguments by parameter."""
+    """A traced call, with its arguments by parameter."""
 
     at: Place
     function: str

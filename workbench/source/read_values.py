@@ -39,8 +39,8 @@ from workbench.source.parsed import (
     is_starred,
 )
 
-_DEPTH = 40
-"""Longest chain of names that is followed; a longer one is a circle."""
+_MAX_NAME_CHAIN = 40
+"""Maximum length of a chain of names that is followed; a longer one is a cycle."""
 _CONDITION_NODES = (
     ast.Name,
     ast.Attribute,
@@ -65,7 +65,7 @@ class Unknown(Exception):
 def trace_call(
     project: Project, frame: FrameType, parameters: Sequence[str], values: Mapping[str, Any]
 ) -> Trace | None:
-    """The call that `frame` is making.
+    """Trace the call that `frame` is making.
 
     Args:
         parameters: parameters of the called function, in order.
@@ -115,8 +115,8 @@ class ValueReader:
     """Follows the arguments of one call while its frame exists.
 
     The frame has the value of every name, and its code the exact position of the call. A name is followed to its
-    assignment: by the text alone if only one can hold, else to the one that has the running value. Any doubt is `Unknown`,
-    since the answer decides whether a line of the author's file is edited.
+    assignment: by the text if only one can hold, else to the one that has the running value. Any doubt raises `Unknown`,
+    since the result decides whether a line of the author's file is edited.
     """
 
     def __init__(self, project: Project, file: SourceFile, call: ast.expr, frame: FrameType) -> None:
@@ -128,7 +128,7 @@ class ValueReader:
 
     def part(self, file: SourceFile, node: ast.expr, reads: Reads = ()) -> TracedValue:
         """The parts of an expression. Raises Unknown."""
-        if len(reads) > _DEPTH:
+        if len(reads) > _MAX_NAME_CHAIN:
             raise Unknown(f"`{file.code(node)}` is defined by itself")
         if isinstance(node, ast.IfExp):
             return self.part(file, node.body if self._test(file, node.test) else node.orelse, reads)
@@ -156,7 +156,7 @@ class ValueReader:
     def _evaluate(
         self, file: SourceFile, node: ast.expr, whole: ast.expr, made: Callable[[Any], _Made]
     ) -> _Made:
-        """`made(value of node)`. Raises Unknown that names the expression `whole`."""
+        """`made(value of node)`. Raises Unknown with the expression `whole` in its message."""
         try:
             return made(self._run(file, node))
         except Exception as exc:  # the author's classes may raise anything
@@ -178,7 +178,7 @@ class ValueReader:
         return names, {name: running.f_locals[name] for name in ("self", "cls") if name in running.f_locals}
 
     def _check(self, file: SourceFile, node: ast.AST) -> None:
-        """Raises Unknown unless `node` is made of numbers, names that can be followed, and known functions."""
+        """Raise Unknown unless `node` is made of numbers, names that can be followed, and known functions."""
         if isinstance(node, _NAME_NODES):
             if not self._is_from_library(file, node):
                 self.part(file, node)
@@ -269,7 +269,7 @@ class ValueReader:
     # --- names --------------------------------------------------------------------------------------
 
     def _is_from_library(self, file: SourceFile, node: ast.AST) -> bool:
-        """True for ``np.pi``, and for an imported ``pi``."""
+        """Whether a name comes from a library: ``np.pi``, or an imported ``pi``."""
         if isinstance(node, ast.Attribute):
             owner = self._object(file, node.value)
             return (
@@ -409,7 +409,7 @@ class ValueReader:
         except Unknown as exc:
             raise Unknown(f"`{code}` depends on what only the running task knows") from exc
         where, base, others = file, node.value, None
-        for _ in range(_DEPTH):
+        for _ in range(_MAX_NAME_CHAIN):
             if isinstance(base, _NAME_NODES):
                 where, base, more = self._follow(where, base)
                 others = others or more
@@ -426,7 +426,7 @@ def classes_of(cls: type) -> set[tuple[str, str]]:
 
 
 def _concerned_by(binding: Binding) -> Callable[[str, str], bool]:
-    """Whether an object of a class may have an attribute's binding, see `Project.readers`."""
+    """Function that returns whether an object of a class may have an attribute's binding; see `Project.readers`."""
     file = binding.file
     around = next((scope for scope in file.scopes(binding.node) if isinstance(scope, ast.ClassDef)), None)
     home = None if around is None else _class_named(file.path, file.qualname(around))
@@ -476,12 +476,12 @@ def _entry(file: SourceFile, base: ast.expr, key: Plain) -> ast.expr | None:
 
 
 def _is_named(node: ast.AST) -> bool:
-    """A name or attribute: evaluating it again has no effect."""
+    """Whether `node` is a name or attribute, which can be evaluated again without effect."""
     return all(isinstance(inner, (ast.Name, ast.Attribute, ast.Load)) for inner in ast.walk(node))
 
 
 def _is_number(node: ast.AST) -> bool:
-    """A plain number, perhaps with a sign."""
+    """Whether `node` is a plain number, perhaps with a sign."""
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
         node = node.operand
     return isinstance(node, ast.Constant) and type(node.value) in (int, float)

@@ -1,4 +1,4 @@
-"""Edits of traced values: where in the source each is written, and the text of the new value."""
+"""Edits traced values: finds where in the source each is written, and makes the text of the new value."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from workbench.source.parsed import (
 class Changes:
     """Collects edits of traced values and turns them into replacements of text.
 
-    A value is edited where it is written if nothing else reads it there. Else (one ``pose`` for two cameras, a
-    constant that the scene uses) the new value is written in place of the name, for this use alone, with a note.
+    A value is edited where it is written if nothing else reads it there. Otherwise (one ``pose`` for two cameras, a
+    constant that the scene uses), the new value is written in place of the name, only for this use, with a note.
 
-    Places come from the worker, whose texts may differ: one that is not an expression of these files raises RefusedEdit.
+    Places come from the worker, whose texts may differ: a place that is no expression of these files raises RefusedEdit.
     """
 
     def __init__(self, project: Project) -> None:
@@ -87,7 +87,7 @@ class Changes:
     # --- new values ---------------------------------------------------------------------------------
 
     def number(self, value: TracedValue, requested: float, decimals: int) -> None:
-        """Edit `value` to `requested`, unless it is the same to so many decimals."""
+        """Edit `value` to `requested`, unless both are equal to `decimals` decimals."""
         if written_value(value, requested, decimals) == value.value:
             return
         inner, requested, decimals = _inner_target(value, requested, decimals)
@@ -105,7 +105,7 @@ class Changes:
         return any(part in self.texts or part in self.added for part in value.walk())
 
     def emit(self, value: TracedValue, known: int = 0) -> None:
-        """Turn the edits within `value` into replacements. The first `known` of its reads are followed already."""
+        """Turn the edits within `value` into replacements. The first `known` of its reads are already handled."""
         if not self.is_edited(value):
             return
         for index, read in enumerate(value.reads[known:], known):
@@ -135,7 +135,7 @@ class Changes:
         if not self.is_edited(value):
             home, named = self.find(value.reads[known].at) if value.reads[known:] else (file, node)
             if home is into and not isinstance(home.scopes(named)[0], ast.ClassDef):
-                # Not a name of a class body, which its methods do not see.
+                # Skip a name of a class body, which its methods do not see.
                 return home.code(named)
         if isinstance(value.value, float):
             if self.is_edited(value):
@@ -174,7 +174,7 @@ class Changes:
 
 
 def written_value(value: TracedValue, requested: float, decimals: int) -> float:
-    """The number that results from writing `requested` with so many decimals."""
+    """The number that results from writing `requested` with `decimals` decimals."""
     assert isinstance(value.value, float)
     if abs(value.value - requested) <= 0.5000001 * 10**-decimals:
         return value.value
@@ -223,12 +223,12 @@ def list_text(values: Sequence[float], decimals: int) -> str:
 
 
 def matrix_text(rows: Sequence[Sequence[float]]) -> str:
-    """Rows of pixels, to a thousandth."""
+    """Matrix of pixels as text, rounded to a thousandth."""
     return "[" + ", ".join(list_text(row, 3) for row in rows) + "]"
 
 
 def quaternion_texts(quaternion: Sequence[float]) -> list[str]:
-    """The four numbers of `quaternion` (wxyz), as short as they are within 1e-7 of a unit quaternion.
+    """The four numbers of `quaternion` (wxyz), as short as possible within 1e-7 of a unit quaternion.
 
     SAPIEN does not normalise: 0.7071 in place of 0.7071068 gives the camera a frame that is no rotation.
     """

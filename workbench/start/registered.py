@@ -25,7 +25,7 @@ from workbench.machine.files import read_regular_file, replace_file
 from workbench.machine.folders import cache_folder
 from workbench.machine.loop import BlockingPool, begin, do, on_loop
 from workbench.machine.maniskill_installed import installed_maniskills, lines_if_lacking
-from workbench.machine.processes.child_python import LOWEST
+from workbench.machine.processes.child_python import LOWEST_NICENESS
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import Question
 
@@ -108,7 +108,7 @@ class RegisteredTasks:
         """Called on the loop when there is another view."""
         self._folder = Path()
         self._disk = BlockingPool("registered-tasks")
-        self._process = Background(niceness=LOWEST)
+        self._process = Background(niceness=LOWEST_NICENESS)
         self._work: asyncio.Task[None] | None = None
 
     @on_loop

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
-from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file
+from workbench.machine.files import MAX_SOURCE_BYTES, read_regular_file
 from workbench.source.parsed import plain_line_ends
 from workbench.task.library_names import LIBRARY_ROOTS, files_named_like_libraries, is_library, is_own_file
 
@@ -165,7 +165,7 @@ class AuthorFinder(MetaPathFinder):
         """The text to execute for `path`. Raises OSError, or SyntaxError if it is not text."""
         if path in self.given:
             return self.given[path]
-        raw = read_regular_file(path, MOST_SOURCE_BYTES)
+        raw = read_regular_file(path, MAX_SOURCE_BYTES)
         try:
             return decode(path, raw)
         except SyntaxError:
@@ -249,8 +249,8 @@ def read_source(path: str | Path) -> str:
 
 
 def read_exactly(path: str | Path) -> tuple[bytes, str, str]:
-    """Bytes of a Python source file, its text with its own line ends, and its encoding. Raises as `read_source` does."""
-    raw = read_regular_file(path, MOST_SOURCE_BYTES)
+    """A Python source file's bytes, its text with its own line ends, and its encoding. Raises as `read_source`."""
+    raw = read_regular_file(path, MAX_SOURCE_BYTES)
     return raw, *exact_text(str(path), raw)
 
 

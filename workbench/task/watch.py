@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import cycle, islice
 from pathlib import Path
 
-from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file, real_path
+from workbench.machine.files import MAX_SOURCE_BYTES, read_regular_file, real_path
 from workbench.machine.processes.watched_thread import report_failure, watched_thread
 from workbench.task.modules import decode
 
@@ -168,7 +168,7 @@ def _status(path: Path) -> tuple[int, ...]:
 
 def _read(path: Path) -> Content:
     try:
-        raw = read_regular_file(path, MOST_SOURCE_BYTES)
+        raw = read_regular_file(path, MAX_SOURCE_BYTES)
     except OSError:
         return None
     try:

@@ -36,7 +36,7 @@ def body_of(env: Any, name: str) -> Any:
 def table(env: Any) -> Iterator[tuple[Any, LeanBody]]:
     """ManiSkill's, of a file whose metal is 1 everywhere, and the lean one beside it."""
     body = body_of(env, "table-workspace")
-    lean = LeanMaterials().beside(body)
+    lean = LeanMaterials().lean_copy(body)
     assert lean is not None
     lean.component.visibility = 0.0
     body.entity.add_component(lean.component)
@@ -92,7 +92,7 @@ def test_it_is_not_for_a_body_whose_material_the_author_changes_later(
             setattr(wood, name, sapien.render.RenderTexture2D(value, "R8G8B8A8Unorm") if texture else value)
         assert not lean.is_like_exact()
         if "metallic_texture" in changed:
-            assert LeanMaterials().beside(body) is None, "nothing of it is the same everywhere"
+            assert LeanMaterials().lean_copy(body) is None, "nothing of it is the same everywhere"
     finally:
         for name, value in was.items():
             setattr(wood, name, value)

@@ -118,7 +118,7 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
 
     # A debugger that is gone lets go, and what it would have stopped at is passed and told.
     client.close()
-    view = wait_until(session, lambda v: said(v, "a breakpoint was passed") == 1, "the note")
+    view = wait_until(session, lambda v: said(v, "a breakpoint was skipped") == 1, "the note")
     wait_until(session, lambda v: v.task_serial > before.task_serial + 1 and v.busy is None, "the version")
     assert session.worker_pid == worker
 
@@ -174,7 +174,7 @@ def test_a_port_that_is_taken_is_refused_or_another_found(monkeypatch: pytest.Mo
         taken = other.getsockname()[1]
         with pytest.raises(ValueError, match=f"--debug-port {taken} cannot be listened on"):
             port_for_debugger(taken)
-        monkeypatch.setattr("workbench.machine.processes.debugger.USUAL_PORT", taken)
+        monkeypatch.setattr("workbench.machine.processes.debugger.DEFAULT_PORT", taken)
         assert port_for_debugger(None) not in (0, taken)
 
 

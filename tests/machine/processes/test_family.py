@@ -154,7 +154,7 @@ def test_a_family_is_ended_when_asked_and_nobody_else(begin: Callable[..., subpr
 def test_a_keeper_that_was_stopped_is_not_waited_for(
     begin: Callable[..., subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.machine.processes.family._LONGEST_END", 0.1)
+    monkeypatch.setattr("workbench.machine.processes.family._END_TIMEOUT_SECONDS", 0.1)
     keeper = begin("wait")
     all_of_it = members(keeper.pid)
     os.kill(keeper.pid, signal.SIGSTOP)

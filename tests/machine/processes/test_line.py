@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from tests.drive.waiting import until
 from workbench.live.messages import Event, Loading
-from workbench.machine.processes.wire import MOST_BYTES, MessageSocket, Unreadable, pack, pack_message
+from workbench.machine.processes.wire import MAX_MESSAGE_BYTES, MessageSocket, Unreadable, pack, pack_message
 
 
 class Ends:
@@ -103,7 +103,7 @@ def test_what_was_read_is_not_kept_also_where_the_next_message_has_always_begun(
         ends.theirs.sendall(whole[1:] + whole[:1])
         assert ends.line.receive(60) == Loading("x" * 100_000)
     assert psutil.Process().memory_info().rss - before < 50 * 2**20
-    ends.theirs.sendall(whole[1:] + struct.pack("!i", MOST_BYTES) + b"x")
+    ends.theirs.sendall(whole[1:] + struct.pack("!i", MAX_MESSAGE_BYTES) + b"x")
     assert ends.line.receive(60) is not None and ends.line.receive(0) is None
     assert psutil.Process().memory_info().rss - before < 100 * 2**20, "a length alone takes no memory"
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from workbench.machine.maniskill_installed import lines_if_lacking
-from workbench.machine.processes.child_python import LOWEST, quick_imports
+from workbench.machine.processes.child_python import LOWEST_NICENESS, quick_imports
 from workbench.machine.processes.family import begin_family
 from workbench.machine.versions import untested_text
 
@@ -33,8 +33,8 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
     begin_family(server)
     if niceness:
         os.nice(niceness)
-    if niceness >= LOWEST:
-        # Use only idle CPU time. Some containers forbid it.
+    if niceness >= LOWEST_NICENESS:
+        # Only what no other process wants. Some containers forbid it.
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     # A server that a script started in the background ignores SIGINT, and we would inherit that.

@@ -1,4 +1,4 @@
-"""Which shader SAPIEN makes a camera with: selected, kept for cameras that change scenes, replaced where it cannot draw."""
+"""Selects the shader of a camera, keeps it when the camera changes scenes, and replaces one that this machine cannot draw."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def selected(shader: ShaderConfig, folder: Path | None = None) -> Iterator[None]
     """Context in which SAPIEN makes cameras with `shader`.
 
     Args:
-        folder: of a shader that replaces `shader` and has the same textures.
+        folder: folder of a shader that replaces `shader` and has the same textures.
     """
     before = _Selection.now()
     set_shader_pack(shader)
@@ -74,9 +74,9 @@ def note_shader(camera: sapien.render.RenderCameraComponent) -> None:
 
 @contextmanager
 def made_again(camera: sapien.render.RenderCameraComponent) -> Iterator[None]:
-    """Within this, the shader of `note_shader` is selected. Add the camera to a scene within it.
+    """Context in which the camera's shader (see `note_shader`) is selected; add the camera to a scene within it.
 
-    Without it a task with a minimal sensor and a default human camera gets a default sensor, which lacks
+    Without it, a task with a minimal sensor and a default human camera would get a default sensor, which lacks
     ``PositionSegmentation``.
     """
     before, own = _Selection.now(), _made_with.get(camera)
@@ -90,19 +90,18 @@ def made_again(camera: sapien.render.RenderCameraComponent) -> Iterator[None]:
         before.select()
 
 
-# --- ray tracing where there is none ---------------------------------------------------------------
+# --- machines without ray tracing ------------------------------------------------------------------
 
 
 def drawable(config: CameraConfig) -> CameraConfig:
-    """`config`; a copy with the default shader, which has the same textures, if it is ray traced and this machine cannot.
-
-    ``shader_pack`` of the copy is the one that was asked for.
+    """`config`; or, if it is ray traced and this machine cannot trace rays, a copy with the default shader, which has the
+    same textures. ``shader_pack`` of the copy keeps the requested name.
     """
     asked = config.shader_config
     if asked is None or not is_ray_traced(asked.shader_pack) or why_no_ray_tracing() is None:
         return config
     drawn = copy.copy(config)
-    # ManiSkill names rt-fast and rt-med rt when it applies keywords to a config.
+    # ManiSkill replaces the names rt-fast and rt-med by rt when it applies keywords to a config.
     drawn.shader_pack = next(
         (name for name, of in PREBUILT_SHADER_CONFIGS.items() if of is asked), asked.shader_pack
     )
@@ -129,7 +128,7 @@ def is_ray_traced(shader_pack: str) -> bool:
 
 @cache
 def install_drawable_cameras(is_batched: Callable[[Any], bool]) -> None:
-    """Make ManiSkill's cameras of a batched CPU scene with `drawable` configs, once a process; others stay stock."""
+    """Let ManiSkill make cameras of batched CPU scenes with `drawable` configs; installed once per process."""
     stock = Camera.__init__
 
     @wraps(stock)

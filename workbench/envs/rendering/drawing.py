@@ -1,4 +1,4 @@
-"""A picture that SAPIEN draws: named in errors, and limited in time."""
+"""Draws pictures with SAPIEN under a time limit, and names the camera in errors."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ class CannotDraw(CoreRefusal, RuntimeError):
 
 @contextmanager
 def drawing(key: CameraKey, site: CallSite | None = None) -> Iterator[None]:
-    """Let SAPIEN draw a camera within this, or wait for its picture.
+    """Context in which SAPIEN draws a camera, or the caller waits for its picture.
 
     Args:
-        site: where its config is made.
+        site: where the config of the camera is made.
 
     Raises:
         CannotDraw: SAPIEN raised.
     """
     camera = _named(key, site)
     late = (
-        f"{camera} was not ready after {PICTURE_SECONDS:g} s, so this process is ended. Draw it smaller, or look with "
+        f"{camera} was not ready after {PICTURE_SECONDS:g} s, so this process is ended. Draw it smaller, or see with "
         "`workbench doctor` which driver draws; --env render_backend=none draws nothing."
     )
     with limited(late):

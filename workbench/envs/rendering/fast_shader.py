@@ -1,4 +1,4 @@
-"""Cameras that draw what SAPIEN's minimal shader draws, without what adds nothing to their picture."""
+"""Cameras that draw the pictures of SAPIEN's minimal shader, without the work that adds nothing to them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from workbench.machine.folders import cache_folder, read_private, write_private
 
 COLOR = frozenset({"Color"})
 ALL = frozenset({"Color", "PositionSegmentation", "GbufferDepth"})
-"""Textures of the minimal shader that a fast camera has: those of `COLOR` alone, or all."""
+"""Textures of the minimal shader that a fast camera has: only those of `COLOR`, or all."""
 
 Edits = tuple[tuple[str, str], ...]
 """Replacements in a shader's text: (old, new); each old passage occurs once."""
 
-# Without an environment map, which adds black: two cube maps are looked up for each pixel, and a third in the last pass,
-# which then only copies. w of a position is 1. The transposed inverse is, but for its scale, the cofactors.
+# No environment map, which would add black: it looks up two cube maps for each pixel, and a third in the last pass, which
+# then only copies. w of a position is 1. The transposed inverse equals the cofactors, apart from its scale.
 _VERTICES: Edits = (
     ("mat3(transpose(inverse(modelView)))", "sign(determinant(m)) * mat3(cross(m[1], m[2]), cross(m[2], m[0]), cross(m[0], m[1]))"),
     ("  mat3 normalMatrix", "  mat3 m = mat3(modelView);\n  mat3 normalMatrix"),
@@ -47,7 +47,7 @@ _PIXELS: Edits = (
     ("out vec4 outColorRaw;", "out vec4 outColor;"),
     ("  outColorRaw = ", "  outColor = "),
 )  # fmt: skip
-# The same light with less arithmetic: of two unit vectors, the half between them follows from their angle.
+# The same light with less arithmetic: the half vector of two unit vectors follows from their angle.
 _LIGHT: Edits = (
     ("  vec3 color = emission.rgb;\n", """  vec3 color = emission.rgb;
   float nv = dot(normal, camDir);
@@ -87,7 +87,8 @@ _COLOR_PIXELS: Edits = (
 
 @lru_cache(maxsize=2)
 def shader_folder(textures: frozenset[str]) -> Path | None:
-    """SAPIEN's minimal shader, cut down to these textures (`COLOR` or `ALL`); None if the installed one is not the known one."""
+    """Folder of SAPIEN's minimal shader, reduced to these textures (`COLOR` or `ALL`); None if the installed shader is
+    unknown."""
     source = Path(sapien.__file__).parent / "vulkan_shader"
     vertices, pixels = _VERTICES, _PIXELS + _LIGHT
     if textures == COLOR:
@@ -114,7 +115,7 @@ def shader_folder(textures: frozenset[str]) -> Path | None:
 def _edited(text: str, edits: Edits) -> str:
     for was, becomes in edits:
         if text.count(was) != 1:
-            raise ValueError(f"{was!r} is not there once")
+            raise ValueError(f"{was!r} does not occur exactly once")
         text = text.replace(was, becomes)
     return text
 
@@ -129,22 +130,22 @@ class _Fast:
 
 
 class FastCameras:
-    """A second camera for each exact camera of a scene, with the same size; it follows the exact one."""
+    """A second camera for each exact camera of a scene, with the same size, which follows the exact one."""
 
     def __init__(self, sub_scenes: Sequence[sapien.Scene]) -> None:
         self._sub_scenes = sub_scenes
         self._made: dict[tuple[int, frozenset[str]], _Fast] = {}
-        """Fast cameras by the id of the exact component, and the textures."""
+        """Fast cameras by the id of the exact component and the textures."""
 
     def follow(
         self, env: int, config: Any, exact: sapien.render.RenderCameraComponent, textures: Collection[str]
     ) -> None:
-        """Put the fast camera for these textures where `exact` is; call it before ``update_render``.
+        """Move the fast camera for these textures to where `exact` is; call it before ``update_render``.
 
-        There is none for textures and shaders other than the minimal one's, nor with an environment map.
+        There is no fast camera for other shaders and textures than the minimal one's, nor with an environment map.
 
         Args:
-            config: ManiSkill's, of the camera.
+            config: ManiSkill's config of the camera.
         """
         chosen = _smallest(textures)
         system = self._sub_scenes[env].render_system
@@ -155,17 +156,17 @@ class FastCameras:
         fast = self._made.get((id(exact), chosen))
         if fast is None:
             with selected(MINIMAL, folder):
-                fast = self._made[id(exact), chosen] = _beside(exact, system)
+                fast = self._made[id(exact), chosen] = _make_fast(exact, system)
         fast.component.local_pose = exact.get_global_pose()
         k = exact.get_intrinsic_matrix()
         fast.component.set_perspective_parameters(
             exact.near, exact.far, k[0, 0], k[1, 1], k[0, 2], k[1, 2], k[0, 1]
         )
 
-    def beside(
+    def camera_for(
         self, exact: sapien.render.RenderCameraComponent, textures: Collection[str]
     ) -> sapien.render.RenderCameraComponent:
-        """The camera to draw these textures with, which is `exact` where no other follows it."""
+        """The camera with which to draw these textures; `exact` itself where no fast one follows it."""
         fast = self._made.get((id(exact), _smallest(textures)))
         return exact if fast is None else fast.component
 
@@ -174,7 +175,7 @@ def _smallest(textures: Collection[str]) -> frozenset[str]:
     return COLOR if COLOR.issuperset(textures) else ALL
 
 
-def _beside(exact: sapien.render.RenderCameraComponent, system: Any) -> _Fast:
+def _make_fast(exact: sapien.render.RenderCameraComponent, system: Any) -> _Fast:
     scene, entity = sapien.Scene([system]), sapien.Entity()
     component = sapien.render.RenderCameraComponent(exact.width, exact.height)
     entity.add_component(component)

@@ -30,28 +30,28 @@ from workbench.envs.scene.shapes import Mesh
 from workbench.envs.scene.simplify import drop_uvs
 from workbench.envs.simulation.drawn_poses import NOWHERE_ELSE, Places
 
-HEAVY = 500
-"""Triangles above which a body's mesh is simplified. Cylinders, spheres and the like stay exact too: layered thin
+HEAVY_FACES = 500
+"""Triangles above which a body's mesh is simplified. Cylinders, spheres and the like always stay exact: layered thin
 discs, such as ManiSkill's targets, would lose a layer."""
-TOLERANCE = 0.6
-"""Pixels that a surface may be off in a picture of `_SMALL` pixels; more in larger pictures, where fewer of the pixels
-are on edges."""
-_SMALL = 128
-_NEAREST = 0.02
-"""Smallest distance in metres that tolerances assume: no camera stays nearer for long, and one within its own mount
-would forbid any simplification."""
-_FINEST = 1e-4
-"""Unit of the tolerances in metres: they are this times powers of the fourth root of two, so that similar poses give
-the same meshes."""
+TOLERANCE_PIXELS = 0.6
+"""Pixels that a surface may be off in a picture with sides of `_TOLERANCE_SIDE_PIXELS`; more in larger pictures, where a
+smaller share of the pixels is on edges."""
+_TOLERANCE_SIDE_PIXELS = 128
+_MIN_DISTANCE_METRES = 0.02
+"""Smallest distance that tolerances assume: no camera stays nearer for long, and a camera inside its own mount would
+forbid any simplification."""
+_TOLERANCE_UNIT_METRES = 1e-4
+"""Unit of the tolerances: they are this times powers of the fourth root of two, so that similar poses give the same
+meshes."""
 
-_WORTH_FEWER_TEXTURES = 256 * 256
-"""Pixels of a picture below which fewer textures save no more than it costs to check whether the author changed the
-material."""
-_SAME_PLACE = 1e-5, 1e-4
-"""Tolerance in metres and (roughly) radians: a body that moved less, as seen from a camera, has not moved."""
+_MIN_LEAN_PIXELS = 256 * 256
+"""Pixels of a picture below which fewer textures save less than the check whether the author changed the material
+costs."""
+_SAME_POSE_TOLERANCES = 1e-5, 1e-4
+"""Tolerances in metres and (roughly) radians: a body that moved less, as seen from a camera, counts as not moved."""
 
 Bodies = tuple[tuple[sapien.render.RenderBodyComponent, sapien.render.RenderBodyComponent | None], ...]
-"""The exact component of each body of an env that is drawn differently, and what is drawn instead; None for nothing."""
+"""For each body of an env that is drawn differently: its exact component, and what is drawn instead (None for nothing)."""
 
 
 @contextmanager
@@ -72,12 +72,12 @@ def shown(bodies: Bodies) -> Iterator[None]:
 
 
 class FastShapes:
-    """The simplified shapes of a scene, beside the exact ones and hidden, made for each camera at its first fast picture.
+    """The simplified shapes of a scene: hidden components next to the exact ones, made at each camera's first fast picture.
 
-    How much a body is simplified is decided by its distance from the camera where both are then, by the lens and by the
-    size in pixels. What is outside the camera's view is not drawn; a body that the camera is fixed to, whose triangles are
-    mostly beside or behind it, is cut to what is in view. The shapes share the materials of the exact ones, so that a
-    colour which is changed later changes in both; a body's id in segmentation pictures is that of its entity.
+    How much a body is simplified depends on its distance from the camera at that moment, on the lens and on the size in
+    pixels. Bodies outside the camera's view are not drawn; a body that the camera is fixed to, whose triangles are mostly
+    out of view, is cut to those in view. The shapes share the materials of the exact ones, so that a later change of colour
+    changes both; a body's id in segmentation pictures is that of its entity.
     """
 
     def __init__(self, sub_scenes: Sequence[sapien.Scene]) -> None:
@@ -93,7 +93,7 @@ class FastShapes:
         ]
         """(B, 2, 3) bounding boxes of each env, in the frames of its bodies."""
         self._components: dict[Hashable, tuple[Any, Any]] = {}
-        """Simplified components by the id of the exact component, which is kept with each, and by how it is simplified."""
+        """Simplified components, each with the exact one (kept alive), by the id of the exact one and the simplification."""
         self._tolerances: dict[Hashable, dict[str, float]] = {}
         """Tolerances by camera and name of the body."""
         self._cut: dict[tuple[Hashable, str], _Cut] = {}
@@ -110,17 +110,18 @@ class FastShapes:
         camera: Sequence[sapien.render.RenderCameraComponent],
         places: Places = NOWHERE_ELSE,
     ) -> None:
-        """Choose what the camera of this name sees where it and the bodies are now; call it before ``update_render``.
+        """Choose the shapes that this camera draws, by the present poses; call it before ``update_render``.
 
         Args:
-            camera: its component in each env.
-            places: where bodies of this env are drawn instead; its cameras have been moved with them.
+            key: name of the camera.
+            camera: the camera's component in each env.
+            places: poses at which bodies of this env are drawn in place of their own; its cameras were moved with them.
         """
         if key not in self._tolerances:
             self._tolerances[key] = self._tolerances_of(camera)
         component, of_env = camera[env], self._heavy[env]
         drawn: list[tuple[Any, Any]] = []
-        if component.width * component.height >= _WORTH_FEWER_TEXTURES:
+        if component.width * component.height >= _MIN_LEAN_PIXELS:
             drawn += [(body, lean.component) for body, lean in self._lean[env] if lean.is_like_exact()]
         if of_env:
             drawn += self._drawn_of_heavy(env, key, component, places)
@@ -152,7 +153,7 @@ class FastShapes:
                     continue
             tolerance = self._tolerances[key][name]
             simplified = self._simplified(body, tolerance)
-            # A link stands at a slant in its box, which may reach into view where it does not.
+            # The box of a slanted link may reach into view although the link does not.
             if not is_in and is_outside(self._corners_of(body, tolerance), here):
                 drawn.append((body, None))
             elif simplified is not None:
@@ -160,11 +161,11 @@ class FastShapes:
         return drawn
 
     def bodies(self, key: Hashable, env: int) -> Bodies:
-        """What `prepare` chose last for this camera."""
+        """The bodies that `prepare` chose last for this camera."""
         return self._of_camera.get((key, env), ())
 
     def remove(self) -> None:
-        """Take them out of the scene."""
+        """Remove the shapes from the scene."""
         for _, fast in self._components.values():
             if fast is not None:
                 fast.entity.remove_component(fast)
@@ -178,25 +179,25 @@ class FastShapes:
         self._cut.clear()
 
     def _tolerances_of(self, camera: Sequence[sapien.render.RenderCameraComponent]) -> dict[str, float]:
-        """Tolerances in metres, by the name of the body: the same in all envs, where equal states are to look alike."""
+        """Tolerances in metres, by body name; the same in all envs, so that equal states look the same."""
         finest: dict[str, float] = {}
         for env, (component, of_env) in enumerate(zip(camera, self._heavy, strict=True)):
             position = np.asarray(component.get_global_pose().p, np.float32)
             for (entity, _), points in zip(of_env, self._corner_points[env], strict=True):
                 name = _shared_name(entity, env)
-                # SAPIEN's `get_global_aabb_fast` goes through all vertices each time: a millisecond a link.
+                # Faster than SAPIEN's `get_global_aabb_fast`, which visits all vertices each time: a millisecond per link.
                 at = _moved(points, entity.pose.to_transformation_matrix())
                 off = _tolerance(component, _distance(position, at.min(axis=0), at.max(axis=0)))
                 finest[name] = min(finest.get(name, np.inf), off)
         return {name: _rounded(off) for name, off in finest.items()}
 
     def _corners_of_parts(self, body: Any) -> NDArray[np.float64]:
-        """(P, 3) corners of the boxes around the parts of what is drawn, in the body's frame."""
+        """(P, 3) corners of the boxes around the parts of a drawn body, in its frame."""
         parts = self._parts[id(body)]
         return np.concatenate([_moved(self._chosen.box(part.exact), part.placed) for part in parts])
 
     def _corners_of(self, body: Any, tolerance: float) -> NDArray[np.float64]:
-        """(P, 3) points around what is drawn of it, in its frame."""
+        """(P, 3) points around the body as drawn with this tolerance, in its frame."""
         by = (id(body), tolerance)
         if by not in self._corners:
             each = [
@@ -207,11 +208,11 @@ class FastShapes:
         return self._corners[by]
 
     def _nearest(self, body: Any, pose: sapien.Pose, planes: Planes) -> float:
-        """Metres to the nearest vertex of a triangle that is in view, infinite where none is.
+        """Metres to the nearest vertex of a triangle that is in view; infinite where none is.
 
         Args:
-            pose: of the body, in the camera's frame.
-            planes: of the camera, in the body's frame.
+            pose: pose of the body, in the camera's frame.
+            planes: view planes of the camera, in the body's frame.
         """
         eye, nearest = np.asarray(pose.inv().p), np.inf
         for part in self._parts[id(body)]:
@@ -249,11 +250,11 @@ def _add_hidden(component: Any, body: Any) -> None:
 
 
 def _lean_bodies(sub_scenes: Sequence[sapien.Scene]) -> list[list[tuple[Any, LeanBody]]]:
-    """Bodies of each env that are not simplified, each with a body of fewer textures to draw in its place."""
+    """Bodies of each env that are not simplified, each with a body with fewer textures to draw in its place."""
     materials, found = LeanMaterials(), []
     for sub_scene in sub_scenes:
         light = [body for body in _bodies(sub_scene) if not _is_heavy(body)]
-        made = [(body, lean) for body in light if (lean := materials.beside(body)) is not None]
+        made = [(body, lean) for body in light if (lean := materials.lean_copy(body)) is not None]
         for body, lean in made:
             _add_hidden(lean.component, body)
         found.append(made)
@@ -270,16 +271,20 @@ class _Cut:
     planes: Planes
 
     def is_for(self, pose: sapien.Pose, planes: Planes) -> bool:
-        """Whether a body that is there now, and this lens, give the same picture of it."""
+        """Whether the cut is still right for a body at this pose, seen through this lens."""
         off = np.abs(np.asarray(pose.p) - np.asarray(self.pose.p)).max()
         now, then = np.asarray(pose.q), np.asarray(self.pose.q)
         # A quaternion and its negative are one rotation.
         turned = min(np.abs(now - then).max(), np.abs(now + then).max())
-        return off <= _SAME_PLACE[0] and turned <= _SAME_PLACE[1] and np.array_equal(planes, self.planes)
+        return (
+            off <= _SAME_POSE_TOLERANCES[0]
+            and turned <= _SAME_POSE_TOLERANCES[1]
+            and np.array_equal(planes, self.planes)
+        )
 
 
 def _pose(entity: sapien.Entity, places: Places) -> sapien.Pose:
-    """Where it is drawn."""
+    """Pose at which an entity is drawn."""
     if id(entity) not in places:
         return entity.pose
     pose = places[id(entity)][1]
@@ -292,7 +297,7 @@ def heavy_bodies(sub_scene: sapien.Scene) -> Iterator[sapien.render.RenderBodyCo
 
 
 def _is_heavy(body: Any) -> bool:
-    return _faces(body) > HEAVY and not _has_tangents(body)
+    return _faces(body) > HEAVY_FACES and not _has_tangents(body)
 
 
 def _bodies(sub_scene: sapien.Scene) -> Iterator[Any]:
@@ -303,7 +308,7 @@ def _bodies(sub_scene: sapien.Scene) -> Iterator[Any]:
 
 
 def unknown_meshes(sub_scenes: Sequence[sapien.Scene]) -> list[Mesh]:
-    """The meshes of heavy bodies that were never simplified on this machine: that takes seconds for a robot."""
+    """The meshes of heavy bodies that were never simplified on this machine, which takes seconds for a robot."""
     found: dict[int, Mesh] = {}
     for sub_scene in sub_scenes:
         for body in heavy_bodies(sub_scene):
@@ -315,7 +320,7 @@ def unknown_meshes(sub_scenes: Sequence[sapien.Scene]) -> list[Mesh]:
 
 
 def _has_tangents(body: Any) -> bool:
-    """Whether a part has a normal map: SAPIEN makes the tangents that it needs of meshes in files alone."""
+    """Whether a part has a normal map, whose tangents SAPIEN makes only for meshes from files."""
     return any(
         part.material.normal_texture is not None for shape in body.render_shapes for part in shape.parts
     )
@@ -331,7 +336,7 @@ class _Part:
     exact: Mesh
     scale: tuple[float, float, float]
     placed: NDArray[np.float64]
-    """(4, 4) from points of the mesh, with its scale, to the body's frame."""
+    """(4, 4) transform from points of the mesh, including its scale, to the body's frame."""
 
     @property
     def material(self) -> Any:
@@ -351,7 +356,7 @@ def _moved(points: NDArray[np.floating], by: NDArray[np.floating]) -> NDArray[np
 
 
 class _Chosen:
-    """Simplified meshes by exact mesh, which is often shared by all envs."""
+    """Cache of simplified meshes by exact mesh, which all envs often share."""
 
     def __init__(self) -> None:
         self._made: dict[tuple[int, bool, float], tuple[Mesh, Mesh]] = {}
@@ -359,19 +364,19 @@ class _Chosen:
         self._corners: dict[int, tuple[Mesh, NDArray[np.float64]]] = {}
 
     def box(self, exact: Mesh) -> NDArray[np.float64]:
-        """(8, 3) its corners."""
+        """(8, 3) corners of the mesh's bounding box."""
         if id(exact) not in self._boxes:
             self._boxes[id(exact)] = exact, box_corners(exact.vertices)
         return self._boxes[id(exact)][1]
 
     def corners(self, mesh: Mesh) -> NDArray[np.float64]:
-        """(P, 3) of what is around it."""
+        """(P, 3) corner points around the mesh."""
         if id(mesh) not in self._corners:
             self._corners[id(mesh)] = mesh, corners_of(mesh.vertices)
         return self._corners[id(mesh)][1]
 
     def mesh(self, part: _Part, tolerance: float) -> Mesh:
-        """What stands for a part of a body that may be off by `tolerance`."""
+        """The simplified mesh of a part of a body that may be off by `tolerance` metres."""
         largest = max(map(abs, part.scale))
         if largest == 0 or not _is_mesh(part.shape):
             return part.exact
@@ -379,7 +384,7 @@ class _Chosen:
         key = (id(part.exact), textured, tolerance / largest)
         if key not in self._made:
             mesh = part.exact if textured else drop_uvs(part.exact)
-            # With the exact one, whose id would else be another's.
+            # Stored with the exact mesh, so that its id is not reused.
             self._made[key] = part.exact, within(mesh, tolerance / largest)
         return self._made[key][1]
 
@@ -396,10 +401,10 @@ def _simplified(
     chosen: _Chosen,
     planes: Planes | None = None,
 ) -> sapien.render.RenderBodyComponent | None:
-    """None where nothing of it can be simplified, or nothing is in view.
+    """A simplified copy of a body; None where no part can be simplified, or nothing is in view.
 
     Args:
-        planes: in the body's frame, to cut its triangles to; None for all of them.
+        planes: view planes in the body's frame to which its triangles are cut; None for all triangles.
     """
     shapes, fewer = [], False
     for part in parts:
@@ -440,14 +445,14 @@ def _is_mesh(shape: Any) -> bool:
 
 
 def _shared_name(entity: Any, env: int) -> str:
-    """The name without ManiSkill's prefix of the env, so that a body is equally fine in all envs."""
+    """The name without ManiSkill's env prefix, so that a body has the same tolerance in all envs."""
     return entity.name.removeprefix(f"scene-{env}-").removeprefix(f"scene-{env}_")
 
 
 def _tolerance(camera: sapien.render.RenderCameraComponent, distance: float) -> float:
     """Metres that a surface at this distance may be off."""
-    pixels_off = TOLERANCE * max(1.0, camera.height / _SMALL) ** 0.5
-    return pixels_off * _pixel(camera) * max(distance, _NEAREST)
+    pixels_off = TOLERANCE_PIXELS * max(1.0, camera.height / _TOLERANCE_SIDE_PIXELS) ** 0.5
+    return pixels_off * _pixel(camera) * max(distance, _MIN_DISTANCE_METRES)
 
 
 def _pixel(camera: sapien.render.RenderCameraComponent) -> float:
@@ -457,11 +462,11 @@ def _pixel(camera: sapien.render.RenderCameraComponent) -> float:
 
 
 def _distance(point: NDArray[np.floating], low: NDArray[np.floating], high: NDArray[np.floating]) -> float:
-    """Metres to the box between these corners; 0 within it."""
+    """Metres from a point to the box between these corners; 0 inside."""
     return float(np.linalg.norm(np.maximum(0.0, np.maximum(low - point, point - high))))
 
 
 def _rounded(tolerance: float) -> float:
-    if tolerance < _FINEST:
+    if tolerance < _TOLERANCE_UNIT_METRES:
         return tolerance
-    return _FINEST * 2.0 ** (np.floor(4 * np.log2(tolerance / _FINEST)) / 4)
+    return _TOLERANCE_UNIT_METRES * 2.0 ** (np.floor(4 * np.log2(tolerance / _TOLERANCE_UNIT_METRES)) / 4)

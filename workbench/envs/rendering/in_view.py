@@ -1,4 +1,4 @@
-"""What a camera cannot see: boxes and triangles wholly outside its field of view. And what never moves before it."""
+"""Finds what a camera cannot see (boxes and triangles outside its field of view), and what never moves relative to it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from trimesh.convex import hull_points
 
 from workbench.envs.scene.shapes import Mesh
 
-_MARGIN = 1.0
-"""Pixels around the picture that count as in view: a tolerance for poses that moved since they were measured."""
+_MARGIN_PIXELS = 1.0
+"""Margin around the picture that counts as in view: a tolerance for poses that changed since they were measured."""
 
 Planes = NDArray[np.float64]
 """(5, 4) left, right, top, bottom and near: a point is in view where all of ``planes @ (x, y, z, 1)`` are positive."""
@@ -26,17 +26,17 @@ Planes = NDArray[np.float64]
 def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
     """View planes of a camera, in its own frame: x forward, y left, z up."""
     k = np.asarray(camera.get_intrinsic_matrix(), np.float64)
-    # Times x, the column and the row of a point's pixel.
+    # Column and row of a point's pixel, multiplied by x.
     column, row, x = (
         np.array([k[0, 2], -k[0, 0], -k[0, 1], 0]),
         np.array([k[1, 2], 0, -k[1, 1], 0]),
         np.eye(4)[0],
     )
     planes = [
-        column + _MARGIN * x,
-        (camera.width + _MARGIN) * x - column,
-        row + _MARGIN * x,
-        (camera.height + _MARGIN) * x - row,
+        column + _MARGIN_PIXELS * x,
+        (camera.width + _MARGIN_PIXELS) * x - column,
+        row + _MARGIN_PIXELS * x,
+        (camera.height + _MARGIN_PIXELS) * x - row,
         x - [0, 0, 0, 0.99 * camera.near],
     ]
     return np.array(planes)
@@ -45,8 +45,8 @@ def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
 def outside_and_inside(
     boxes: NDArray[np.float32], planes: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(B,) whether boxes (B, 2, 3) are wholly outside one of the planes (B, 5, 4), each in the frame of its box; and whether
-    they are wholly inside all."""
+    """(B,) whether boxes (B, 2, 3) are entirely outside one of the planes (B, 5, 4), each in the frame of its box; and (B,)
+    whether they are entirely inside all."""
     sides = planes[:, :, None, :3] * boxes[:, None]
     farthest = sides.max(axis=2).sum(axis=-1) + planes[..., 3]
     nearest = sides.min(axis=2).sum(axis=-1) + planes[..., 3]
@@ -54,12 +54,12 @@ def outside_and_inside(
 
 
 def is_outside(points: NDArray[np.float64], planes: Planes) -> bool:
-    """Whether points (P, 3), and so what is between them, are wholly outside one of the planes, in whose frame they are."""
+    """Whether points (P, 3), and so everything between them, are entirely outside one of the planes of the same frame."""
     return bool((planes[:, :3] @ points.T + planes[:, 3:]).max(axis=1).min() < 0)
 
 
 def corners_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(P, 3) those of their convex hull, or of their box where they have none: in one plane, or not numbers."""
+    """(P, 3) corners of the points' convex hull, or of their box if they have no hull (in one plane, or not finite)."""
     try:
         return np.asarray(hull_points(points), np.float64)
     except (QhullError, ValueError):
@@ -67,12 +67,12 @@ def corners_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def box_corners(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(8, 3) of the box around them."""
+    """(8, 3) corners of the box around the points."""
     return np.array(list(product(*zip(points.min(axis=0), points.max(axis=0)))), np.float64)
 
 
 def cut_to_view(mesh: Mesh, planes: Planes) -> Mesh:
-    """`mesh` without the triangles that are wholly outside one of the planes, in whose frame it is."""
+    """`mesh` without the triangles that are entirely outside one of the planes, which are in its frame."""
     outside = (mesh.vertices @ planes[:, :3].T + planes[:, 3] < 0) @ (1 << np.arange(len(planes)))
     of_faces = outside[mesh.faces]
     kept = mesh.faces[(of_faces[:, 0] & of_faces[:, 1] & of_faces[:, 2]) == 0]
@@ -87,15 +87,15 @@ def cut_to_view(mesh: Mesh, planes: Planes) -> Mesh:
 
 
 def fixed_to(entity: sapien.Entity) -> set[int]:
-    """Ids of the entities of an articulation that never move as seen from this one."""
+    """Ids of the entities of an articulation that never move relative to this one."""
     link: Any = entity.find_component_by_type(physx.PhysxArticulationLinkComponent)
     found, left = {id(entity)}, [] if link is None else [link]
     while left:
         link = left.pop()
-        beside = [child for child in link.children if child.joint.type == "fixed"]
+        neighbours = [child for child in link.children if child.joint.type == "fixed"]
         if link.parent is not None and link.joint.type == "fixed":
-            beside.append(link.parent)
-        for other in beside:
+            neighbours.append(link.parent)
+        for other in neighbours:
             if id(other.entity) not in found:
                 found.add(id(other.entity))
                 left.append(other)

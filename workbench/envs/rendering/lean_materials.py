@@ -1,4 +1,4 @@
-"""Bodies drawn without textures that are the same everywhere: SAPIEN's shaders look each of them up for every pixel."""
+"""Draws bodies without constant textures, each of which SAPIEN's shaders would look up for every pixel."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _VALUES = (
 )
 _TEXTURES = ("base_color", "emission", "normal", "roughness", "metallic", "transmission")
 _KNOWN_FORMATS = ("R8G8B8A8Unorm", "R8Unorm")
-_MOST_TEXELS = 1 << 24
-"""Limit of texels that are read in a scene: a million take 10 to 20 ms, and a furnished house has hundreds of millions."""
+_MAX_READ_TEXELS = 1 << 24
+"""Maximum texels that are read in a scene: a million take 10 to 20 ms, and a furnished house has hundreds of millions."""
 
 
 @dataclass(frozen=True)
 class LeanBody:
-    """Copy of an exact component with the same meshes and with materials of its own."""
+    """Copy of an exact component with the same meshes and its own materials."""
 
     component: sapien.render.RenderBodyComponent
     _exact: list[Any]
@@ -35,25 +35,25 @@ class LeanBody:
     """Values of these materials when they were copied."""
 
     def is_like_exact(self) -> bool:
-        """Whether the author has changed nothing of the exact materials. SAPIEN does not draw each later change of a material
-        that was hidden meanwhile, so this one is for those that stay."""
+        """Whether the exact materials are unchanged. SAPIEN does not draw every change of a material that was made while it was
+        hidden, so a body whose materials change must be drawn exactly."""
         now = [_read(material) for material in self._exact]
         return all(map(_equal, now, self._copied))
 
 
 class LeanMaterials:
-    """Makes `LeanBody` for a scene, whose envs share the textures of their files."""
+    """Makes each `LeanBody` of a scene, whose envs share the textures of their files."""
 
     def __init__(self) -> None:
         self._constants: list[tuple[Any, float | None]] = []
-        """Textures with their constant value, a list since a texture has no hash. A texture that the author changes in
+        """Textures with their constant value; a list, since a texture has no hash. A texture that the author changes in
         place is not read again."""
         self._texels = 0
-        """Texels that were read."""
+        """Number of texels read so far."""
 
-    def beside(self, body: Any) -> LeanBody | None:
-        """None where all textures say something, and where the body is not of files alone: SAPIEN shares the materials of
-        any other mesh with its copies, and makes the tangents of normal maps from files alone."""
+    def lean_copy(self, body: Any) -> LeanBody | None:
+        """A lean copy of a body; None if no texture is constant, or not all of its meshes are from files: SAPIEN shares the
+        materials of other meshes with their copies, and makes the tangents of normal maps only from files."""
         parts = [part for shape in body.render_shapes for part in shape.parts]
         if all(self._metallic(part.material) is None for part in parts):
             return None
@@ -83,7 +83,7 @@ class LeanMaterials:
             to.metallic_texture, to.metallic = None, metallic
 
     def _metallic(self, material: Any) -> float | None:
-        """What stands for the metallic texture of a material, if it has one that is the same everywhere."""
+        """The value that replaces the metallic texture of a material, if that is constant; else None."""
         texture = material.metallic_texture
         if texture is None:
             return None
@@ -91,14 +91,14 @@ class LeanMaterials:
             if known == texture:
                 return value
         self._texels += texture.width * texture.height
-        value = _constant(texture) if self._texels <= _MOST_TEXELS else None
+        value = _constant(texture) if self._texels <= _MAX_READ_TEXELS else None
         self._constants.append((texture, value))
         return value
 
 
 def _constant(texture: Any) -> float | None:
-    """The number that a texture has everywhere, in its red and its blue: SAPIEN reads the one of a picture and the other
-    of a glTF file's, which holds the roughness in its green."""
+    """The number that a texture has everywhere, in red and blue: SAPIEN reads red from a picture, and blue from a glTF
+    file's texture, which holds the roughness in green."""
     if texture.is_srgb or texture.format not in _KNOWN_FORMATS:
         return None
     pixels = np.asarray(texture.download())
@@ -107,7 +107,7 @@ def _constant(texture: Any) -> float | None:
 
 
 def _from_file(shape: Any) -> Any:
-    """Copy of the shape with materials of its own; None where the shape is no longer what its file gives."""
+    """Copy of the shape with its own materials; None where the shape no longer equals its file."""
     if not isinstance(shape, sapien.render.RenderShapeTriangleMesh) or not shape.filename:
         return None
     try:

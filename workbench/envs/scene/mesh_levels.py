@@ -1,4 +1,4 @@
-"""Simplified versions of a mesh, kept on disk: coarser and coarser ones, each with its distance from the exact surface."""
+"""Simplified versions (levels) of a mesh, cached on disk, each with its distance from the exact surface."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ from workbench.machine.folders import cache_folder, read_private, write_private
 
 _VERSION = 3
 """Version of the cached files; increase it when the levels change."""
-_FEWEST_FACES = 24
-_LOST, _USELESS = 0.01, 0.1
+_MIN_FACES = 24
+_LOST_PIECE_ERROR, _USELESS_ERROR = 0.01, 0.1
 """Errors relative to the size of the mesh: above the first, a piece of the mesh may be missing, so coarsening by pieces
 is tried too; above the second, no level is made."""
-_SIMPLE = 150
-"""Triangles up to which a mesh stays as it is: layered thin discs, such as ManiSkill's targets, would lose a layer (see
+_SIMPLE_FACES = 150
+"""Triangles up to which a mesh stays exact: layered thin discs, such as ManiSkill's targets, would lose a layer (see
 `from_afar`)."""
-_FEW = 32, 48, 72, 100, 144, 200, 280, 400, 800, 1600
-"""Triangle counts that `from_afar` tries, fewest first; for each it tries grids of `_GRIDS` cells."""
-_GRIDS = 12, 24, 48
-_LARGE = 20_000
-"""Triangles above which a level is made from the level before: making it from the exact mesh takes too long."""
+_AFAR_FACES = 32, 48, 72, 100, 144, 200, 280, 400, 800, 1600
+"""Triangle counts that `from_afar` tries, fewest first; for each it tries grids of `_AFAR_CELLS` cells."""
+_AFAR_CELLS = 12, 24, 48
+_LARGE_FACES = 20_000
+"""Triangles above which a level is made from the previous level: making it from the exact mesh takes too long."""
 _CHECKED_POINTS = 1500
 """Points on the exact surface at which the distance to a level is measured."""
-_SAMPLES = 10_000
-"""Most points on a level that are searched for the triangle nearest to a point."""
-_MOST_KEPT = 500
-"""Most meshes in memory."""
-_MOST_ON_DISK = 512 << 20
+_SEARCHED_POINTS = 10_000
+"""Maximum points on a level that are searched for the triangle nearest to a point."""
+_MAX_MESHES = 500
+"""Maximum number of meshes in memory."""
+_MAX_CACHE_BYTES = 512 << 20
 """Limit of the cache in bytes, including files of other versions; the least recently used files are deleted first."""
 
 
@@ -62,7 +62,7 @@ class Level:
 
 
 def content_hash(mesh: Mesh) -> str:
-    """Digest of all that decides the levels of a mesh."""
+    """Digest of everything that determines the levels of a mesh."""
     digest = hashlib.blake2b(digest_size=16)
     for array in (mesh.vertices, mesh.faces, mesh.normals, mesh.uvs):
         digest.update(b"-" if array is None else np.ascontiguousarray(array).data)
@@ -77,8 +77,8 @@ _keeping = threading.Lock()
 def levels_of(mesh: Mesh) -> tuple[Level, ...]:
     """Simplified versions of `mesh`, from fine to coarse, each with about half the triangles of the one before.
 
-    The first call for a mesh takes some 0.1 s for each thousand triangles; later ones, also of other processes, read a
-    file. May be called from several threads.
+    The first call for a mesh takes some 0.1 s for each thousand triangles; later calls, also in other processes, read a
+    file. Thread-safe.
     """
     name = content_hash(mesh)
     with _keeping:
@@ -96,14 +96,14 @@ def levels_of(mesh: Mesh) -> tuple[Level, ...]:
 def _keep(name: str, levels: tuple[Level, ...]) -> None:
     with _keeping:
         _kept[name] = levels
-        if len(_kept) > _MOST_KEPT:
+        if len(_kept) > _MAX_MESHES:
             _kept.popitem(last=False)
 
 
 def reduced_mesh(mesh: Mesh, max_faces: int) -> Mesh:
-    """`mesh` with about `max_faces` triangles, as `simplify.reduce_mesh` makes it, on a grid; kept on disk.
+    """`mesh` with about `max_faces` triangles, by `simplify.reduce_mesh` and rounded to a grid; cached on disk.
 
-    A robot's take 0.6 s, which everybody waits for who opens a task.
+    Without the cache, opening a task would take 0.6 s longer for the meshes of a robot.
     """
     name = f"{content_hash(mesh)}-{max_faces}"
     kept = _read(name)
@@ -116,13 +116,12 @@ def reduced_mesh(mesh: Mesh, max_faces: int) -> Mesh:
 
 
 def from_afar(mesh: Mesh, error: float) -> Mesh:
-    """`mesh` with few triangles, 99 % of its surface within `error` of them; kept on disk.
+    """`mesh` with few triangles, such that 99 % of its surface is within `error` of them; cached on disk.
 
-    For what is some pixels large: unlike in `levels_of`, vertices on a coarse grid are joined first, without which hundreds
-    of loose pieces keep their triangles. Simple meshes and textured ones stay as they are. The first call for a mesh takes
-    some 0.2 s.
+    For objects a few pixels large: unlike in `levels_of`, vertices are first joined on a coarse grid, without which hundreds
+    of loose pieces keep their triangles. Simple and textured meshes stay exact. The first call for a mesh takes some 0.2 s.
     """
-    if len(mesh.faces) <= _SIMPLE or mesh.uvs is not None or error <= 0:
+    if len(mesh.faces) <= _SIMPLE_FACES or mesh.uvs is not None or error <= 0:
         return mesh
     name = f"{content_hash(mesh)}-afar-{error:.3g}"
     with _keeping:
@@ -136,9 +135,12 @@ def from_afar(mesh: Mesh, error: float) -> Mesh:
 
 
 def _few_faces(mesh: Mesh, error: float) -> Mesh:
-    """The first of ever finer meshes that is near enough; `mesh` itself where none is."""
-    for faces in (count for count in _FEW if count < 0.8 * len(mesh.faces)):
-        for coarser in (collapse_mesh(mesh, faces), *(cluster_mesh(mesh, faces, cells) for cells in _GRIDS)):
+    """The coarsest mesh that is near enough; `mesh` itself where none is."""
+    for faces in (count for count in _AFAR_FACES if count < 0.8 * len(mesh.faces)):
+        for coarser in (
+            collapse_mesh(mesh, faces),
+            *(cluster_mesh(mesh, faces, cells) for cells in _AFAR_CELLS),
+        ):
             if len(coarser.faces) <= 1.5 * faces and deviation(mesh, coarser) <= error:
                 return _shaded(coarser, None if mesh.normals is None else ShadedSurface(mesh))
     return mesh
@@ -149,7 +151,7 @@ def _shaded(coarser: Mesh, surface: ShadedSurface | None) -> Mesh:
 
 
 def are_known(mesh: Mesh) -> bool:
-    """Whether `levels_of` this mesh takes no time: they are in memory or on disk."""
+    """Whether the levels of this mesh are in memory or on disk, so that `levels_of` takes no time."""
     name = content_hash(mesh)
     with _keeping:
         return name in _kept or (_folder() / f"{name}.npz").exists()
@@ -162,7 +164,7 @@ def within(mesh: Mesh, error: float) -> Mesh:
 
 
 def _made(mesh: Mesh) -> Iterator[Level]:
-    if len(mesh.faces) <= _FEWEST_FACES:
+    if len(mesh.faces) <= _MIN_FACES:
         return
     flat = flat_rectangle(mesh)
     if flat is not None:
@@ -171,29 +173,29 @@ def _made(mesh: Mesh) -> Iterator[Level]:
     surface = None if mesh.normals is None else ShadedSurface(mesh)
     finer, faces, worst = mesh, len(mesh.faces), 0.0
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    while faces // 2 >= _FEWEST_FACES:
+    while faces // 2 >= _MIN_FACES:
         faces //= 2
-        # Nearest to the surface is what is made of the exact mesh; of a very large one that takes too long.
-        source = mesh if len(mesh.faces) <= _LARGE else finer
+        # A level made from the exact mesh is nearest to the surface; for a very large mesh that takes too long.
+        source = mesh if len(mesh.faces) <= _LARGE_FACES else finer
         coarser = coarsen_mesh(source, faces)
         error = deviation(mesh, coarser)
-        if error > _LOST * extent and mesh.uvs is None:
+        if error > _LOST_PIECE_ERROR * extent and mesh.uvs is None:
             by_pieces = coarsen_mesh(source, faces, by_pieces=True)
             fewer = len(by_pieces.faces) < 0.9 * len(finer.faces)
             if fewer and (other := deviation(mesh, by_pieces)) < error:
                 coarser, error = by_pieces, other
-        if len(coarser.faces) >= 0.9 * len(finer.faces) or error > _USELESS * extent:
+        if len(coarser.faces) >= 0.9 * len(finer.faces) or error > _USELESS_ERROR * extent:
             break
-        # A level that happens to be nearer than the one before it is not finer.
+        # A level counts as no nearer than the finer one before it.
         finer, worst = coarser, max(worst, error)
         yield Level(_shaded(coarser, surface), worst)
 
 
 def deviation(exact: Mesh, reduced: Mesh) -> float:
-    """The distance from `reduced` within which 99 % of the surface of `exact` are, measured at points by chance."""
+    """The distance from `reduced` within which 99 % of the surface of `exact` is, measured at random points."""
     random = np.random.default_rng(0)
     points = _points_on(exact, _CHECKED_POINTS, random)[0][-_CHECKED_POINTS:]
-    samples, which = _points_on(reduced, min(_SAMPLES, 20 * len(reduced.faces) + 2000), random)
+    samples, which = _points_on(reduced, min(_SEARCHED_POINTS, 20 * len(reduced.faces) + 2000), random)
     triangles = reduced.vertices[reduced.faces].astype(np.float64)
     near = np.asarray(KDTree(samples).query(points, k=min(4, len(samples)))[1]).reshape(len(points), -1)
     best = np.full(len(points), np.inf)
@@ -206,12 +208,12 @@ def deviation(exact: Mesh, reduced: Mesh) -> float:
 def _points_on(
     mesh: Mesh, count: int, random: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (P, 3) on the surface, one on each triangle, some along the long ones and the last `count` evenly by area, and their triangles."""
+    """Points (P, 3) on the surface, and their triangles: one on each triangle, then `count` by length, then `count` by area."""
     triangles = mesh.vertices[mesh.faces].astype(np.float64)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(across, axis=1) + 1e-30
     longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1) + 1e-30
-    # By length too: a long thin triangle would have its few points far from most of it.
+    # By length too: with few points, most of a long thin triangle would be far from all of them.
     by_length = random.choice(len(triangles), count, p=longest / longest.sum())
     by_area = random.choice(len(triangles), count, p=area / area.sum())
     which = np.concatenate([np.arange(len(triangles)), by_length, by_area])
@@ -227,7 +229,7 @@ def _folder() -> Path:
 
 
 def _read(name: str) -> tuple[Level, ...] | None:
-    """None where there is no file, or none of ours."""
+    """The cached levels; None where there is no file, or it is invalid."""
     try:
         content = read_private(f"{name}.npz", _folder())
         if content is None:
@@ -268,7 +270,7 @@ def _make_room() -> None:
     for path in cache_folder().glob("meshes-*/*.npz"):
         status = path.stat()
         files.append((status.st_mtime, status.st_size, path))
-    over = sum(size for _, size, _ in files) - _MOST_ON_DISK
+    over = sum(size for _, size, _ in files) - _MAX_CACHE_BYTES
     for _, size, path in sorted(files):
         if over <= 0:
             return

@@ -1,4 +1,4 @@
-"""Normals of meshes: made from their faces, or so that few triangles are shaded like the many they stand for."""
+"""Computes normals of meshes: from their faces, or such that few triangles are shaded like the exact mesh."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from scipy.spatial import KDTree
 from workbench.envs.scene.shapes import Mesh
 
 _CREASE_COSINE = float(np.cos(np.deg2rad(40.0)))
-"""Neighbouring faces at a smaller angle are shaded as one smooth surface."""
-_ON_EXACT = 2_000, 10, 20_000
+"""Cosine of the angle (40 degrees) below which neighbouring faces are shaded as one smooth surface."""
+_EXACT_POINTS = 2_000, 10, 20_000
 """Points sampled on an exact surface by area, in addition to one on each triangle: a constant, a number per triangle,
 and the limit of both."""
-_ON_COARSE = 2_000
+_COARSE_POINTS = 2_000
 """Points sampled on a coarse surface by area, in addition to some on each triangle."""
-_NEAREST = 8
-"""Nearest points of the exact surface, among which one that faces the same way is chosen."""
-_ALIKE_COSINE = 0.3
+_NEIGHBOURS = 8
+"""Number of nearest points of the exact surface, from which one that faces the same way is chosen."""
+_MIN_FACING_COSINE = 0.3
 _SHARED_DEGREES = 20.0
-"""Angle between normals of a coarse mesh's faces at a vertex, below which they share one normal: a seventh fewer
+"""Angle between normals of a coarse mesh's faces at a vertex below which they share one normal: a seventh fewer
 vertices, for a twentieth of the shading error."""
 _OWN_WEIGHT = 0.02
 """Weight of a vertex's own normal relative to the normals of the surface around it: it decides only where they
@@ -54,7 +54,7 @@ def with_normals(mesh: Mesh) -> Mesh:
         [np.bincount(a[smooth], weighted[b[smooth] // 3, k], minlength=len(corners)) for k in range(3)],
         axis=1,
     ).astype(np.float64)
-    # A face without area has a zero normal, which is drawn black.
+    # A face without area has a zero normal, which would be drawn black.
     empty = np.linalg.norm(normals, axis=1) < 1e-20
     normals[empty] = [0.0, 0.0, 1.0]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -71,8 +71,11 @@ def with_normals(mesh: Mesh) -> Mesh:
 
 
 def share_smooth(mesh: Mesh, degrees: float = 10.0) -> Mesh:
-    """`mesh` with vertices at one place (and of one uv) only once where their normals differ by less than `degrees`: the
-    corners of a reduced mesh take normals of different vertices of its source. Files and browsers have a sixth less to hold."""
+    """`mesh` with vertices of equal position (and uv) merged where their normals differ by less than `degrees`.
+
+    The corners of a reduced mesh take normals from different vertices of its source. Merging saves a sixth of the memory in
+    files and browsers.
+    """
     if mesh.normals is None:
         return mesh
     rows = mesh.vertices if mesh.uvs is None else np.concatenate([mesh.vertices, mesh.uvs], axis=1)
@@ -81,7 +84,7 @@ def share_smooth(mesh: Mesh, degrees: float = 10.0) -> Mesh:
     leader = np.arange(len(place))
     left, least = leader, np.cos(np.deg2rad(degrees))
     while len(left):
-        # The first that is left at each place takes those that are like it.
+        # The first remaining vertex at each place absorbs those that are like it.
         _, first, of = np.unique(place[left], return_index=True, return_inverse=True)
         takes = left[first][of.reshape(-1)]
         alike = np.einsum("vk,vk->v", mesh.normals[left], mesh.normals[takes]) >= least
@@ -106,34 +109,35 @@ class ShadedSurface:
     def __init__(self, mesh: Mesh) -> None:
         assert mesh.normals is not None
         triangles = mesh.vertices[mesh.faces].astype(np.float64)
-        some, of_each, most = _ON_EXACT
+        some, of_each, most = _EXACT_POINTS
         which, weights = _points(triangles, 1, min(some + of_each * len(triangles), most))
         self._tree = KDTree(np.einsum("sk,skd->sd", weights, triangles[which]))
-        # A normal that is no number counts as none: one would spread over all that it is fitted to.
+        # A normal with NaN or infinity counts as missing: it would spread to everything that is fitted to it.
         normals = np.nan_to_num(mesh.normals.astype(np.float64), posinf=0.0, neginf=0.0)
         self._normals = _unit(np.einsum("sk,skd->sd", weights, normals[mesh.faces[which]]))
 
     def normals_at(
         self, points: NDArray[np.float64], facing: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """(P, 3) normals near `points` (P, 3) on the side that looks the way of `facing` (P, 3); and (P,) whether there is one."""
-        count = min(_NEAREST, self._tree.n)
+        """(P, 3) normals near `points` (P, 3) on the side that faces along `facing` (P, 3); and (P,) whether there is one."""
+        count = min(_NEIGHBOURS, self._tree.n)
         near = np.asarray(self._tree.query(points, k=count)[1]).reshape(-1, count)
         candidates = self._normals[near]
         alike = np.einsum("skd,sd->sk", candidates, facing)
-        # The nearest that agrees; on a folded face none does, and the most similar is taken.
-        agrees = alike > _ALIKE_COSINE
+        # The nearest point that faces the same way; on a folded face none does, and the most similar one is taken.
+        agrees = alike > _MIN_FACING_COSINE
         choice = np.where(agrees.any(axis=1), agrees.argmax(axis=1), alike.argmax(axis=1))
         every = np.arange(len(points))
         return candidates[every, choice], alike[every, choice] > 0
 
     def shade(self, coarse: Mesh) -> Mesh:
-        """`coarse`, which has normals, with those that shade its triangles most like this surface; vertices with nearly the same are
-        shared.
+        """`coarse` with the normals that shade its triangles most like this surface; it must have normals, and vertices with
+        nearly the same normal are shared.
 
-        Least squares over points on its triangles, by area, of the normal between a triangle's corners from that of the surface: a
-        vertex where a large flat face ends takes that of the face, though the surface bends right there. (Normals of the nearest
-        vertices shade such faces as if they were round, which is twice as many pixels off as simpler outlines are.)
+        The normals minimise the squared difference between the interpolated normal of a triangle and the normal of the surface,
+        over points sampled by area. So a vertex at the end of a large flat face takes the normal of the face, although the
+        surface bends right there. (Normals of the nearest vertices shade such faces as if they were round: twice as many
+        pixels are off as for simpler outlines.)
         """
         coarse = share_smooth(coarse, _SHARED_DEGREES)
         assert coarse.normals is not None
@@ -141,7 +145,7 @@ class ShadedSurface:
         across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         area = np.linalg.norm(across, axis=1)
         each = 6 if len(triangles) < 4_000 else 3 if len(triangles) < 20_000 else 1
-        which, weights = _points(triangles, each, _ON_COARSE)
+        which, weights = _points(triangles, each, _COARSE_POINTS)
         wanted, known = self.normals_at(
             np.einsum("sk,skd->sd", weights, triangles[which]), _unit(across)[which]
         )
@@ -154,11 +158,11 @@ class ShadedSurface:
         kept = _OWN_WEIGHT * diagonal + 1e-6 * diagonal.mean() + 1e-30
         normal = (normal + diags_array(kept)).tocsr()
         right = at.T @ (stands_for[:, None] * wanted) + kept[:, None] * own
-        # Well conditioned, once scaled: some ten iterations.
+        # Well conditioned once scaled: takes some ten iterations.
         scale = diags_array(1.0 / normal.diagonal())
         found = [cg(normal, b, x0=x, M=scale, rtol=1e-3, maxiter=60)[0] for b, x in zip(right.T, own.T)]
         fitted = np.stack(found, axis=1)
-        # Where surfaces that face each other meet in a point, theirs cancel out.
+        # Normals of surfaces that face each other cancel out where they meet in a point.
         none = np.linalg.norm(fitted, axis=1) < 0.1
         fitted[none] = own[none]
         return share_smooth(replace(coarse, normals=_unit(fitted).astype(np.float32)))
@@ -171,7 +175,7 @@ def _unit(vectors: NDArray) -> NDArray[np.float64]:
 def _points(
     triangles: NDArray[np.float64], each: int, by_area: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Points by chance, `each` on every triangle (F, 3, 3) and more by area: the triangle of each, and (P, 3) weights of its corners."""
+    """Random points, `each` on every triangle (F, 3, 3) and `by_area` more by area: their triangles, and (P, 3) corner weights."""
     random = np.random.default_rng(0)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(across, axis=1) + 1e-30

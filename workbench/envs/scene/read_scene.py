@@ -25,39 +25,39 @@ from workbench.envs.scene.simplify import drop_uvs, flat_rectangle, share_vertic
 from workbench.envs.simulation.hiding import shown_visibility
 
 _FLAT_FACES = 100
-"""Meshes with more faces are tested for being a flat rectangle."""
-_KEPT_MESHES = 1000
-MOST_FACES = 375
-"""Most faces of a visual: a Panda of 136,000 triangles becomes 9,000 and looks the same."""
-MOST_TEXELS = 1024
-"""Texels on the longest side of a texture."""
+"""Number of faces above which a mesh is tested for being a flat rectangle."""
+_MAX_KEPT_MESHES = 1000
+MAX_FACES = 375
+"""Maximum faces of a visual: a Panda of 136,000 triangles becomes 9,000 and looks the same."""
+MAX_SIDE_TEXELS = 1024
+"""Maximum texels on the longest side of a texture."""
 
 
-_GREY: dict[BodyKind, float] = {"link": 0.55, "dynamic": 0.32, "kinematic": 0.22, "static": 0.12}
+_LINEAR_GREY: dict[BodyKind, float] = {"link": 0.55, "dynamic": 0.32, "kinematic": 0.22, "static": 0.12}
 """Linear grey: moving bodies are lighter than static ones."""
-_PLANE_HALF_SIZE = 50.0
-"""PhysX planes are infinite; this is half the default width of ManiSkill's ground."""
+_PLANE_HALF_SIZE_METRES = 50.0
+"""Half size at which PhysX's infinite planes are drawn: half the default width of ManiSkill's ground."""
 _X_FROM_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
 class MeshPart:
-    """A mesh with its material on one body of one env, not read yet."""
+    """A mesh with its material on one body of one env; read on demand."""
 
     key: Hashable
     """Parts with equal keys look the same."""
     read: Callable[[], tuple[Mesh, Material]]
 
 
-def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_TEXELS) -> SceneGeometry:
-    """Meshes, materials and instances of all bodies of a scene.
+def read_geometry(env: Any, max_faces: int = MAX_FACES, max_texels: int = MAX_SIDE_TEXELS) -> SceneGeometry:
+    """Read meshes, materials and instances of all bodies of a scene.
 
     The scene is walked by cheap keys (file, scale, pose, colour), and triangles are read only for a new key: 16 envs of a
-    Panda cost little more than one. Meshes from files are kept, reduced, for the life of the process, for the next reload.
+    Panda cost little more than one. Reduced meshes of files are cached for the life of the process, for the next reload.
 
-    Bodies that are hidden now are included; `SceneGeometry.body_hidden` names those that the task
-    hides from its sensors. Without a render device the collision shapes are given, in grey; bodies that have none (goal
-    markers) are missing then.
+    Bodies that are hidden now are included; `SceneGeometry.body_hidden` marks those that the task
+    hides from its sensors. Without a render device the collision shapes are returned, in grey; bodies without any (goal
+    markers) are then missing.
     """
     index = scene_index(env)
     walk = _RenderWalk(max_faces, max_texels, maniskill_private.hidden_objects(env))
@@ -100,7 +100,7 @@ def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_
 
 def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[MeshPart]:
     body = entity.find_component_by_type(physx.PhysxRigidBaseComponent)
-    grey = _GREY[kind]
+    grey = _LINEAR_GREY[kind]
     material = Material((grey, grey, grey, 1.0), roughness=0.8)
     for shape in () if body is None else body.collision_shapes:
         place = _Placement.of(shape)
@@ -113,7 +113,7 @@ def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[MeshPart]:
 
 
 class _RenderWalk:
-    """One walk over the render bodies of a scene; keeps the textures that it found."""
+    """One walk over the render bodies of a scene; collects their textures."""
 
     def __init__(self, max_faces: int, max_texels: int, hidden: Sequence[Any]) -> None:
         self._max_faces, self._max_texels, self._hidden = max_faces, max_texels, hidden
@@ -209,7 +209,7 @@ class _Placement:
         vertices = (mesh.vertices * scale) @ rotation.T + np.array(self.position)
         normals = None
         if mesh.normals is not None:
-            # Normals transform by the inverse transpose: an uneven scale would tilt them.
+            # Normals transform by the inverse transpose: a non-uniform scale would tilt them.
             normals = (mesh.normals / np.where(scale == 0, 1.0, scale)) @ rotation.T
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
             normals = normals.astype(np.float32)
@@ -243,7 +243,7 @@ def _source(shape: Any, part: Any, index: int) -> _Source:
 
 
 def _file_version(filename: str) -> tuple[int, int] | None:
-    """Changes when the file changes: an author edits meshes too."""
+    """Value that changes when the file changes, since authors edit meshes too; None if it cannot be read."""
     try:
         stat = os.stat(filename)
     except OSError:
@@ -281,7 +281,7 @@ def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
         mesh = share_vertices(mesh) if len(mesh.faces) <= max_faces else reduced_mesh(mesh, max_faces)
     if source.keep:
         _kept_meshes[key] = mesh
-        if len(_kept_meshes) > _KEPT_MESHES:
+        if len(_kept_meshes) > _MAX_KEPT_MESHES:
             _kept_meshes.popitem(last=False)
     return mesh
 
@@ -289,7 +289,7 @@ def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
 def exact_part(shape: Any, part: Any, index: int) -> tuple[Mesh, tuple[float, float, float]]:
     """A part of a render shape with all its triangles, and the scale that it is drawn with on its local pose.
 
-    Meshes of files are kept for the life of the process.
+    Meshes of files are cached for the life of the process.
     """
     source = _source(shape, part, index)
     scale = _Placement.of(shape).scale
@@ -298,7 +298,7 @@ def exact_part(shape: Any, part: Any, index: int) -> tuple[Mesh, tuple[float, fl
     key = (source.key, "exact")
     if key not in _kept_exact:
         _kept_exact[key] = _read_part(source)
-        if len(_kept_exact) > _KEPT_MESHES:
+        if len(_kept_exact) > _MAX_KEPT_MESHES:
             _kept_exact.popitem(last=False)
     _kept_exact.move_to_end(key)
     return _kept_exact[key], scale
@@ -384,13 +384,13 @@ def _along_x(mesh: trimesh.Trimesh) -> Mesh:
 
 
 def _plane() -> Mesh:
-    s = _PLANE_HALF_SIZE
+    s = _PLANE_HALF_SIZE_METRES
     corners = np.array([[0, -s, -s], [0, s, -s], [0, s, s], [0, -s, s]], dtype=np.float32)
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32))
 
 
 def _oriented(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> Mesh:
-    """Triangles facing outwards: a mirrored scale (negative volume) turns them round."""
+    """A mesh whose triangles face outwards: a mirrored scale (negative volume) turns them inwards."""
     corners = vertices[triangles].astype(np.float64)
     volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     faces = np.asarray(triangles, np.uint32)

@@ -1,4 +1,4 @@
-"""Bodies of a built scene, where their poses are, and which have a state."""
+"""Index of the bodies of a built scene: where their poses are stored, and which have a state."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from workbench.envs.scene.shapes import BodyKind
 from workbench.envs.simulation.cpu_system import batched_system
 
 _T = TypeVar("_T")
-_AWAY = 5e4
-"""Metres along each axis from where an actor was hidden, if it is still hidden; ``Actor.hide_visual`` moves it by 99999."""
+_HIDDEN_METRES = 5e4
+"""Distance along each axis from an actor's true pose above which it is still hidden; ``Actor.hide_visual`` moves it by
+99999 m."""
 
 
 def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
-    """Cache ``find(env)`` on the env's scene, so that it is called once a scene, and again when bodies came or went."""
+    """Cache ``find(env)`` on the env's scene: it is called once per scene, and again when bodies are added or removed."""
     name = f"_workbench {find.__module__}.{find.__qualname__}"
 
     @wraps(find)
@@ -40,10 +41,10 @@ def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
 class SceneIndex:
     """The bodies of one built scene.
 
-    Asked one by one a body's pose costs 2 us, so 64 envs of 16 bodies cost 2 ms a frame. Here it is found once which row of
-    ``px.cuda_rigid_body_data`` belongs to which (env, body), and a frame is one gather. Static bodies are not in that
-    tensor: `fixed` has their poses. In GPU simulation a hidden body was moved 99999 m away; `hidden_poses` has its true pose.
-    Objects that differ from env to env (`Actor.merge`) are one body by the merged name.
+    A getter for one body's pose takes 2 us, so 64 envs of 16 bodies would take 2 ms a frame. The index finds once which row
+    of ``px.cuda_rigid_body_data`` belongs to which (env, body), and a frame is then one gather. Static bodies are not in
+    that tensor: `fixed` has their poses. In GPU simulation a hidden body was moved 99999 m away; `hidden_poses` has its true
+    pose. Objects that differ between envs (`Actor.merge`) are one body with the merged name.
     """
 
     names: tuple[str, ...]
@@ -51,7 +52,7 @@ class SceneIndex:
     kinds: tuple[BodyKind, ...]
     """(B,)"""
     owners: tuple[str, ...]
-    """(B,) the actor's name again, or the articulation's."""
+    """(B,) name of the actor or articulation that the body belongs to."""
     hidden: tuple[bool, ...]
     """(B,) whether the task hides it from its sensors."""
     entities: NDArray[np.object_]
@@ -66,9 +67,9 @@ class SceneIndex:
     rows: Any
     """(K,) row of each moving (env, body) in ``px.cuda_rigid_body_data``, for `rows_of`; None on a stock CPU env."""
     slots: NDArray[np.int64]
-    """(K,) the slot of each of `rows`."""
+    """(K,) slot of each entry of `rows`."""
     slot_of: dict[int, int]
-    """``id`` of an entity to its slot; `entities` keeps the entities alive, so ids stay valid."""
+    """Slot by ``id`` of an entity; `entities` keeps the entities alive, so ids stay valid."""
 
     def name_of(self, entity: Any) -> str | None:
         """Body name of an entity or SAPIEN component; None if ManiSkill does not manage it."""
@@ -118,7 +119,7 @@ def scene_index(env: Any) -> SceneIndex:
             if kinds[body] != "static" and scene.gpu_sim_enabled:
                 own = maniskill_private.data_rows_of(struct)
                 slots.append((envs * len(names) + body)[(own >= 0).numpy(force=True)])
-                rows.append(own[own >= 0])  # a body that was removed has none
+                rows.append(own[own >= 0])  # a removed body has no row
     slot_of = {id(entity): slot for slot, entity in enumerate(entities.ravel()) if entity is not None}
     hidden = {
         id(entity)
@@ -168,12 +169,12 @@ def read_poses(env: Any) -> NDArray[np.float32]:
             pose = entity.pose
             poses[env_idx, body] = [*pose.p, *pose.q]
     if index.rows is None:
-        # A stock CPU env has no such tensor, and does not move what it hides.
+        # A stock CPU env has no such tensor, and does not move bodies to hide them.
         for slot, entity in enumerate(index.entities.ravel()):
             if entity is not None:
                 flat[slot] = [*entity.pose.p, *entity.pose.q]
         return poses
-    # Gathered on the tensor's device: one small copy to the host.
+    # Gathered on the tensor's device, so that only a small copy goes to the host.
     moved = rows_of(env.scene.px.cuda_rigid_body_data, index.rows)[:, :7]
     flat[index.slots] = moved if isinstance(moved, np.ndarray) else moved.cpu().numpy()
     for slots, kept in hidden_poses(env):
@@ -183,7 +184,7 @@ def read_poses(env: Any) -> NDArray[np.float32]:
 
 @once_a_scene
 def joints_of_scene(env: Any) -> tuple[tuple[str, Any], ...]:
-    """Articulations that every env has, by name, with as many active joints in each: their joints can be compared."""
+    """Name and articulation of each that every env has with the same number of active joints, so that joints compare."""
     found = []
     for name, articulation in env.scene.articulations.items():
         count = len(articulation.active_joints)
@@ -194,7 +195,7 @@ def joints_of_scene(env: Any) -> tuple[tuple[str, Any], ...]:
 
 
 def joint_names(env: Any) -> tuple[str, ...]:
-    """(J,) names of the joints of `read_joints`: with the articulation's where there are several."""
+    """(J,) names of the joints of `read_joints`, with the articulation's name where there are several."""
     found = joints_of_scene(env)
     return tuple(
         joint.name if len(found) == 1 else f"{name}/{joint.name}"
@@ -213,14 +214,14 @@ def read_joints(env: Any) -> NDArray[np.float32] | None:
 
 
 def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-    """For each Actor that GPU simulation has moved away to hide it: slots (M,) and true poses (M, 7) of its entities, without
-    those that something else has moved since."""
+    """For each Actor that GPU simulation moved away to hide it: slots (M,) and true poses (M, 7) of its entities, without
+    entities that something else has moved since."""
     for actor, slots in scene_index(env).actors:
         if (kept := maniskill_private.pose_before_hiding(actor)) is not None:
             now = rows_of(env.scene.px.cuda_rigid_body_data, maniskill_private.data_rows_of(actor).long())[
                 :, :3
             ]
-            away = ((now - kept[:, :3]).abs() > _AWAY).all(dim=1).cpu().numpy()
+            away = ((now - kept[:, :3]).abs() > _HIDDEN_METRES).all(dim=1).cpu().numpy()
             yield slots[away], kept.cpu().numpy()[away]
 
 
@@ -233,7 +234,7 @@ def present_states(env: Any) -> dict[str, Any]:
 
 
 class StateRows(NamedTuple):
-    """Copies from which the states of a moment are made, one call for each tensor."""
+    """Copies of the tensors (one call for each) from which the states of a moment are made."""
 
     still: list[int]
     places: dict[str, tuple[Any, int | None, Any, int]]
@@ -242,7 +243,7 @@ class StateRows(NamedTuple):
     qpos: Any
     qvel: Any
     asked: dict[str, Any]
-    """States that are in none of these tensors."""
+    """States that are not in these tensors."""
 
     def states(self) -> dict[str, Any]:
         """States as `present_states` returns them."""
@@ -277,8 +278,8 @@ def state_rows(env: Any) -> StateRows:
 
 @once_a_scene
 def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, int | None, Any, int]]]:
-    """Rows (N, B) of ``cuda_rigid_body_data``; the columns B of kinematic bodies, which have no velocity; and of each state its
-    struct and, if all envs have it, its column, and of an articulation its rows (N,) and number of joints."""
+    """Rows (N, B) of ``cuda_rigid_body_data``; the columns B of kinematic bodies, which have no velocity; and for each state
+    its struct, its column if all envs have it, and for an articulation its rows (N,) and number of joints."""
     every, rows, still = np.arange(env.num_envs), [], []
     places: dict[str, tuple[Any, int | None, Any, int]] = {}
     for name, struct in scene_index(env).states.items():
@@ -316,7 +317,7 @@ def row_index(rows: torch.Tensor) -> Any:
 
 
 def rows_of(tensor: Any, rows: Any) -> Any:
-    """(K, D) copy from a tensor of the simulation; an array on the CPU, where numpy takes a quarter of torch's time for a
+    """(K, D) copy from a tensor of the simulation; on the CPU an array, since numpy takes a quarter of torch's time for a
     few hundred numbers."""
     data = tensor.torch()
     return data.numpy().take(rows, axis=0) if data.is_cpu else data[rows]
@@ -336,10 +337,10 @@ def _named_structs(scene: Any) -> Iterator[tuple[str, str, list[Any]]]:
 
 
 def _merged(structs: dict[str, Any], views: dict[Any, Any]) -> Iterator[tuple[str, list[Any]]]:
-    """Structs by name; parts of one merged view together."""
+    """Structs by name; the parts of a merged view share one name."""
     view_of: dict[int, str] = {}
     for name, view in views.items():
-        # Two objects of one env under one view cannot share a column: they keep their own names.
+        # Two objects of one env in one view cannot share a column, so they keep their own names.
         if len(set(maniskill_private.envs_of(view))) == len(maniskill_private.objects_of(view)):
             for thing in maniskill_private.objects_of(view):
                 view_of.setdefault(id(thing), str(name if name is not None else view.name))

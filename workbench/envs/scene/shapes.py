@@ -26,7 +26,7 @@ class Mesh:
     uvs: NDArray[np.float32] | None = None
     """(V, 2), or None where there is no texture. As in glTF and SAPIEN: (0, 0) is the top left corner
     of the first row, v grows downwards, and values outside 0..1 repeat the texture. trimesh and OBJ
-    count v from the bottom: give those ``1 - v``."""
+    count v from the bottom: use ``1 - v`` for those."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Material:
 
 
 def srgb(linear: NDArray[Any]) -> NDArray[Any]:
-    """Linear colours in 0..1, sRGB encoded."""
+    """Encode linear colours in 0..1 as sRGB."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
@@ -73,7 +73,7 @@ class SceneGeometry:
 
     A frame is one array, ``poses[env, body] = [x, y, z, qw, qx, qy, qz]`` in the env's own world frame (metres, z up, quaternion
     wxyz), NaN for a body that an env does not have. Equal shapes are one `Visual` with many instances: a browser draws a
-    thousand instances of one mesh as fast as one, and is unusable with one node a body.
+    thousand instances of one mesh as fast as one, but is unusable with one node per body.
     """
 
     num_envs: int
@@ -107,16 +107,16 @@ def fingerprint(visuals: tuple[Visual, ...]) -> str:
 
 
 class SharedShapes:
-    """Shapes that look the same, kept once, by a digest of all that is seen of them. Not thread-safe.
+    """Cache that stores shapes which look the same once, by a digest of everything visible. Not thread-safe.
 
-    A texture is some megabytes: sixty open recordings of one task would hold half a gigabyte.
+    A texture takes some megabytes: without the cache, sixty open recordings of one task would hold half a gigabyte.
     """
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[Mesh, Material]] = {}
         self._marked: dict[Hashable, tuple[str, Mesh, Material]] = {}
         self._kept: dict[tuple[int, int], tuple[Mesh, Material]] = {}
-        """Shared shapes by the ids of mesh and material; they need no new digest."""
+        """Shared shapes by the ids of mesh and material, for which no digest is needed."""
 
     def share(self, geometry: SceneGeometry) -> SceneGeometry:
         """Copy of the scene that uses earlier meshes and materials where they look the same."""
@@ -133,7 +133,7 @@ class SharedShapes:
         return kept
 
     def learn(self, mark: Hashable, name: str, mesh: Mesh, material: Material) -> None:
-        """Store what a file has under this mark."""
+        """Store the name, mesh and material of a file under this mark."""
         self._marked[mark] = (name, mesh, material)
 
     def known(self, mark: Hashable) -> tuple[str, Mesh, Material] | None:

@@ -15,32 +15,33 @@ from scipy.spatial import KDTree
 from workbench.envs.scene.normals import ShadedSurface, with_normals
 from workbench.envs.scene.shapes import Mesh
 
-_DENSE = 60_000
+_DENSE_FACES = 60_000
 """A mesh with more faces is a CAD assembly, whose vertices are first snapped to a grid: quadric collapse alone takes
 seconds and gets stuck."""
 _CLUSTER_CELLS = 64
 _COARSEST_CELLS = 16
 _WELD_CELLS = 1_000_000
-_MOST_PIECES = 200
-_LEAST_FACES = 24
-_GENTLE, _USUAL = 3, 7
-"""How fast the threshold of a collapse grows (the method's ``agg``): the slower, the more cheap edges go before dear ones."""
+_MAX_PIECES = 200
+_MIN_FACES = 24
+_SLOW_GROWTH, _USUAL_GROWTH = 3, 7
+"""Growth of the collapse threshold (the method's ``agg``): the slower, the more cheap edges go before costly ones."""
 
 
 def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
-    """`mesh` with about `max_faces` triangles; as it is when it has no more than that.
+    """`mesh` with about `max_faces` triangles; unchanged if it has no more than that.
 
     ManiSkill's Panda has 136,000 triangles and its wrist camera 425,000; a browser that draws in software manages some
     200,000 in all. Quadric edge collapse (fast_simplification, Garland and Heckbert) does not move borders, and exporters give
-    every triangle its own three vertices. So vertices at one place are welded first (with a texture only where the uv agrees), and
-    normals are made again, sharp at edges and smooth elsewhere.
+    every triangle its own three vertices. So vertices at one place are welded first (with a texture only where the uv agrees),
+    and normals are computed again, sharp at edges and smooth elsewhere.
 
-    A mesh of many loose pieces may keep up to twice as many, and a textured one more: edges of its texture pieces stay.
+    A mesh of many loose pieces may keep up to twice as many triangles, and a textured one more, since edges of its texture
+    pieces stay.
     """
     reduced = collapse_mesh(mesh, max_faces)
     if reduced is mesh:
         return mesh
-    if mesh.normals is None or len(mesh.faces) > _DENSE:
+    if mesh.normals is None or len(mesh.faces) > _DENSE_FACES:
         return share_vertices(reduced)
     return ShadedSurface(mesh).shade(reduced)
 
@@ -49,7 +50,7 @@ def collapse_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     """`reduce_mesh`, with normals of its own faces."""
     if len(mesh.faces) <= max_faces or not np.ptp(mesh.vertices, axis=0).any():
         return mesh
-    cells = _WELD_CELLS if mesh.uvs is not None or len(mesh.faces) <= _DENSE else _CLUSTER_CELLS
+    cells = _WELD_CELLS if mesh.uvs is not None or len(mesh.faces) <= _DENSE_FACES else _CLUSTER_CELLS
     welded = _weld(mesh.vertices, mesh.faces, mesh.uvs, cells)
     while True:
         vertices, faces, uvs = welded
@@ -70,7 +71,7 @@ def coarsen_mesh(mesh: Mesh, max_faces: int, by_pieces: bool = False) -> Mesh:
     nearer to the surface, and with normals of its own faces.
 
     Args:
-        by_pieces: each connected piece by itself: small ones stay, where a whole one would otherwise be lost.
+        by_pieces: collapse each connected piece by itself, so that small pieces are not lost.
     """
     vertices, faces, uvs = _weld(mesh.vertices, mesh.faces, mesh.uvs, _WELD_CELLS)
     if len(faces) > max_faces:
@@ -82,13 +83,13 @@ def coarsen_mesh(mesh: Mesh, max_faces: int, by_pieces: bool = False) -> Mesh:
 
 
 def cluster_mesh(mesh: Mesh, max_faces: int, cells: int) -> Mesh:
-    """`mesh`, without texture, with about `max_faces` triangles after the vertices in each cell of a grid have become one, and
+    """`mesh`, without texture, with about `max_faces` triangles after the vertices in each cell of a grid are merged, and
     with normals of its own faces.
 
-    Loose pieces grow together, and what is smaller than a cell is gone: for what is seen from afar.
+    Loose pieces grow together, and details smaller than a cell are lost: for objects that are seen from afar.
 
     Args:
-        cells: of the grid along the longest axis.
+        cells: number of grid cells along the longest axis.
     """
     vertices, faces, _ = _weld(mesh.vertices, mesh.faces, None, cells)
     if len(faces) > max_faces:
@@ -99,7 +100,7 @@ def cluster_mesh(mesh: Mesh, max_faces: int, cells: int) -> Mesh:
 
 
 def share_vertices(mesh: Mesh) -> Mesh:
-    """`mesh` with equal vertices only once: exporters give every triangle its own three. Normals that differ by half a
+    """`mesh` with equal vertices merged: exporters give every triangle its own three. Normals that differ by up to half a
     degree count as equal."""
     rows = [np.ascontiguousarray(mesh.vertices)]
     if mesh.normals is not None:
@@ -125,7 +126,7 @@ def rounded(mesh: Mesh) -> Mesh:
     extent = np.ptp(mesh.vertices, axis=0)
     cell = np.exp2(np.floor(np.log2(np.where(extent > 0, extent, 1.0) / 4096)))
     on_grid = (np.round(mesh.vertices / cell) * cell).astype(np.float32)
-    # Flat along an axis, it stays where it is.
+    # Keep the positions along an axis on which the mesh is flat.
     vertices = np.where(extent > 0, on_grid, mesh.vertices)
     normals = None if mesh.normals is None else (np.round(mesh.normals * 48) / 48).astype(np.float32)
     return replace(mesh, vertices=vertices, normals=normals)
@@ -186,7 +187,7 @@ def _weld(
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     welded = inverse.reshape(-1)[faces]
     if cells < _WELD_CELLS:
-        # Surfaces that a coarse grid makes coincide would flicker.
+        # Drop duplicates: surfaces that coincide on a coarse grid would flicker.
         welded = welded[np.sort(np.unique(np.sort(welded, axis=1), axis=0, return_index=True)[1])]
     whole = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
     return vertices[first], welded[whole], None if uvs is None else uvs[first]
@@ -207,9 +208,9 @@ def _collapse(
         if how == "as a whole":
             new_points, new_faces = _collapse_whole(points, triangles, max_faces)
         else:
-            growth = _USUAL if how == "fast" else _GENTLE
+            growth = _USUAL_GROWTH if how == "fast" else _SLOW_GROWTH
             new_points, new_faces = _collapse_pieces(points, triangles, max_faces, growth)
-        # The optimum of a nearly singular quadric can be anywhere: a spike out of the surface.
+        # The optimum of a nearly singular quadric can be anywhere, and would be a spike out of the surface.
         distance, nearest = (np.asarray(x) for x in KDTree(points).query(new_points))
         spike = distance > 0.04
         new_points[spike] = points[nearest[spike]]
@@ -219,7 +220,7 @@ def _collapse(
         points,
         triangles,
         target_count=max_faces,
-        agg=_USUAL if how == "fast" else _GENTLE,
+        agg=_USUAL_GROWTH if how == "fast" else _SLOW_GROWTH,
         return_collapses=True,
         preserve_border=True,
     )[-1]
@@ -234,9 +235,10 @@ def _collapse(
 def _collapse_whole(
     points: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    # Losing a flat lid costs a quadric nothing, unless its border stays. Only what cannot be had so is had otherwise.
+    # Losing a flat lid costs a quadric nothing unless its border is kept. So borders go only if it is the only way to get
+    # few enough faces.
     new_points, new_faces = points, faces
-    for growth, keep_borders in ((_GENTLE, True), (_GENTLE, False), (_USUAL, False)):
+    for growth, keep_borders in ((_SLOW_GROWTH, True), (_SLOW_GROWTH, False), (_USUAL_GROWTH, False)):
         new_points, new_faces = fast_simplification.simplify(
             points, faces, target_count=max_faces, agg=growth, preserve_border=keep_borders
         )[:2]
@@ -250,7 +252,7 @@ def _collapse_pieces(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Collapse each connected piece by itself, with a share of the triangles by its area.
 
-    Losing a flat disc costs a quadric nothing: together with a round housing, its lid goes first.
+    Losing a flat disc costs a quadric nothing: collapsed together with a round housing, its lid would go first.
     """
     count = len(points)
     edges = coo_matrix(
@@ -262,14 +264,14 @@ def _collapse_pieces(
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     share = np.bincount(label, area, minlength=pieces) / max(area.sum(), 1e-20)
     new_points, new_faces, used = [], [], 0
-    for piece in np.unique(label) if pieces <= _MOST_PIECES else [None]:
+    for piece in np.unique(label) if pieces <= _MAX_PIECES else [None]:
         own = faces if piece is None else faces[label == piece]
-        target = max_faces if piece is None else max(_LEAST_FACES, int(share[piece] * max_faces))
+        target = max_faces if piece is None else max(_MIN_FACES, int(share[piece] * max_faces))
         index, flat = np.unique(own, return_inverse=True)
         vertices, triangles = points[index], flat.reshape(-1, 3).astype(np.int32)
         if len(triangles) > target:
-            simpler = fast_simplification.simplify(vertices, triangles, target_count=target, agg=_GENTLE)
-            if growth > _GENTLE and len(simpler[1]) > 1.2 * target:
+            simpler = fast_simplification.simplify(vertices, triangles, target_count=target, agg=_SLOW_GROWTH)
+            if growth > _SLOW_GROWTH and len(simpler[1]) > 1.2 * target:
                 simpler = fast_simplification.simplify(vertices, triangles, target_count=target, agg=growth)
             vertices, triangles = simpler[0], simpler[1]
         new_points.append(vertices)

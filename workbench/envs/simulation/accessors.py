@@ -1,4 +1,4 @@
-"""Wraps ManiSkill's and SAPIEN's state setters and getters: they do what they do on a stock CPU env, and report to the rules."""
+"""Wraps ManiSkill's and SAPIEN's state setters and getters: they work as on a stock CPU env, and report to the rules."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from workbench.envs.simulation.strict_system import StrictCpuSystem
 
 @cache
 def install_struct_access() -> None:
-    """Wrap ManiSkill's setters and getters of state, once a process; a stock scene gets the stock code.
+    """Wrap ManiSkill's setters and getters of state, once per process; a stock scene gets the stock code.
 
     ManiSkill has two implementations of each: one for a single CPU env, which calls SAPIEN's objects, and one for the GPU,
     which reads and writes tensors. Here the second one runs, and what it writes is also written to SAPIEN's objects; while
-    the scene is built there are no tensors, and SAPIEN's objects are read and written alone. `StrictCpuSystem` hears of
-    each, and reports what a GPU does otherwise.
+    the scene is built there are no tensors, and only SAPIEN's objects are read and written. `StrictCpuSystem` is notified of
+    each call, and reports where a GPU behaves differently.
     """
     for each in STATE_PROPERTIES:
         stock: property = each.owner.__dict__[each.name]
@@ -70,7 +70,7 @@ def install_struct_access() -> None:
 
 
 def _chosen(struct: Any) -> NDArray[np.int64]:
-    """Which of the struct's objects a setter writes now."""
+    """Indices of the struct's objects that a setter writes now."""
     return np.flatnonzero(struct.scene._reset_mask[struct._scene_idxs.long()].numpy())
 
 
@@ -154,7 +154,7 @@ def _setter(stock: Callable[..., None], each: StateProperty) -> Callable[..., No
         system.about_to_write(self, each.group, rows)
         mirror, at = system.mirror(each.mirror), each.at(self, rows, chosen)
         if isinstance(self, ArticulationJoint):
-            # ManiSkill's puts the rows of the envs that are reset together with the joints of all.
+            # ManiSkill's setter would combine the rows of the envs being reset with the joints of all envs.
             mirror.now[at] = np.ravel(_rows(self, value, each.name, chosen))
         else:
             _stock_write(stock, self, value, each.name, chosen)
@@ -174,7 +174,7 @@ def _setter(stock: Callable[..., None], each: StateProperty) -> Callable[..., No
 def _put_directly(
     system: BatchedCpuSystem, struct: Any, each: StateProperty, value: Any, chosen: NDArray[np.int64]
 ) -> None:
-    """Write to SAPIEN's objects what is in no tensor: a static or removed actor, and all state while the scene is built."""
+    """Write state that is in no tensor to SAPIEN's objects: static or removed actors, and everything while the scene is built."""
     assert each.write is not None
     if system.laid_out and _is_static(struct, each):
         system.refused_by_gpu(
@@ -244,10 +244,10 @@ def _stock_write(
 
 
 def _rows(struct: Any, value: Any, name: str, chosen: NDArray[np.int64]) -> NDArray[np.float32]:
-    """(k, ...) float32 of what a setter is given for the struct's objects `chosen`, one for each.
+    """(k, ...) float32: the value of a setter for each of the struct's objects `chosen`.
 
-    A stock CPU env takes the first row of a batch of another size. Here a batch for all envs stands for those that are
-    being reset, and of one env the first row is taken.
+    A stock CPU env takes the first row of a batch of another size. Here a batch for all envs gives the rows of the envs that
+    are being reset, and a single env takes the first row.
 
     Raises:
         ValueError: a batch of another size.
@@ -286,7 +286,7 @@ def _rows(struct: Any, value: Any, name: str, chosen: NDArray[np.int64]) -> NDAr
     )
 
 
-# --- what a stock CPU env has at any time ---------------------------------------------------------------
+# --- methods that a stock CPU env has at any time -------------------------------------------------------
 
 
 FIXED_ONCE_BUILT: dict[type, tuple[str, ...]] = {
@@ -325,7 +325,7 @@ def _of_chosen(stock: Callable[..., Any], name: str) -> Callable[..., Any]:
 
 
 def _some(struct: Any, chosen: NDArray[np.int64]) -> Any:
-    """The struct with these of its objects alone."""
+    """The struct with only these of its objects."""
     if len(chosen) == len(struct._objs):
         return struct
     some = copy.copy(struct)
@@ -338,7 +338,7 @@ def _some(struct: Any, chosen: NDArray[np.int64]) -> Any:
 
 
 def _install_cpu_only() -> None:
-    """Methods that ManiSkill has for its single CPU env alone."""
+    """Install methods that ManiSkill has only for its single CPU env."""
     stock_type: Any = ArticulationJoint.__dict__["type"]
     stock_force, stock_model = Articulation.compute_passive_force, Articulation.create_pinocchio_model
     stock_remove = Actor.remove_from_scene
@@ -418,7 +418,7 @@ _OF_CAMERAS = (
 
 
 def _of_chosen_cameras(stock: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a method of cameras to apply to the envs that are being reset; the matrices that ManiSkill keeps are
+    """Wrap a method of cameras to apply only to the envs that are being reset; the matrices that ManiSkill caches are
     computed again."""
 
     @wraps(stock)
@@ -435,7 +435,7 @@ def _of_chosen_cameras(stock: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _with_link_poses(stock: Callable[..., Any]) -> Callable[..., Any]:
-    """While the scene is built, links are where they belong once their articulation is put where it is."""
+    """Wrap a method that reads link poses: while the scene is built, they are right only once the root pose is set again."""
 
     @wraps(stock)
     def call(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -488,9 +488,9 @@ _systems: weakref.WeakSet[BatchedCpuSystem] = weakref.WeakSet()
 def guard_scenes(system: BatchedCpuSystem) -> None:
     """Watch SAPIEN's own setters of state in the scenes of `system`, once it is laid out.
 
-    ``actor._objs[0].set_pose(...)`` moves a body on a stock CPU env and does nothing in GPU simulation. So it does here, but
-    for an env that is not being reset in a partial reset: of its own reset a stock env would know nothing. SAPIEN's classes
-    are shared by all scenes of a process: the setters are replaced once, and do as before for objects of other scenes,
+    ``actor._objs[0].set_pose(...)`` moves a body on a stock CPU env and does nothing in GPU simulation. Here it moves the
+    body, except in a partial reset, if the env is not being reset: a stock env would not run this reset at all. All scenes
+    of a process share SAPIEN's classes, so the setters are replaced once. They stay unchanged for objects of other scenes,
     before a scene is complete, and when the core calls them.
     """
     _install()
@@ -531,7 +531,7 @@ def _guarded(stock: Any, called: str, instead: str) -> Callable[..., Any]:
 
 
 def _system_of(owner: Any) -> tuple[BatchedCpuSystem | None, int]:
-    """The laid-out system in whose scenes a physical body is, and its env."""
+    """The laid-out system and the env of a physical body; None if there is no such system."""
     entity = _entity(owner)
     if entity is not None and entity.scene is not None:
         for system in _systems:
@@ -544,14 +544,14 @@ def _system_of(owner: Any) -> tuple[BatchedCpuSystem | None, int]:
 def _may_write(system: BatchedCpuSystem, env: int, owner: Any, called: str, instead: str) -> bool:
     """Report a setter of SAPIEN's; False if the env is not being reset, and others are."""
     name = owner.name if isinstance(owner, physx.PhysxArticulation) else _entity(owner).name
-    among = system.resetting is None or bool(system.resetting[env])
-    is_left = "" if among else "; the env is not being reset, and left alone here"
+    may_write = system.resetting is None or bool(system.resetting[env])
+    is_left = "" if may_write else "; the env is not being reset, and left alone here"
     system.report(
         "behind-the-tensors",
         f"{called} on '{name}' (env {env}) goes behind the tensors: on the GPU it does nothing{is_left}. Use {instead} "
         "of ManiSkill's object, which sets all envs, or those that are being reset.",
     )
-    return among
+    return may_write
 
 
 def _entity(owner: Any) -> Any:

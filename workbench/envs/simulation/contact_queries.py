@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 _Key = int | tuple[int, int]
-"""The ``id`` of a body, or those of two."""
+"""The ``id`` of a body, or the ids of two."""
 
 
 class CpuArray:
@@ -35,7 +35,8 @@ class ImpulseQuery:
     """Net contact impulses of bodies, or of pairs: on the first body by the second."""
 
     held: Sequence[Any]
-    """The bodies or pairs, kept alive: pybind11 keeps one Python object a body only while it lives, and `rows` has ids."""
+    """The bodies or pairs, kept alive: pybind11 keeps the one Python object of a body only while it is used, and `rows` has
+    ids."""
     cuda_impulses: CpuArray
     """(len(held), 3) newton seconds of the last substep."""
     rows: Mapping[_Key, Sequence[tuple[int, int]]]
@@ -46,9 +47,9 @@ class ImpulseQuery:
 class ContactReader:
     """Answers queries about the last substep of the systems; `invalidate` after each substep.
 
-    Reading the points of a PhysX contact takes microseconds in Python. The lists are walked at most once a step, for any
-    number of queries, and points are read only of contacts that a query counts. (PickCube, 64 envs: ``is_grasping`` took
-    1,900 us of a control step while every contact of the cube was read, 1,200 us since; 850 are ManiSkill's own.) Sums have
+    Reading the points of a PhysX contact takes microseconds in Python. So the lists are walked at most once a step, for any
+    number of queries, and points are read only of contacts that a query counts. (PickCube, 64 envs: ``is_grasping`` takes
+    1,200 us of a control step, of which 850 are ManiSkill's own; 1,900 us if every contact of the cube is read.) Sums have
     the order and precision of ``mani_skill.utils.sapien_utils.compute_total_impulse``, so that numbers equal stock ManiSkill's.
     """
 
@@ -73,7 +74,7 @@ class ContactReader:
         for row, key, sign in what:
             rows.setdefault(key, []).append((row, sign))
         query = ImpulseQuery(held, CpuArray(torch.zeros((len(held), 3))), rows)
-        # Held weakly: a task may make new queries after every reset, and those that it dropped must cost nothing.
+        # Held weakly: a task may make new queries after every reset, and dropped ones must cost nothing.
         self._queries.add(query)
         self._wanted = {key for query in self._queries for key in query.rows}
         self._cache = None
@@ -83,12 +84,12 @@ class ContactReader:
         self._cache = None
 
     def stepped(self, but: Collection[int] = ()) -> None:
-        """All systems but these made a substep: their own lists are valid again."""
+        """Note that all systems except `but` made a substep, so their own lists are valid again."""
         self._cache = None
         self._carried = {env: touching for env, touching in self._carried.items() if env in but}
 
     def carry(self, system: int, contacts: list[tuple[tuple[int, int], NDArray[np.float32]]]) -> None:
-        """Answer for one system with these contacts, as of `counted`, until its next substep.
+        """Use these contacts, as returned by `counted`, for one system until its next substep.
 
         PhysX's own list is that of its last substep, before the state was restored.
         """
@@ -102,17 +103,17 @@ class ContactReader:
             for key in (pair, first):
                 for row, sign in rows.get(key, ()):
                     total[row] += impulse * sign
-            # If both are one body, stock ManiSkill counts the contact for the first only.
+            # If both are the same body, stock ManiSkill counts the contact only for the first.
             for row, _ in rows.get(second, ()) if second != first else ():
                 total[row] -= impulse
         query.cuda_impulses.torch().copy_(torch.from_numpy(total))
 
     def counted(self) -> list[tuple[tuple[int, int], NDArray[np.float32]]]:
-        """The ids of the two bodies, and the impulse on the first, of every contact that a query counts."""
+        """Ids of the two bodies, and the impulse on the first, for every contact that a query counts."""
         if self._cache is None:
             found = self._cache = []
             wanted = self._wanted
-            # Without a query nothing is counted, and a list of 256 systems takes a millisecond.
+            # Without a query nothing is counted; reading the lists of 256 systems would take a millisecond.
             asked = range(len(self.systems)) if wanted else sorted(self._carried)
             for index in asked:
                 if index in self._carried:

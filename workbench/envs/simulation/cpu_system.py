@@ -34,15 +34,15 @@ TENSORS: Mapping[str, tuple[Group, ...]] = {
     "cuda_articulation_target_qvel": ("targets",),
 }
 MOVING: tuple[Group, ...] = ("bodies", "links", "joints")
-"""What a step moves; targets and joint forces stay as they were set."""
-_OF_ALL = {"config", "get_config", "get_timestep", "scene_collision_id", "get_scene_collision_id"}
-"""Members of a system that give the same for each env."""
-_WRITES = {"unpack"}
+"""Groups that a step changes; targets and joint forces stay as they were set."""
+_SHARED_MEMBERS = {"config", "get_config", "get_timestep", "scene_collision_id", "get_scene_collision_id"}
+"""Members of a system that return the same for each env."""
+_WRITING_MEMBERS = {"unpack"}
 """Members of a CPU system that change its state."""
 
 
 def _applies(mirror: Callable[[Mirrors], Mirror]) -> Callable[..., None]:
-    """A ``gpu_apply_*`` of one mirror. What differs from the last fetch is applied, whatever the index buffer names."""
+    """A ``gpu_apply_*`` method for one mirror. It applies what differs from the last fetch, whatever the index buffer names."""
 
     def apply(self: BatchedCpuSystem, index_buffer: Any = None) -> None:
         self._apply(mirror(self._mirrors))
@@ -60,21 +60,21 @@ def _tensor(name: str) -> property:
 
 
 class BatchedCpuSystem:
-    """What ManiSkill calls ``scene.px``, over N separate ``PhysxCpuSystem``s with CPU tensors.
+    """N separate ``PhysxCpuSystem``s with CPU tensors, behind the interface of ManiSkill's ``scene.px`` on a GPU.
 
-    ManiSkill's GPU code talks to ``scene.px`` alone: it reads tensors (``cuda_rigid_body_data`` ...) after ``gpu_fetch_*`` and
-    writes them before ``gpu_apply_*``. So every task runs here through the code path of the GPU, partial resets and reset masks
-    included, and env i is what ManiSkill's single CPU env would be.
+    ManiSkill's GPU code uses only ``scene.px``: it reads tensors (``cuda_rigid_body_data`` ...) after ``gpu_fetch_*`` and
+    writes them before ``gpu_apply_*``. So every task runs here through the code path of the GPU, including partial resets and
+    reset masks, and env i equals ManiSkill's single CPU env.
 
     * A fetch is ``PhysxCpuSystem.pack()`` and ``sapien.Scene.pack_poses()`` of each env (about 3 us) and one gather over all
-      envs; a Python getter costs 2 us *a body*.
-    * ManiSkill's setters write through (`wrote`), its getters give the state of now (`refresh`), as on a stock CPU env: a
-      task that neither applies nor fetches does here what it does there.
-    * An apply writes what else differs from the last fetch: a partial reset wakes no body of another env.
-    * Link velocities, joint accelerations and joint forces are fetched when they are read: few tasks do.
+      envs; a Python getter takes 2 us *per body*.
+    * ManiSkill's setters write through (`wrote`), and its getters return the current state (`refresh`), as on a stock CPU
+      env: a task that neither applies nor fetches behaves as it does there.
+    * An apply writes only what else differs from the last fetch: a partial reset wakes no body of another env.
+    * Link velocities, joint accelerations and joint forces are fetched only when they are read, which few tasks do.
 
     Shapes: R bodies (dynamic and kinematic actors, then links, env after env), A articulations,
-    D the largest number of degrees of freedom. Poses are world poses of each env's own frame.
+    D the largest number of degrees of freedom. Poses are world poses in each env's own frame.
     """
 
     def __init__(self, scenes: Sequence[sapien.Scene], threads: int | None = None) -> None:
@@ -91,19 +91,19 @@ class BatchedCpuSystem:
         self._behind: set[Group] = set()
         """Groups whose tensors are older than the simulation."""
         self.is_writing = False
-        """Whether a setter of ManiSkill's runs."""
+        """Whether a setter of ManiSkill's is running."""
         self.held_back = False
-        """Whether setters write to the tensors alone, see `holding_back`."""
+        """Whether setters write only to the tensors, see `holding_back`."""
         self.resetting: torch.Tensor | None = None
-        """(N,) bool during a reset of some envs and not of others: only they are stepped."""
+        """(N,) bool during a partial reset: the envs being reset, which alone are stepped."""
         self.static_moves = 0
-        """Poses that static actors were given."""
+        """Number of poses that were set on static actors."""
         self._version = 0
         """Increases when the simulation may differ from what was fetched."""
         self._beginning: list[bytes] = []
         """Packed state of each env as it was built."""
         self.layout_version = 0
-        """Increases when rows belong to other bodies."""
+        """Increases when rows are assigned to other bodies."""
         self._read_at: dict[str, int] = {}
         """`_version` at the last read of each value that is read on demand."""
 
@@ -179,7 +179,7 @@ class BatchedCpuSystem:
 
     @contextmanager
     def holding_back(self) -> Iterator[None]:
-        """Context in which setters write to the tensors alone; the simulation changes only when they are applied."""
+        """Context in which setters write only to the tensors; the simulation changes when the tensors are applied."""
         self.held_back = True
         try:
             yield
@@ -188,7 +188,7 @@ class BatchedCpuSystem:
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
-        """Within this, `substeps` calls of `step` may be done together; a read of state does them at once."""
+        """Context in which `substeps` calls of `step` may be merged; a read of state does the pending ones at once."""
         with self.stepper.merging(substeps):
             yield
         self.catch_up()
@@ -203,15 +203,15 @@ class BatchedCpuSystem:
         self.step()
 
     def step_finish(self) -> None:
-        """Nothing to do: `step_start` stepped."""
+        """Do nothing: `step_start` has stepped."""
 
     def sync_poses_gpu_to_cpu(self) -> None:
-        """Nothing to do: SAPIEN's entities are the simulation here."""
+        """Do nothing: SAPIEN's entities are the simulation here."""
 
     # --- building ----------------------------------------------------------------------------------
 
     def gpu_init(self) -> None:
-        """Make the tensors over the scene's bodies; called once, when the scene is complete."""
+        """Make the tensors for the scene's bodies; called once, when the scene is complete."""
         layout = self._layout = lay_out(self.systems)
         self.layout_version += 1
         self._packed = self._posed = None
@@ -241,7 +241,7 @@ class BatchedCpuSystem:
         check_layout(layout, self._pack(), self._link_poses)
         for mirror in found.all:
             mirror.fetch()
-        for row, articulation in enumerate(layout.articulations):  # which no pack holds
+        for row, articulation in enumerate(layout.articulations):  # packs do not hold qf
             found.qf.now[row, : articulation.dof] = found.qf.seen[row, : articulation.dof] = articulation.qf
         self._behind.clear()
 
@@ -267,7 +267,7 @@ class BatchedCpuSystem:
         return self._laid_out.index_of.get(id(articulation), -1)
 
     def _lay_out_again(self) -> None:
-        """Bodies were added or removed since the scene was laid out."""
+        """Lay out the scene again, after bodies were added or removed."""
         self.refused_by_gpu(
             "Bodies are built or removed once the simulation runs: on the GPU this fails. Build them in _load_scene; with "
             "reconfiguration_freq=1 it runs before each episode."
@@ -278,13 +278,13 @@ class BatchedCpuSystem:
         self.keep_beginning()
 
     def keep_beginning(self) -> None:
-        """Keep the present state as the one that `heal` puts back."""
+        """Store the present state, which `heal` restores."""
         self._beginning = [*self.packs()]
 
     def heal(self, envs: Sequence[int]) -> None:
-        """Put back what is NaN or infinite in these envs: each such body or articulation to where it was built.
+        """Restore bodies and articulations with NaN or infinite state in these envs to where they were built.
 
-        PhysX carries a NaN on for ever, and a reset puts right only what the task sets.
+        PhysX keeps a NaN for ever, and a reset corrects only what the task sets.
         """
         numbers = self._pack()
         if np.isfinite(numbers).all():
@@ -305,7 +305,7 @@ class BatchedCpuSystem:
             self.refresh(group)
 
     def note_structure(self) -> None:
-        """Entities were removed from a scene."""
+        """Note that entities were removed from a scene."""
         self._moved(MOVING)
         self._pose_lengths = []
 
@@ -331,7 +331,7 @@ class BatchedCpuSystem:
         # The tensors exist from `gpu_init` on: explain an earlier access.
         if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
             raise RefusedCall(_TOO_EARLY)
-        if name in _OF_ALL:
+        if name in _SHARED_MEMBERS:
             return getattr(self.systems[0], name)
         if hasattr(physx.PhysxCpuSystem, name) and not name.startswith("_"):
             return self._of_one_env(name)
@@ -346,7 +346,7 @@ class BatchedCpuSystem:
         """A member of the CPU system of the only env.
 
         Raises:
-            NeedsOneEnv: there are several.
+            NeedsOneEnv: there are several envs.
         """
         place = place_of(frames_of_the_task())
         if len(self.systems) > 1:
@@ -358,9 +358,9 @@ class BatchedCpuSystem:
         self.report(
             "one-env-only", f"scene.px.{name} does not exist in GPU simulation.{_INSTEAD.get(name, '')}"
         )
-        self.packs()  # makes pending substeps, and writes pending targets
+        self.packs()  # does pending substeps, and writes pending targets
         member = getattr(self.systems[0], name)
-        if name not in _WRITES:
+        if name not in _WRITING_MEMBERS:
             return member
 
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -373,17 +373,17 @@ class BatchedCpuSystem:
     # --- for the rules: see `StrictCpuSystem` -----------------------------------------------------------
 
     def report(self, rule: str, message: str) -> None:
-        """The task breaks a rule."""
+        """Report that the task breaks a rule."""
 
     def refused_by_gpu(self, message: str) -> None:
-        """The task does what GPU simulation refuses."""
+        """Report that the task does what GPU simulation refuses."""
         self.report("refused-by-gpu", message)
 
     def about_to_write(self, struct: Any, group: Group, rows: NDArray[np.int64]) -> None:
-        """A setter of `struct` will write `rows` of `group`'s tensor."""
+        """Note that a setter of `struct` will write `rows` of `group`'s tensor."""
 
     def about_to_read(self, struct: Any, group: Group, rows: NDArray[np.int64]) -> None:
-        """A getter of `struct` will read `rows` of `group`'s tensor."""
+        """Note that a getter of `struct` will read `rows` of `group`'s tensor."""
 
     def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
         """The method that sets one kind of drive target of a joint."""
@@ -406,7 +406,7 @@ class BatchedCpuSystem:
         self._behind.discard(group)
 
     def refresh(self, group: Group) -> None:
-        """Read `group` from the simulation if it is behind, but not over what was written and not applied."""
+        """Read `group` from the simulation if its tensors are out of date; keeps writes that were not applied."""
         self.catch_up()
         if group in self._behind:
             self._follow_structure()
@@ -415,7 +415,7 @@ class BatchedCpuSystem:
                 mirror.refresh()
 
     def tensor(self, name: str) -> CpuArray:
-        """One of `TENSORS`, as the simulation is now (within a setter: as it was read last)."""
+        """One of `TENSORS`, up to date with the simulation (within a setter: as it was last read)."""
         for group in () if self.is_writing else TENSORS[name]:
             self.refresh(group)
         return self._tensors[name]
@@ -427,28 +427,28 @@ class BatchedCpuSystem:
         self._fetch("links")
 
     def gpu_fetch_articulation_link_velocity(self) -> None:
-        """The root's comes with `gpu_fetch_articulation_link_pose`; see `fetch_link_velocities`."""
+        """Do nothing: roots are fetched by `gpu_fetch_articulation_link_pose`, others by `fetch_link_velocities`."""
 
     def gpu_fetch_articulation_qpos(self) -> None:
         self._fetch("joints")
 
     def gpu_fetch_articulation_qvel(self) -> None:
-        """Comes with `gpu_fetch_articulation_qpos`."""
+        """Do nothing: fetched by `gpu_fetch_articulation_qpos`."""
 
     def gpu_fetch_articulation_qacc(self) -> None:
-        """Fetched when `cuda_articulation_qacc` is read."""
+        """Do nothing: fetched when `cuda_articulation_qacc` is read."""
 
     def gpu_fetch_articulation_target_qpos(self) -> None:
         self._fetch("targets")
 
     def gpu_fetch_articulation_target_qvel(self) -> None:
-        """Comes with `gpu_fetch_articulation_target_qpos`."""
+        """Do nothing: fetched by `gpu_fetch_articulation_target_qpos`."""
 
     def gpu_fetch_articulation_link_incoming_joint_forces(self) -> None:
-        """Fetched when `cuda_articulation_link_incoming_joint_forces` is read."""
+        """Do nothing: fetched when `cuda_articulation_link_incoming_joint_forces` is read."""
 
     def gpu_update_articulation_kinematics(self) -> None:
-        """Nothing to do: on the CPU, links follow when qpos or the root pose is set."""
+        """Do nothing: on the CPU, links follow when qpos or the root pose is set."""
 
     def _unread(self, what: str, things: Iterable[Any]) -> Iterable[Any]:
         """`things`, or none if `what` was read since the last change."""
@@ -471,9 +471,9 @@ class BatchedCpuSystem:
         return _array(self._joint_forces)
 
     def fetch_link_velocities(self) -> None:
-        """Read velocities of all links into columns 7 to 12; on demand, since it takes two getters a link."""
+        """Read velocities of all links into columns 7 to 12; on demand, since it takes two getters per link."""
         layout = self._laid_out
-        # Roots' velocities came with the poses, and may have been written since.
+        # Velocities of roots were fetched with the poses, and may have been written since.
         now, seen = self._mirrors.links.now, self._mirrors.links.seen
         for row, link in self._unread("links", zip(layout.link_rows, layout.links, strict=True)):
             if not link.is_root:
@@ -496,18 +496,18 @@ class BatchedCpuSystem:
             packs = self.stepper.pose_packs()
             lengths = [len(pack) // 4 for pack in packs]
             if lengths != self._pose_lengths:
-                # Cameras are added after the scene is laid out, and a task may remove what is drawn.
+                # Entities change after the layout: cameras are added, and a task may remove what is drawn.
                 self._link_pose_at = link_poses_at(layout, self.scenes)
                 self._pose_lengths = lengths
             self._posed = np.frombuffer(b"".join(packs), dtype=np.float32)
         return self._posed[self._link_pose_at]
 
     def note_change(self) -> None:
-        """The state was changed by a call on one of `systems` or of their objects."""
+        """Note that a call on one of `systems` or of their objects changed the state."""
         self._moved(MOVING)
 
     def note_direct_write(self, env: int) -> None:
-        """The task writes to one of SAPIEN's objects in this env."""
+        """Note that the task writes to one of SAPIEN's objects in this env."""
         self._moved(MOVING, {env})
 
     def _stepped(self) -> None:
@@ -515,7 +515,7 @@ class BatchedCpuSystem:
         self._forget_packs(MOVING)
 
     def _moved(self, behind: Iterable[Group], envs: Iterable[int] | None = None) -> None:
-        """At a write to the simulation of these envs (None: of all): drop packed state, and note which groups are behind."""
+        """After a write to the simulation of these envs (None: all), drop packed state and mark groups as out of date."""
         self.catch_up()
         self.stepper.forget(envs)
         self._forget_packs(behind)
@@ -553,13 +553,13 @@ class BatchedCpuSystem:
         values: NDArray[np.float32],
         write: Callable[[NDArray[np.bool_]], None],
     ) -> None:
-        """A setter wrote `values` to the rows and columns `at` of a mirror's tensor: write them to the simulation too.
+        """Write `values`, which a setter put at the rows and columns `at` of a mirror's tensor, to the simulation too.
 
         Args:
-            write: does so, through SAPIEN's objects; called with which of the rows to write.
+            write: writes through SAPIEN's objects; called with a mask of the rows to write.
 
         Raises:
-            ValueError: as `Mirror.may_write`; the tensor is as before.
+            ValueError: as `Mirror.may_write`; the tensor is unchanged.
         """
         if self.held_back:
             return
@@ -569,7 +569,7 @@ class BatchedCpuSystem:
             each = zip(at[0].tolist(), values, strict=True)
             whole = np.array([mirror.may_write(value, row) for row, value in each], dtype=bool)
         own = self._mirrors
-        # Links follow: their poses and, as PhysX rounds it, the root's.
+        # Links follow: their poses change, and the root's as PhysX rounds it.
         follow: tuple[Group, ...] = ("links",) if mirror in (own.qpos, own.links) else ()
         self._moved(follow, {*mirror.envs[at[0]].tolist()})
         write(whole)
@@ -577,7 +577,7 @@ class BatchedCpuSystem:
         mirror.now[at] = mirror.seen[at] = values[whole]
 
     def wrote_targets(self, mirror: DriveTargets, rows: NDArray[np.int64]) -> None:
-        """A setter wrote drive targets of these articulations: they are applied before the next step."""
+        """Note that a setter wrote drive targets of these articulations; they are applied before the next step."""
         mirror.note(rows)
 
     def mirror(self, name: str) -> Any:
@@ -605,7 +605,7 @@ class BatchedCpuSystem:
             mirror.apply()
 
     def apply_changes(self) -> None:
-        """Apply what ``ManiSkillScene._gpu_apply_all`` applies, but only what differs."""
+        """Apply the tensors of ``ManiSkillScene._gpu_apply_all``, but only where they differ from the last fetch."""
         own = self._mirrors
         for mirror in (
             own.bodies,
@@ -649,7 +649,7 @@ class BatchedCpuSystem:
                     body.add_force_torque(values[row], zero)
                 else:
                     body.add_force_torque(zero, values[row])
-        # PhysX takes a force for one substep; a row that stays would push again at the next apply.
+        # PhysX applies a force for one substep; a row that keeps its value would push again at the next apply.
         values[:] = 0.0
 
     # --- contacts ----------------------------------------------------------------------------------
@@ -680,6 +680,6 @@ def _array(values: NDArray[np.float32]) -> CpuArray:
 def batched_system(scene: Any) -> BatchedCpuSystem | None:
     """The batched CPU system of a ManiSkillScene, or None for any other scene.
 
-    Not by isinstance, for which `BatchedCpuSystem` is a ``PhysxGpuSystem``.
+    isinstance cannot tell: it takes a `BatchedCpuSystem` for a ``PhysxGpuSystem``.
     """
     return scene.px if issubclass(type(scene.px), BatchedCpuSystem) else None

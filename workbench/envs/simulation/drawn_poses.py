@@ -1,4 +1,4 @@
-"""Draws bodies elsewhere than SAPIEN has them, without moving them."""
+"""Draws bodies at other poses than their own, without moving them."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ NOWHERE_ELSE: Places = {}
 def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callable[[], None]]:
     """Context in which entities and their cameras are drawn at `places`; the entities stay where they are.
 
-    Yields a function that moves what is drawn: call it after ``update_render``, which draws entities where they are.
-    Cameras are moved before it.
+    Yields a function that moves the drawn bodies: call it after ``update_render``, which resets them to their entities.
+    Cameras are moved before ``update_render``.
 
     Args:
         components: cameras that may be on one of the entities.

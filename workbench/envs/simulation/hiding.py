@@ -1,4 +1,4 @@
-"""Hides actors of a batched CPU scene from cameras, and leaves them where they are."""
+"""Hides actors of a batched CPU scene from cameras without moving them."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from workbench.envs import maniskill_private
 from workbench.envs.error_notes import RefusedCall
 from workbench.envs.simulation.cpu_system import batched_system
 
-_KEPT = "_workbench_visibility"
+_VISIBILITY_ATTRIBUTE = "_workbench_visibility"
 """Attribute of a hidden actor: its render bodies and how visible they were."""
 
 
 @cache
 def install_hiding() -> None:
-    """Let ``Actor.hide_visual`` and ``show_visual`` set the visibility in batched CPU scenes, once a process.
+    """Let ``Actor.hide_visual`` and ``show_visual`` set the visibility in batched CPU scenes, once per process.
 
-    Stock does so on the CPU too. In GPU simulation it moves an actor 99999 m away and keeps its pose aside, which shows
-    wrong poses, and shows the actor again, where another struct moves or reads it: the actor that it was merged into
-    (ManiSkill #1447). Other scenes get the stock code.
+    Stock does so on the CPU too. In GPU simulation it moves an actor 99999 m away and stores its pose. If another struct, the
+    actor that it was merged into, then moves or reads it, poses are wrong and the actor is visible again (ManiSkill #1447).
+    Other scenes get the stock code.
     """
     stock: property = Actor.__dict__["pose"]
     Actor.pose = property(  # type: ignore[assignment]
@@ -47,23 +47,23 @@ def _in_batched_scenes(ours: Callable[[Any], None], stock: Callable[[Any], None]
 
 
 def why_not_hidden(thing: Any) -> str:
-    """Why ManiSkill cannot hide a member of ``_hidden_objects``, as a clause; empty if it can. `RuntimeError` in a batched CPU
-    scene, an assertion or an AttributeError in others."""
+    """Why ManiSkill cannot hide a member of ``_hidden_objects``, as a clause; empty if it can. Hiding it raises `RuntimeError`
+    in a batched CPU scene, AssertionError or AttributeError in others."""
     if not isinstance(thing, Actor):
-        return f"it is no actor but a {type(thing).__name__}, and only actors can be hidden"
+        return f"it is a {type(thing).__name__}, and only actors can be hidden"
     if thing.merged and "has_collision_shapes" not in vars(thing):
         return "it is merged, and may collide. If it does not, set its has_collision_shapes to False first"
     if thing.px_body_type == "static":
         return "it is static. Build it with build_kinematic()"
     return (
-        "it has collision shapes. Hide an actor that is made of visuals alone"
+        "it has collision shapes. Hide an actor that consists of visuals only"
         if thing.has_collision_shapes
         else ""
     )
 
 
 def _where_it_is(stock: Any) -> Callable[..., Any]:
-    """Stock's getter or setter, which in GPU simulation takes the pose of a hidden actor for one that is kept aside."""
+    """Wrap stock's getter or setter of a pose, which in GPU simulation uses the stored pose of a hidden actor."""
 
     @wraps(stock)
     def call(self: Any, *args: Any) -> Any:
@@ -87,22 +87,22 @@ def _hide(actor: Any) -> None:
         for thing in maniskill_private.objects_of(actor)
     )
     kept = [(body, body.visibility) for body in bodies if body is not None and body.visibility > 0]
-    setattr(actor, _KEPT, kept)
+    setattr(actor, _VISIBILITY_ATTRIBUTE, kept)
     for body, _ in kept:
         body.visibility = 0.0
 
 
 def _show(actor: Any) -> None:
     actor.hidden = False
-    for body, visibility in vars(actor).pop(_KEPT, ()):
+    for body, visibility in vars(actor).pop(_VISIBILITY_ATTRIBUTE, ()):
         body.visibility = visibility
 
 
 def shown_visibility(actors: Iterable[Any], body: Any) -> float:
-    """How visible a render body is where it is shown: a ghost of 0.3 stays one.
+    """Visibility of a render body where it is shown: a transparent one of 0.3 keeps it.
 
     Args:
-        actors: those that may hide it.
+        actors: actors that may hide the body.
     """
-    hidden = (kept for actor in actors for kept in vars(actor).get(_KEPT, ()))
+    hidden = (kept for actor in actors for kept in vars(actor).get(_VISIBILITY_ATTRIBUTE, ()))
     return next((was for other, was in hidden if other is body), body.visibility) or 1.0

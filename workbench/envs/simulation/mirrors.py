@@ -1,4 +1,4 @@
-"""Tensors that tasks write to, each with what the simulation holds."""
+"""Tensors that tasks write to, each with the simulation's last known values."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ GROUPS: tuple[Group, ...] = get_args(Group)
 Floats = NDArray[np.float32]
 Source = tuple[Any, Callable[[], Floats]]
 """Index into a tensor, and the function that reads those numbers from the simulation."""
-_MOVED = 1e-4
-"""Metres, radians, per second. PhysX rounds the root pose of an articulation when it is set, by about 1e-7."""
+_MOVED_TOLERANCE = 1e-4
+"""Tolerance in metres, radians, or these per second. PhysX rounds an articulation's root pose by about 1e-7 when it is set."""
 
 
 class Mirror:
-    """K rows of a tensor (R, W), or some of their columns, with what the simulation holds of them."""
+    """K rows of a tensor (R, W), or some of their columns, with the simulation's last known values."""
 
     def __init__(
         self,
@@ -44,7 +44,7 @@ class Mirror:
             whole: (R, W) the tensor, and the last known values of the simulation.
             names, envs: (R,) body name and env of each row.
             rows: (K,) rows of this mirror; None for all.
-            sources: read by a fetch; the first has the present rows.
+            sources: sources that a fetch reads; the first has the present rows.
             owners: (K,) SAPIEN's objects, for `put`.
             put: called with an owner, its row (W,) and a mask of the numbers to set.
         """
@@ -56,14 +56,14 @@ class Mirror:
         self.at: Any = columns if rows is None else (rows, columns)
         self.sources, self._owners, self._put = sources, owners, put
         self.sound: Callable[[int], bool] = lambda env: True
-        """Whether all that is known of the state of an env is finite."""
+        """Function that returns whether all known state of an env is finite."""
 
     def differs(self) -> NDArray[np.bool_]:
-        """(K, W) what was written and neither applied nor overwritten by a fetch."""
+        """(K, W) True where a number was written and neither applied nor overwritten by a fetch."""
         return differ(self.now[self.at], self.seen[self.at])
 
     def changed(self) -> NDArray[np.int64]:
-        """Which of the K rows differ."""
+        """Indices of those of the K rows that differ."""
         return np.flatnonzero(self.differs().any(axis=1))
 
     def fetch(self) -> None:
@@ -72,7 +72,7 @@ class Mirror:
             self.now[at] = self.seen[at] = read()
 
     def refresh(self) -> None:
-        """Read the simulation's values, except over what was written and not applied."""
+        """Read the simulation's values; keeps numbers that were written and not applied."""
         for at, read in self.sources:
             written = differ(self.now[at], self.seen[at])
             self.seen[at] = read()
@@ -83,9 +83,9 @@ class Mirror:
         self.now[self.at] = self.seen[self.at]
 
     def behind(self) -> NDArray[np.bool_]:
-        """(K, W), or fewer columns: what the simulation moved since the last fetch."""
+        """(K, W), or fewer columns: True where the simulation moved since the last fetch."""
         at, read = self.sources[0]
-        return np.abs(self.now[at] - read()) > _MOVED
+        return np.abs(self.now[at] - read()) > _MOVED_TOLERANCE
 
     def apply(self) -> None:
         """Write what differs to the simulation.
@@ -105,11 +105,11 @@ class Mirror:
         """Whether to write these numbers of a row to the simulation.
 
         PhysX does not check: a NaN pose spreads to everything that it touches and may crash the process. In an env that holds
-        NaN already, whatever is computed of it is NaN: there it is left out, until a reset puts the env right.
+        NaN already, everything computed from it is NaN: there such numbers are skipped until a reset repairs the env.
 
         Raises:
-            ValueError: one is NaN or infinite, and the env is sound. What was written and not applied is discarded, or every
-                later apply would raise again.
+            ValueError: a number is NaN or infinite, and the env is sound. Writes that were not applied are discarded, or
+                every later apply would raise again.
         """
         if np.isfinite(values).all():
             return True
@@ -123,7 +123,7 @@ class Mirror:
 
 
 def differ(a: Floats, b: Floats) -> NDArray[np.bool_]:
-    """Where two arrays differ; NaN equals NaN, which the simulation itself may hold."""
+    """Mask of the numbers in which two arrays differ; NaN equals NaN, which the simulation itself may hold."""
     differs = a != b
     if differs.any():
         differs &= ~(np.isnan(a) & np.isnan(b))
@@ -133,10 +133,10 @@ def differ(a: Floats, b: Floats) -> NDArray[np.bool_]:
 class DriveTargets(Mirror):
     """Position or velocity targets of the joints of every articulation.
 
-    Setting a target wakes a sleeping articulation even if the value stays, and ManiSkill's CPU controllers set theirs at
-    every control step. So an articulation whose targets were set since the last apply is written, whether or not they
-    changed, or a robot at rest would fall asleep here and not in stock. That is 1200 calls a control step for 64 Pandas, so
-    each env's thread makes them, just before its step.
+    Setting a target wakes a sleeping articulation even if the value stays, and ManiSkill's CPU controllers set targets at
+    every control step. So targets that were set since the last apply are written, changed or not: otherwise, a robot at rest
+    would fall asleep here but not in stock. That is 1200 calls per control step for 64 Pandas, so each env's thread makes
+    them, just before its step.
     """
 
     def __init__(
@@ -155,12 +155,12 @@ class DriveTargets(Mirror):
         self._set = np.zeros(len(self.now), dtype=bool)
         """(A,) whether targets were set since the last apply."""
         self.pending = False
-        """Whether any were."""
+        """Whether any targets were set since the last apply."""
         self._setters, self._later = setters, later
         self._of_env = {int(env): np.flatnonzero(self.envs == env).tolist() for env in np.unique(self.envs)}
 
     def note(self, rows: NDArray[np.int64]) -> None:
-        """These rows were set."""
+        """Note that these rows were set."""
         self._set[rows] = self.pending = True
 
     def drop(self) -> None:
@@ -168,7 +168,7 @@ class DriveTargets(Mirror):
         self._set[:] = self.pending = False
 
     def apply(self) -> None:
-        """Schedule what was set.
+        """Schedule the targets that were set.
 
         Raises:
             ValueError: as `may_write`.
@@ -254,7 +254,7 @@ class Mirrors:
             *(self.bodies, self.links, self.qpos, self.qvel, self.qf),
             *(self.targets, self.velocity_targets),
         )
-        """Each number once; `roots` and `root_velocities` are part of `links`."""
+        """Mirrors that together hold each number once; `roots` and `root_velocities` are part of `links`."""
         self.of = {group: [mirror for mirror in self.all if mirror.group == group] for group in GROUPS}
         """Mirrors that are fetched together."""
         for mirror in (*self.all, self.roots, self.root_velocities):

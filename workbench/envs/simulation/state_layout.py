@@ -1,4 +1,4 @@
-"""Where the state of N CPU physics systems is: rows of tensors, and bytes of packs."""
+"""Layout of the state of N CPU physics systems: rows in tensors, and positions in packs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 BODY = 13
 """Floats of a body in ``pack()``: quaternion wxyz, position, linear and angular velocity."""
 _FROM_PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
-"""Columns of ManiSkill's row [p, q, v, w] in a packed body [q, p, v, w]."""
+"""Position of each column of ManiSkill's row [p, q, v, w] in a packed body [q, p, v, w]."""
 _IN_ENV = re.compile(r"^scene-\d+[-_]")
 _FROM_PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
 
@@ -27,12 +27,12 @@ class StateLayout:
     ``PhysxCpuSystem.pack()`` gives float32: each dynamic or kinematic body as quaternion wxyz, position, linear and angular
     velocity; then each articulation as the same 13 numbers of its root, its qpos, its qvel, and target position and target
     velocity of each joint in turn. ``sapien.Scene.pack_poses()`` gives quaternion and position of each entity. Neither is
-    documented (found by measuring, sapien 3.0.3), so `check_layout` compares both with the getters. Envs need not have the same bodies:
-    rows of one follow those of the other, and missing joints read a zero.
+    documented (found by measuring, sapien 3.0.3), so `check_layout` compares both with the getters. Envs need not have the
+    same bodies: each env's rows follow those of the env before, and missing joints read a zero.
     """
 
     bodies: list[Any]
-    """PhysxRigidDynamicComponent. Any, here and below: SAPIEN's stubs want arrays of a literal shape."""
+    """PhysxRigidDynamicComponent. Typed as Any, here and below, since SAPIEN's stubs want arrays of a literal shape."""
     body_rows: NDArray[np.int64]
     links: list[Any]
     """PhysxArticulationLinkComponent."""
@@ -57,13 +57,13 @@ class StateLayout:
     row_of: dict[int, int]
     index_of: dict[int, int]
     size: int
-    """Numbers in the packs of all envs."""
+    """Count of numbers in the packs of all envs."""
     parts: list[list[slice]]
-    """Numbers of each body and articulation in the pack of its env, for each env."""
+    """For each env, the slice of each body and articulation in the env's pack."""
 
 
 def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:
-    rows: list[Any] = []  # the component of each
+    rows: list[Any] = []  # the component of each row
     env_of_row, body_at, joints_at = [], [], []
     roots: dict[int, tuple[int, Any]] = {}  # row and articulation of the first link of each
     packed = 0
@@ -119,7 +119,7 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:
 
 
 def link_poses_at(layout: StateLayout, scenes: Sequence[sapien.Scene]) -> NDArray[np.int64]:
-    """(L, 7) of each link, in the packed poses of all envs, one env's after the other's."""
+    """(L, 7) positions of each link's pose in the concatenated pose packs of all envs."""
     where: dict[int, int] = {}
     first, held = 0, [scene.entities for scene in scenes]  # an id is unique only among objects that are alive
     for entities in held:

@@ -1,4 +1,4 @@
-"""ManiSkill's properties of state: their place in the tensors, and in SAPIEN's own objects."""
+"""ManiSkill's state properties: their place in the tensors, and in SAPIEN's own objects."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class StateProperty:
     read: Callable[[Any, int], Any]
     """Reads the numbers of the struct's i-th object from SAPIEN."""
     write: Callable[[Any, int, Floats], None] | None = None
-    """Writes them, as ManiSkill's setter does on a stock CPU env; None where there is no setter."""
+    """Writes the numbers, as ManiSkill's setter does on a stock CPU env; None where there is no setter."""
 
     def rows(self, struct: Any) -> torch.Tensor:
         """(M,) the row of each object in the mirror's tensor."""
@@ -54,7 +54,7 @@ class StateProperty:
         return rows, self.columns
 
     def read_all(self, struct: Any) -> Any:
-        """What the getter gives, from SAPIEN's objects: (M, W), or (M,) of a joint."""
+        """The getter's value, read from SAPIEN's objects: (M, W), or (M,) for a joint."""
         values = [np.asarray(self.read(struct, i), np.float32) for i in range(len(struct._objs))]
         width = max(map(len, values)) if values[0].ndim else 0
         rows = [np.pad(v, (0, width - len(v))) for v in values] if width else values
@@ -67,7 +67,7 @@ def _numbers(pose: Any) -> list[float]:
 
 
 def _setter(owner: type, name: str) -> Callable[[Any, Any], None]:
-    """SAPIEN's own, without the guard of `accessors`, which replaces it later."""
+    """SAPIEN's own setter, without the guard with which `accessors` replaces it later."""
     return vars(owner)[name].fset
 
 
@@ -86,7 +86,7 @@ _TARGETS = {
 
 def _write_velocity(struct: Any, i: int, row: Floats, name: str) -> None:
     body = struct._bodies[i]
-    # ManiSkill's `set_state` gives a velocity to every actor, on a stock CPU env to dynamic ones.
+    # ManiSkill's `set_state` sets the velocity of every actor; a stock CPU env sets it only for dynamic ones.
     if not body.kinematic:
         _VELOCITY[name](body, row)
 
@@ -221,9 +221,9 @@ TARGETS_OF_ALL = {
     "drive_targets": "drive_target",
     "drive_velocities": "drive_velocity_target",
 }
-"""Properties of an Articulation: the property of each of its active joints."""
+"""Properties of an Articulation, with the property of each active joint that they collect."""
 TARGET_SETTERS: dict[str, MirrorName] = {
     "set_joint_drive_targets": "targets",
     "set_joint_drive_velocity_targets": "velocity_targets",
 }
-"""Methods of an Articulation."""
+"""Methods of an Articulation that set drive targets."""

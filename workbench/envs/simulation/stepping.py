@@ -15,7 +15,7 @@ import sapien.physx as physx
 
 
 class Stepper:
-    """Substeps of N systems, done when they are needed.
+    """Steps N systems lazily: substeps are done when they are needed.
 
     PickCube-v1, 64 envs, two cores, physics part of a control step of five substeps (the bits are the same in every row,
     ``tests/envs/simulation/test_stepping.py``):
@@ -25,11 +25,11 @@ class Stepper:
         one thread, the five substeps of an env in a row        17 ms
         two threads, the five substeps in a row                  9 ms
 
-    *Threads*, not processes: `native_step` frees the interpreter lock, so no system is forked or copied, and what a task does
-    to its SAPIEN objects stays true. One system for all envs with PhysX's own threads would need the envs metres apart, which
+    *Threads*, not processes: `native_step` releases the interpreter lock, so no system is forked or copied, and a task can
+    use its SAPIEN objects directly. One system for all envs with PhysX's own threads would need the envs metres apart, which
     costs float precision.
 
-    *In a row*: a Panda, table and cube touch some hundreds of kB, which a walk through all envs throws out of the cache.
+    *In a row*: a Panda, table and cube touch some hundreds of kB, which a walk through all envs evicts from the cache.
     ManiSkill runs hooks between substeps, so their order changes only when no hook can notice it (`merging`).
 
     The thread that stepped an env also packs it, while it is in that core's cache (12 us cold, 3 us warm).
@@ -43,7 +43,7 @@ class Stepper:
     ) -> None:
         """
         Args:
-            threads: most threads; None for one on each core that this process may use.
+            threads: maximum number of threads; None for one on each core that this process may use.
         """
         self._systems, self._scenes = systems, scenes
         self.threads = 1 if native_step() is None else (threads or usable_cores())
@@ -57,7 +57,7 @@ class Stepper:
         """Envs that are neither stepped nor given drive targets."""
 
     def renew(self, env: int) -> None:
-        """Use the env's new system in the list."""
+        """Use the env's new system, after it was replaced in the list."""
         self.step_once[env] = _step_of(self._systems[env])
         self.forget()
 
@@ -67,7 +67,7 @@ class Stepper:
         return self._owed > 0
 
     def step(self) -> bool:
-        """One substep of every env; False if it waits for the control step's last."""
+        """One substep of every env; False if it is deferred to the last substep of the control step."""
         self._owed += 1
         if self._owed < self._in_a_row:
             return False
@@ -76,7 +76,7 @@ class Stepper:
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
-        """Within this, `substeps` calls of `step` are done together, at the last one or when state is read."""
+        """Context in which `substeps` calls of `step` are done together, at the last one or when state is read."""
         self._in_a_row = substeps
         try:
             yield
@@ -88,7 +88,7 @@ class Stepper:
         self._writes.append(write)
 
     def write_now(self) -> None:
-        """Make the pending writes."""
+        """Do the pending writes."""
         writes, self._writes = self._writes, []
         for env in range(len(self._systems)) if writes else ():
             for write in writes if env not in self.frozen else ():
@@ -103,7 +103,7 @@ class Stepper:
         writes, self._writes = self._writes, []
         packs: list[bytes] = [b""] * len(self._systems)
         pose_packs: list[bytes] = [b""] * len(self._systems)
-        # No fetch follows a single substep within a control step: its packs would be wasted.
+        # No fetch follows a single substep within a control step, so packing would be wasted.
         packing = count > 1
 
         def advance(env: int) -> None:
@@ -168,18 +168,18 @@ PLATFORM_ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
 
 @dataclass(frozen=True)
 class NativeStep:
-    """The C++ method behind ``PhysxCpuSystem.step()``, and what finds the object to call it on.
+    """The C++ method behind ``PhysxCpuSystem.step()``, and the means to find the address of its object.
 
     ``step()`` holds the interpreter lock, so threads over independent systems gain nothing. SAPIEN's shared library exports
-    the C++ method, and ctypes frees the lock while it runs: the same code on the same object. The object's address comes
+    the C++ method, and ctypes releases the lock while it runs: the same code on the same object. The object's address comes
     from ``_pybind11_conduit_v1_`` (pybind11 2.14, "Allowing extensions of one binding to use another's objects"), which
     checks ABI and C++ type. The exported names are those of sapien 3.0.3 on Linux
-    (``tests/envs/simulation/test_native_step.py``). If one is missing, `why_not_native` says which, and SAPIEN's own
+    (``tests/envs/simulation/test_native_step.py``). If one is missing, `why_not_native` returns its name, and SAPIEN's own
     binding steps the systems one after the other.
     """
 
     call: Callable[[int], None]
-    """Steps the system at this address once; the interpreter lock is free while it runs."""
+    """Steps the system at this address once; the interpreter lock is released while it runs."""
     type_capsule: object
 
     def address_of(self, system: physx.PhysxCpuSystem) -> int:
@@ -202,7 +202,7 @@ def native_step() -> NativeStep | None:
 
 
 def why_not_native() -> str | None:
-    """One sentence, or None when `native_step` works."""
+    """Why `native_step` does not work, in one sentence; None if it works."""
     found = _find()
     return found if isinstance(found, str) else None
 
@@ -211,7 +211,7 @@ def why_not_native() -> str | None:
 def _find() -> NativeStep | str:
     version = f"sapien {sapien.__version__}"
     try:
-        # Only the copy that pysapien has loaded: another would have its own PhysX.
+        # Use only the copy that pysapien has loaded: another would have its own PhysX.
         library = ctypes.CDLL(LIBRARY, mode=os.RTLD_NOLOAD | os.RTLD_NOW)
         step = library[STEP]
         type_info = ctypes.addressof(ctypes.c_char.in_dll(library, TYPE_INFO))
@@ -241,11 +241,11 @@ def usable_cores() -> int:
 
 
 class EnvThreads:
-    """Threads that wait for `run`; one run at a time.
+    """Thread pool for one `run` at a time.
 
-    Envs cost unequal time, so all threads, the caller's too, take the next env from one iterator; ``next`` on a list
-    iterator is atomic under the interpreter lock. (16 Pandas on two cores: 2.6 ms, with a ``concurrent.futures`` executor of
-    two 4.0 ms, in one thread 4.8 ms.)
+    Envs take unequal time, so all threads, including the caller's, take the next env from one iterator; ``next`` on a list
+    iterator is atomic under the interpreter lock. (16 Pandas on two cores: 2.6 ms; with a ``concurrent.futures`` executor of
+    two threads 4.0 ms, in one thread 4.8 ms.)
     """
 
     def __init__(self) -> None:
@@ -253,10 +253,10 @@ class EnvThreads:
         self._helpers: list[_Helper] = []
 
     def run(self, job: Callable[[int], None], count: int, threads: int) -> None:
-        """``job(0)`` to ``job(count - 1)``, each once, on up to `threads` threads; the caller is one of them.
+        """Run ``job(0)`` to ``job(count - 1)``, each once, on up to `threads` threads; the caller is one of them.
 
         Raises:
-            Exception: the first that a job raised, after all threads have stopped.
+            Exception: the first exception of a job, after all threads have stopped.
         """
         todo = iter(range(count))
         helpers = min(threads, count) - 1
@@ -266,7 +266,7 @@ class EnvThreads:
             return
         working: list[_Helper] = []
         with self._busy:
-            # A run that is torn (by too deep a recursion, or an interrupt) leaves none: nobody knows what they wait for.
+            # An interrupted run (RecursionError, KeyboardInterrupt) leaves no helpers: it is unknown what they wait for.
             every, self._helpers = self._helpers, []
             try:
                 while len(every) < helpers:
@@ -277,7 +277,7 @@ class EnvThreads:
                 for index in todo:
                     job(index)
             finally:
-                # Also after an exception here: the others still use what the caller will release.
+                # Also after an exception here: the helpers still use what the caller will release.
                 errors = [helper.end() for helper in working]
             self._helpers = every
         for error in errors:
@@ -293,7 +293,7 @@ class _Helper:
         self._job: Callable[[int], None] | None = None
         self._todo: Iterator[int] = iter(())
         self._error: BaseException | None = None
-        # A daemon, so that it does not keep the interpreter alive.
+        # A daemon thread, so that it does not keep the interpreter alive.
         threading.Thread(target=self._work, name="env-step", daemon=True).start()
 
     def begin(self, job: Callable[[int], None], todo: Iterator[int]) -> None:
@@ -302,7 +302,7 @@ class _Helper:
 
     def end(self) -> BaseException | None:
         self._done.acquire()
-        self._job = None  # the job holds the env, which must not outlive its user here
+        self._job = None  # the job holds the env, which must not be kept alive here
         return self._error
 
     def _work(self) -> None:

@@ -35,10 +35,10 @@ class _Write:
 
 
 class Writes:
-    """Writes that the task neither applied nor fetched over, each with the frames that led to it.
+    """Writes that the task neither applied nor overwrote by a fetch, each with the frames that led to it.
 
-    What a GPU loses shows at the next fetch, and is reported at the line that wrote. A task may also take a whole tensor and
-    write to it unseen: then the line that took it is reported.
+    A write that a GPU loses is noticed at the next fetch, and reported at the line that wrote. A task may also take a whole
+    tensor and write to it unseen; then the line that took the tensor is reported.
     """
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ class Writes:
         self._kept.append(_Write(group, rows, frames_of_the_task()))
 
     def note_handed_out(self, tensor: str, reader: FrameType) -> bool:
-        """Note the code that reads a whole tensor, unless it is the core's own; whether it was noted."""
+        """Note the code that reads a whole tensor, unless it is the core's own; returns whether it was noted."""
         if reader.f_globals.get("__name__", "").startswith(_OWN_CODE):
             return False
         frames = frames_of_the_task(reader)
@@ -75,17 +75,17 @@ class Writes:
         return ()
 
 
-ENVS_NAMED = THINGS_NAMED = 8
+MAX_NAMED_ENVS = MAX_NAMED_BODIES = 8
 
 
 class StrictCpuSystem(BatchedCpuSystem):
     """A `BatchedCpuSystem` that reports breaches of the rules of GPU simulation.
 
-    On the GPU a setter writes to a tensor. ``gpu_apply_*`` overwrites the simulation by it and ``gpu_fetch_*`` it by the
-    simulation, for all envs and without a message. So a pose that was set and not applied is lost at the next fetch, an
-    apply after a step without a fetch puts every body of every env back, and a read between the two gives the past.
-    `BatchedCpuSystem` does what a stock CPU env does instead; this class keeps account of what a GPU would hold, reports
-    where that differs, and changes no bit. It compares values, not calls: a pose set to what it was is no fault.
+    On the GPU a setter writes to a tensor. ``gpu_apply_*`` copies the tensor to the simulation and ``gpu_fetch_*`` copies the
+    simulation to the tensor, for all envs and without a message. So a pose that was set and not applied is lost at the next
+    fetch, an apply after a step without a fetch moves every body of every env back, and a read before the fetch returns the
+    past. `BatchedCpuSystem` does what a stock CPU env does; this class tracks what a GPU would hold, reports where that
+    differs, and changes no bit. It compares values, not calls: setting a pose to its present value is no breach.
     """
 
     rules: BrokenRules
@@ -101,17 +101,17 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._stale: set[Group] = set()
         """Groups that moved since they were fetched."""
         self._moved_unfetched: dict[Group, str] = {}
-        """Name of a body that had moved, for each stale group that was refreshed since then."""
+        """For each stale group that was refreshed since then, the name of a body that had moved."""
         self._frames_of_step: tuple[Frame, ...] = ()
-        """Frames of the task's own last step; empty if ManiSkill made the step."""
+        """Frames of the last step that the task itself made; empty if ManiSkill made it."""
         self.being_reset: torch.Tensor | None = None
-        """(N,) bool while ``_initialize_episode`` runs for some envs and not for others."""
+        """(N,) bool while ``_initialize_episode`` runs for some envs only."""
         self.reported_elsewhere: set[str] = set()
         """Names already reported for other envs in the present partial reset."""
         self._outdated: set[int] = set()
         """Articulations whose links in a GPU's tensor are older than a write of qpos or root pose."""
         self._not_updated: set[int] = set()
-        """Articulations applied since a GPU would have computed link poses."""
+        """Articulations applied since a GPU would last have computed link poses."""
         super().__init__(scenes, *args, **kwargs)
 
     def gpu_init(self) -> None:
@@ -121,14 +121,14 @@ class StrictCpuSystem(BatchedCpuSystem):
             kept.clear()
 
     def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
-        # The core's own call, for every joint in every control step: without the guard of `accessors`.
+        # Called by the core for every joint in every control step, so without the guard of `accessors`.
         function = getattr(type(joint), method)
         return partial(getattr(function, "__wrapped__", function), joint)
 
     # --- called by ManiSkill's setters and getters (see accessors) ------------------------------------
 
     def about_to_write(self, struct: Any, group: Group, rows: NDArray[np.int64]) -> None:
-        """A setter of `struct` will write `rows` of `group`'s tensor."""
+        """Check that a setter of `struct` may write `rows` of `group`'s tensor, and note the write."""
         self._hold(group)
         self._writes.note(group, rows)
         if self.being_reset is not None:
@@ -143,9 +143,9 @@ class StrictCpuSystem(BatchedCpuSystem):
                 )
 
     def about_to_read(self, struct: Any, group: Group, rows: NDArray[np.int64]) -> None:
-        """A getter of `struct` will read `rows` of `group`'s tensor."""
+        """Check that a getter of `struct` may read `rows` of `group`'s tensor."""
         self.catch_up()
-        # An Articulation answers for its root, which is never old.
+        # Skip an Articulation: it reads its root, which is never out of date.
         if group == "links" and (self._outdated or self._writes) and hasattr(struct, "is_root"):
             if not bool(struct.is_root.all()):
                 self._refuse_old_links(struct)
@@ -181,13 +181,13 @@ class StrictCpuSystem(BatchedCpuSystem):
     # --- what a GPU would hold ---------------------------------------------------------------------------
 
     def _hold(self, group: Group) -> None:
-        """Keep what a GPU's simulation holds of a group's tensors: they will be written."""
+        """Copy a group's tensors, which are about to be written, as what a GPU's simulation would hold."""
         for mirror in self._mirrors.of[group]:
             if id(mirror.now) not in self._held:
                 self._held[id(mirror.now)] = mirror.now.copy()
 
     def _unapplied(self, mirror: Mirror) -> NDArray[np.bool_]:
-        """(K, W) what was written and not applied, for a GPU."""
+        """(K, W) True where a number was written and, on a GPU, would not be applied."""
         held = self._held.get(id(mirror.now))
         differs = mirror.differs()
         return differs if held is None else differs | differ(mirror.now[mirror.at], held[mirror.at])
@@ -208,7 +208,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         super().refresh(group)
         for mirror, was in before:
             held = self._held.get(id(mirror.now))
-            if held is not None:  # of what was not written a GPU holds what moved
+            if held is not None:  # where nothing was written, a GPU holds what moved
                 held[...] = np.where(differ(was, held), held, mirror.now)
             if group in self._stale and group not in self._moved_unfetched:
                 moved = differ(mirror.now[mirror.at], was[mirror.at]).any(axis=1)
@@ -231,7 +231,7 @@ class StrictCpuSystem(BatchedCpuSystem):
                 self._outdated &= self._not_updated
 
     def _settled(self, group: Group) -> None:
-        """The group was fetched."""
+        """Note that the group was fetched."""
         self._writes.forget(group)
         if not self._writes:
             self._held.clear()
@@ -249,7 +249,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._not_updated.clear()
 
     def _refuse_loss(self, mirror: Mirror) -> None:
-        """Break the rule if a fetch of a GPU would overwrite what was set."""
+        """Report a breach if a fetch on a GPU would overwrite what was set."""
         lost = self._unapplied(mirror)
         if not lost.any():
             return
@@ -281,7 +281,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     def _apply(self, mirror: Mirror) -> None:
         self.catch_up()
         if mirror.group in self._stale and mirror is not self._mirrors.root_velocities:
-            # qpos and qvel are fetched together: an apply of one reports both.
+            # qpos and qvel are fetched together, so an apply of one checks both.
             self._refuse_stale_apply(self._mirrors.of["joints"] if mirror.group == "joints" else [mirror])
         if mirror is self._mirrors.roots or mirror is self._mirrors.qpos:
             changed = np.flatnonzero(self._unapplied(mirror).any(axis=1)).tolist()
@@ -346,7 +346,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     # --- partial resets --------------------------------------------------------------------------------
 
     def refuse_unapplied_writes(self, reset: torch.Tensor) -> None:
-        """Break the rule if a write to an env that is not in the mask `reset` (N,) was never applied."""
+        """Report a breach if a write to an env that is not in the mask `reset` (N,) was never applied."""
         for mirror in self._mirrors.all:
             if mirror.group == "targets":
                 continue
@@ -367,7 +367,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         return self.layout_version, [mirror.now[mirror.at].copy() for mirror in self._mirrors.all]
 
     def refuse_changes_elsewhere(self, before: tuple[int, list[Floats]], reset: torch.Tensor) -> None:
-        """Break the rule if an env that is not in the mask `reset` (N,) differs from `before`."""
+        """Report a breach if an env that is not in the mask `reset` (N,) differs from `before`."""
         version, states = before
         if version != self.layout_version:
             return  # rows belong to other bodies
@@ -376,7 +376,7 @@ class StrictCpuSystem(BatchedCpuSystem):
                 continue
             differs = differ(mirror.now[mirror.at], was)
             if mirror is self._mirrors.links:
-                # Velocities of links are fetched on demand, which is no change (except a root's).
+                # Ignore velocities of links other than roots: they are fetched on demand, which is no change.
                 differs[~np.isin(mirror.rows, self._laid_out.root_rows), 7:] = False
             changed = mirror.rows[differs.any(axis=1)]
             changed = changed[~reset.numpy()[mirror.envs[changed]]]
@@ -396,17 +396,17 @@ _STEP_ACTION = BaseEnv._step_action.__code__
 
 
 def _by_name(rows: NDArray[np.int64], names: list[str]) -> Iterator[tuple[str, NDArray[np.int64]]]:
-    """Rows by name, for at most `THINGS_NAMED` names."""
+    """Rows by name, for at most `MAX_NAMED_BODIES` names."""
     found: dict[str, list[int]] = {}
     for row in rows.tolist():
         found.setdefault(names[row], []).append(row)
-    for name in list(found)[:THINGS_NAMED]:
+    for name in list(found)[:MAX_NAMED_BODIES]:
         yield name, np.array(found[name], dtype=np.int64)
 
 
 def envs_named(envs: Any) -> str:
     """``env 3``, or ``envs 0, 1, 2``, at most eight of them."""
     numbers = sorted({int(env) for env in envs})
-    named = ", ".join(str(env) for env in numbers[:ENVS_NAMED])
-    more = f" and {len(numbers) - ENVS_NAMED} more" if len(numbers) > ENVS_NAMED else ""
+    named = ", ".join(str(env) for env in numbers[:MAX_NAMED_ENVS])
+    more = f" and {len(numbers) - MAX_NAMED_ENVS} more" if len(numbers) > MAX_NAMED_ENVS else ""
     return f"env{'s' if len(numbers) > 1 else ''} {named}{more}"

@@ -1,4 +1,4 @@
-"""Simulation state of chosen envs of a `BatchedCpuSystem`: read, and written into the same or other envs."""
+"""Reads the simulation state of chosen envs of a `BatchedCpuSystem`, and writes it into the same or other envs."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from workbench.envs.simulation.cpu_system import BatchedCpuSystem, batched_syste
 from workbench.envs.simulation.state_layout import BODY
 
 _ROOT_POSE_ATTEMPTS = 4
-"""Attempts to set a root pose; two were enough in all tasks that were tried."""
+"""Maximum attempts to set a root pose; two were enough in all tasks that were tried."""
 _EXACT_POINT_ATTEMPTS = 40
-"""Attempts to find a state that reads back as written; all but some humanoids need one."""
+"""Maximum attempts to find a state that reads back as written; all but some humanoids need one."""
 _LAST_BIT = np.float32(2**-24)
 """Last bit (2**-24) of the numbers of a quaternion, and of a position of about a metre."""
 
@@ -54,13 +54,14 @@ class CpuState:
 
     ``PhysxCpuSystem.pack()`` has pose and velocity of every body, qpos, qvel and drive targets. In addition:
 
-    * *Names*: bytes of two envs mean the same only if the envs have the same parts. `Contents` says what they mean; where
-      they differ, the bytes are put together from the target's and the source's.
-    * *Sleep*: writing a pose wakes a body, which then moves by micrometres. What slept is put to sleep again. Every body is
-      asked (2 us each): a velocity in the pack does not mean that one is awake (cubes of StackCube sleep with some left).
+    * *Names*: bytes of two envs mean the same only if the envs have the same parts, which `Contents` lists. Where the
+      parts differ, the bytes are assembled from the target's and the source's.
+    * *Sleep*: writing a pose wakes a body, which then moves by micrometres. Bodies that slept are put to sleep again. Every
+      body is asked (2 us each), since a velocity in the pack does not mean that it is awake (cubes of StackCube sleep with
+      some velocity left).
     * *Forces* of ``set_qf``.
-    * *Contacts*: after a restore PhysX's list is that of another moment, and ``is_grasping`` would answer for it. The counted
-      impulses are kept, and answer queries until the next substep.
+    * *Contacts*: after a restore PhysX's list is that of another moment, and ``is_grasping`` would answer for that. The
+      counted impulses are kept, and answer queries until the next substep.
     * *Static actors* are where they were built, unless the task has moved one.
     """
 
@@ -73,14 +74,14 @@ class CpuState:
     qf: NDArray[np.float32]
     """(A, D) joint forces of their articulations, env after env, padded with zeros."""
     touching: tuple[tuple[int, str, str], ...]
-    """(T,) contacts that a query counts: which of the n envs, and the names of two bodies."""
+    """(T,) contacts that a query counts: index among the n envs, and the names of two bodies."""
     impulses: NDArray[np.float32]
     """(T, 3) N s on the first body of each."""
     statics: tuple[dict[str, tuple[float, ...]], ...]
     """(n,) poses (7,) of static actors, by name; empty where none was ever moved."""
 
     def articulations(self, k: int) -> slice:
-        """Which of `qf` are env k's."""
+        """Rows of `qf` of env k's articulations."""
         first = sum(_articulations(contents) for contents in self.contents[:k])
         return slice(first, first + _articulations(self.contents[k]))
 
@@ -162,7 +163,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
 
 
 def _getter(component: Any, name: str) -> Callable[[], bool]:
-    # Called for every body at every snapshot, so without the look-up of the property.
+    # Called for every body at every snapshot, so the property is looked up only once.
     return partial(getattr(type(component), name).fget, component)
 
 
@@ -211,8 +212,8 @@ def write_cpu_state(
     own = px.packs()
     for i in env_idx:
         for _, _, component in plan.sleepers[i]:
-            # Else the time until it sleeps depends on what it touched before: a cube that was in a hand fell asleep one
-            # substep later than one that was not.
+            # Without this, the time until the body sleeps depends on what it touched before: a cube that was in a hand fell
+            # asleep one substep later than one that was not.
             component.put_to_sleep()
     if fresh_physics:
         for i in renew_physics(env.scene, env_idx):
@@ -253,8 +254,8 @@ def write_cpu_state(
 def make_cpu_exact_point(env: Any, env_idx: list[int]) -> None:
     """Give these envs a PhysX scene without a past, with their present state.
 
-    A snapshot of now and the same actions then repeat what follows to the last bit. A root of an articulation that PhysX
-    does not return as set is moved by some last bits, to where it does.
+    A snapshot taken now and the same actions then repeat what follows to the last bit. If PhysX does not return an
+    articulation's root pose as it was set, the root is moved by some last bits until it does.
     """
     left, state, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
     positions = list(range(len(env_idx)))
@@ -301,7 +302,7 @@ def _write_joint_forces(
     matches: dict[int, Sequence[int | None]],
     fresh_physics: bool,
 ) -> None:
-    """Write ``set_qf``'s forces into each env; `matches` as of `_joined`."""
+    """Write ``set_qf``'s forces into each env; `matches` as returned by `_joined`."""
     rows, theirs = [], []
     firsts = list(accumulate(map(_articulations, state.contents), initial=0))
     for i, k in sources.items():
@@ -322,7 +323,7 @@ def _write_joint_forces(
 
 
 def _asked_for(plan: CpuStatePlan, env: int, packed: bytes) -> bytes:
-    """The bytes that read back as `packed`: with the roots that `_settle_roots` found."""
+    """The bytes to write so that `packed` is read back: with the roots that `_settle_roots` found."""
     for at, (wanted, asked) in plan.settled[env].items():
         if packed[at : at + len(wanted)] == wanted:
             packed = packed[:at] + asked + packed[at + len(wanted) :]
@@ -332,8 +333,8 @@ def _asked_for(plan: CpuStatePlan, env: int, packed: bytes) -> bytes:
 def _settle_roots(px: BatchedCpuSystem, plan: CpuStatePlan, env: int, packed: bytes) -> None:
     """Make articulations' root poses read back as packed.
 
-    PhysX keeps a root by its centre of mass, and returns it with another last bit, which adds up over snapshots of
-    snapshots. So the pose is set with the opposite error. The result is kept, since most roots do not move.
+    PhysX stores a root by its centre of mass, and returns a pose with another last bit, which adds up over snapshots of
+    snapshots. So the pose is set with the opposite error. The result is cached, since most roots do not move.
     """
     numbers = np.frombuffer(packed, dtype=np.float32)
     at = sum(part.size for part in plan.contents[env] if part.joints is None)
@@ -410,11 +411,11 @@ def _touching(
 def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
     """Give these envs of a batched CPU scene a new PhysX scene, which has no past.
 
-    PhysX solves contacts in the order of numbers that it gave to pairs of shapes, and reuses numbers, last returned first. So
-    the last bits of a result depend on all that was ever touched in that scene, and no call takes that back (tried:
-    ``unpack``, moving everything apart and together). The same grasp, written twice into the same env, continued differently in
-    five of eight envs. So the env's entities move, in order, into a new ``sapien.Scene`` with a new ``PhysxCpuSystem`` and the
-    same ``RenderSystem``: 0.2 ms for a Panda, a table and a cube. SAPIEN's components stay the same Python objects.
+    PhysX solves contacts in the order of numbers that it assigns to pairs of shapes, and reuses freed numbers, last freed
+    first. So the last bits of a result depend on every contact that the scene ever had, and no call resets that (tried:
+    ``unpack``, moving everything apart and together). The same grasp, written twice into the same env, continued differently
+    in five of eight envs. So the env's entities move, in order, into a new ``sapien.Scene`` with a new ``PhysxCpuSystem``
+    and the same ``RenderSystem``: 0.2 ms for a Panda, a table and a cube. SAPIEN's components stay the same Python objects.
 
     Poses, velocities and drive targets stay; joint forces (``set_qf``) and contacts are gone.
 
@@ -422,17 +423,17 @@ def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
         scene: the env's ``ManiSkillScene``, over a `BatchedCpuSystem`.
 
     Returns:
-        Envs that were left as they are: entities were removed from them since they were built, so that SAPIEN
-        would give the others new numbers, by which ManiSkill's segmentation pictures name them.
+        Envs that were left unchanged: entities were removed from them since they were built, so SAPIEN would renumber the
+        others, and ManiSkill's segmentation pictures name bodies by number.
     """
     px: BatchedCpuSystem = scene.px
-    px.packs()  # the old systems make pending substeps
+    px.packs()  # makes the old systems do their pending substeps
     default = physx.get_scene_config()
     left = [i for i in env_idx if not _keeps_entity_ids(px.scenes[i])]
     try:
         for i in sorted(set(env_idx) - set(left)):
             old = px.systems[i]
-            # A system takes gravity and solver from the process's default, which may be another env's.
+            # A new system takes gravity and solver from the process's default, which may be another env's.
             physx.set_scene_config(old.config)
             system = physx.PhysxCpuSystem()
             system.timestep = old.timestep
@@ -462,10 +463,10 @@ def _moved(old: sapien.Scene, physics: physx.PhysxCpuSystem) -> sapien.Scene:
     for entity in entities:
         new.add_entity(entity)
     for entity, camera in zip(carriers, cameras, strict=True):
-        # One by one, since two cameras of an entity may have different shaders.
+        # Add cameras one by one, since two cameras of an entity may have different shaders.
         with made_again(camera):
             entity.add_component(camera)
-        give_brdf_table(camera)  # it has a new renderer, which would compute one for seconds
+        give_brdf_table(camera)  # the camera has a new renderer, which would compute a table for seconds
     return new
 
 

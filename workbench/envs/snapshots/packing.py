@@ -23,7 +23,7 @@ class PackedSnapshot:
     keys: tuple[int, ...] | None
     """Numbers of its parts; None if they equal those of the previous snapshot."""
     new_parts: dict[int, bytes]
-    """Parts that were not given out yet, by number."""
+    """Parts that were not sent yet, by number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +50,13 @@ class _SentPart:
 class SnapshotPacker:
     """Packs the snapshots of one env, one after the other.
 
-    Most of a snapshot stays from step to step (generators, goal poses). These *parts* are pickled when they change, get a
-    number that no other part of this packer has, and are given out once; the *body* is the snapshot pickled without them, by
-    pickle's persistent ids. Equality is identity first, bytes second. The server keeps both and imports neither torch nor
-    ManiSkill; a worker unpickles them joined as a plain `Snapshot`.
+    Most of a snapshot stays the same from step to step (generators, goal poses). These *parts* are pickled when they change,
+    get a number that no other part of this packer has, and are sent once; the *body* is the snapshot pickled without them,
+    with pickle's persistent ids. Parts are compared by identity first, then by bytes. The server keeps both and imports
+    neither torch nor ManiSkill; a worker unpickles them joined as a plain `Snapshot`.
 
     PickCube-v1, random actions, two cores (``tests/benchmarks/history_cost.py``): for 16 envs the body of a step has 8.8 KB
-    where the pickled snapshot has 107, for 64 envs 32 KB and 380. Cutting takes 0.3 and 0.4 ms, the snapshot itself 0.6 and
+    where the pickled snapshot has 107, for 64 envs 32 KB and 380. Packing takes 0.3 and 0.4 ms, the snapshot itself 0.6 and
     0.9 ms. A reset of one env adds 5 KB.
     """
 
@@ -65,7 +65,7 @@ class SnapshotPacker:
     _buffers: dict[str, Buffer] = field(default_factory=dict)
     """The buffers of the last snapshot, by path."""
     _next_key: int = field(default_factory=lambda: secrets.randbits(30) << 30)
-    """Random: the server may still keep parts of an earlier worker."""
+    """Starts at random, since the server may still keep parts of an earlier worker."""
     _last_keys: tuple[int, ...] | None = None
 
     def pack(self, snapshot: Snapshot) -> PackedSnapshot:
@@ -76,7 +76,7 @@ class SnapshotPacker:
         for name, value in self._parts_of(snapshot).items():
             places[id(value)] = len(self._kept)
             kept = before.get(name)
-            # Two calls less for each generator of each env.
+            # Saves two calls for each generator of each env.
             stays = kept is not None and kept.value is value
             self._kept[name] = kept if stays else self._part(kept, value, new)  # type: ignore[assignment]
         self._buffers = snapshot.memory.task.buffers
@@ -89,7 +89,7 @@ class SnapshotPacker:
         return PackedSnapshot(body.getvalue(), None if same else keys, new)
 
     def _parts_of(self, snapshot: Snapshot) -> dict[Any, Any]:
-        """The values that mostly stay, by name."""
+        """The values that rarely change, by name."""
         memory, task = snapshot.memory, snapshot.memory.task
         stays: dict[Any, Any] = {"contents": getattr(snapshot.simulation, "contents", ())}
         stays |= {"built": task.built, "omitted": task.omitted, **memory.shared_rng._asdict()}
@@ -104,7 +104,7 @@ class SnapshotPacker:
     def _part(self, kept: _SentPart | None, value: Any, new: dict[int, bytes]) -> _SentPart:
         """The part with this value: that of the previous snapshot, or a new one.
 
-        Never an older one: the server drops parts that no kept moment needs.
+        Never an older one, since the server drops parts that no stored moment needs.
         """
         if kept is not None and _is_the_same(kept.value, value):
             return kept

@@ -1,4 +1,4 @@
-"""Random generators of a running task: read, and written back."""
+"""Reads the random generators of a running task, and restores them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import torch
 
 _KEY = 624
 _WORDS = ctypes.c_char * 16
-"""Words 1 to 4 of the key in numpy's ``mt19937_state``, which is the key and the position, of 4 bytes each. A draw moves the
-position, and the last of a key makes all words anew. Word 0 is the same for every seed."""
+"""Words 1 to 4 of the key in numpy's ``mt19937_state``, which is the key and the position, in words of 4 bytes. A draw
+advances the position; the last draw of a key regenerates all words. Word 0 is the same for every seed."""
 _POSITION = ctypes.c_char * 4
 _HAS_GAUSS = 3
-"""Index in ``RandomState.get_state()`` of the flag for a normal number kept aside."""
+"""Index in ``RandomState.get_state()`` of the flag for a cached normal number."""
 
 RngState = tuple[Any, ...]
 """State of a generator, as returned by ``RandomState.get_state()``."""
@@ -25,13 +25,13 @@ RngState = tuple[Any, ...]
 class SharedRng(NamedTuple):
     """The generators of the process: torch's, numpy's and Python's.
 
-    They belong to no env, and to the author's training loop as much as to the task: they are put back only when a whole batch
-    goes back to its place.
+    They belong to no env, and to the author's training loop as much as to the task. So they are restored only together with
+    all envs.
     """
 
     torch_cpu: np.ndarray
     torch_device: np.ndarray | None
-    """The CUDA generator's, for an env whose tensors live there."""
+    """State of the CUDA generator, for an env whose tensors are on that device."""
     numpy: RngState
     python: Any
 
@@ -41,20 +41,22 @@ class _ReadStates:
     generators: list[np.random.RandomState]
     """Generators, kept alive since their memory is read by address."""
     memory: list[ctypes.Array[ctypes.c_char]]
-    """Views of what tells each state from others: some words of its key, its position."""
+    """Views of the numbers that distinguish states: some words of the key, and the position."""
     copied: bytes
     """Content of `memory` at the last read."""
     states: list[RngState]
     settled: bool
-    """Whether none keeps a normal number aside."""
+    """Whether no generator holds a cached normal number."""
 
 
 class RngReader:
-    """Reads the generators of one env object, and remembers what it read.
+    """Reads the generators of one env object, and caches the result.
 
-    ``RandomState.get_state`` takes 55 us a generator, for 64 envs a third of a control step. So a generator is read only when
-    its position or some words of its key differ from the last (0.2 us; whole keys of many envs do not fit into a core's cache; numpy publishes ``BitGenerator.ctypes.state_address``). One exception:
-    every second normal number is kept aside, and taking it changes no byte. While one is kept, all are read.
+    ``RandomState.get_state`` takes 55 us per generator, for 64 envs a third of a control step. So a generator is read only
+    if its position or some words of its key changed, which are compared in memory (0.2 us; numpy publishes
+    ``BitGenerator.ctypes.state_address``, and whole keys of many envs do not fit into a core's cache). One exception: numpy
+    caches every second normal number, and taking it changes none of these bytes. While one is cached, all generators are
+    read.
     """
 
     def __init__(self) -> None:
@@ -95,13 +97,13 @@ class RngReader:
                 now[i] = state
         seen = self._seen.get(purpose)
         if seen is not None:
-            # So that restoring the same snapshot again finds the states that it would write.
+            # So that a second restore of the same snapshot has nothing to write.
             seen.states, seen.copied = now, b"".join(seen.memory)
             seen.settled = not any(state[_HAS_GAUSS] for state in now)
 
 
 def read_shared_rng(device: torch.device) -> SharedRng:
-    # The generator whose methods np.random's functions are.
+    # The functions of np.random are methods of this generator.
     (numpy_state,) = _shared_reader.read("numpy", [np.random.get_state.__self__])  # type: ignore[attr-defined]
     return SharedRng(
         torch.get_rng_state().numpy(),

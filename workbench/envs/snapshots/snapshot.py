@@ -1,4 +1,4 @@
-"""Snapshots of chosen envs: taken, restored, and steps of some envs alone."""
+"""Takes and restores snapshots of chosen envs, and steps some envs alone."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Memory(NamedTuple):
     elapsed_steps: NDArray[np.int32]
     """(n,) control steps since each env's reset."""
     episode_seeds: NDArray[np.int64]
-    """(n,) as of `maniskill_private.episode_seeds`."""
+    """(n,) from `maniskill_private.episode_seeds`."""
     rng: dict[str, list[RngState]]
     """(n,) each: ManiSkill's generators of each env, by purpose."""
     task: TaskState
@@ -39,24 +39,26 @@ class Memory(NamedTuple):
 class Snapshot(NamedTuple):
     """Everything that decides how the episodes of chosen envs continue. Copies only: it can be pickled, and outlives its env.
 
-    Gathered from PhysX's bodies, joints and drive targets (`cpu_state`), the tensors of the task and its controllers
-    (`task_state`), elapsed steps and random generators (`rng`), a row an env: one env's state fits its own place, another
-    env, or by name an env that was built again.
+    It holds PhysX's bodies, joints and drive targets (`cpu_state`), the tensors of the task and its controllers
+    (`task_state`), elapsed steps and random generators (`rng`), with a row per env. So one env's state can be restored in
+    place, into another env, or by name into an env that was built again.
 
-    *Two restores of a snapshot continue identically*, to the last bit: a restored env gets a PhysX scene without a past. *A restore
-    continues as the uninterrupted run* except for what PhysX keeps to itself: contact caches, the order in which it solves
-    contacts, and the last bit of an articulation's root. Nothing else is missing (tested: an uninterrupted run whose bodies
-    move into a new scene, with no number written, continues as the restored one). Five steps later that is nothing for a
-    cart-pole, 1e-3 rad of a joint where a hand holds or pushes, 2e-2 rad for a humanoid that lies on the ground, and without bound where a
-    fall or a slip hangs on it (``tests/benchmarks/restore_distance.py``; figures in ``web_assets/docs/reference/task_ids.md``). Writing
-    an earlier state and repeating the steps does not help. Exact is a snapshot at an *exact point* (`begin_anew`, or right
-    after a restore) with every step since then made again; the session goes back so (`live.worker.go_back`).
+    *Two restores of a snapshot continue identically*, to the last bit: a restored env gets a PhysX scene without a past.
+
+    *A restore continues like the uninterrupted run* except for state that PhysX does not expose: contact caches, the order
+    in which it solves contacts, and the last bit of an articulation's root. Nothing else is missing (tested: an
+    uninterrupted run whose bodies move into a new scene, with no number written, continues like the restored one). After
+    five steps the difference is zero for a cart-pole, 1e-3 rad of a joint where a hand holds or pushes, 2e-2 rad for a
+    humanoid that lies on the ground, and unbounded where a fall or a slip depends on it
+    (``tests/benchmarks/restore_distance.py``; figures in ``web_assets/docs/reference/task_ids.md``). Writing an earlier
+    state and repeating the steps does not help. To continue exactly, take the snapshot at an *exact point* (`begin_anew`, or
+    right after a restore) and repeat every step since then, as the session does (`live.worker.go_back`).
     """
 
     num_envs: int
     """N, of the env from which it was taken."""
     env_idx: tuple[int, ...]
-    """(n,) which of them."""
+    """(n,) the envs that it holds."""
     simulation: CpuState | GpuState
     memory: Memory
 
@@ -110,8 +112,8 @@ def restore_snapshot(
 
     The env may be another, made again or of an edited task. Then actors and articulations are matched by name,
     articulations also by the names of their joints, and attributes of the task by name and shape. What the task keeps for a
-    whole batch (counters, a controller's step) is restored if all envs are; the process's random generators, if all
-    return to where they were, in a snapshot of as many.
+    whole batch (counters, a controller's step) is restored only if all envs are. The process's random generators are
+    restored only if, in addition, each env gets its own state back and the snapshot is of as many envs.
 
     Afterwards the tensors, poses and contact queries are those of the restored moment. ``env._last_obs`` is not: call
     ``env.get_obs(env.get_info())``, or use `TaskEnv.restore`, which does.
@@ -120,12 +122,13 @@ def restore_snapshot(
         env_idx: the envs to restore; None for those of the snapshot.
         source: the snapshot's envs whose state they get: one for all, or one each. None: each its own; or if the snapshot
             has a single env, that one.
-        fresh_physics: whether the envs get a PhysX scene without a past, and so continue identically, to the last bit. Without it, a
-            restore is several times as fast, and later contacts may be solved in another order (`renew_physics`).
+        fresh_physics: give the envs a PhysX scene without a past, so that they continue identically, to the last bit.
+            Without it, a restore is several times as fast, and later contacts may be solved in another order
+            (`renew_physics`).
 
     Raises:
         IndexError, ValueError: `env_idx` or `source` names an env that does not exist, or their lengths differ.
-        TypeError: a GPU env's snapshot for a CPU env, or the other way round.
+        TypeError: the snapshot is of a GPU env and `env` is on the CPU, or the reverse.
     """
     env = maniskill_private.open_env(env)
     if not isinstance(snapshot, Snapshot):
@@ -140,7 +143,7 @@ def restore_snapshot(
     else:
         _require_gpu(env)
         carried, missed = write_gpu_state(env, targets, state, positions)
-    # In any order.
+    # All envs, each with its own state, in any order.
     whole = snapshot.num_envs == env.num_envs == len(targets) and all(
         snapshot.env_idx[k] == i for i, k in zip(targets, positions, strict=True)
     )
@@ -184,7 +187,7 @@ def take_memory(env: BaseEnv, env_idx: list[int]) -> Memory:
 
 @contextmanager
 def remembering(env: BaseEnv) -> Iterator[None]:
-    """Restore the task's memory afterwards: its hooks may count and draw, and must not do so twice in a step."""
+    """Context that restores the task's memory at its end: hooks may count and draw, and must not do so twice in a step."""
     every = list(range(env.num_envs))
     memory = take_memory(env, every)
     try:
@@ -235,8 +238,8 @@ def _pairs(
         raise ValueError("source needs env_idx: the envs that get the state")
     if env_idx is None and max(snapshot.env_idx) >= env.num_envs:
         raise IndexError(
-            f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: name with env_idx the "
-            "envs to restore, and with source whose state they get"
+            f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: name the envs to "
+            "restore with env_idx, and the envs whose state they get with source"
         )
     targets = envs_of_batch(snapshot.env_idx if env_idx is None else env_idx, env.num_envs)
     if source is None:
@@ -263,9 +266,10 @@ def _pairs(
 def step_only(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iterator[None]:
     """Context in which control steps move these envs only.
 
-    The task's hooks run for all envs or for none, but on the CPU PhysX has a scene an env, and the others are not stepped. What
-    hooks did to them (a step counted, targets, a buffer) is restored from `others`; their physics only where it was written
-    to, since writing even the present state wakes what slept. In GPU simulation all envs step, and the others are restored.
+    The task's hooks run for all envs or for none, but on the CPU PhysX has a scene per env, and the others are not stepped.
+    What hooks did to them (a step counted, targets, a buffer) is restored from `others`; their physics only where it was
+    written to, since writing even the present state wakes sleeping bodies. In GPU simulation all envs step, and the others
+    are restored.
 
     Args:
         others: a snapshot of all other envs, restored at the end; None if their state does not matter.
@@ -307,7 +311,7 @@ _JOINT_TENSORS = ("qf", "target_qpos", "target_qvel")
 class GpuState:
     """The simulation state of n envs: the tensors that ManiSkill reads and writes, by name.
 
-    What PhysX keeps on the device besides them (contacts, sleep) is out of reach.
+    Other state of PhysX on the device (contacts, sleep) cannot be read.
     """
 
     states: dict[str, NDArray[np.float32]]

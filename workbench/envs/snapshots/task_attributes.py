@@ -22,18 +22,18 @@ from workbench.machine.versions import stored_names
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 """Immutable values, which need no copy."""
-_ENTERED = (
+_ENTERED_TYPES = (
     *PLAIN,
     *(torch.Tensor, np.ndarray, Pose, dict, list, tuple),
     *(torch.nn.Module, torch.Generator, np.random.Generator, np.random.RandomState, set, bytearray),
 )
-"""Types that may hold state; those of the last row cannot be kept, and are reported."""
-_NOT_ENTERED = (
+"""Types that may hold state; those of the last row cannot be copied, and are reported."""
+_SKIPPED_PACKAGES = (
     *("mani_skill", "sapien", "gymnasium", "torch", "numpy", "trimesh", "transforms3d", "builtins"),
     *("_thread", "weakref", "functools", "pathlib", "workbench"),
 )
 """Packages whose objects belong to the simulation or hold no state of an episode."""
-_DEEPEST = 8
+_MAX_DEPTH = 8
 
 
 @dataclass
@@ -59,14 +59,14 @@ class Walk:
     owners: dict[str, Any] = field(default_factory=dict)
     """Objects whose attributes were read, by path."""
     simulation: frozenset[int] = frozenset()
-    """Addresses of the simulation's tensors: a view of one is no memory of the task."""
+    """Addresses of the simulation's tensors, since a view of one is not state of the task."""
 
 
 def walk_task_values(env: BaseEnv) -> Walk:
-    """Everything that a task may remember.
+    """Find everything that a task may remember.
 
-    Looked for on the env, its agents and their controllers, through dicts, lists, tuples, dataclasses, Poses and objects of
-    classes in the task's module. Not entered: what belongs to ManiSkill, SAPIEN, gymnasium or torch, and BaseEnv's members.
+    Searched are the env, its agents and their controllers, through dicts, lists, tuples, dataclasses, Poses and objects of
+    classes in the task's module. Not entered: objects of ManiSkill, SAPIEN, gymnasium or torch, and BaseEnv's members.
     """
     walk = Walk(env, task_class(env).__module__)
     walk.entered[id(env)] = env
@@ -92,16 +92,16 @@ def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth:
             walk.leaves.append(TaskValue(path, value, put))
         return
     if isinstance(value, tuple) and all(isinstance(item, PLAIN) for item in value):
-        # As immutable as its items. A list of plain values is one leaf too, but may have a row for each env.
+        # A tuple is as immutable as its items. A list of plain values is one leaf too, but may have a row for each env.
         walk.leaves.append(TaskValue(path, value, put))
         return
     if id(value) in walk.entered:
         return
     walk.entered[id(value)] = value
-    if depth > _DEEPEST:
-        walk.omitted[path] = f"more than {_DEEPEST} containers deep"
+    if depth > _MAX_DEPTH:
+        walk.omitted[path] = f"more than {_MAX_DEPTH} containers deep"
     elif isinstance(value, Pose):
-        # A Pose is frozen, so another takes its place; torch may hold on to the old one.
+        # A Pose is frozen, so another takes its place; torch may still use the old one.
         _enter(walk, value.raw_pose, f"{path}.raw_pose", lambda raw: put(Pose(raw)), depth + 1)
     elif isinstance(value, dict):
         for key, item in list(value.items()):
@@ -156,24 +156,26 @@ def _has_members(cls: type, author: str) -> bool:
     if issubclass(cls, (type, torch.nn.Module)) or not cls.__dictoffset__:
         return False
     return cls.__module__ == author or (
-        dataclasses.is_dataclass(cls) and cls.__module__.split(".")[0] not in _NOT_ENTERED
+        dataclasses.is_dataclass(cls) and cls.__module__.split(".")[0] not in _SKIPPED_PACKAGES
     )
 
 
 @lru_cache(maxsize=4096)
 def _is_ignored(cls: type, author: str) -> bool:
-    """Whether an object is skipped without a report: upstream's, or code."""
-    if issubclass(cls, _ENTERED) or _has_members(cls, author):
+    """Whether an object is skipped without a report: one of an upstream package, or code."""
+    if issubclass(cls, _ENTERED_TYPES) or _has_members(cls, author):
         return False
-    return cls.__module__.split(".")[0] in _NOT_ENTERED or any("__call__" in vars(c) for c in cls.__mro__)
+    return cls.__module__.split(".")[0] in _SKIPPED_PACKAGES or any(
+        "__call__" in vars(c) for c in cls.__mro__
+    )
 
 
 @lru_cache(maxsize=1)
 def base_env_members() -> frozenset[str]:
-    """The attributes that ManiSkill's BaseEnv sets on itself: read off its code, ``self.NAME = ...``.
+    """The attributes that ManiSkill's BaseEnv sets on itself, read from its code: ``self.NAME = ...``.
 
-    Options, spaces, sensors, last observation and generators: no state, or restored by name (elapsed steps, generators).
-    ``agent`` is entered.
+    These are options, spaces, sensors, last observation and generators: not state, or restored by name (elapsed steps,
+    generators). ``agent`` is entered.
     """
     names: set[str] = set()
     for member in vars(BaseEnv).values():

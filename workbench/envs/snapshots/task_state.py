@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from workbench.envs.scene.scene_index import once_a_scene
 from workbench.envs.snapshots.task_attributes import PLAIN, TaskValue, walk_task_values
 
-_LARGEST_OF_BATCH = 1 << 16
-"""Elements of a tensor that holds for the whole batch; a larger one is data, not state."""
+_MAX_BATCH_ELEMENTS = 1 << 16
+"""Size limit of a tensor that holds for the whole batch; a larger one is data, not state."""
 
 
 class Buffer(NamedTuple):
@@ -33,17 +33,18 @@ class Buffer(NamedTuple):
 
 
 class TaskState(NamedTuple):
-    """What a task, its robots and their controllers remembered; ManiSkill's ``get_state_dict`` has none of it.
+    """State that a task, its robots and their controllers keep, and that ManiSkill's ``get_state_dict`` lacks.
 
-    *Rows*: a tensor, array or list of plain values whose first dimension is N has a row an env, and the rows of chosen envs are
-    copied. All else (a counter, a threshold) holds for the whole batch, and is put back only when all envs are.
+    *Rows*: a tensor, array or list of plain values whose first dimension is N has a row per env, and the rows of chosen envs
+    are copied. Everything else (a counter, a threshold) holds for the whole batch, and is restored only when all envs are.
 
-    *State or scene*: ``self.peg_half_sizes`` has a row an env too, but describes pegs that were built. What has not changed
+    *State or scene*: ``self.peg_half_sizes`` has a row per env too, but describes pegs that were built. What has not changed
     since the scene was built (`note_scene`) belongs to the scene: it is not copied, and a restore gives it the value that it
     was built with. In GPU simulation nothing is noted, and everything counts as state.
 
-    *New tensors*: a value is put back as a new tensor, since the old one may be another's (a controller's target is often the
-    caller's action). Two attributes that were one tensor stay one. What cannot be carried is named, with the reason.
+    *New tensors*: a value is restored as a new tensor, since something else may use the old one (a controller's target is
+    often the caller's action). Two attributes that were one tensor stay one. What cannot be carried is named, with the
+    reason.
     """
 
     buffers: dict[str, Buffer]
@@ -52,19 +53,19 @@ class TaskState(NamedTuple):
     built: frozenset[str]
     """Paths that existed when the scene was built."""
     omitted: dict[str, str]
-    """What could not be kept: path and reason."""
+    """State that could not be copied: path and reason."""
 
 
 @dataclass(frozen=True)
 class _BuiltValue:
-    """A value as it was when the scene was built."""
+    """A value at the time when the scene was built."""
 
     value: Any
     """The object, for comparison by identity."""
     version: int
     """torch's count of writes to a tensor."""
     kept: Buffer
-    """Its content."""
+    """Copy of the value's content."""
 
 
 @dataclass
@@ -94,7 +95,7 @@ def note_scene(env: BaseEnv) -> None:
 def note_constructed(env: BaseEnv) -> None:
     """Mark the plain values that the task's ``__init__`` set after BaseEnv's as part of the scene.
 
-    Else a restore into an env of the edited file would write the old file's ``self.threshold = 0.02``.
+    Without this, a restore into an env of the edited file would write the old file's ``self.threshold = 0.02``.
     """
     plain = [leaf for leaf in walk_task_values(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))]
     _scene_of(env).add(env, plain)
@@ -112,7 +113,7 @@ def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
         if not _changed(value, scene.values.get(leaf.path)):
             continue
         whole = isinstance(value, torch.Tensor) and not is_per_env(value, env.num_envs)
-        if whole and value.numel() > _LARGEST_OF_BATCH:
+        if whole and value.numel() > _MAX_BATCH_ELEMENTS:
             omitted[leaf.path] = f"a tensor {tuple(value.shape)} that has no row for each env"
         else:
             buffers[leaf.path] = _kept(value, env.num_envs, chosen)
@@ -120,7 +121,7 @@ def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
 
 
 def _kept(value: Any, num_envs: int, env_idx: NDArray[np.int64] | None = None) -> Buffer:
-    """A copy of a value; if it has a row for each env, of the rows of `env_idx`, or of all."""
+    """A copy of a value, or of its rows of `env_idx` (None: all) if it has a row for each env."""
     per_env, dtype = is_per_env(value, num_envs), None
     if per_env and env_idx is not None:
         value = [value[i] for i in env_idx] if isinstance(value, list) else value[env_idx]
@@ -135,8 +136,8 @@ def write_task_state(
 ) -> tuple[dict[str, None], dict[str, str]]:
     """Put row ``positions[k]`` of every buffer into env ``env_idx[k]``.
 
-    Values of the whole batch are restored too if all envs are, each to its own state or all to that of one: they are then
-    at one moment.
+    Values of the whole batch are restored only if all envs are, each to its own state or all to that of one, since the
+    envs are then at one moment.
 
     Returns:
         Paths that were carried, and paths that were not with the reason.
@@ -156,7 +157,7 @@ def write_task_state(
             if not _changed(value, built):
                 continue
             if built is None or leaf.path not in state.built:
-                # A controller's start and step exist from its first action on, without meaning before it.
+                # A controller's start and step exist only after its first action.
                 if is_per_env(value, env.num_envs) and not leaf.path.startswith("agent."):
                     missed[leaf.path] = "it is not in the snapshot; left unchanged"
                 continue
@@ -182,7 +183,7 @@ def write_task_state(
         if isinstance(new, str):
             missed[leaf.path] = new
             continue
-        # Keeps the old value alive, or a new tensor could get its id.
+        # Keep the old value alive, since a new tensor could get its id.
         replaced[id(value)] = value, new
         leaf.put(new)
         carried[leaf.path] = None

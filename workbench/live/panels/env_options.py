@@ -11,7 +11,7 @@ from typing import Any
 import viser
 
 from workbench.envs.keywords import MODES, HowMade, Keyword, as_json, read_value, shown
-from workbench.envs.recorded_run import HOW_IT_IS_RUN
+from workbench.envs.recorded_run import RUN_KEYWORDS
 from workbench.live.commands import (
     MAX_VALUE_CHARACTERS,
     ApplyEnvOptions,
@@ -186,7 +186,7 @@ def _same(a: str | None, b: str) -> bool:
 
 
 def _of_the_machine(kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in kwargs.items() if name in HOW_IT_IS_RUN}
+    return {name: value for name, value in kwargs.items() if name in RUN_KEYWORDS}
 
 
 # --- inputs ------------------------------------------------------------------------------------------
@@ -265,7 +265,7 @@ def options_html(reference: object, view: SessionView) -> str:
         "env_options",
         refused=[] if refused is None else _in_words(view.options, refused),
         further=_pairs(further),
-        given=bool(options.env_kwargs.keys() - HOW_IT_IS_RUN),
+        given=bool(options.env_kwargs.keys() - RUN_KEYWORDS),
         device="" if view.task is None else view.task.device,
         command=command_line(lasting(str(reference)), options),
         reset=ResetEnvOptions(),

@@ -1,1 +1,1 @@
-"""How processes are started, confined and ended, and their messages."""
+"""Starts, confines and ends processes, and carries their messages."""

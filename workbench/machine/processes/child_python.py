@@ -1,4 +1,4 @@
-"""Starts Python child processes, and speeds up slow imports or undoes what they leave."""
+"""Starts Python child processes; speeds up slow imports and undoes their changes of the environment."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-LOWEST = 19
-"""Niceness of a process that gets only the CPU time that all others leave over."""
+LOWEST_NICENESS = 19
+"""Niceness of a process that gets only the CPU time that all others leave."""
 
 
 def python_command(*arguments: str) -> list[str]:
@@ -24,12 +24,12 @@ def python_command(*arguments: str) -> list[str]:
 
 
 def script_command(script: str, *arguments: str) -> list[str]:
-    """Command line of a child that runs a file with the standard library alone, which starts in some milliseconds."""
+    """Command line of a child that runs a file with only the standard library, which starts in some milliseconds."""
     return [sys.executable, "-I", "-S", script, *arguments]
 
 
 def child_environment(**further: str) -> dict[str, str]:
-    """Environment of such a child, with ``further`` variables.
+    """Environment of a Python child process, with ``further`` variables.
 
     Drops empty entries of ``PYTHONPATH``, which mean the current folder (``PYTHONPATH=:/opt/lib`` has one).
     """
@@ -41,12 +41,13 @@ def child_environment(**further: str) -> dict[str, str]:
 def start_with_socket(
     module: str, environment: dict[str, str], new_session: bool = False
 ) -> tuple[subprocess.Popen[bytes], socket.socket]:
-    """Start ``python -m MODULE SOCKET``, which prints nowhere; returns it and the other end of that socket, of whole messages.
+    """Start ``python -m MODULE SOCKET`` without output; returns the process and the other end of the socket, which keeps
+    message boundaries.
 
-    Ctrl-C does not reach it: it is for this process, which still needs it. Raises OSError.
+    Ctrl-C reaches only this process, which still needs the child. Raises OSError.
 
     Args:
-        new_session: give it a session of its own, not only a group.
+        new_session: start the child in its own session, not only in its own process group.
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
@@ -69,8 +70,8 @@ def start_with_socket(
 
 @contextmanager
 def unchanged_environment() -> Iterator[None]:
-    """Undo what an import within this sets: children inherit it, and a worker is forked only where the environment is the
-    first one's."""
+    """Context that undoes changes of the environment by imports: children would inherit them, and a worker is forked only
+    if its environment equals the first worker's."""
     before = dict(os.environ)
     try:
         yield
@@ -84,18 +85,18 @@ def unchanged_environment() -> Iterator[None]:
 
 @contextmanager
 def quick_imports() -> Iterator[None]:
-    """Disable garbage collection within this, and exempt what was imported from later collections. Importing torch, ManiSkill and rerun takes
-    a quarter less.
+    """Context for imports without garbage collection; exempts what was imported from later collections.
 
-    Of a million objects made by imports, ten thousand are garbage. Without the exemption BaseEnv's collections at every build
-    and close take 0.25 s each, most of a reload of 16 envs.
+    Importing torch, ManiSkill and rerun takes a quarter less time: of a million objects made by imports, ten thousand are
+    garbage. Without the exemption, BaseEnv's collections at every build and close take 0.25 s each, most of a reload of 16
+    envs.
     """
     before, enabled = len(sys.modules), gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if len(sys.modules) > before:  # else only garbage of others would be frozen
+        if len(sys.modules) > before:  # without imports, only unrelated garbage would be frozen
             gc.freeze()
         if enabled:
             gc.enable()

@@ -1,4 +1,4 @@
-"""Confines a process that reads files of others (Landlock and resource limits)."""
+"""Confines a process that reads untrusted files (Landlock and resource limits)."""
 
 from __future__ import annotations
 
@@ -15,44 +15,44 @@ _ASK_VERSION = 1
 _PATH_BENEATH = 1
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1 << 0, 1 << 1, 1 << 2, 1 << 3
 _FILE_RIGHTS = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
-"""File rights that each version of Landlock adds; all but reading are given up."""
-_OF_FILES = _EXECUTE | _WRITE_FILE | _READ_FILE
+"""File rights that each version of Landlock adds; all except reading are given up."""
+_FILE_ONLY_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE
 """Rights that apply to files that are not folders."""
 _TCP_RIGHTS = 0b11
 """Rights to bind and to connect, from version 4 on."""
 _SCOPES = 0b11
-"""Scopes that keep out the abstract sockets of other processes and signals to them, from version 6 on."""
+"""Scopes that forbid abstract sockets of, and signals to, other processes, from version 6 on."""
 _PR_SET_NO_NEW_PRIVS = 38
-_SYSTEM = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
+_SYSTEM_PATHS = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
            "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
-MOST_WRITTEN = 1 << 20
-"""Most bytes of a written file; this limit also holds without Landlock."""
-MOST_OPEN_FILES = 512
+MAX_WRITTEN_BYTES = 1 << 20
+"""Maximum size of a written file; this limit also holds without Landlock."""
+MAX_OPEN_FILES = 512
 
 
 def landlock_version() -> int:
     """Version of Landlock in this kernel; 0 if the kernel has none, or Landlock is turned off.
 
-    Asked by system calls, since libc has no names for Landlock (``include/uapi/linux/landlock.h``).
+    Uses system calls, since libc has no functions for Landlock (``include/uapi/linux/landlock.h``).
     """
     return max(_call(_CREATE_RULESET, None, 0, _ASK_VERSION), 0)
 
 
 def confine(reads: Iterable[Path], most_memory: int, writes: Iterable[Path] = ()) -> None:
-    """Restrict this process and its children: they read only below `reads`, and programs and libraries.
+    """Restrict this process and its children: they can read only below `reads`, programs and libraries.
 
-    They write only below `writes`, open no TCP connection, signal no outside process, and gain no rights by what they
-    start.
+    They can write only below `writes`, open no TCP connection, signal no outside process, and gain no rights from programs
+    that they start.
 
     Args:
-        most_memory: bytes that may be allocated.
+        most_memory: maximum bytes that may be allocated.
     """
     writes = tuple(writes)
     resource.setrlimit(resource.RLIMIT_DATA, (most_memory, most_memory))
     if not writes:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_WRITTEN, MOST_WRITTEN))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_WRITTEN_BYTES, MAX_WRITTEN_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    most = min(MOST_OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
+    most = min(MAX_OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     ctypes.CDLL(None).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
     if landlock_version():
@@ -71,7 +71,7 @@ def _restrict(reads: tuple[Path, ...], writes: tuple[Path, ...]) -> None:
         raise OSError(ctypes.get_errno(), "Landlock gives no ruleset")
     try:
         read = _READ_FILE | _READ_DIR
-        for path in (*_SYSTEM, *_python()):
+        for path in (*_SYSTEM_PATHS, *_python()):
             _allow(ruleset, path, read | _EXECUTE)
         for path in reads:
             _allow(ruleset, os.fspath(path), read)
@@ -97,7 +97,7 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
         return  # not on this system
     try:
         if not os.path.isdir(path):
-            rights &= _OF_FILES
+            rights &= _FILE_ONLY_RIGHTS
         rule = rights.to_bytes(8, sys.byteorder) + place.to_bytes(4, sys.byteorder, signed=True)
         if _call(_ADD_RULE, ruleset, _PATH_BENEATH, rule, 0) < 0:
             raise OSError(ctypes.get_errno(), f"Landlock takes no rule for {path}")

@@ -11,14 +11,14 @@ import threading
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-USUAL_PORT = 5678
-"""Default port of editors."""
+DEFAULT_PORT = 5678
+"""Port that editors use by default."""
 HOST = "127.0.0.1"
-"""Address of this machine only: a client that attaches can run any code."""
+"""Loopback address only, since a client that attaches can run any code."""
 
 
 class CannotDebug(ValueError):
-    """debugpy cannot listen; the text says why."""
+    """debugpy cannot listen; the message has the reason."""
 
 
 def listen_for_debugger(port: int, hold: Callable[[bool], None]) -> None:
@@ -38,7 +38,7 @@ def listen_for_debugger(port: int, hold: Callable[[bool], None]) -> None:
     except ImportError as error:
         raise CannotDebug(f"debugpy cannot be imported: {error}") from error
     _report_suspension(pydevd.PyDB, hold)
-    # Processes that a task starts would each wait for a debugger of their own.
+    # Otherwise, each process that a task starts would wait for its own debugger.
     debugpy.configure(subProcess=False)
     try:
         debugpy.listen((HOST, port))
@@ -78,7 +78,7 @@ def debug_here(on_message: Callable[[str], None]) -> None:
 def _report_suspension(debugger: Any, hold: Callable[[bool], None]) -> None:
     """Call `hold` around debugpy's one method in which a thread is suspended; debugpy has no event for it.
 
-    Without this the supervisor would take a worker at a breakpoint for one that hangs.
+    Without this, the supervisor would treat a worker at a breakpoint as hanging.
     """
     wait_suspended = getattr(debugger, "do_wait_suspend", None)
     if wait_suspended is None:
@@ -111,7 +111,7 @@ def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., N
         place = caller.f_code.co_filename, caller.f_lineno
         if place not in passed:
             passed.add(place)
-            message = f"{place[0]}:{place[1]}: a breakpoint was passed, since no debugger is attached to {HOST}:{port}"
+            message = f"{place[0]}:{place[1]}: a breakpoint was skipped, since no debugger is attached to {HOST}:{port}"
             print(message, file=sys.stderr)
 
     if os.environ.get("PYTHONBREAKPOINT") != "0":
@@ -120,16 +120,16 @@ def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., N
 
 
 def port_for_debugger(wanted: int | None) -> int:
-    """A free port of this machine: `wanted`, or where that is None `USUAL_PORT` or any other.
+    """A free port of this machine: `wanted`; if that is None, `DEFAULT_PORT` or, if it is taken, any other.
 
     Raises:
-        ValueError: debugpy is not installed, or `wanted` is taken or no port.
+        ValueError: debugpy is not installed, or `wanted` is taken or not a port.
     """
     if importlib.util.find_spec("debugpy") is None:
         raise ValueError("--debug needs debugpy, which is not installed: pip install debugpy")
     if wanted is not None and not 0 <= wanted < 2**16:
         raise ValueError(f"--debug-port must be from 0 to {2**16 - 1}, not {wanted}")
-    for port in (USUAL_PORT, 0) if wanted is None else (wanted,):
+    for port in (DEFAULT_PORT, 0) if wanted is None else (wanted,):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
@@ -157,11 +157,11 @@ ONE_PROCESS = "remove this line, or use --workers 1 without --cluster in a termi
 
 
 class NoDebugger(RuntimeError):
-    """The author's code calls a debugger where there is no terminal."""
+    """The author's code calls a debugger in a process without a terminal."""
 
 
 def refuse_breakpoints(advice: str) -> None:
-    """Make both raise `NoDebugger` at their own line, in this process.
+    """Make ``breakpoint()`` and ``pdb.set_trace()`` raise `NoDebugger` at their own line, in this process.
 
     Python's debugger would read the end of its input and raise a bare ``BdbQuit`` at the next line. A ``PYTHONBREAKPOINT``
     that names another function, or 0, stays in effect.
@@ -179,7 +179,7 @@ def refuse_breakpoints(advice: str) -> None:
 
 
 def pass_breakpoints() -> None:
-    """Make both do nothing in this process, which runs in the background."""
+    """Make ``breakpoint()`` and ``pdb.set_trace()`` do nothing in this process, which runs in the background."""
 
     def pass_breakpoint(*arguments: Any, **keywords: Any) -> None:
         pass

@@ -1,4 +1,4 @@
-"""Process trees: read from ``/proc``, and ended as a whole."""
+"""Reads process trees from ``/proc``, and ends them as a whole."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, NoReturn, Protocol
 
-_PAGE = os.sysconf("SC_PAGE_SIZE")
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 def children(pid: int) -> list[int]:
-    """Process ids of its children, including zombies; empty if it is gone."""
+    """Process ids of a process's children, including zombies; empty if the process is gone."""
     found: list[int] = []
     try:
         for thread in os.listdir(f"/proc/{pid}/task"):
             found += map(int, _read(f"/proc/{pid}/task/{thread}/children").split())
     except FileNotFoundError:
-        # A kernel without that file, or a thread or the process has ended.
+        # The kernel lacks that file, or a thread or the process has ended.
         return _children_by_parent(pid)
     except OSError:
         return found
@@ -44,23 +44,23 @@ def family(pid: int) -> list[int]:
 def resident_memory(pid: int) -> int:
     """Resident bytes of the process, including shared ones; 0 if the process is gone."""
     try:
-        return int(_read(f"/proc/{pid}/statm").split()[1]) * _PAGE
+        return int(_read(f"/proc/{pid}/statm").split()[1]) * _PAGE_BYTES
     except (OSError, IndexError):
         return 0
 
 
 def allocated_memory(pid: int) -> int:
-    """Resident bytes without mapped files; 0 if it is gone. The kernel may drop hundreds of megabytes of mapped libraries
-    while something else is allocated."""
+    """Resident bytes without mapped files; 0 if the process is gone. Mapped libraries are not counted, since the kernel may
+    drop hundreds of megabytes of them while something else is allocated."""
     try:
         _, resident, shared, *_ = _read(f"/proc/{pid}/statm").split()
-        return (int(resident) - int(shared)) * _PAGE
+        return (int(resident) - int(shared)) * _PAGE_BYTES
     except (OSError, ValueError):
         return 0
 
 
 def proportional_memory(pids: Iterable[int]) -> int:
-    """Bytes that these processes have in memory together, by PSS: a page that they share counts once.
+    """Bytes that these processes have in memory together (PSS): a page that they share counts once.
 
     Takes milliseconds for each process of a gigabyte.
     """
@@ -68,7 +68,7 @@ def proportional_memory(pids: Iterable[int]) -> int:
 
 
 def main_thread_ended(pid: int) -> bool:
-    """Whether the main thread of the process has ended and others have not; also true for a moment of any exit."""
+    """Whether the main thread of the process has ended and others have not; also True for a moment during any exit."""
     try:
         return _state_and_parent(pid)[0] == "Z" and len(os.listdir(f"/proc/{pid}/task")) > 1
     except OSError:
@@ -94,7 +94,7 @@ def _children_by_parent(pid: int) -> list[int]:
 
 def _state_and_parent(pid: int | str) -> tuple[str, int]:
     try:
-        # The name in brackets may contain anything.
+        # The process name in brackets may contain anything.
         state, parent = _read(f"/proc/{pid}/stat").rpartition(b")")[2].split()[:2]
     except (OSError, ValueError):
         return "", 0
@@ -110,8 +110,8 @@ def _read(path: str) -> bytes:
 
 
 _PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_CHILD_SUBREAPER = 1, 4, 36
-_LONGEST_END = 5.0
-"""Longest wait in seconds for killed processes to end; a process that waits for a disk may take longer."""
+_END_TIMEOUT_SECONDS = 5.0
+"""Timeout for killed processes to end; a process that waits for a disk may take longer."""
 _SIGNALS = {signal.SIGCHLD, signal.SIGTERM}
 
 
@@ -122,25 +122,25 @@ def main() -> None:
 
 
 def begin_family(server: int) -> None:
-    """Continue in a child of this process; the process itself never returns from here, and is its keeper.
+    """Fork: the child returns and becomes the worker; this process never returns, and becomes the child's keeper.
 
-    A task may start processes that leave the worker's group (``setsid``) or its family (two forks), which nothing finds once
-    the worker is gone. The keeper is their *subreaper*: a process below it that loses its parent becomes its child. When the worker
-    ends, or the server asks (SIGTERM) or is gone, the keeper kills its children until it has none, and ends as the worker
-    did. It kills nothing else: a child's number is free only after its parent has waited for it. A cgroup would need rights
-    that a container or an ssh login does not give.
+    A task may start processes that leave the worker's group (``setsid``) or its process tree (double fork), which cannot be
+    found once the worker is gone. The keeper is their *subreaper*: a process below it that loses its parent becomes its
+    child. When the worker ends, or the server asks (SIGTERM) or is gone, the keeper kills its children until it has none,
+    and exits with the worker's status. It kills nothing else, since a child's process id is not reused before its parent has
+    waited for it. A cgroup would need rights that a container or an ssh login does not have.
 
-    Call it before any import (the keeper then has 6 MB of its own) and before any thread is started.
+    Call it before any import (the keeper then takes 6 MB) and before any thread is started.
 
     Args:
         server: process id of the parent. The keeper ends its family when the parent is gone.
     """
     libc = ctypes.CDLL(None)
-    # Blocked until `_keep` waits for them: else SIGCHLD is lost, and SIGTERM ends us before the worker.
+    # Blocked until `_keep` waits for them: otherwise, SIGCHLD is lost, and SIGTERM ends the keeper before the worker.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     signal.signal(
         signal.SIGCHLD, signal.SIG_DFL
-    )  # the parent may have set it to be ignored: then no child can be waited for
+    )  # the parent may have set SIGCHLD to be ignored: then no child can be waited for
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != server:
         sys.exit("the server is gone")
@@ -149,18 +149,18 @@ def begin_family(server: int) -> None:
     worker = os.fork()
     if worker != 0:
         _keep(worker)
-    # A group of its own: signals of the author's code to its group must not reach the keeper. No session of its own: Linux
-    # shares the cores among sessions first (autogroups), and work that should leave them to another worker could not.
+    # A new group: signals of the author's code to its group must not reach the keeper. But no new session: Linux shares the
+    # cores among sessions first (autogroups), so background work could not leave them to another worker.
     os.setpgid(0, 0)
     for number in (signal.SIGTTIN, signal.SIGTTOU):
-        # Else code that asks the terminal, which belongs to the server's group, is stopped for ever.
+        # Otherwise, code that uses the terminal, which belongs to the server's group, is stopped for ever.
         signal.signal(number, signal.SIG_IGN)
     end_with_parent(keeper)
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def end_with_parent(parent: int) -> None:
-    """Ask the kernel to end this process with `parent`, its parent process, which must have one thread."""
+    """Let the kernel kill this process when `parent`, its parent process, ends; `parent` must have only one thread."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
@@ -189,9 +189,9 @@ def end_family(keeper: Keeper) -> None:
     """End a process that called `begin_family` and all that it started; returns when all have ended."""
     keeper.terminate()
     try:
-        keeper.wait(timeout=2 * _LONGEST_END)
+        keeper.wait(timeout=2 * _END_TIMEOUT_SECONDS)
     except subprocess.TimeoutExpired:
-        # The keeper is stopped. The worker ends with it; what was detached does not.
+        # The keeper is stopped. Killing it ends the worker, but not detached processes.
         keeper.kill()
         keeper.wait()
 
@@ -208,7 +208,7 @@ def describe_exit(code: int | None) -> str:
 
 
 def _keep(worker: int) -> NoReturn:
-    # The server sees the worker's end when shared descriptors close: the keeper must hold none.
+    # The server notices the worker's end when shared descriptors close, so the keeper must hold none.
     for fd in sorted(map(int, os.listdir("/proc/self/fd"))):
         if fd > 2:
             try:
@@ -227,12 +227,12 @@ def _keep(worker: int) -> NoReturn:
 
 
 def _end_all() -> dict[int, int]:
-    """Kill all children, and the processes that become children by that; returns exit statuses."""
+    """Kill all children, and the processes that thereby become children; returns exit statuses."""
     ended: dict[int, int] = {}
-    deadline = time.monotonic() + _LONGEST_END
+    deadline = time.monotonic() + _END_TIMEOUT_SECONDS
     while (ours := children(os.getpid())) and time.monotonic() < deadline:
         for pid in ours:
-            os.kill(pid, signal.SIGKILL)  # its number is not reused before we reap it
+            os.kill(pid, signal.SIGKILL)  # its process id is not reused before it is reaped
         ended |= _reap()
         signal.sigtimedwait(_SIGNALS, 0.005)
     return ended | _reap()
@@ -256,7 +256,7 @@ def _leave_with(status: int | None) -> NoReturn:
     number = signal.SIGKILL if status is None else os.WTERMSIG(status)
     if number != signal.SIGKILL:
         signal.signal(number, signal.SIG_DFL)
-        ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0)  # the worker has dumped its core
+        ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0)  # the worker has already dumped its core
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [number])
     os.kill(os.getpid(), number)
     time.sleep(1.0)

@@ -1,4 +1,4 @@
-"""Ends this process, with a message, where native code does not return. Run as a script this is the process that does it."""
+"""Kills this process, with a message, if native code does not return. Run as a script, this is the watching process."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 PICTURE_SECONDS = 180.0
-"""Time limit of one picture, in seconds. The first picture of a process takes seconds, in which shaders are compiled."""
-_MOST_BYTES = 2000
-"""Most bytes of a message: a pipe takes these in one piece."""
+"""Timeout of one picture. The first picture of a process takes seconds, since shaders are compiled."""
+_MAX_MESSAGE_BYTES = 2000
+"""Maximum size of a message: a pipe writes so much atomically."""
 
 
 @dataclass
@@ -23,7 +23,7 @@ class _Watcher:
     """The process that watches this one."""
 
     pid: int
-    """Process id of the process that is watched. A fork of it is not watched."""
+    """Id of the watched process. A fork of that process is not watched."""
     seconds: float
     process: subprocess.Popen[bytes] | None = None
     pipe: int = -1
@@ -34,7 +34,7 @@ _watcher: _Watcher | None = None
 
 
 def end_after(seconds: float = PICTURE_SECONDS) -> None:
-    """End this process when work within `limited` takes longer than `seconds`. Without this call `limited` does
+    """Kill this process when work within `limited` takes longer than `seconds`. Without this call, `limited` does
     nothing."""
     global _watcher
     end_limit()
@@ -52,10 +52,10 @@ def end_limit() -> None:
 
 @contextmanager
 def limited(message: str) -> Iterator[None]:
-    """Do native work within this that may not return, such as waiting for a driver.
+    """Context for native work that may not return, such as waiting for a driver.
 
     Python's own threads and signal handlers do not run meanwhile, so another process watches: it prints `message` to stderr
-    and kills this one. It costs 6 MB from the first use on, and 20 us each time.
+    and kills this one. It takes 6 MB from the first use on, and 20 us each time.
     """
     watcher = _watcher
     if watcher is None or watcher.within or watcher.pid != os.getpid():
@@ -63,7 +63,7 @@ def limited(message: str) -> Iterator[None]:
         return
     if watcher.process is None:
         _start(watcher)
-    _tell(watcher, " ".join(message.split()).encode()[:_MOST_BYTES])
+    _tell(watcher, " ".join(message.split()).encode()[:_MAX_MESSAGE_BYTES])
     watcher.within = True
     try:
         yield
@@ -73,12 +73,12 @@ def limited(message: str) -> Iterator[None]:
 
 
 def _tell(watcher: _Watcher, line: bytes) -> None:
-    with suppress(BrokenPipeError):  # it was killed: nothing is limited from now on
+    with suppress(BrokenPipeError):  # the watcher was killed: nothing is limited from now on
         os.write(watcher.pipe, line + b"\n")
 
 
 def _start(watcher: _Watcher) -> None:
-    # Here, since this file also runs as a script that has the standard library alone.
+    # Imported here, since this file also runs as a script with only the standard library.
     from workbench.machine.processes.child_python import script_command
 
     read, watcher.pipe = os.pipe()
@@ -88,7 +88,7 @@ def _start(watcher: _Watcher) -> None:
             pass_fds=[read],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            process_group=0,  # Ctrl-C in the terminal is for the process that is watched
+            process_group=0,  # Ctrl-C in the terminal must reach only the watched process
         )
     finally:
         os.close(read)

@@ -1,4 +1,4 @@
-"""Threads that report what they raise, and start again; and threads that leave the cores to others."""
+"""Threads that report exceptions and restart, and threads that run only on idle cores."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from contextlib import contextmanager, suppress
 
 logger = logging.getLogger(__name__)
 
-FIRST_PAUSE, LONGEST_PAUSE = 0.05, 5.0
-"""Seconds before a thread starts again; doubled at each failure."""
-_LOOK = 0.05
-"""Seconds between two checks whether somebody waits."""
+FIRST_BACKOFF_SECONDS, MAX_BACKOFF_SECONDS = 0.05, 5.0
+"""Backoff before a thread is restarted; doubled at each failure."""
+_POLL_SECONDS = 0.05
+"""Interval between checks whether the work is wanted."""
 
 _listeners: list[Callable[[str], None]] = []
 _lock = threading.Lock()
 
 
 def watched_thread(name: str, work: Callable[[], None]) -> threading.Thread:
-    """A thread, not started, that runs `work` until it returns, again after each exception.
+    """A thread (not started yet) that runs `work` until it returns, and restarts it after each exception.
 
     `work` must be restartable, such as a loop over a queue.
     """
 
     def keep_at_it() -> None:
-        pause = FIRST_PAUSE
+        pause = FIRST_BACKOFF_SECONDS
         while True:
             try:
                 return work()
             except Exception as error:
                 report_failure(f"The thread '{name}' failed and is started again", error)
             threading.Event().wait(pause)
-            pause = min(2 * pause, LONGEST_PAUSE)
+            pause = min(2 * pause, MAX_BACKOFF_SECONDS)
 
     return threading.Thread(target=keep_at_it, name=name, daemon=True)
 
@@ -55,7 +55,7 @@ def report_failure(what: str, error: BaseException) -> None:
         try:
             listener(text)
         except Exception:
-            # The listener's terminal may be the cause.
+            # The listener itself may fail, for example because its terminal is gone.
             logger.exception("%s", text)
 
 
@@ -73,19 +73,19 @@ def stop_listening(listener: Callable[[str], None]) -> None:
 
 @contextmanager
 def on_free_cores(wanted: Callable[[], bool]) -> Iterator[None]:
-    """Within this, the threads of this process, and those that they start, run only on cores that nobody else wants.
+    """Context in which the threads of this process, and threads that they start, run only on cores that are idle.
 
-    A nice value is not enough: on two busy cores, play at unlimited speed was slower beside a process at nice 10. Those
-    that want the cores must be in the same session (see `begin_family`).
+    A nice value is not enough: on two busy cores, play at unlimited speed was slower next to a process at nice 10. The
+    processes that use the cores must be in the same session (see `begin_family`).
 
     Args:
-        wanted: asked often; after True they run as before, since somebody waits for this process.
+        wanted: polled; after it returns True, the threads run normally, since a caller waits for this process.
     """
     done = threading.Event()
     low = {int(thread) for thread in os.listdir("/proc/self/task")}
 
     def watch() -> None:
-        while not done.wait(_LOOK) and not wanted():
+        while not done.wait(_POLL_SECONDS) and not wanted():
             pass
         _schedule(os.SCHED_OTHER, {int(thread) for thread in os.listdir("/proc/self/task")})
 
@@ -101,6 +101,6 @@ def on_free_cores(wanted: Callable[[], bool]) -> Iterator[None]:
 
 def _schedule(policy: int, threads: set[int]) -> None:
     for thread in threads:
-        # It may have ended; a container may forbid it.
+        # The thread may have ended, or a container may forbid the call.
         with suppress(OSError):
             os.sched_setscheduler(thread, policy, os.sched_param(0))

@@ -1,4 +1,4 @@
-"""Messages between processes, calls and answers, and the sockets that carry them."""
+"""Messages between processes (calls, answers, events), and the sockets that carry them."""
 
 from __future__ import annotations
 
@@ -19,30 +19,31 @@ from typing import Any, ClassVar, ForwardRef, Generic, TypeVar, get_args, get_or
 import msgspec
 import numpy as np
 
-MOST_BYTES = 1 << 30
-"""Most bytes of one message. The largest of a working task, its meshes and the pictures of all envs, are some 100 MB."""
-_PIECE, _SMALL = 1 << 18, 1 << 14
-"""Bytes of one read, more than a socket's buffer; and bytes below which a message is copied and sent at once."""
+MAX_MESSAGE_BYTES = 1 << 30
+"""Maximum size of one message. The largest messages of a working task, its meshes and the pictures of all envs, have some
+100 MB."""
+_READ_BYTES, _COPIED_BYTES = 1 << 18, 1 << 14
+"""Size of one read, larger than a socket's buffer; and size below which a message is copied to be sent in one call."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
 """msgpack extensions: the next array, or a repeated one."""
-_NUMBERS = "biufcSU"
+_ARRAY_KINDS = "biufcSU"
 """Kinds of arrays that may be sent; arrays of objects may not."""
-_LONGEST = 500
-"""Most bytes of the description of one array."""
+_MAX_DESCRIPTION_BYTES = 500
+"""Maximum size of the description of one array."""
 _Head = tuple[str, int | None, msgspec.Raw]
 Value = TypeVar("Value", covariant=True)
 
 
 class Unreadable(EOFError):
-    """The received bytes are no message, and nothing after them can be read; the text says why."""
+    """The received bytes are not a message, and nothing after them can be read; the text has the reason."""
 
 
 # --- calls -----------------------------------------------------------------------------------------
 
 
 class Question(Generic[Value]):
-    """Base of what a `Call` can ask; its answer is a `Value`."""
+    """Base class of requests in a `Call`; the answer is a `Value`."""
 
     part: ClassVar[Any] = None
     """Type of progress messages before the answer."""
@@ -65,7 +66,7 @@ def value_type(question: type[Question[Any]]) -> Any:
     return kind
 
 
-# --- lines -----------------------------------------------------------------------------------------
+# --- sockets ---------------------------------------------------------------------------------------
 
 
 def _poll(end: socket.socket) -> select.poll:
@@ -79,15 +80,16 @@ def has_come(end: socket.socket, seconds: float | None = 0.0) -> bool:
 
     False where another thread has closed `end`.
     """
-    # By a poll object of its own: one that two threads ask at once raises RuntimeError.
+    # Uses its own poll object: one that two threads use at once raises RuntimeError.
     return end.fileno() >= 0 and bool(_poll(end).poll(None if seconds is None else 1000 * seconds))
 
 
 class MessageSocket:
-    """One end of a socket. Another thread than the one that receives may send, and any may ask whether something `waits`.
+    """One end of a socket for messages. One thread may receive while another sends; any thread may call `waits`.
 
-    The author's code runs in the worker: it may write anything into the socket, and end in the middle of a message. So what
-    comes is either data of the expected types or `Unreadable`. A message is msgpack that is read by its types, never a pickle:
+    The author's code runs in the worker: it may write anything into the socket, and end in the middle of a message. So
+    received bytes are either data of the expected types or `Unreadable`. A message is msgpack decoded by type, never a
+    pickle:
 
         4 bytes    length of all that follows; framed as `multiprocessing.connection.Connection` does it
         4 bytes    length of the message
@@ -105,9 +107,9 @@ class MessageSocket:
         self.end = end
         self._unpacker = Unpacker(kinds, questions)
         self._poll = _poll(end)
-        self._came, self._piece = bytearray(), memoryview(bytearray(_PIECE))
+        self._received, self._piece = bytearray(), memoryview(bytearray(_READ_BYTES))
         self._at = 0
-        """Offset of the next message in `_came`."""
+        """Offset of the next message in `_received`."""
 
     def send(self, message: object) -> None:
         """Send a message; blocks until all of it is written. Raises OSError if the other end is closed."""
@@ -116,7 +118,7 @@ class MessageSocket:
     def send_bytes(self, raw: bytes) -> None:
         """Send a packed message. Raises as `send`."""
         head = _LENGTH.pack(len(raw))
-        for piece in (head + raw,) if len(raw) < _SMALL else (head, raw):  # no copy of what is large
+        for piece in (head + raw,) if len(raw) < _COPIED_BYTES else (head, raw):  # no copy of what is large
             self.end.sendall(piece)
 
     def waits(self) -> bool:
@@ -124,10 +126,10 @@ class MessageSocket:
         return has_come(self.end)
 
     def receive(self, timeout: float | None) -> Any:
-        """The next message; None if none is complete within `timeout` seconds (None waits for ever).
+        """Wait up to `timeout` seconds (None waits for ever) for the next complete message; None if there is none.
 
         Raises:
-            Unreadable: the bytes are no message.
+            Unreadable: the bytes are not a message.
             EOFError: the other end is closed, and all complete messages were received.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
@@ -143,37 +145,37 @@ class MessageSocket:
             if not count:
                 raise EOFError
             if self._at:
-                self._came, self._at = self._came[self._at :], 0
-            self._came += self._piece[:count]
+                self._received, self._at = self._received[self._at :], 0
+            self._received += self._piece[:count]
         return message
 
     def _whole(self) -> Any | None:
         """The next message if it is complete."""
         begin = self._at + _LENGTH.size
-        if len(self._came) < begin:
+        if len(self._received) < begin:
             return None
-        length = _LENGTH.unpack_from(self._came, self._at)[0]
-        if length > MOST_BYTES:
-            raise Unreadable(f"it says that it is {length} bytes long")
-        came, end = self._came, begin + length
-        if len(came) < end:
+        length = _LENGTH.unpack_from(self._received, self._at)[0]
+        if length > MAX_MESSAGE_BYTES:
+            raise Unreadable(f"its stated length is {length} bytes")
+        received, end = self._received, begin + length
+        if len(received) < end:
             return None
         self._at = end
-        if end == len(came):  # do not keep a large buffer until more comes
-            self._came, self._at = bytearray(), 0
-        return self._unpacker.message(memoryview(came)[begin:end])
+        if end == len(received):  # do not keep a large buffer until more data arrives
+            self._received, self._at = bytearray(), 0
+        return self._unpacker.message(memoryview(received)[begin:end])
 
 
 # --- bytes -----------------------------------------------------------------------------------------
 
 
 def pack(value: object) -> bytes:
-    r"""Bytes of dataclasses, arrays and plain data.
+    r"""Encode dataclasses, arrays and plain data.
 
-    A text with lone surrogates arrives escaped (``\udcff``), which can be read but opens no file; a `Path` arrives as it is.
+    A text with lone surrogates arrives escaped (``\udcff``), which can be read but opens no file; a `Path` arrives unchanged.
 
     Raises:
-        TypeError: it contains something else.
+        TypeError: `value` contains something else.
     """
     arrays = _Written()
     try:
@@ -186,20 +188,20 @@ def pack(value: object) -> bytes:
 
 
 def pack_message(message: object) -> bytes:
-    """Bytes of a request or an event; a `Call` is sent under the name of its question."""
+    """Encode a request or an event; a `Call` is sent under the name of its question."""
     if isinstance(message, Call):
         return pack((type(message.request).__name__, message.number, message.request))
     return pack((type(message).__name__, None, message))
 
 
 class Unpacker:
-    """Reads what `pack` made. Used on one thread."""
+    """Decoder for `pack` and `pack_message`. Not thread-safe."""
 
     def __init__(self, kinds: Sequence[type] = (), questions: Sequence[type] = ()) -> None:
         """
         Args:
-            kinds: accepted messages.
-            questions: accepted in a `Call`.
+            kinds: accepted types of messages.
+            questions: accepted types of requests in a `Call`.
         """
         self._kinds = {(kind.__name__, False): kind for kind in kinds}
         self._kinds |= {(kind.__name__, True): kind for kind in questions}
@@ -207,21 +209,21 @@ class Unpacker:
         self._arrays = _Read(memoryview(b""))
 
     def unpack(self, raw: bytes | bytearray | memoryview, kind: Any) -> Any:
-        """The value that `pack` was given.
+        """Decode a value that `pack` encoded.
 
         Args:
-            kind: its type, as an annotation.
+            kind: type of the value, as an annotation.
 
         Raises:
-            Unreadable: it is not of this type.
+            Unreadable: the value is not of this type.
         """
         return self._guarded(lambda: self._decoder(kind).decode(self._begin(raw)))
 
     def message(self, raw: bytes | bytearray | memoryview) -> Any:
-        """The message that `pack_message` was given.
+        """Decode a message that `pack_message` encoded.
 
         Raises:
-            Unreadable: it is none of the accepted ones.
+            Unreadable: the message is not of an accepted type.
         """
         return self._guarded(lambda: self._message(raw))
 
@@ -229,7 +231,7 @@ class Unpacker:
         name, number, body = self._decoder(_Head).decode(self._begin(raw))
         kind = self._kinds.get((name, number is not None))
         if kind is None:
-            raise Unreadable(f"it was a {name[:100]}, which is no message")
+            raise Unreadable(f"it is a {name[:100]}, which is not a message")
         message = self._decoder(kind).decode(body)
         return message if number is None else Call(number, message)
 
@@ -254,20 +256,20 @@ class Unpacker:
         except Unreadable:
             raise
         except Exception as error:
-            # Any exception: the bytes may be made to break their reader.
+            # Any exception, since the bytes may be crafted to break their reader.
             raise Unreadable(f"{type(error).__name__}: {_line(error)}") from error
         finally:
             self._arrays = _Read(memoryview(b""))
 
 
 class _Written:
-    """Arrays of a message that is packed."""
+    """Collects the arrays of a message while it is encoded."""
 
     def __init__(self) -> None:
         self.parts: list[Any] = []
         self._numbers: dict[int, int] = {}
         self._alive: list[np.ndarray] = []
-        """Arrays that are kept alive, since `_numbers` goes by their id."""
+        """Arrays that are kept alive, since `_numbers` has their ids."""
 
     def hook(self, value: object) -> object:
         if isinstance(value, np.ndarray):
@@ -289,7 +291,7 @@ class _Written:
 
 
 class _Read:
-    """Arrays of a message that is unpacked."""
+    """Reads the arrays of a message while it is decoded."""
 
     def __init__(self, rest: memoryview) -> None:
         self._rest = rest
@@ -298,11 +300,11 @@ class _Read:
     def take(self, code: int, data: memoryview) -> np.ndarray:
         if code == _AGAIN:
             return self._taken[int(bytes(data))] if bytes(data).isdigit() else _refuse_array()
-        if code != _ARRAY or len(data) > _LONGEST:
+        if code != _ARRAY or len(data) > _MAX_DESCRIPTION_BYTES:
             _refuse_array()
         dtype, shape, size = _described(bytes(data))
         if size > len(self._rest):
-            raise ValueError("an array is longer than what came")
+            raise ValueError("an array is longer than the data")
         # A copy, so that one array does not keep the whole message alive.
         array = np.zeros(0, dtype) if size == 0 else np.frombuffer(self._rest[:size], dtype).copy()
         if dtype.kind == "b":  # other bytes than 0 and 1 are undefined in numpy
@@ -319,7 +321,7 @@ def _refuse_array() -> Any:
 
 @functools.lru_cache(1000)
 def _array_description(dtype: np.dtype, shape: tuple[int, ...]) -> msgspec.msgpack.Ext:
-    if dtype.kind not in _NUMBERS:
+    if dtype.kind not in _ARRAY_KINDS:
         raise TypeError(f"an array of {dtype} cannot be sent")
     return msgspec.msgpack.Ext(_ARRAY, msgspec.msgpack.encode((dtype.str, shape)))
 
@@ -327,8 +329,8 @@ def _array_description(dtype: np.dtype, shape: tuple[int, ...]) -> msgspec.msgpa
 @functools.lru_cache(1000)
 def _described(data: bytes) -> tuple[np.dtype, tuple[int, ...], int]:
     name, shape = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...]])
-    # Only as numpy writes them ("<f4"): it also reads records, and old aliases with a warning.
-    if re.fullmatch(rf"[<>|][{_NUMBERS}]\d+", name) is None:
+    # Accept dtypes only as numpy writes them ("<f4"): numpy also reads records, and old aliases with a warning.
+    if re.fullmatch(rf"[<>|][{_ARRAY_KINDS}]\d+", name) is None:
         _refuse_array()
     dtype = np.dtype(name)
     if dtype.itemsize == 0 or min(shape, default=0) < 0:
