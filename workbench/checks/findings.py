@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from workbench.checks.results import RuleResult, State, counts, state_text
 from workbench.checks.rule_pages import RulePage, rule_page
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.checks.state import ChecksView
 from workbench.envs.gpu_rules import DEGREES, Degree, Finding, Rule
 from workbench.envs.outliers import OUTLIER_RULES

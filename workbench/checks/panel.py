@@ -9,7 +9,7 @@ import viser
 
 from workbench.checks.commands import CheckAfterSave, CheckNow, StopChecks, ToggleRule
 from workbench.checks.findings import MOST_SHOWN, Card, cards, count, summary, undecided, without_finding
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.checks.silencing import Comment, comments_without_effect
 from workbench.checks.state import RUNNING, ChecksView
 from workbench.live.view import SessionView

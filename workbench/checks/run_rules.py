@@ -11,19 +11,6 @@ from pathlib import Path
 import numpy as np
 
 import workbench
-from workbench.checks.by_hook import (
-    cameras,
-    devices,
-    evaluate,
-    files,
-    observation,
-    placement,
-    reproduce,
-    reward,
-    scene,
-    solved,
-    source,
-)
 from workbench.checks.evidence.checkup import (
     Check,
     CheckEnded,
@@ -37,7 +24,23 @@ from workbench.checks.evidence.checkup import (
 )
 from workbench.checks.evidence.over_seeds import OverSeeds
 from workbench.checks.results import RuleResult, Seen, Silenced, State, failed, merged
-from workbench.checks.rules import core_rules_of
+from workbench.checks.rule_check import RuleCheck, checks_in
+from workbench.checks.rule_table import gpu_rules_of
+from workbench.checks.rules import (
+    cameras,
+    devices,
+    evaluate,
+    files,
+    observation,
+    placement,
+    reproduce,
+    reward,
+    scene,
+    solved,
+    source,
+    step,
+    visual_modes,
+)
 from workbench.envs import action_vector as actions
 from workbench.envs.broken_rule import NeedsOneEnv
 from workbench.envs.gpu_rules import Degree, Finding, silence_of
@@ -58,25 +61,28 @@ class RuleGroup:
     checks: Mapping[str, Check]
 
 
-GROUPS: tuple[RuleGroup, ...] = (
-    RuleGroup("source", {**source.CHECKS, **files.CHECKS}),
-    RuleGroup("resets", placement.CHECKS),
-    RuleGroup("success", {**evaluate.CHECKS, **placement.RUN_CHECKS}),
-    RuleGroup("rewards", reward.CHECKS),
-    RuleGroup("tensors", devices.CHECKS),
-    RuleGroup("the same again", reproduce.CHECKS),
-    RuleGroup("observations", observation.CHECKS),
-    RuleGroup("the scene", scene.CHECKS),
-    RuleGroup("pictures", {**observation.PICTURE_CHECKS, **cameras.CHECKS}),
-    RuleGroup("planned episodes", solved.CHECKS),
+DECLARED: Mapping[str, tuple[RuleCheck, ...]] = {
+    "source": checks_in(source, files),
+    "resets": checks_in(placement),
+    "success": checks_in(evaluate, step),
+    "rewards": checks_in(reward),
+    "tensors": checks_in(devices),
+    "the same again": checks_in(reproduce),
+    "observations": checks_in(observation),
+    "the scene": checks_in(scene),
+    "pictures": checks_in(visual_modes, cameras),
+    "planned episodes": checks_in(solved),
+}
+"""The checks of `checks.rules` by the name of their group, in the order in which they run: common mistakes first."""
+GROUPS = tuple(
+    RuleGroup(name, {each.rule.id: each.check for each in checks}) for name, checks in DECLARED.items()
 )
-"""In the order in which they run: what people meet most first."""
 RULES_OVER_SEEDS: Mapping[str, OverSeeds] = {
     rule: check for group in GROUPS for rule, check in group.checks.items() if isinstance(check, OverSeeds)
 }
 """The rules whose results depend on which seeds are looked at, and on how many. All others look at the source, at what is
 built, or at the first batch."""
-CORE = RuleGroup("GPU simulation", {})
+GPU_SIMULATION = RuleGroup("GPU simulation", {})
 """All rules of GPU simulation: the env under check reports them, whatever runs."""
 _OF_RETURNS = ("evaluate-rows", "reward-rows")
 _OF_SEVERAL = frozenset(
@@ -86,7 +92,7 @@ _OF_SEVERAL = frozenset(
     )
 )
 """Rules of GPU simulation about the other envs: one env alone cannot break them."""
-CORE_RESETS = 6
+GPU_RESETS = 6
 """Resets of random envs, with steps between them."""
 ONE_ENV = "With one env it runs: --num-envs 1."
 
@@ -267,13 +273,13 @@ def raised(error: Problem, checkup: Checkup) -> Found:
     )
 
 
-def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
+def check_gpu_rules(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
     """Step, and reset random envs among them, while the rules of GPU simulation look. Gives what each came to, but for breaches:
-    those are in `Checkup.findings`, of all that ran, and `core_results` makes results of them. Raises CheckEnded."""
+    those are in `Checkup.findings`, of all that ran, and `gpu_results` makes results of them. Raises CheckEnded."""
     further: list[RuleResult] = []
     not_applicable: dict[str, str] = {}
     try:
-        ended = ended_as(lambda: _of_task(lambda: _run_core(checkup), checkup))
+        ended = ended_as(lambda: _of_task(lambda: _run_gpu_rules(checkup), checkup))
         error = ended.problem
         if error is None:
             not_applicable = _nothing_there(checkup.task)
@@ -283,9 +289,9 @@ def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResu
         raise
     except Exception as error:
         problem = problem_of_crash(error)
-        return [failed(rule, problem) for rule in core_rules_of(degrees)]
+        return [failed(rule, problem) for rule in gpu_rules_of(degrees)]
     results: list[RuleResult] = []
-    for rule in core_rules_of(degrees):
+    for rule in gpu_rules_of(degrees):
         of_rule = ended
         if rule in not_applicable:
             of_rule = LookEnd("not_applicable", not_applicable[rule])
@@ -295,10 +301,10 @@ def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResu
     return [*results, *further]
 
 
-def _run_core(checkup: Checkup) -> None:
+def _run_gpu_rules(checkup: Checkup) -> None:
     rng, task = np.random.default_rng(0), checkup.task
     checkup.reset(task, checkup.seeds[0])
-    for _ in range(CORE_RESETS):
+    for _ in range(GPU_RESETS):
         for _ in range(2):
             checkup.step(task, actions.random_action(task.parts, task.num_envs, rng))
         count = int(rng.integers(1, max(2, task.num_envs)))
@@ -315,12 +321,12 @@ def _nothing_there(task: TaskEnv) -> dict[str, str]:
     return found
 
 
-def core_results(
+def gpu_results(
     findings: Iterable[Finding], silenced: Iterable[Silenced], degrees: Mapping[str, Degree]
 ) -> Iterator[RuleResult]:
     """The results of the rules of GPU simulation that were broken while all others were checked."""
     findings, silenced = list(findings), list(silenced)
-    for rule in core_rules_of(degrees):
+    for rule in gpu_rules_of(degrees):
         of_rule = [replace(each, degree=degrees[rule]) for each in findings if each.rule == rule]
         once = {each.key: each for each in of_rule}
         off = {

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from workbench.checks.results import RuleResult, State
-from workbench.checks.rules import RULES, did_you_mean
+from workbench.checks.rule_table import RULES, did_you_mean
 from workbench.envs.gpu_rules import Silence, silences
 from workbench.machine.parse_python import parse_python
 

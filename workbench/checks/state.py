@@ -11,7 +11,7 @@ from typing import Any, Literal
 from workbench.checks.commands import CheckAfterSave, CheckNow, StopChecks
 from workbench.checks.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.checks.results import RuleResult, by_rule, failed
-from workbench.checks.rules import core_rules_of, degree_of_each
+from workbench.checks.rule_table import degree_of_each, gpu_rules_of
 from workbench.envs.gpu_rules import Finding
 from workbench.live.effects import Asked
 from workbench.live.events import FileSaved, LoadDone, VersionLoaded
@@ -320,7 +320,7 @@ class CheckJobs:
                     raise
                 # What it was at fails, and the rest is asked of another process.
                 problem = Problem("worker", str(died), None, None, None, "")
-                rules = core_rules_of(degrees) if under_way == "" else filter(None, [under_way])
+                rules = gpu_rules_of(degrees) if under_way == "" else filter(None, [under_way])
                 for rule in rules:
                     checked(failed(rule, problem))
                 group += under_way == ""  # that is the last one

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.envs.gpu_rules import Rule
+from workbench.envs.gpu_rules import DeclaredRule, declared_rule
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.envs.step_result import StepResult
 
@@ -50,43 +50,150 @@ class OutlierKind(Enum):
         return made
 
 
-OUTLIER_RULES = {
+OUTLIER_RULES: Mapping[str, DeclaredRule] = {
     rule.id: rule
     for rule in (
-        Rule(
+        declared_rule(
             "bodies-stay",
             "warn",
-            "While the task runs, bodies neither fly off nor fall out of the scene.",
-            "An episode without the body cannot be solved, and its numbers leave the range of all others.",
             "step",
+            """While the task runs, bodies neither fly off nor fall out of the scene.
+
+            An episode without the body cannot be solved, and its numbers leave the range of all others.
+
+            ## Why
+            An episode without its body cannot be solved, and runs to the time limit. Its observations and
+            rewards are many times larger than all others: among thousands of envs a few such episodes spoil
+            running means and the value function. Most often bodies overlap, or a force is too high. The same
+            scene explodes more often on the GPU.
+
+            ## Mend
+            Let nothing overlap and nothing be thrown. If a body may be lost, end the episode there.
+
+            ```python fragment
+            def evaluate(self):
+                fallen = self.cube.pose.p[:, 2] < -0.1
+                return {"success": self.reached() & ~fallen, "fail": fallen}
+            ```
+
+            ## How it is checked
+            The rule looks at random rollouts of all seeds, of up to 50 steps, and at episodes that you play.
+            It reports a body that is faster than 20 m/s, that is 20 cm below everything that stands still,
+            that is half a metre below where its episode began (if it belongs to no articulation), or whose
+            pose is NaN. Bodies without a shape are left out, and so is what happens after the end of an
+            episode. The limits are wide: the rule does not see a cube that rolls off a low block.
+            """,
         ),
-        Rule(
+        declared_rule(
             "entries-finite",
             "warn",
-            "Numbers that evaluate() returns are finite.",
-            "A mean over envs or episodes is NaN as soon as one of them is, and a comparison with NaN is false.",
             "evaluate",
+            """Numbers that evaluate() returns are finite.
+
+            One NaN makes a mean over envs or episodes NaN, and a comparison with NaN is false.
+
+            ## Why
+            Trainers and loggers take the mean of an entry over envs and episodes: one NaN among 4096 envs
+            makes it NaN. A comparison with NaN is false, so a success that is computed from it is never
+            reached. The reward often uses the same number.
+
+            ## Mend
+            Clamp divisors and the arguments of roots. For a value that is not known, return 0 and a bool that
+            says so.
+
+            ```python fragment
+            height = self.block.pose.p[:, 2]
+            tilt = self.rise / self.run.abs().clamp(min=1e-6)
+            return {"tilt": tilt, "lifted": height > 0.1}
+            ```
+
+            ## How it is checked
+            The rule reads each floating entry after the resets of all seeds, at each step of random rollouts
+            of up to 50 steps, and in those of `--actions`. While you play, it looks at each step and flags an
+            env with such an entry. It does not see other states.
+            """,
         ),
-        Rule(
+        declared_rule(
             "reward-finite",
             "stop",
-            "Rewards are finite, also at the edges of joints and table.",
-            "One NaN makes the whole network NaN.",
             "compute_dense_reward",
+            """Rewards are finite, even at the limits of joints and the edges of the table.
+
+            One NaN makes the whole network NaN.
+
+            ## Why
+            One NaN in a batch of 4096 envs makes the loss NaN, then every weight of the network. Training
+            ends there, often after hours, since the state that gives NaN is rare.
+
+            ## Mend
+            Clamp divisors and the arguments of roots and logarithms.
+
+            ```python fragment
+            speed = torch.linalg.norm(velocity, dim=1)
+            straight = velocity[:, 0] / speed.clamp(min=1e-6)
+            ```
+
+            ## How it is checked
+            The rule reads the reward in random rollouts of all seeds, and in those of `--actions`. Then, for
+            the first two batches of seeds, it puts joints at random places and at their limits, and bodies at
+            random places around their start and at each goal mark, and calls the reward hook without a step.
+            While you play, it looks at each step and flags an env that breaks the rule. It does not see other
+            states.
+            """,
         ),
-        Rule(
+        declared_rule(
             "reward-normalized",
             "warn",
-            "The normalized dense reward and the sparse one lie within -1 and 1.",
-            "Learning rates and clipping of trainers expect that range.",
             "compute_normalized_dense_reward",
+            """The normalized dense reward and the sparse reward lie between -1 and 1.
+
+            Learning rates and clipping of trainers expect that range.
+
+            ## Why
+            Trainers are tuned for rewards of about 1 per step. Larger rewards scale the value loss and the
+            gradients, or are clipped, so that the best states look alike.
+
+            ## Mend
+            Divide by the largest dense reward of one step.
+
+            ```python fragment
+            def compute_normalized_dense_reward(self, obs, action, info):
+                return self.compute_dense_reward(obs, action, info) / 3
+            ```
+
+            ## How it is checked
+            The rule reads the normalized or sparse reward, whichever the task is made with, in random
+            rollouts of all seeds and in those of `--actions`. While you play, it flags an env with a reward
+            outside the range. It also reads the reward of states with success: of the states that
+            `reward-finite` makes, and what the reward hook returns when it is told that all envs succeed, if
+            that is one number. The result is *not known* if no success was seen, since success pays the
+            largest reward. It is *not applicable* for a plain dense reward.
+            """,
         ),
-        Rule(
+        declared_rule(
             "observation-finite",
             "stop",
-            "Observations are finite.",
-            "One NaN makes the whole network NaN.",
             "_get_obs_extra",
+            """Observations are finite.
+
+            One NaN makes the whole network NaN.
+
+            ## Why
+            One NaN in a batch of 4096 envs makes the network's output NaN, then its weights, even if the
+            reward is finite. Running means of a normaliser stay NaN forever.
+
+            ## Mend
+            Clamp divisors, or leave the number out.
+
+            ```python fragment
+            direction = offset / torch.linalg.norm(offset, dim=1, keepdim=True).clamp(min=1e-6)
+            ```
+
+            ## How it is checked
+            The rule reads each number of the observation in random rollouts of all seeds, and in the states
+            that `reward-finite` makes. Pictures are left out. While you play, it looks at each step and flags
+            an env that breaks the rule. It does not see other states.
+            """,
         ),
     )
 }

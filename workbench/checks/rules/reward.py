@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.checks.by_hook.evaluate import flags
-from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, SHORT, OddStates, odd_states
-from workbench.checks.evidence.over_seeds import OverSeeds, first_kind, tried
+from workbench.checks.evidence.over_seeds import first_kind, tried
 from workbench.checks.evidence.rollouts import Episodes
 from workbench.checks.results import Seen
+from workbench.checks.rule_check import outlier_check, rule
+from workbench.checks.rules.evaluate import flags
 from workbench.envs.broken_rule import Place
 from workbench.envs.outliers import REWARD_RANGES, ROUNDING
 from workbench.machine.text import of
@@ -57,6 +58,7 @@ def see_reward_finite(checkup: Checkup) -> Iterator[Seen]:
     yield Seen(("", "odd states"), place, bad.size, count=int(bad.sum()), texts=texts)
 
 
+@outlier_check("reward-finite", see=see_reward_finite)
 def reward_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     if (row := first_kind(sorted(rows, key=lambda row: len(row.names)))) is None:
         return
@@ -85,8 +87,28 @@ def see_reward_changes(checkup: Checkup) -> Iterator[Seen]:
     )
 
 
+@rule("reward-changes", "warn", "compute_dense_reward", see=see_reward_changes)
 def reward_changes(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    """One step with another reward than all others is enough."""
+    """A dense reward changes while the robot moves.
+
+    The policy has nothing to learn from.
+
+    ## Why
+    A reward that is the same everywhere gives no direction: the policy stays random.
+
+    ## Mend
+    Let the reward depend on a distance that the robot changes.
+
+    ```python fragment
+    distance = torch.linalg.norm(self.cube.pose.p - self.agent.tcp.pose.p, dim=1)
+    return 1 - torch.tanh(5 * distance)
+    ```
+
+    ## How it is checked
+    The rule reads the dense reward in random rollouts of all seeds (up to 50 steps), and reports it if it is
+    one number throughout. The result is *not applicable* for sparse rewards. The rule does not see a reward
+    that changes but leads nowhere.
+    """
     most, least = max(row.numbers[0] for row in rows), min(row.numbers[1] for row in rows)
     if most - least < 1e-7:
         yield Found(
@@ -139,6 +161,7 @@ def see_reward_normalized(checkup: Checkup) -> Iterator[Seen]:
     yield of("success", "in states with success", paid, len(paid))
 
 
+@outlier_check("reward-normalized", see=see_reward_normalized)
 def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     if (row := first_kind(rows)) is not None:
         ranges = [one.numbers for one in rows if one.names == row.names and one.numbers]
@@ -167,8 +190,30 @@ def paid_at_success(seen: OddStates, mode: str) -> float | None:
     return float(told[0])
 
 
+@rule("reward-ratio", "warn", "compute_normalized_dense_reward")
 def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
-    """Both hooks, called on the same odd states, and again with success."""
+    """The normalized dense reward is the dense reward divided by a constant.
+
+    The two modes train different tasks.
+
+    ## Why
+    People choose between the two modes for the scale, not for the task. If one is not the other divided by a
+    constant, results with one say little about the other.
+
+    ## Mend
+    Compute the normalized reward from the dense reward.
+
+    ```python fragment
+    def compute_normalized_dense_reward(self, obs, action, info):
+        return self.compute_dense_reward(obs, action, info) / 3
+    ```
+
+    ## How it is checked
+    The rule calls both hooks on the same states, those that `reward-finite` makes, with the same action, and
+    again with `info["success"]` true in all envs. It restores the task's memory between the calls. A rising
+    straight line with an offset is noted, and is no finding. The result is *not applicable* without both
+    rewards.
+    """
     seen = checkup.look(odd_states)
     if not DENSE_HOOKS.keys() <= seen.reward.keys():
         raise NotApplicable("it lacks a dense or a normalized dense reward")
@@ -241,8 +286,38 @@ def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
         yield Seen(("paid",), place, numbers=numbers, texts=(where,))
 
 
+@rule("reward-order", "warn", "compute_dense_reward", see=see_reward_order)
 def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    """By the range of all rewards of the same kind of episodes."""
+    """The dense reward at success is not lower than elsewhere in the same episode.
+
+    Policies learn to avoid success.
+
+    ## Why
+    If the way to success earns more than success, a policy that maximises the reward stops just before it.
+    The reward curve rises and the success rate does not.
+
+    ## Mend
+    Give success the most, after all other terms.
+
+    ```python fragment
+    reward = reach + place
+    reward[info["success"]] = 3  # more than reach + place can be
+    ```
+
+    ## How it is checked
+    For each episode that has states with and without success, the rule compares the largest rewards of both:
+    in random rollouts, in those of `--actions`, and in the states that `reward-finite` makes. A body at the
+    goal is often a success; from there the rule moves all bodies and joints back towards the reset until
+    success ends, so that states just short of success are compared too. A difference below 5% of the rewards'
+    range does not count.
+
+    The rule also calls the reward hook once more for each of these states, with `info["success"]` true in all
+    envs. If the reward is then one number, as after `reward[info["success"]] = 0.5`, that number is what
+    success pays, and no state without success may earn more. This finds the mistake even if no episode
+    succeeds.
+
+    Without either, the result is *not known*.
+    """
     ends: dict[str, list[tuple[float, ...]]] = {}
     for row in rows:
         if row.names[0] == "all":
@@ -298,7 +373,31 @@ def see_reward_needs_success(checkup: Checkup) -> Iterator[Seen]:
         )
 
 
+@rule("reward-needs-success", "warn", "compute_dense_reward", see=see_reward_needs_success)
 def reward_needs_success(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    """Only success earns the largest normalized reward.
+
+    Policies learn to wait where they earn as much as at success.
+
+    ## Why
+    If a state without success earns the largest reward, waiting there earns as much as success, and more if
+    success ends the episode.
+
+    ## Mend
+    Leave the largest reward to success.
+
+    ```python fragment
+    reward = reach + place  # at most 2
+    reward[info["success"]] = 3
+    return reward / 3
+    ```
+
+    ## How it is checked
+    The rule reports a normalized reward of 0.999 or more in a state without success, in random rollouts, in
+    those of `--actions`, and in the states that `reward-finite` makes. The result is *not applicable* without
+    a normalized reward or an entry `success`. It is *not known* if the reward goes beyond 1, or if no episode
+    or state that was tried succeeds, since the rule then did not see what is paid near success.
+    """
     if any(row.size > LARGEST for row in rows):
         raise NotKnown("its normalized reward goes beyond 1")
     given, places = sum(row.count for row in rows), [text for row in rows for text in row.texts]
@@ -394,13 +493,3 @@ def _hooks(checkup: Checkup) -> tuple[str, ...]:
     """The hooks that make the present reward, as a person would look for them."""
     mode = checkup.task.env.reward_mode
     return ("compute_dense_reward", REWARD_HOOKS[mode]) if "dense" in mode else (REWARD_HOOKS[mode],)
-
-
-CHECKS: Mapping[str, Check] = {
-    "reward-finite": OverSeeds(see_reward_finite, reward_finite),
-    "reward-changes": OverSeeds(see_reward_changes, reward_changes),
-    "reward-normalized": OverSeeds(see_reward_normalized, reward_normalized),
-    "reward-ratio": reward_ratio,
-    "reward-order": OverSeeds(see_reward_order, reward_order),
-    "reward-needs-success": OverSeeds(see_reward_needs_success, reward_needs_success),
-}
