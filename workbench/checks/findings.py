@@ -14,7 +14,7 @@ from workbench.envs.outliers import OUTLIER_RULES
 
 _SUMMED: tuple[State, ...] = ("kept", "silenced", "not_known", "not_applicable", "failed")
 _UNDECIDED: tuple[State, ...] = ("not_known", "not_applicable")
-MOST_SHOWN = 5
+MAX_SHOWN = 5
 """Maximum number of findings of one rule that are shown."""
 
 

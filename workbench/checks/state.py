@@ -23,10 +23,10 @@ from workbench.machine.loop import do
 from workbench.page.command import Command, Refused
 from workbench.task.problem import Problem
 
-AHEAD = 2.0
+AHEAD_SECONDS = 2.0
 """Seconds of checking at low priority; then at the lowest, since a person waits more for the rescored history than
 for the last rule."""
-MOST_DEATHS = 5
+MAX_DEATHS = 5
 """Most processes that may die in one check; the rule that was running fails, and the next process checks the others."""
 ChecksState = Literal["none", "off", "loading", "checking", "done", "stopped", "failed"]
 RUNNING: tuple[ChecksState, ...] = ("loading", "checking")
@@ -310,13 +310,13 @@ class CheckJobs:
 
         group, groups = 0, 1
         while group < groups:
-            ahead = began is None or time.monotonic() - began < AHEAD
+            ahead = began is None or time.monotonic() - began < AHEAD_SECONDS
             priority: Priority = "low" if ahead else "lowest"
             try:
                 answer = await self._process.in_turns(job, partial(ask, group), priority)
             except ProcessDied as died:
                 deaths += 1
-                if began is None or deaths > MOST_DEATHS:
+                if began is None or deaths > MAX_DEATHS:
                     raise
                 # What it was at fails, and the rest is asked of another process.
                 problem = Problem("worker", str(died), None, None, None, "")

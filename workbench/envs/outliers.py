@@ -14,11 +14,11 @@ from workbench.envs.gpu_rules import DeclaredRule, declared_rule
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.envs.step_result import StepResult
 
-FASTEST = 20.0
+MAX_SPEED = 20.0
 """m/s, as a mean over a control step; robots of the field move at a tenth of it."""
-UNDER_EVERYTHING = 0.2
+UNDER_FLOOR_METRES = 0.2
 """Metres under the lowest point of all static bodies."""
-DEEPEST_DROP = 0.5
+MAX_DROP_METRES = 0.5
 """Metres below the start of the episode, of a body that is not part of an articulation: more than off a block, less than
 off a table."""
 REWARD_RANGES: dict[str, tuple[float, float]] = {"sparse": (-1.0, 1.0), "normalized_dense": (-1.0, 1.0)}
@@ -249,7 +249,7 @@ class OutlierWatch:
         self._loose = self._present & shaped & (kinds == "dynamic")
         self._dt = control_dt
         self._low, self._high = REWARD_RANGES.get(reward_mode, (-np.inf, np.inf))
-        self._floor = lowest_still_point(geometry, first.poses) - UNDER_EVERYTHING
+        self._floor = lowest_still_point(geometry, first.poses) - UNDER_FLOOR_METRES
         self._before = first.poses[..., :3].copy()
         self._start = self._before[..., 2].copy()
 
@@ -297,8 +297,8 @@ class OutlierWatch:
             speed = np.where(self._moves, np.linalg.norm(place - self._before, axis=2) / self._dt, 0.0)
             drop = np.where(self._loose, self._start - place[..., 2], 0.0)
             lost: Any = self._present & ~np.isfinite(step.poses).all(axis=2)
-            fast: Any = speed > FASTEST
-            dropped: Any = drop > DEEPEST_DROP
+            fast: Any = speed > MAX_SPEED
+            dropped: Any = drop > MAX_DROP_METRES
             under: Any = self._moves & (place[..., 2] < self._floor)
         self._before = place.copy()
 

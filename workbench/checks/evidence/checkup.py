@@ -56,7 +56,7 @@ PICTURED_ENVS = 2
 FIRST_BUILT_SEED = 2022
 """With which BaseEnv's constructor builds env 0; env i with the i-th after it."""
 SEEDS_ALONE = 2
-MOST_OBS = 4096
+MAX_LEAF_NUMBERS = 4096
 """Leaves of an observation with more numbers per env are pictures."""
 
 
@@ -587,7 +587,7 @@ def leaf_rows(value: Any, num_envs: int) -> dict[str, NDArray[np.float64]]:
     for name, leaf in flat_entries(value):
         if not isinstance(leaf, torch.Tensor) or leaf.ndim == 0 or len(leaf) != num_envs:
             continue
-        if leaf.numel() <= MOST_OBS * num_envs and not leaf.is_complex():
+        if leaf.numel() <= MAX_LEAF_NUMBERS * num_envs and not leaf.is_complex():
             read[name or "obs"] = leaf.reshape(num_envs, -1).double().numpy(force=True).copy()
     return read
 

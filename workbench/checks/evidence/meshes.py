@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 _BYTES_PER_TRIANGLE = 3.0
 """No format of a mesh stores a triangle in less, unless it is compressed."""
 _RAYS = 162
-_MOST_TRIANGLES = 50_000
-_LEAST_WALL, _LEAST_OPEN = 0.6, 0.03
+_MAX_TRIANGLES = 50_000
+_MIN_WALL_SHARE, _MIN_OPEN_SHARE = 0.6, 0.03
 """Shares of all directions, seen from within a hollow, in which there is a wall, and in which it is open."""
 
 
@@ -30,7 +30,7 @@ def is_hollow(file: str) -> bool | None:
     """Whether something could be put into it: from the middle of its convex hull, walls are seen in most directions and
     nothing in some, on one side. None if that cannot be said: it cannot be read, or has too many triangles."""
     mesh = _read(file)
-    if mesh is None or len(mesh.faces) > _MOST_TRIANGLES:
+    if mesh is None or len(mesh.faces) > _MAX_TRIANGLES:
         return None
     if len(mesh.faces) < 4:
         return False
@@ -41,7 +41,7 @@ def is_hollow(file: str) -> bool | None:
     directions = trimesh.creation.icosphere(subdivisions=2).vertices[:_RAYS]
     hits = _crossings(np.asarray(mesh.triangles), np.asarray(hull.center_mass), np.asarray(directions))
     through = hits == 0
-    if not _LEAST_OPEN <= through.mean() <= 1 - _LEAST_WALL:
+    if not _MIN_OPEN_SHARE <= through.mean() <= 1 - _MIN_WALL_SHARE:
         return False
     # An opening is on one side; gaps of a ring, a frame or a star are on several.
     return float(np.linalg.norm(directions[through].mean(axis=0))) > 0.5

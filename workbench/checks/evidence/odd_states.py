@@ -25,12 +25,12 @@ from workbench.task.blame import blamed, returns_check
 
 BATCHES = 2
 """Batches of seeds whose states are changed."""
-AROUND = 0.15
+MARGIN_METRES = 0.15
 """Metres beyond where bodies begin."""
-HIGHEST = 0.3
+HEIGHT_METRES = 0.3
 """Metres above where a body begins."""
 KINDS = ("right after the reset", "with joints and bodies at random places", "with joints at their limits")
-MOST_GOALS = 4
+MAX_GOALS = 4
 """A drawing has hundreds of marks."""
 AT_GOAL = "with bodies at the place of {}"
 SHORT = "on the way back from a success to the reset"
@@ -68,7 +68,7 @@ def odd_states(checkup: Checkup) -> OddStates:
         checkup.reset(task, seeds)
         begun = read_states(task.env)
         rounds = [(kind, _changed(task.env, begun, kind, rng)) for kind in KINDS]
-        for goal in _goals(task.env)[:MOST_GOALS]:
+        for goal in _goals(task.env)[:MAX_GOALS]:
             rounds.append((AT_GOAL.format(goal.partition("/")[2]), _at(task.env, begun, goal)))
         for kind, states in rounds:
             succeeded = _put(checkup, kind, states, seeds, rng, seen)
@@ -163,7 +163,7 @@ def _changed(env: BaseEnv, begun: States, kind: str, rng: np.random.Generator) -
             rows[:, BODY:] = _joints(struct, len(rows), rng, at_limits=kind == KINDS[2])
         elif struct is not None and struct.px_body_type == "dynamic" and kind == KINDS[1]:
             here = np.isfinite(rows).all(axis=1)
-            highest = rows[:, 2:3] + HIGHEST
+            highest = rows[:, 2:3] + HEIGHT_METRES
             places = np.concatenate([np.tile(low[:2], (len(rows), 1)), rows[:, 2:3]], axis=1)
             spans = np.concatenate([np.tile(high[:2], (len(rows), 1)), highest], axis=1) - places
             turned = rng.normal(size=(len(rows), 4))
@@ -174,16 +174,16 @@ def _changed(env: BaseEnv, begun: States, kind: str, rng: np.random.Generator) -
 
 
 def _box(env: BaseEnv, begun: States) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(3,) lowest and highest place of what moves, and `AROUND` it."""
+    """(3,) lowest and highest place of what moves, and `MARGIN_METRES` it."""
     places = [
         rows[np.isfinite(rows).all(axis=1), :3]
         for name, rows in begun.items()
         if name.startswith("actors/") and scene_index(env).states[name].px_body_type == "dynamic"
     ]
     if not places:
-        return np.full(3, -AROUND, np.float32), np.full(3, AROUND, np.float32)
+        return np.full(3, -MARGIN_METRES, np.float32), np.full(3, MARGIN_METRES, np.float32)
     together = np.concatenate(places)
-    return together.min(axis=0) - AROUND, together.max(axis=0) + AROUND
+    return together.min(axis=0) - MARGIN_METRES, together.max(axis=0) + MARGIN_METRES
 
 
 def _joints(articulation: Any, count: int, rng: np.random.Generator, at_limits: bool) -> NDArray[np.float32]:

@@ -1,1 +1,1 @@
-"""The rules, one function each, by the hook that they guard."""
+"""The rules: a function each, in files by hook."""

@@ -34,18 +34,20 @@ from workbench.task.blame import blamed
 
 RESETS = 4
 """Resets of `Checkup.pictured` whose pictures are measured."""
-MOST_OBJECTS = 30
-"""Objects that are looked for: each takes a picture of its own."""
+MAX_OBJECTS = 30
+"""Maximum number of objects that are looked for: each takes an extra picture."""
 MISSED_SHARE = 0.25
-"""Of the pictures in which an object may be out of view."""
+"""Share of the pictures in which an object may be out of view."""
 BACKGROUND_SHARE = 0.5
-MOST_PIXELS = 512 * 512
+"""Share of the pixels that may be empty background."""
+MAX_PIXELS = 512 * 512
+"""Maximum number of pixels of a sensor camera."""
 HOOKS: Mapping[CameraKind, str] = {
     "sensor": "_default_sensor_configs",
     "human": "_default_human_render_camera_configs",
 }
-UNIT = 1e-3
-"""Largest difference of a quaternion's length from 1."""
+UNIT_TOLERANCE = 1e-3
+"""Maximum difference between the length of a quaternion and 1."""
 
 
 @rule("camera-sees", "warn", "_default_sensor_configs")
@@ -99,7 +101,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     env = checkup.pictured.env
     for key, report in reports.items():
         things = report.wanted_objects(None)
-        # Where it is the only one, each object says so.
+        # With one camera, each object that it misses is a finding already.
         one_of_several = len(reports) > 1 and mount_of(env, cameras_of(env)[key]) is None
         if one_of_several and not any((thing.alone > 0).any() for thing in things):
             found = True
@@ -111,8 +113,8 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
             )
     if covered:
         yield Note(f"covered by other things in every picture after a reset: {listed(covered)}")
-    if not found and (count := len(_drawn(env))) > MOST_OBJECTS:
-        raise NotKnown(f"{MOST_OBJECTS} of {count} objects were looked for")
+    if not found and (count := len(_drawn(env))) > MAX_OBJECTS:
+        raise NotKnown(f"{MAX_OBJECTS} of {count} objects were looked for")
 
 
 @rule("camera-background", "warn", "_default_sensor_configs")
@@ -186,7 +188,7 @@ def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
         raise NotApplicable("it has no camera of its own")
     for (kind, _), config in own.items():
         lengths = np.linalg.norm(rows_of_pose(config)[:, 3:], axis=1)
-        if np.abs(lengths - 1).max() > UNIT:
+        if np.abs(lengths - 1).max() > UNIT_TOLERANCE:
             yield Found(
                 f"the quaternion of camera {config.uid!r} has length {lengths[0]:.3g}: its picture is turned and zoomed, and "
                 "its extrinsics are scaled. Give a unit quaternion; if look_at() looks straight up or down, move the eye "
@@ -256,7 +258,7 @@ def camera_size(checkup: Checkup) -> Iterator[Found | Note]:
     than 512 x 512 pixels. It does not add up several cameras.
     """
     for config in _own_configs(checkup):
-        if config.width * config.height > MOST_PIXELS:
+        if config.width * config.height > MAX_PIXELS:
             megabytes = config.width * config.height * 16 / 1e6
             yield Found(
                 f"sensor camera {config.uid!r} has {config.width} x {config.height} pixels: its textures take about "
@@ -352,13 +354,13 @@ def _measured(env: Any, e: int, key: CameraKey, objects: list[SceneObject]) -> C
 
 
 def _objects(env: Any) -> list[SceneObject]:
-    """Robots and scenery, and the first of the others."""
+    """The robots, the scenery and the first other objects."""
     scenery = [thing for thing in list_objects(env) if thing.robot or thing.scenery]
-    return [*scenery, *_drawn(env)[:MOST_OBJECTS]]
+    return [*scenery, *_drawn(env)[:MAX_OBJECTS]]
 
 
 def _drawn(env: Any) -> list[SceneObject]:
-    """Objects that are neither robot nor scenery and have anything to see: a body may only carry a camera."""
+    """Objects that are neither robot nor scenery and that are drawn: a body may only carry a camera."""
     index = scene_index(env)
     return [
         thing
@@ -369,6 +371,7 @@ def _drawn(env: Any) -> list[SceneObject]:
 
 
 def _own_configs(checkup: Checkup) -> list[Any]:
+    """Configs of the task's sensor cameras. Raises NotApplicable without one."""
     of_task, _ = checkup.look(sensor_configs)
     if not of_task:
         raise NotApplicable("it has no sensor camera of its own")
@@ -376,6 +379,7 @@ def _own_configs(checkup: Checkup) -> list[Any]:
 
 
 def _place(checkup: Checkup, key: CameraKey) -> Place | None:
+    """The author's line that makes a sensor camera."""
     of_task, of_robot = checkup.look(sensor_configs)
     for config in (*of_task, *of_robot):
         if config.uid == key[1]:
@@ -384,7 +388,7 @@ def _place(checkup: Checkup, key: CameraKey) -> Place | None:
 
 
 def _site(checkup: Checkup, config: Any, hook: str = "_default_sensor_configs") -> Place | None:
-    """Where the author's code makes a config; else the hook."""
+    """The author's line that makes a config; the hook if other code makes it."""
     site = maniskill_private.camera_site(config)
     if site is None or site.file not in map(str, checkup.loaded.source_files):
         return checkup.places.hook(hook)

@@ -93,7 +93,7 @@ def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _how_often(count: int, uses: TensorUses) -> str:
-    """``once in each step``, ``2 times for each env in each step``; ``4 times in 3 steps`` where they differ."""
+    """Text such as ``once in each step``, ``2 times for each env in each step``, or ``4 times in 3 steps`` if steps differ."""
     if count % uses.steps:
         return f"{_times(count)} in {uses.steps} steps"
     a_step = count // uses.steps
@@ -137,7 +137,7 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
         for loop in _loops_over_envs(function):
             place = module.place(loop.iter, function.name)
             found.setdefault(place[:2], place)
-    # Before anything runs: of a task that raises they are known too.
+    # Reported before anything runs: the task may raise.
     yield from map(_found_loop, found.values())
     if not any(True for _ in checkup.places.reached_from(*EVERY_STEP)):
         raise NotApplicable("it has no hook of its own that runs at every step")
@@ -158,6 +158,7 @@ def _found_loop(place: Place) -> Found:
 
 
 def _loops_over_envs(function: ast.FunctionDef) -> Iterator[ast.For | ast.comprehension]:
+    """Loops and comprehensions of a function whose iterable names something with an item for each env."""
     counts = {"env_idx"} | {
         target.id
         for node in ast.walk(function)
@@ -177,7 +178,7 @@ def _loops_over_envs(function: ast.FunctionDef) -> Iterator[ast.For | ast.compre
 
 
 def _is_count(node: ast.expr) -> bool:
-    """``self.num_envs``, ``len(env_idx)``."""
+    """Whether the expression is ``self.num_envs`` or ``len(env_idx)``."""
     if isinstance(node, ast.Attribute):
         return node.attr in ("num_envs", "_num_envs")
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "len":
@@ -186,7 +187,7 @@ def _is_count(node: ast.expr) -> bool:
 
 
 def _is_loop(checkup: Checkup, place: Place) -> bool:
-    """Whether a loop is in this line, and not ``x, y = tensor``."""
+    """Whether the line has a loop, and not ``x, y = tensor``."""
     module: Module | None = next((each for each in checkup.places.modules if each.file == place[0]), None)
     return module is not None and any(
         isinstance(node, _LOOPS) and node.iter.lineno <= place[1] <= (node.iter.end_lineno or 0)

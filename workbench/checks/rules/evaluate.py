@@ -20,12 +20,13 @@ from workbench.envs.broken_rule import Place
 from workbench.machine.text import listed, of
 
 READ_BY_MANISKILL = ("success", "fail", "elapsed_steps")
+"""Entries of ``evaluate()`` that ManiSkill reads."""
 FLICKER_SHARE = 0.25
-"""Of the steps on which success was true for the first time and gone at the next."""
+"""Share of the steps at which success becomes true that may be followed by a step without success."""
 
 
 def see_success_at_reset(checkup: Checkup) -> Iterator[Seen]:
-    """Over all seeds."""
+    """One row: the seeds whose reset gives success."""
     success = _flag(checkup.starts, "success")[0]
     seeds = [seed for seed, true in zip(checkup.starts.seeds, success, strict=True) if true]
     yield Seen(place=checkup.places.entry("success"), tried=len(success), seeds=tuple(seeds))
@@ -66,14 +67,14 @@ def success_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_success_stays_possible(checkup: Checkup) -> Iterator[Seen]:
-    """Whether there is an entry at all, and in how many rollouts it is reached."""
+    """Rows: whether ``evaluate()`` has an entry, and how many episodes of each kind reach success."""
     entries = checkup.starts.evaluate
     own = checkup.loaded.cls.compute_sparse_reward is not BaseEnv.compute_sparse_reward
     sparse = checkup.task.env.reward_mode == "sparse" and not own
     if sparse and any(known != "elapsed_steps" for _, known in _misspelt(entries)):
         raise NotKnown("an entry has nearly the name that ManiSkill reads, see entry-name")
     if "success" not in entries and "fail" not in entries:
-        # As ManiSkill's tasks of walking, balancing and drawing.
+        # ManiSkill's tasks of walking, balancing and drawing have neither.
         yield Seen(place=checkup.places.hook("evaluate"), count=int(sparse))
     elif "success" in entries:
         for episodes in checkup.rollouts:
@@ -154,7 +155,7 @@ def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _misspelt(entries: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Names of entries that are nearly one that ManiSkill reads and that is missing, and that one."""
+    """Pairs (entry, name that ManiSkill reads): the entry has nearly that name, and no entry has it."""
     for name in entries:
         for known in READ_BY_MANISKILL:
             close = difflib.SequenceMatcher(None, name.lower(), known).ratio() >= 0.8
@@ -200,7 +201,7 @@ def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def see_success_and_fail(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts, up to the kind that has both; and whether there was a success and a fail at all."""
+    """A row for each kind of rollouts, up to the first breach: states with both, and whether any success and any fail occurred."""
     for episodes in checkup.rollouts:
         success, fail = _flag(episodes, "success"), _flag(episodes, "fail")
         both = success & fail
@@ -246,7 +247,7 @@ def success_and_fail(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def _seen_at(bad: NDArray[np.bool_], episodes: Episodes, names: tuple[str, ...], place: Place | None) -> Seen:
-    """A row of a breach that is there at states, (T, K), of episodes."""
+    """A row about the breaches `bad`, (T, K), in states of episodes."""
     seeds = tuple(episodes.seeds[i] for i in np.flatnonzero(bad.any(axis=0)))
     texts: tuple[str, ...] = ()
     if seeds:
@@ -256,12 +257,12 @@ def _seen_at(bad: NDArray[np.bool_], episodes: Episodes, names: tuple[str, ...],
 
 
 def _episodes_of(row: Seen) -> str:
-    """``3 of 32 random episodes``, of a row whose first name is their kind."""
+    """Text such as ``3 of 32 random episodes`` for a row whose first name is the kind of episodes."""
     return of(len(row.seeds), row.tried, f"{row.names[0]} episode")
 
 
 def see_success_flickers(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts that succeed."""
+    """A row for each kind of rollouts: how often success becomes true, and how often it is false again at the next step."""
     for episodes in checkup.rollouts:
         success = _flag(episodes, "success")
         begun = success[1:-1] & ~success[:-2]
@@ -319,7 +320,7 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_entries_finite(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts."""
+    """A row for each kind of rollouts, and one for each of its entries that is not finite."""
     told: set[str] = set()
     for episodes in checkup.rollouts:
         numbers = float(sum(rows.dtype.kind == "f" for rows in episodes.evaluate.values()))
@@ -354,7 +355,7 @@ def entries_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
-    """(T + 1, K)"""
+    """(T + 1, K) of an entry of ``evaluate()``. Raises NotApplicable if it is missing."""
     rows = episodes.evaluate.get(name)
     if rows is None:
         raise NotApplicable(f"evaluate() has no entry {name}")
@@ -362,5 +363,5 @@ def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
 
 
 def flags(rows: NDArray) -> NDArray[np.bool_]:
-    """(T, K) of (T, K, ...)."""
+    """(T, K) bools from rows (T, K, ...)."""
     return np.logical_or.reduce(rows.reshape(*rows.shape[:2], -1).astype(bool), axis=2)

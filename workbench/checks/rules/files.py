@@ -41,7 +41,7 @@ _WRITES_OR_ASKS = {
     "savez_compressed", "savetxt", "dump", "export", "imwrite", "to_csv", "glob", "listdir", "iterdir",
 }  # fmt: skip
 _DATASET_IDS = {"ycb:": "ycb"}
-"""How ``get_actor_builder(scene, id="ycb:...")`` names a model, and the download that has it."""
+"""Prefix of a model's id, as in ``get_actor_builder(scene, id="ycb:...")``, to the download that has the model."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class NamedFile:
     path: Path
     place: Place
     relative: bool
-    """Found from the folder of the process only."""
+    """Whether it depends on the current folder of the process."""
     always: bool
-    """In no branch of an ``if``."""
+    """Whether it stands in no branch of an ``if``."""
 
 
 @rule("missing-file", "stop", "class")
@@ -161,7 +161,7 @@ def _named_files(checkup: Checkup) -> Iterator[NamedFile]:
 
 
 def _branches(function: ast.FunctionDef) -> set[ast.AST]:
-    """What runs under a condition."""
+    """The nodes that run under a condition."""
     return {
         part
         for node in ast.walk(function)
@@ -171,7 +171,7 @@ def _branches(function: ast.FunctionDef) -> set[ast.AST]:
 
 
 def _paths_in(node: ast.AST, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
-    """The longest expressions that are paths."""
+    """The outermost expressions that are paths, with their values."""
     if isinstance(node, ast.Call):
         yield from _loaded_by(node, values)
     value = (
@@ -189,7 +189,7 @@ def _paths_in(node: ast.AST, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
 
 
 def _loaded_by(call: ast.Call, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
-    """What a call reads: its first argument or ``filename=``, where it is a name, a constant or relative."""
+    """The file that a call reads: its first argument or ``filename=``, if that is a name, a constant or a relative path."""
     name = getattr(call.func, "attr", getattr(call.func, "id", ""))
     if name not in _LOADS and not name.endswith("_from_file"):
         return
@@ -238,7 +238,7 @@ class _Values:
         self._open: set[str] = set()
 
     def of(self, node: ast.AST) -> Any:
-        """Its value, if that is a str, a Path, a number or a module; else None."""
+        """The value of the expression if it is a str, a Path, a number or a module; else None."""
         if isinstance(node, ast.Constant):
             return node.value
         if isinstance(node, ast.Name):

@@ -17,11 +17,12 @@ from workbench.envs.broken_rule import Place
 from workbench.envs.state_columns import flat_names, split_flat
 from workbench.machine.text import of
 
-HUGE = 1000.0
+HUGE_NUMBER = 1000.0
+"""Maximum absolute value of a number in an observation."""
 
 
 def see_observation_finite(checkup: Checkup) -> Iterator[Seen]:
-    """Over random rollouts: a row for each leaf; where all are finite, also over odd states."""
+    """A row for each leaf in random rollouts; if all are finite, one for the first leaf that is not in odd states."""
     finite = True
     for name, rows in _leaves(checkup).items():
         bad = np.logical_or.reduce(~np.isfinite(rows), axis=2)
@@ -64,7 +65,7 @@ def observation_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_observation_constant(checkup: Checkup) -> Iterator[Seen]:
-    """Over random rollouts and odd states: the numbers of each leaf in which none changes."""
+    """A row for each leaf in random rollouts and odd states, with its numbers if none of them changes."""
     seen = checkup.look(odd_states)
     yield Seen(tried=len(checkup.seeds))
     for name, rows in _leaves(checkup).items():
@@ -127,10 +128,10 @@ def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_observation_huge(checkup: Checkup) -> Iterator[Seen]:
-    """Over random rollouts: a row for each leaf."""
+    """A row for each leaf in random rollouts, with the states in which it is huge."""
     for name, rows in _leaves(checkup).items():
         size = np.abs(np.nan_to_num(rows, posinf=0, neginf=0))
-        huge = size.max(axis=2) > HUGE
+        huge = size.max(axis=2) > HUGE_NUMBER
         texts: tuple[str, ...] = ()
         if huge.any():
             step, env = (int(i) for i in np.argwhere(huge)[0])
@@ -182,7 +183,7 @@ def _require_leaves(rows: Sequence[Seen]) -> None:
 
 
 def _leaves(checkup: Checkup) -> dict[str, NDArray[np.float64]]:
-    """(T + 1, K, D) of random rollouts by leaf; a flat observation is split by its names."""
+    """(T + 1, K, D) by leaf, in random rollouts; a flat observation is split by its names."""
     obs = checkup.random.obs
     names = flat_names(checkup.task, checkup.task.obs) if [*obs] == ["obs"] else None
     if names is None:
@@ -192,7 +193,7 @@ def _leaves(checkup: Checkup) -> dict[str, NDArray[np.float64]]:
 
 
 def place_of_leaf(checkup: Checkup, leaf: str) -> Place | None:
-    """Where the task makes a leaf."""
+    """The author's line that makes a leaf."""
     owner, _, name = leaf.partition("/")
     if owner == "agent":
         return checkup.places.hook("_get_obs_agent")

@@ -24,32 +24,33 @@ from workbench.envs.scene.scene_index import SceneIndex, joints_of_scene, presen
 from workbench.machine.text import listed, of
 from workbench.task.problem import TaskError
 
-DEEP = 0.002
-"""Metres that two bodies may overlap: contacts of bodies at rest are about so deep."""
-MOVED, TURNED = 0.02, 0.35
-"""Metres and radians in a second. A body that is put down 1 cm above the table may settle."""
-STARTS_MOVING = 0.01
-"""Of a velocity, in m/s or rad/s: the task wants that body to move."""
-SAGGED = {"prismatic": 0.02, "revolute": 0.1}
-"""Metres and radians in a second."""
+OVERLAP_METRES = 0.002
+"""Depth in metres that two bodies may overlap: contacts of bodies at rest are about that deep."""
+MOVED_METRES, TURNED_RADIANS = 0.02, 0.35
+"""Metres and radians that a body may move in a second: a body that is put down 1 cm above the table may settle."""
+MOVING_SPEED = 0.01
+"""Velocity in m/s or rad/s after a reset from which on the task wants the body to move."""
+SAG_LIMITS = {"prismatic": 0.02, "revolute": 0.1}
+"""Metres and radians that a joint may move in a second."""
 POSTURES = 40
-"""Random postures of each env's robot from which its reach is found."""
-REACH_MARGIN = 0.05
-"""Metres that a body's middle may be further away than the robot comes."""
-NOT_UNIT = 1e-3
+"""Number of random postures of each env's robot from which its reach is found."""
+REACH_MARGIN_METRES = 0.05
+"""Metres by which the middle of a body may be beyond the reach."""
+UNIT_TOLERANCE = 1e-3
+"""Maximum difference between the length of a quaternion and 1."""
 _CREATED = ("zeros", "ones", "rand", "randn", "randint", "empty", "full", "tile", "arange")
 _SIZED = ("repeat", "expand", "new_zeros", "new_ones", "uniform", "normal", "view", "reshape")
 _REORDERED = ("roll", "scalar_first", "wxyz", "[3, 0, 1, 2]", "xyzw")
 
 
 def see_overlaps_at_reset(checkup: Checkup) -> Iterator[Seen]:
-    """Over all seeds: a row for each pair of bodies."""
+    """A row for each pair of bodies that overlaps after a reset."""
     fixed = immovable(checkup)
     seeds_of: dict[tuple[str, str], list[int]] = {}
     depths: dict[tuple[str, str], float] = {}
     for seed, overlaps in checkup.overlaps.items():
         for overlap in overlaps:
-            if overlap.depth > DEEP and not fixed.issuperset(overlap.bodies):
+            if overlap.depth > OVERLAP_METRES and not fixed.issuperset(overlap.bodies):
                 seeds_of.setdefault(overlap.bodies, []).append(seed)
                 depths[overlap.bodies] = max(depths.get(overlap.bodies, 0), overlap.depth)
     yield Seen(tried=len(checkup.overlaps))
@@ -110,10 +111,10 @@ def overlap_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_falls_at_reset(checkup: Checkup) -> Iterator[Seen]:
-    """Over all seeds, while the robot holds still for a second."""
+    """Rows of the bodies that move while the robot holds still for a second, and of those that are left out."""
     index, still = scene_index(checkup.task.env), checkup.still
     robots = _robots(checkup)
-    # What a hand holds may slip, and what is pushed out of the robot has a rule of its own.
+    # A body in the hand may slip, and a body that is pushed out of the robot breaks another rule.
     wanted = _start_moving(checkup) | _touched(checkup, robots)
     yield from (Seen(("wanted", owner)) for owner in sorted(wanted))
     before, after = still.poses[0], still.poses[-1]
@@ -135,7 +136,7 @@ def see_falls_at_reset(checkup: Checkup) -> Iterator[Seen]:
         turned = _angle(before[:, body, 3:], after[:, body, 3:])
         # A body that an env lacks is NaN in both.
         lost = ~np.isfinite(after[:, body]).all(axis=1) & np.isfinite(before[:, body]).all(axis=1)
-        bad = (moved > MOVED) | (turned > TURNED) | lost
+        bad = (moved > MOVED_METRES) | (turned > TURNED_RADIANS) | lost
         if not bad.any():
             continue
         furthest = np.nan_to_num(np.where(bad, moved, 0), nan=np.inf)
@@ -261,9 +262,9 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _whole_batches_at(function: ast.FunctionDef, lines: Collection[int | None]) -> Iterator[ast.AST]:
-    """The calls that make a tensor of self.num_envs rows which is used in these lines, beyond its rows of ``env_idx``."""
+    """The calls that make a tensor of self.num_envs rows of which these lines use more than the rows of ``env_idx``."""
     made: dict[str, ast.AST] = {}
-    """By the local name, or the attribute of self, that such a tensor is kept in."""
+    """Local name or attribute of self to the call that made its tensor."""
     for statement in _statements(function):
         value = getattr(statement, "value", None)
         source = None if value is None else next(_uses(value, made), None)
@@ -285,15 +286,15 @@ def _statements(function: ast.FunctionDef) -> list[ast.stmt]:
 
 
 def _name_of(node: ast.AST) -> str:
-    """``p``, ``self.begun``; empty for anything else."""
+    """The name of a local variable or attribute, such as ``p`` or ``self.begun``; empty for anything else."""
     if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "self":
         return f"self.{node.attr}"
     return node.id if isinstance(node, ast.Name) else ""
 
 
 def _uses(node: ast.AST, made: Mapping[str, ast.AST]) -> Iterator[ast.AST]:
-    """Of the whole batches that a part of the source makes or names, the calls that make them; not where only rows are
-    taken."""
+    """The calls that make the whole batches which a part of the source makes or names, except where it takes only some
+    rows."""
     batches = {id(batch): batch for batch in _whole_batches(node)}
     waiting: list[ast.AST] = [node]
     while waiting:
@@ -310,7 +311,7 @@ def _uses(node: ast.AST, made: Mapping[str, ast.AST]) -> Iterator[ast.AST]:
 
 
 def _takes_rows(node: ast.Subscript) -> bool:
-    """Whether it is ``x[env_idx]``, ``x[env_idx, :2]``, ``x[mask]``; not ``x[:, :2]``, which has all rows."""
+    """Whether the index takes rows, as ``x[env_idx]``, ``x[env_idx, :2]`` and ``x[mask]`` do; ``x[:, :2]`` has all rows."""
     first = node.slice.elts[0] if isinstance(node.slice, ast.Tuple) and node.slice.elts else node.slice
     if isinstance(first, ast.Slice):
         return first.lower is not None or first.upper is not None
@@ -328,7 +329,7 @@ def _whole_batches(within: ast.AST) -> Iterator[ast.AST]:
 
 
 def _is_num_envs(node: ast.AST) -> bool:
-    """Whether it is ``self.num_envs``, or a tuple or list with it."""
+    """Whether the node is ``self.num_envs``, or a tuple or list with it."""
     if isinstance(node, (ast.Tuple, ast.List)):
         return any(_is_num_envs(item) for item in node.elts)
     return isinstance(node, ast.Attribute) and node.attr == "num_envs"
@@ -435,7 +436,7 @@ def unit_quaternion(checkup: Checkup) -> Iterator[Found | Note]:
         raise NotApplicable("its own lines set no pose")
     for name, quaternions, place in _quaternions(checkup):
         length = np.linalg.norm(quaternions, axis=1)
-        wrong = np.abs(length - 1) > NOT_UNIT
+        wrong = np.abs(length - 1) > UNIT_TOLERANCE
         if wrong.any():
             yield Found(
                 f"the quaternion of {name} has length {length[wrong][0]:.3g}: {_text(quaternions[wrong][0])}. Divide it "
@@ -445,7 +446,7 @@ def unit_quaternion(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _quaternions(checkup: Checkup) -> Iterator[tuple[str, NDArray[np.float32], Place | None]]:
-    """Name, (b, 4) and place of what the author's lines set."""
+    """Name, quaternions (b, 4) wxyz and place of each pose that the author's lines set."""
     placed = checkup.placed
     for each in checkup.builds:
         if each.place is not None and each.quaternion is not None:
@@ -456,7 +457,7 @@ def _quaternions(checkup: Checkup) -> Iterator[tuple[str, NDArray[np.float32], P
 
 
 def see_robot_holds(checkup: Checkup) -> Iterator[Seen]:
-    """Over all seeds, while the controllers are asked to hold, for a second: a row for each joint."""
+    """A row for each driven joint, while the controllers hold their pose for a second."""
     env = checkup.task.env
     if not checkup.task.parts:
         raise NotApplicable("it has no robot")
@@ -482,7 +483,7 @@ def see_robot_holds(checkup: Checkup) -> Iterator[Seen]:
             column += 1
             if owner not in robots or joint.name not in driven:
                 continue
-            bad = away > SAGGED[kind]
+            bad = away > SAG_LIMITS[kind]
             yield Seen(
                 (owner, joint.name),
                 place,
@@ -533,7 +534,7 @@ def robot_holds(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
-    """Over all seeds: how far each body is."""
+    """A row for each dynamic body, with its distance from the robot's base."""
     task = checkup.task
     robots = agents(task.env)
     if not robots:
@@ -551,7 +552,7 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
         if index.kinds[body] != "dynamic":
             continue
         distance = np.nan_to_num(np.linalg.norm(poses[:, body, :3] - base, axis=1))
-        beyond = np.flatnonzero(distance > reach + REACH_MARGIN)
+        beyond = np.flatnonzero(distance > reach + REACH_MARGIN_METRES)
         yield Seen(
             (name,),
             where_placed(checkup, name) if len(beyond) else None,
@@ -603,7 +604,7 @@ def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def _reach(checkup: Checkup, articulation: Any, tool: Any) -> tuple[NDArray[np.float32], float]:
-    """(3,) the base, and how far the tcp comes from it, from random postures within the joints' limits."""
+    """Position (3,) of the base, and the reach of the tcp in metres, from random postures within the joint limits."""
     task = checkup.task
     checkup.reset(task, next(checkup.batches()))
     limits = articulation.get_qlimits()
@@ -649,20 +650,20 @@ def _robots(checkup: Checkup) -> set[str]:
 
 
 def _start_moving(checkup: Checkup) -> set[str]:
-    """Names of what a reset gives a velocity."""
+    """Names of the bodies that a reset gives a velocity."""
     moving: set[str] = set()
     checkup.reset(checkup.task, next(checkup.batches()))
     for name, rows in present_states(checkup.task.env).items():
         rows = np.asarray(rows)
         joints = (rows.shape[1] - 13) // 2
         speeds = np.concatenate([rows[:, 7:13], rows[:, 13 + joints :]], axis=1)
-        if (np.abs(np.nan_to_num(speeds)) > STARTS_MOVING).any():
+        if (np.abs(np.nan_to_num(speeds)) > MOVING_SPEED).any():
             moving.add(name.split("/", 1)[1])
     return moving
 
 
 def _touched(checkup: Checkup, robots: set[str]) -> set[str]:
-    """Names of what touches a robot after the reset of some seed."""
+    """Names of the bodies that touch a robot after the reset of some seed."""
     pairs = [
         [body.split("/", 1)[0] for body in overlap.bodies]
         for overlaps in checkup.overlaps.values()
@@ -677,7 +678,8 @@ def _is_fixed(articulation: Any) -> bool:
 
 
 def immovable(checkup: Checkup) -> set[str]:
-    """Bodies that no contact moves: static and kinematic ones, and links between which and a fixed root no joint is."""
+    """Names of the bodies that no contact moves: static and kinematic bodies, and links without a joint between them and a
+    fixed root."""
     index: SceneIndex = scene_index(checkup.task.env)
     found = {
         name for name, kind in zip(index.names, index.kinds, strict=True) if kind in ("static", "kinematic")

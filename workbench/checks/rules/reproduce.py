@@ -22,18 +22,19 @@ from workbench.envs.task_env import TaskEnv
 from workbench.machine.text import listed
 from workbench.task.blame import blamed
 
-ROUNDS = 6
-"""Partial resets, with a step between them."""
+PARTIAL_RESETS = 6
+"""Number of partial resets, with a step between them."""
 REPLAYED_STEPS = 10
-SAME = 1e-4
-"""Largest difference of two numbers that are equal: poses come back rounded."""
-RESTORED = 1e-3
-"""The same after a state dict, whose link poses are computed from joints again; of larger numbers, relative."""
+"""Number of steps that are made twice."""
+SAME_TOLERANCE = 1e-4
+"""Maximum difference of two numbers that count as equal: poses come back rounded."""
+RESTORED_TOLERANCE = 1e-3
+"""Maximum difference after a state dict is restored, which computes link poses from joints; relative for numbers above 1."""
 _RESET_HOOKS = ("_initialize_episode", "reset")
 _RESULT_HOOKS = ("evaluate", "_get_obs_extra", "_get_obs_agent", "get_info", "get_obs")
-"""They give what a reset returns."""
+"""Hooks that make the result of a reset."""
 Numbers = dict[str, NDArray[np.float64]]
-"""(N, ...) by name."""
+"""Arrays (N, ...) by name."""
 
 
 @rule("runs", "stop", "_initialize_episode")
@@ -65,7 +66,7 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
     task, rng = checkup.task, np.random.default_rng(1)
     every = range(checkup.num_envs)
     checkup.reset(task, None)
-    for turn in range(ROUNDS):
+    for turn in range(PARTIAL_RESETS):
         count = int(rng.integers(1, checkup.num_envs + 1))
         chosen = sorted(int(i) for i in rng.choice(every, count, replace=False))
         checkup.reset(task, None if turn % 2 else [1000 * turn + i for i in chosen], chosen)
@@ -115,10 +116,10 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     if checkup.num_envs > 1:
         checkup.reset(task, None, [checkup.num_envs - 1])
     again = _seen(task, checkup.reset(task, seeds))
-    differing = _differing(first, again, SAME)
+    differing = _differing(first, again, SAME_TOLERANCE)
     if differing:
         drawn = first_draw(checkup.places, global_draw, *_RESET_HOOKS, *_RESULT_HOOKS)
-        # Within the reset torch is seeded, and what comes of its result is asked for after it.
+        # torch is seeded within the reset; the hooks of its result run after it.
         drawn = drawn or first_draw(checkup.places, torch_draw, *_RESULT_HOOKS)
         place, called = drawn or (checkup.places.hook("_initialize_episode"), "")
         yield Found(
@@ -177,17 +178,17 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
             state = _copied(task.env.get_state_dict())
             before = _rescored(task)
             noisy = _differing(before, _rescored(task), 0)
-            # Only the simulation was elsewhere, not the task: velocities of links, say, come back otherwise.
+            # Only the simulation moves away and back here: numbers that differ now, such as velocities of links, are noise.
             for each in (elsewhere, state):
                 task.env.set_state_dict(each)
                 apply_and_fetch(task.env)
-            noisy |= _differing(before, _rescored(task), RESTORED)
+            noisy |= _differing(before, _rescored(task), RESTORED_TOLERANCE)
         checkup.reset(task, others)
         with blamed("reset", checkup.loaded, task):
             task.env.set_state_dict(state)
             apply_and_fetch(task.env)
             after = _rescored(task)
-    differing = _differing(before, after, RESTORED)
+    differing = _differing(before, after, RESTORED_TOLERANCE)
     lost = {name: by for name, by in differing.items() if name not in noisy}
     if lost:
         yield Found(
@@ -230,7 +231,7 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
         raise NotApplicable("it takes no actions")
     first, second = (_episode(checkup, task, seeds) for _ in range(2))
     for step, (one, other) in enumerate(zip(first, second, strict=True)):
-        if not (differing := _differing(one, other, SAME)):
+        if not (differing := _differing(one, other, SAME_TOLERANCE)):
             continue
         if step == 0:
             raise NotKnown("the same seed gives another start")
@@ -319,13 +320,13 @@ def _of_result(result: StepResult) -> Numbers:
 def _rescored(task: TaskEnv) -> Numbers:
     """Reward, evaluate() and observation of the present state, for an action of zeros."""
     action = np.zeros((task.num_envs, sum(len(part.names) for part in task.parts)), np.float32)
-    # Of a task without a reward, it would raise.
+    # The reward of a task without one would raise.
     result = task.rescore(None if task.env.reward_mode == "none" else action)
     return {**_of_result(result), **_observed(task)}
 
 
 def _observed(task: TaskEnv) -> Numbers:
-    """The leaves of the observation, of a flat one too."""
+    """The leaves of the observation; a flat one is split by its names."""
     found: Numbers = {}
     for name, value in read_obs(task).items():
         names = flat_names(task, task.obs) if name == "obs" else None
@@ -345,7 +346,7 @@ def _episode(checkup: Checkup, task: TaskEnv, seeds: list[int]) -> list[Numbers]
 
 
 def _differing(one: Numbers, other: Numbers, tolerance: float) -> dict[str, float]:
-    """By how much at most, of what differs. Infinite where shapes differ."""
+    """Largest difference by name of the numbers that differ; infinite if their shapes differ."""
     found: dict[str, float] = {}
     for name in one.keys() & other.keys():
         a, b = one[name], other[name]

@@ -21,20 +21,21 @@ from workbench.envs.outliers import REWARD_RANGES, ROUNDING
 from workbench.machine.text import of
 
 REWARD_HOOKS = {**DENSE_HOOKS, "sparse": "compute_sparse_reward"}
-LARGEST = 1.0 + 1e-4
-"""Of a normalized reward, with room for rounding."""
-ALL_THERE_IS = 0.999
-"""A normalized reward from here on counts as the largest."""
-SAME_RATIO = 1e-3
-"""Largest difference from the dense reward over a constant, as a share of the largest normalized reward."""
-TELLING = 0.05
-"""The ratio is taken where the dense reward has this share of its largest, since rounding decides it near 0."""
-CLEARLY_LOWER = 0.05
-"""As a share of all rewards' range."""
+"""Hook of each reward mode."""
+MAX_NORMALIZED = 1.0 + 1e-4
+"""Maximum of a normalized reward, with room for rounding."""
+FULL_REWARD = 0.999
+"""Normalized reward from which on it counts as the largest."""
+RATIO_TOLERANCE = 1e-3
+"""Maximum difference from the dense reward over a constant, as a share of the largest normalized reward."""
+RATIO_SHARE = 0.05
+"""Share of the largest dense reward from which on the ratio is taken, since rounding decides it near 0."""
+CLEARLY_LOWER_SHARE = 0.05
+"""Difference of rewards, as a share of the range of all rewards, from which on it counts."""
 
 
 def see_reward_finite(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts, up to the kind with a breach; else over odd states."""
+    """A row for each kind of rollouts up to the first breach; without one, a row for the odd states."""
     _require_reward(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     for episodes in checkup.rollouts:
@@ -75,7 +76,7 @@ def reward_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_reward_changes(checkup: Checkup) -> Iterator[Seen]:
-    """Over random rollouts: the largest and the smallest."""
+    """One row: the largest and the smallest reward of random rollouts."""
     _require_dense(checkup)
     reward = _rewards(checkup, checkup.random)
     known = np.nan_to_num(reward)
@@ -119,8 +120,8 @@ def reward_changes(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_reward_normalized(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts, where the reward is the normalized or the sparse one, up to the kind with a breach; then over the odd
-    states with success."""
+    """A row for each kind of rollouts up to the first breach; without one, a row for the odd states with success. For a
+    normalized or sparse reward only."""
     mode = checkup.task.env.reward_mode
     if mode not in REWARD_RANGES:
         raise NotApplicable("its reward is neither normalized nor sparse")
@@ -183,7 +184,7 @@ def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def paid_at_success(seen: OddStates, mode: str) -> float | None:
-    """What the reward is wherever evaluate() reports success, as far as it is one number; None if that is not so."""
+    """The reward at success if it is the same number in all states; else None."""
     told = np.concatenate([*seen.told.get(mode, ()), np.zeros(0)])
     if not len(told) or not np.isfinite(told).all() or np.ptp(told) > ROUNDING:
         return None
@@ -222,12 +223,12 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
     )
     finite = np.isfinite(dense) & np.isfinite(normalized)
     size = float(np.abs(dense[finite]).max(initial=0))
-    telling = finite & (np.abs(dense) > TELLING * size)
+    telling = finite & (np.abs(dense) > RATIO_SHARE * size)
     if not telling.any():
         raise NotKnown("its dense reward is 0 or not finite in all states that were tried")
     constant = float(np.median(normalized[telling] / dense[telling]))
     wrong = np.abs(normalized - constant * dense)
-    off = finite & (wrong > SAME_RATIO * np.abs(normalized[finite]).max())
+    off = finite & (wrong > RATIO_TOLERANCE * np.abs(normalized[finite]).max())
     if off.any() and (line := _straight_line(dense[finite], normalized[finite])) is not None:
         yield Note(f"the normalized reward is the dense one times {line[0]:.4g} plus {line[1]:.4g}")
     elif off.any():
@@ -242,17 +243,17 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] | None:
-    """Slope and offset with which the dense reward becomes the normalized one; None if it is no rising line."""
+    """Slope and offset of the line from the dense to the normalized reward; None if it is no rising line."""
     if np.ptp(dense) == 0:
         return None
     slope, offset = (float(number) for number in np.polyfit(dense, normalized, 1))
     wrong = np.abs(slope * dense + offset - normalized).max()
-    return (slope, offset) if slope > 0 and wrong <= SAME_RATIO * np.abs(normalized).max() else None
+    return (slope, offset) if slope > 0 and wrong <= RATIO_TOLERANCE * np.abs(normalized).max() else None
 
 
 def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts and odd states: a row for each episode that has success and a higher reward elsewhere; and one for what
-    is paid at success, where that is one number."""
+    """A row for each episode, in rollouts and odd states, that has success and a higher reward elsewhere; and one for the reward
+    at success, if that is one number."""
     _require_dense(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     every = _scored(checkup)
@@ -329,7 +330,7 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     for row in rows:
         if row.names[0] == "episode":
             at_success, elsewhere = row.numbers
-            if elsewhere > at_success + CLEARLY_LOWER * ranges[row.names[1]]:
+            if elsewhere > at_success + CLEARLY_LOWER_SHARE * ranges[row.names[1]]:
                 lower.append((elsewhere - at_success, at_success, elsewhere, row.texts[0]))
                 place = row.place
     advice = 'Give success the most: `reward[info["success"]] = LARGEST_REWARD`.'
@@ -345,7 +346,7 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     for row in rows:
         if row.names == ("paid",):
             paid, elsewhere, least, most = row.numbers
-            if elsewhere > paid + CLEARLY_LOWER * (most - least):
+            if elsewhere > paid + CLEARLY_LOWER_SHARE * (most - least):
                 yield Found(
                     f'the reward is {paid:.4g} wherever info["success"] is true, and {elsewhere:.4g} without success '
                     f"({row.texts[0]}). {advice}",
@@ -357,11 +358,11 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_reward_needs_success(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts and odd states, where the reward is the normalized one."""
+    """A row for each kind of rollouts and each batch of odd states. For a normalized reward only."""
     if checkup.task.env.reward_mode != "normalized_dense":
         raise NotApplicable("its reward is not the normalized dense one")
     for scored in _scored(checkup):
-        most = (scored.reward >= ALL_THERE_IS) & ~scored.success
+        most = (scored.reward >= FULL_REWARD) & ~scored.success
         tried = sum(scored.tried(column) for column in range(scored.reward.shape[1]))
         places = [scored.where(int(row), int(column)) for row, column in np.argwhere(most)[:1]]
         yield Seen(
@@ -398,7 +399,7 @@ def reward_needs_success(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     a normalized reward or an entry `success`. It is *not known* if the reward goes beyond 1, or if no episode
     or state that was tried succeeds, since the rule then did not see what is paid near success.
     """
-    if any(row.size > LARGEST for row in rows):
+    if any(row.size > MAX_NORMALIZED for row in rows):
         raise NotKnown("its normalized reward goes beyond 1")
     given, places = sum(row.count for row in rows), [text for row in rows for text in row.texts]
     if given:
@@ -424,14 +425,14 @@ class _Scored:
     success: NDArray[np.bool_]
     """(T, K)"""
     places: list[list[str]]
-    """(1, K) or (T, K) which state that is, for a sentence."""
+    """(1, K) or (T, K) description of each state, for a sentence."""
     of: str
     """The kind of episodes, or which odd states."""
     short: NDArray[np.bool_] | None = None
-    """(T,) the odd states that are short of a success; None for episodes, which come there by steps."""
+    """(T,) whether an odd state is short of a success; None for episodes, which reach success by steps."""
 
     def tried(self, column: int) -> bool:
-        """Whether an episode has a success, and states without one that are near it."""
+        """Whether an episode has a success, and states near it without success."""
         success = self.success[:, column]
         near = success if self.short is None else success[self.short]
         return bool(success.any()) and not bool(near.all())
@@ -443,7 +444,7 @@ class _Scored:
 
 
 def _scored(checkup: Checkup) -> list[_Scored]:
-    """Of all rollouts, then of the odd states of each batch."""
+    """Rewards and success of all rollouts, then of the odd states of each batch."""
     found: list[_Scored] = []
     for episodes in checkup.rollouts:
         rewards = np.nan_to_num(_rewards(checkup, episodes))
@@ -471,7 +472,7 @@ def _scored(checkup: Checkup) -> list[_Scored]:
 
 
 def _rewards(checkup: Checkup, episodes: Episodes) -> NDArray:
-    """(T, K)"""
+    """(T, K). Raises NotApplicable without a reward, and NotKnown without a step."""
     _require_reward(checkup)
     if not episodes.reward.size:
         raise NotKnown("no step was made")
@@ -490,6 +491,6 @@ def _require_dense(checkup: Checkup) -> None:
 
 
 def _hooks(checkup: Checkup) -> tuple[str, ...]:
-    """The hooks that make the present reward, as a person would look for them."""
+    """The hooks that make the present reward, in the order in which a person would look for them."""
     mode = checkup.task.env.reward_mode
     return ("compute_dense_reward", REWARD_HOOKS[mode]) if "dense" in mode else (REWARD_HOOKS[mode],)

@@ -24,13 +24,15 @@ from workbench.envs.scene.scene_index import scene_index
 from workbench.envs.simulation.hiding import why_not_hidden
 from workbench.machine.text import listed
 
-DEEP_AT_LOAD = 0.005
-"""Metres."""
-MOST_LINKS = 64
-MOST_TRIANGLES = 100_000
+OVERLAP_METRES = 0.005
+"""Depth in metres from which on an overlap counts."""
+MAX_LINKS = 64
+"""Maximum number of links of an articulation in PhysX on the GPU."""
+MAX_TRIANGLES = 100_000
+"""Maximum number of triangles of a drawn mesh."""
 _RESETS = ("_initialize_episode", "_load_scene", "_load_agent", "set_state_dict", "set_state")
-STILL = 1e-5
-"""Metres, and numbers of a quaternion."""
+STILL_TOLERANCE = 1e-5
+"""Maximum difference of poses that count as equal, in metres and numbers of a quaternion."""
 
 
 @rule("robot-pose", "warn", "_load_agent")
@@ -115,8 +117,8 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _is_unposed(checkup: Checkup, each: Built) -> bool:
-    """Whether it should have an initial pose and has none. What stays at the origin is where it belongs, and a kinematic body
-    harms only what it is inside of."""
+    """Whether a body should have an initial pose and has none. A body that stays at the origin needs none, and a kinematic body
+    harms only a body that it is inside of."""
     if each.quaternion is not None or each.kind == "static":
         return False
     if each.kind == "kinematic" and each.name not in _inside_others(checkup):
@@ -125,7 +127,7 @@ def _is_unposed(checkup: Checkup, each: Built) -> bool:
 
 
 def _stay_at_origin(checkup: Checkup) -> set[str]:
-    """Evidence: names of what no contact moves, and that is at the origin after a reset."""
+    """Evidence: names of the bodies that no contact moves and that are at the origin after a reset."""
     task = checkup.task
     checkup.reset(task, next(checkup.batches()))
     index, fixed = scene_index(task.env), immovable(checkup)
@@ -135,12 +137,13 @@ def _stay_at_origin(checkup: Checkup) -> set[str]:
     return {
         name
         for name, struct in structs.items()
-        if name not in moved and (np.abs(struct.pose.raw_pose.numpy(force=True) - origin) < STILL).all()
+        if name not in moved
+        and (np.abs(struct.pose.raw_pose.numpy(force=True) - origin) < STILL_TOLERANCE).all()
     }
 
 
 def _inside_others(checkup: Checkup) -> set[str]:
-    """Names of the bodies that are built inside others, and of the parts of what they were merged to."""
+    """Names of the bodies that are built inside others, and of the parts of merged bodies among them."""
     names = {body.split("/", 1)[0] for overlap in checkup.alone.overlaps for body in overlap.bodies}
     return names.union(*(merge.parts for merge in _merges(checkup) if merge.name in names))
 
@@ -175,14 +178,14 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     bodies of other envs that are built with other shapes.
     """
     builds = _builds(checkup)
-    # Those have a rule of their own.
+    # The rule initial-pose reports these.
     unposed = {each.name for each in builds if _is_unposed(checkup, each)}
     unposed |= {str(merge.name) for merge in _merges(checkup) if not unposed.isdisjoint(merge.parts)}
     places = {each.name: each.place for each in builds}
     fixed = immovable(checkup)
     for overlap in checkup.alone.overlaps:
         owners = [body.split("/", 1)[0] for body in overlap.bodies]
-        harmless = overlap.depth < DEEP_AT_LOAD or fixed.issuperset(overlap.bodies)
+        harmless = overlap.depth < OVERLAP_METRES or fixed.issuperset(overlap.bodies)
         if harmless or not unposed.isdisjoint(owners):
             continue
         own = [places[owner] for owner in owners if places.get(owner) is not None]
@@ -195,7 +198,8 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def see_kinematic_never_moved(checkup: Checkup) -> Iterator[Seen]:
-    """Over the resets of all seeds and random episodes, where no hook of a step sets a pose: it may do so later."""
+    """A row for each kinematic body, with the range of its pose over resets and random episodes. Raises NotKnown if a hook of a
+    step sets a pose, which it may do later."""
     if any(
         _sets_a_pose(function) for _, function in checkup.places.functions() if function.name not in _RESETS
     ):
@@ -242,7 +246,7 @@ def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     for row in together(rows):
         ends = np.array([one.numbers for one in rows if one.names == row.names])
         apart = ends[:, :7].max(axis=0) - ends[:, 7:].min(axis=0)
-        if not (np.nan_to_num(apart) > STILL).any():
+        if not (np.nan_to_num(apart) > STILL_TOLERANCE).any():
             still.setdefault(row.place, []).append(row.names[0])
     for place, names in still.items():
         yield Found(
@@ -320,7 +324,7 @@ def too_many_links(checkup: Checkup) -> Iterator[Found | Note]:
     if not checkup.task.env.scene.articulations:
         raise NotApplicable("it has no articulation")
     for name, articulation in checkup.task.env.scene.articulations.items():
-        if (count := len(articulation.links)) > MOST_LINKS:
+        if (count := len(articulation.links)) > MAX_LINKS:
             yield Found(
                 f"{name} has {count} links. Join those with fixed joints between them, or divide it.",
                 places.get(name) or checkup.places.hook("_load_agent", "_load_scene"),
@@ -444,9 +448,9 @@ def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
         raise NotApplicable("no body of its own is drawn from a mesh file")
     unknown: list[str] = []
     for file, each in files.items():
-        if (count := triangles_in(file, MOST_TRIANGLES)) is None:
+        if (count := triangles_in(file, MAX_TRIANGLES)) is None:
             unknown.append(Path(file).name)
-        elif count > MOST_TRIANGLES:
+        elif count > MAX_TRIANGLES:
             yield Found(
                 f"{each.name} is drawn with {count:,} triangles ({Path(file).name}). Reduce the mesh "
                 "(trimesh: mesh.simplify_quadric_decimation(face_count=20_000)).",
@@ -518,7 +522,7 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
             )
             return
     if not partial:
-        # One that stands in each env alone has as many rows then as all others.
+        # With one env each body has as many rows as there are envs.
         checkup.require_several()
 
 
@@ -582,12 +586,12 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _name_on(env: Any, thing: Any) -> str:
-    """``self.goal`` of what the task keeps as that; empty if it does not."""
+    """The attribute that holds a body, such as ``self.goal``; empty if none does."""
     return next((f"self.{name}" for name, value in vars(env).items() if value is thing), "")
 
 
 def _hiding_line(checkup: Checkup, thing: Any) -> Place | None:
-    """The line that puts it into ``_hidden_objects``: one that names it, else the first."""
+    """The line that puts a body into ``_hidden_objects``: one that names the body, else the first."""
     name = _name_on(checkup.task.env, thing)
     lines = [
         (name != "" and name in ast.unparse(statement), module.place(statement))
@@ -642,7 +646,7 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def see_env_spacing(checkup: Checkup) -> Iterator[Seen]:
-    """Over the resets of all seeds and random episodes: a row for each body that comes too far."""
+    """A row for each body that leaves its env's space in resets and random episodes."""
     index, half = scene_index(checkup.task.env), checkup.task.env.sim_config.spacing / 2
     moving = [i for i, kind in enumerate(index.kinds) if kind in ("dynamic", "link") and not index.hidden[i]]
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])[:, :, moving]
@@ -698,7 +702,7 @@ def env_spacing(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def _sets_a_pose(function: ast.FunctionDef) -> bool:
-    """Whether it calls set_pose or set_state, or assigns a pose."""
+    """Whether a function calls set_pose or set_state, or assigns a pose."""
     for node in ast.walk(function):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             if node.func.attr in ("set_pose", "set_state", "set_state_dict"):
@@ -728,7 +732,7 @@ def _merges(checkup: Checkup) -> list:
 
 
 def _own(checkup: Checkup) -> Iterator[Built]:
-    """What the author's files build, of bodies of one kind for each env only the first; without robots."""
+    """Bodies that the author's files build, without robots; of a body that is built for each env only the first."""
     lines = set()
     for each in _builds(checkup):
         if each.place is not None and not each.of_robot and (each.place, each.name) not in lines:

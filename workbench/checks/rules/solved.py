@@ -17,14 +17,14 @@ from workbench.planning.verdicts import ENOUGH_SEEDS, MOST_OF, PlannedEpisodes
 from workbench.planning.verdicts import RULES as VERDICTS
 from workbench.task.blame import blamed
 
-SEEDS = ENOUGH_SEEDS
-"""Most seeds that are solved: each takes seconds."""
-STEPS = 200
-"""Of an episode whose task has no time limit."""
-AFTER_SUCCESS = 5
-"""Control steps that an episode goes on after its success."""
-_OF_SUCCESS = {"reward-exploited": 1, "reward-stuck": 0, "reward-against": MOST_OF, "success-lost": MOST_OF}
-"""Rules that speak of success, with the fewest solved seeds from which on it says something that they are not broken."""
+MAX_SEEDS = ENOUGH_SEEDS
+"""Maximum number of seeds that are planned: each takes seconds."""
+STEPS_WITHOUT_LIMIT = 200
+"""Maximum number of control steps of an episode whose task has no time limit."""
+STEPS_AFTER_SUCCESS = 5
+"""Number of control steps that an episode goes on after its success."""
+_MIN_SOLVED = {"reward-exploited": 1, "reward-stuck": 0, "reward-against": MOST_OF, "success-lost": MOST_OF}
+"""Rules about success, with the minimum number of solved seeds that shows that they are kept."""
 
 
 @rule("reward-exploited", "warn", "compute_dense_reward", solve=True)
@@ -209,7 +209,7 @@ def _verdict(checkup: Checkup, rule_id: str, hook: str) -> Iterator[Found | Note
 
 
 def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
-    """The first seeds, each to its success, its fail or the end of its time.
+    """Evidence for `Checkup.look`: episodes of the first seeds, each to its success, its fail or its time limit.
 
     Raises:
         NotApplicable, NotKnown: nothing can be planned.
@@ -228,7 +228,7 @@ def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
         with blamed("build", checkup.loaded):
             planner = Planner(live.env, made_with=made_with)  # type: ignore[arg-type]
         try:
-            for seed in checkup.seeds[:SEEDS]:
+            for seed in checkup.seeds[:MAX_SEEDS]:
                 found.append(_solved(checkup, live, planner, seed))
         finally:
             with blamed("step", checkup.loaded):
@@ -245,7 +245,7 @@ def _solved(checkup: Checkup, live: TaskEnv, planner: Planner, seed: int) -> Pla
     except NotAlike as error:
         raise NotKnown(str(error)) from error
     after = 0
-    for _ in range(live.max_episode_steps or STEPS):
+    for _ in range(live.max_episode_steps or STEPS_WITHOUT_LIMIT):
         with blamed("step", checkup.loaded, rolled):
             action = planner.flat_actions([0])
         log.add_plan(planner.plans[0])
@@ -253,19 +253,19 @@ def _solved(checkup: Checkup, live: TaskEnv, planner: Planner, seed: int) -> Pla
         log.add_step(step, 0)
         success, fail = (bool(step.evaluate.get(name, np.zeros(1))[0]) for name in ("success", "fail"))
         after += success or after > 0
-        if fail or after > AFTER_SUCCESS:
+        if fail or after > STEPS_AFTER_SUCCESS:
             break
     return log.episode()
 
 
 def _require_tried(rule_id: str, episodes: PlannedEpisodes) -> None:
-    """Raise NotApplicable or NotKnown where no verdict says nothing."""
+    """Raise NotApplicable or NotKnown if the episodes do not show that the rule is kept."""
     entries = {name for one in episodes.all for name in one.evaluate}
-    if rule_id in _OF_SUCCESS and "success" not in entries:
+    if rule_id in _MIN_SOLVED and "success" not in entries:
         raise NotApplicable("evaluate() has no entry success")
     if rule_id == "failing-pays" and "fail" not in entries:
         raise NotApplicable("evaluate() has no entry fail")
     if len(episodes.all) < ENOUGH_SEEDS:
         raise NotKnown(f"fewer than {ENOUGH_SEEDS} seeds were planned")
-    if len(episodes.solved) < _OF_SUCCESS.get(rule_id, 0):
+    if len(episodes.solved) < _MIN_SOLVED.get(rule_id, 0):
         raise NotKnown(f"planning solved {len(episodes.solved)} of {len(episodes.all)} seeds")

@@ -26,8 +26,9 @@ from workbench.task import registry
 HOOKS = tuple(
     name for name, member in vars(BaseEnv).items() if callable(member) or isinstance(member, property)
 )
+"""All methods and properties of BaseEnv."""
 AT_RESETS = ("_initialize_episode", "reset", *EVERY_STEP)
-"""Hooks that run after the GPU's simulation has begun."""
+"""Hooks that run after the GPU simulation has begun."""
 _BUILDERS = {"create_actor_builder": ActorBuilder, "create_articulation_builder": ArticulationBuilder}
 _GPU_CALLS = {"_gpu_apply_all", "_gpu_fetch_all"}
 _STATE = re.compile(r"(get_|set_)?(\w+_)?(pose|qpos|qvel|velocity|global_pose)$")
@@ -473,7 +474,7 @@ def _decorator(checkup: Checkup) -> Place | None:
 
 
 def _class_value(checkup: Checkup, name: str) -> Place | None:
-    """Where the class, or one that it inherits in the author's files, assigns this; else the class."""
+    """The line of the class, or of a base class in the author's files, that assigns this name; else the class."""
     owner = next((cls for cls in checkup.loaded.cls.__mro__ if name in vars(cls)), None)
     if owner is not None and (found := checkup.places.class_definition(owner)) is not None:
         module, node = found
@@ -493,7 +494,7 @@ def _as_tuple(robot: Any) -> Any:
 
 
 def _implemented(cls: type[BaseEnv]) -> tuple[str, ...]:
-    """Those of its reward modes that it has."""
+    """The declared reward modes that the class has methods for."""
     have = [
         mode
         for mode in cls.SUPPORTED_REWARD_MODES
@@ -521,8 +522,8 @@ def _builders(function: ast.FunctionDef) -> dict[str, set[str]]:
 
 
 def _names_of(checkup: Checkup, cls: type) -> set[str]:
-    """All names that an object of this class may have: of its classes, those that the author's files assign or ask for
-    by ``hasattr``, and those that code outside these files reads or sets."""
+    """All names that an object of this class may have: those of its classes, those that the author's files assign or name in a
+    string, and those that code outside these files reads or sets."""
     own = {module.file for module in checkup.places.modules}
     names = set(dir(cls))
     for module in checkup.places.modules:
@@ -543,7 +544,7 @@ def _names_of(checkup: Checkup, cls: type) -> set[str]:
 
 
 def _guarded(body: list[ast.stmt]) -> Iterator[ast.AST]:
-    """What stands behind a condition about the backend, in these statements and below."""
+    """The nodes behind a condition about the backend, in these statements and below."""
     behind = False
     for statement in body:
         if behind:
@@ -576,7 +577,7 @@ def _ends_in(node: ast.expr, name: str) -> bool:
 
 
 def _is_one_object(node: ast.expr) -> bool:
-    """``self.cube._objs[0]``."""
+    """Whether the expression is one SAPIEN object, such as ``self.cube._objs[0]``."""
     return isinstance(node, ast.Subscript) and (
         _ends_in(node.value, "_objs") or _ends_in(node.value, "_bodies")
     )

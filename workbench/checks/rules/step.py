@@ -15,7 +15,7 @@ from workbench.machine.text import listed, of
 
 
 def see_bodies_stay(checkup: Checkup) -> Iterator[Seen]:
-    """Over random rollouts, each until its end."""
+    """A row for each body that leaves the scene before the end of a random rollout."""
     rollouts = checkup.random
     of_owner: dict[str, list[SeenOutlier]] = {}
     for seen in sorted(rollouts.outliers, key=lambda seen: (seen.step, seen.seed)):

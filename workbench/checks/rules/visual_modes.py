@@ -25,12 +25,12 @@ from workbench.episodes.recorded_state import read_states
 from workbench.machine.text import listed
 from workbench.task.blame import blamed
 
-MOVED = np.array([0.031, -0.043, 0.057], np.float32)
-"""Metres by which a body is moved, to see which numbers follow."""
-FOLLOWS = 1e-5
-"""Least change of a number that follows."""
-MOST_BODIES = 40
-"""Bodies that are moved one after the other."""
+SHIFT_METRES = np.array([0.031, -0.043, 0.057], np.float32)
+"""Offset in metres by which a body is moved, to see which numbers follow."""
+MIN_CHANGE = 1e-5
+"""Minimum change of a number that follows the body."""
+MAX_BODIES = 40
+"""Maximum number of bodies that are moved, one after the other."""
 
 
 @rule("ground-truth", "warn", "_get_obs_extra")
@@ -80,8 +80,8 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _require_all_moved(checkup: Checkup) -> None:
-    if (count := len(scene_index(checkup.pictured.env).states)) > MOST_BODIES:
-        raise NotKnown(f"{MOST_BODIES} of {count} bodies were looked at")
+    if (count := len(scene_index(checkup.pictured.env).states)) > MAX_BODIES:
+        raise NotKnown(f"{MAX_BODIES} of {count} bodies were looked at")
 
 
 @rule("hidden-goal", "warn", "_get_obs_extra")
@@ -129,7 +129,7 @@ def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
 
 @dataclass
 class Followers:
-    """What changes with the place of one body, and nothing else."""
+    """The numbers that change with the place of one body."""
 
     hidden: bool
     """Whether the task hides the body from pictures."""
@@ -153,13 +153,13 @@ def followers(checkup: Checkup) -> dict[str, Followers]:
         before = _ask(checkup, task)
         again = _ask(checkup, task)
         restless = _changed(before, again)
-        for name, struct in [*index.states.items()][:MOST_BODIES]:
+        for name, struct in [*index.states.items()][:MAX_BODIES]:
             kind, _, body = name.partition("/")
             free = body not in robots if kind == "articulations" else struct.px_body_type == "dynamic"
             if not (free or body in hidden) or np.isnan(begun[name]).any():
                 continue
             states = {other: rows.copy() for other, rows in begun.items()}
-            states[name][:, :3] += MOVED
+            states[name][:, :3] += SHIFT_METRES
             if kind == "articulations":
                 joints = (states[name].shape[1] - BODY) // 2
                 states[name][:, BODY : BODY + joints] += 0.02
@@ -197,5 +197,5 @@ def _changed(before: dict[str, NDArray[np.float64]], now: dict[str, NDArray[np.f
         for name, rows in now.items()
         if name in before
         and rows.shape == before[name].shape
-        and np.abs(np.nan_to_num(rows) - np.nan_to_num(before[name])).max(initial=0) > FOLLOWS
+        and np.abs(np.nan_to_num(rows) - np.nan_to_num(before[name])).max(initial=0) > MIN_CHANGE
     }
