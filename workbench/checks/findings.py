@@ -48,7 +48,7 @@ class Card:
 
     @property
     def silence(self) -> str:
-        """The comment that silences it; without a reason after it it silences nothing."""
+        """The comment that silences the rule, up to the reason, which the author has to add."""
         return f"# workbench: off[{self.rule.id}] "
 
 
@@ -109,7 +109,7 @@ class Undecided:
 
 
 def undecided(results: Iterable[RuleResult]) -> list[Undecided]:
-    """What is not known, then what is not applicable, by reason."""
+    """Rules that are not known, then rules that are not applicable, grouped by reason."""
     found: dict[tuple[State, str], list[str]] = {}
     for state in _UNDECIDED:
         for result in results:

@@ -46,7 +46,7 @@ class CheckReport:
     ignored: tuple[str, ...] = ()
     """Rules that would have been checked without `CheckOptions.ignore`."""
     comments: tuple[Comment, ...] = ()
-    """Silencing comments that silence nothing."""
+    """Silencing comments without effect."""
     missing: int = 0
     """Number of rules that were not checked, counted for each part of the seeds."""
 

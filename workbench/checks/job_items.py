@@ -18,7 +18,7 @@ SEEDS_OF_PART = 32
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """What to check, and how."""
+    """Options of a check."""
 
     task: str
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=8))
@@ -81,7 +81,7 @@ def groups_of(degrees: Mapping[str, Degree]) -> list[RuleGroup]:
         RuleGroup(group.name, {rule: check for rule, check in group.checks.items() if degrees[rule] != "off"})
         for group in GROUPS
     ]
-    # Whether the task runs is known from the last one too.
+    # The last group also shows whether the task runs.
     core = [GPU_SIMULATION] if gpu_rules_of(degrees) or degrees["runs"] != "off" else []
     return [*(group for group in groups if group.checks), *core]
 

@@ -1,4 +1,4 @@
-"""One process of a check: runs the rules that it is dealt, on an env of its own."""
+"""One process of a check: runs the rules of its chunks on separate envs."""
 
 from __future__ import annotations
 

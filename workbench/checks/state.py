@@ -27,7 +27,7 @@ AHEAD_SECONDS = 2.0
 """Seconds of checking at low priority; then at the lowest, since a person waits more for the rescored history than
 for the last rule."""
 MAX_DEATHS = 5
-"""Most processes that may die in one check; the rule that was running fails, and the next process checks the others."""
+"""Maximum number of processes that may die in one check; the running rule fails, and the next process checks the others."""
 ChecksState = Literal["none", "off", "loading", "checking", "done", "stopped", "failed"]
 RUNNING: tuple[ChecksState, ...] = ("loading", "checking")
 DOES: frozenset[type[Command]] = frozenset({CheckNow, StopChecks, CheckAfterSave})
@@ -56,7 +56,7 @@ class ChecksView:
     why: str = ""
     """Why the check stopped or failed, as text."""
     problem: Problem | None = None
-    """What the code raised when it was loaded."""
+    """The error that the code raised when it was loaded."""
     seconds: float = 0.0
     """Seconds since the version was loaded in the background process."""
     after_each_save: bool = True
@@ -318,7 +318,7 @@ class CheckJobs:
                 deaths += 1
                 if began is None or deaths > MAX_DEATHS:
                     raise
-                # What it was at fails, and the rest is asked of another process.
+                # The running rule fails, and another process checks the rest.
                 problem = Problem("worker", str(died), None, None, None, "")
                 rules = gpu_rules_of(degrees) if under_way == "" else filter(None, [under_way])
                 for rule in rules:
@@ -354,7 +354,7 @@ async def load_version(process: Background, job: Job, load: Load) -> None:
 
 
 def _still_there(finding: Finding, source: Mapping[str, str] | None) -> bool:
-    """Whether the line that it is about stands in this version; true where it is about none."""
+    """Whether the line of the finding still stands in this version; true for a finding without a line."""
     if source is None or finding.file is None or not finding.code:
         return True
     text = source.get(finding.file)

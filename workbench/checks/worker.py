@@ -21,7 +21,7 @@ OnProgress = Callable[[int, int, RuleProgress], None]
 """Callback for progress: gets the number of results so far in this group, the number of rules in all, and what is
 begun or done."""
 NUM_ENVS, SEEDS = 8, 32
-"""Envs of a check (one where the page has one), and number of seeds."""
+"""Number of envs of a check (one if the page has one), and number of seeds."""
 
 
 class WorkerChecks:
