@@ -1,4 +1,4 @@
-"""What no healthy task does: numbers that are not finite, bodies that fly off or fall, rewards out of range."""
+"""Finds outliers in control steps: numbers that are not finite, bodies that fly off or fall, rewards out of range."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from workbench.envs.scene.shapes import SceneGeometry
 from workbench.envs.step_result import StepResult
 
 MAX_SPEED = 20.0
-"""m/s, as a mean over a control step; robots of the field move at a tenth of it."""
+"""Maximum speed of a body in m/s, as a mean over a control step; robots move at a tenth of it."""
 UNDER_FLOOR_METRES = 0.2
-"""Metres under the lowest point of all static bodies."""
+"""Depth in metres below the lowest point of all static bodies from which on a body is under the floor."""
 MAX_DROP_METRES = 0.5
-"""Metres below the start of the episode, of a body that is not part of an articulation: more than off a block, less than
-off a table."""
+"""Maximum drop in metres since the start of the episode, of a body that is not part of an articulation: more than the height
+of a block, less than that of a table."""
 REWARD_RANGES: dict[str, tuple[float, float]] = {"sparse": (-1.0, 1.0), "normalized_dense": (-1.0, 1.0)}
-"""By reward mode, where ManiSkill defines a range: sparse is success minus fail, normalized is divided by its maximum (some
-tasks take penalties, so it may be negative). A plain dense reward has none."""
+"""Range of the reward modes for which ManiSkill defines one: sparse is success minus fail, normalized is divided by its maximum
+(some tasks take penalties, so it may be negative). A plain dense reward has no range."""
 ROUNDING = 1e-4
-"""3.0000002 / 3 is not out of range."""
+"""Tolerance of the range: 3.0000002 / 3 is not out of range."""
 
 
 class OutlierKind(Enum):
@@ -202,7 +202,7 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
 
 @dataclass(frozen=True)
 class Outlier:
-    """The first outlier of a kind in an env's episode."""
+    """The first outlier of a kind in one episode of an env."""
 
     kind: OutlierKind
     step: int
@@ -212,7 +212,7 @@ class Outlier:
 
     @property
     def text(self) -> str:
-        """The reason after its rule."""
+        """The rule, then the reason."""
         return self.reason if self.kind.rule is None else f"{self.kind.rule}: {self.reason}"
 
 
@@ -230,8 +230,8 @@ class OutlierSighting:
 
 
 class OutlierWatch:
-    """Checks the control steps of one task, in order, for what no healthy task does: NaN and infinite numbers, bodies that
-    fly off or fall, rewards out of range. The limits are meant to report nothing on every task that works."""
+    """Checks the control steps of one task, in order, for outliers: NaN and infinite numbers, bodies that fly off or fall,
+    rewards out of range. The limits are wide, so that a working task has none."""
 
     def __init__(
         self, geometry: SceneGeometry, first: StepResult, control_dt: float, reward_mode: str
@@ -243,7 +243,7 @@ class OutlierWatch:
         kinds = np.array(geometry.body_kinds)
         self._names = geometry.body_names
         self._present = np.isfinite(first.poses).all(axis=2)
-        # The links without a shape that a free root is made of may be anywhere.
+        # A free root is made of links without a shape, which may be anywhere.
         shaped = np.isin(np.arange(len(kinds)), [body for each in geometry.visuals for body in each.bodies])
         self._moves = self._present & shaped & np.isin(kinds, ("dynamic", "link"))
         self._loose = self._present & shaped & (kinds == "dynamic")
@@ -292,7 +292,7 @@ class OutlierWatch:
 
     def _check_poses(self, step: StepResult) -> list[OutlierSighting]:
         place = step.poses[..., :3]
-        # An env that blew up has NaN and 1e30 in its poses: these are to be found, not to warn about.
+        # An env that exploded has NaN and 1e30 in its poses; numpy must not warn about them.
         with np.errstate(invalid="ignore", over="ignore"):
             speed = np.where(self._moves, np.linalg.norm(place - self._before, axis=2) / self._dt, 0.0)
             drop = np.where(self._loose, self._start - place[..., 2], 0.0)
@@ -310,7 +310,7 @@ class OutlierWatch:
             say: Callable[[int, int], str],
             most: NDArray | None = None,
         ) -> OutlierSighting:
-            """`say` gets env and body: the one that has the most of `most`, or the first."""
+            """`say` gets the env and the body: the one with the largest value in `most`, or the first one."""
 
             def body(env: int) -> int:
                 return int(wrong[env].argmax() if most is None else np.nanargmax(most[env]))
@@ -344,7 +344,7 @@ class OutlierWatch:
 
 
 def _nan_text(values: NDArray) -> str:
-    """Which kind of not finite: some of `values` is NaN or infinite."""
+    """Text that says whether `values` have NaN or infinite numbers."""
     return "is NaN" if np.isnan(values).any() else "is infinite"
 
 
@@ -356,7 +356,7 @@ def lowest_still_point(geometry: SceneGeometry, poses: NDArray[np.float32]) -> f
         instances = np.flatnonzero(static[visual.bodies])
         if not len(instances) or not len(visual.mesh.vertices):
             continue
-        # All envs have the same ground; they differ in what is on it. So one env is enough.
+        # One env is enough: all envs have the same ground, and differ in what is on it.
         p, (w, x, y, z) = np.split(poses[visual.envs[instances[0]], visual.bodies[instances[0]]], [3])
         up = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
         lowest.append(float((visual.mesh.vertices @ up).min() + p[2]))
@@ -365,7 +365,8 @@ def lowest_still_point(geometry: SceneGeometry, poses: NDArray[np.float32]) -> f
 
 
 def _numbers(step: StepResult) -> list[tuple[OutlierKind, str, NDArray]]:
-    """Numbers that the author's code computes: reward, float entries of ``evaluate``, and a policy's action."""
+    """Kind, name and values of the numbers that the author's code computes: reward, float entries of ``evaluate``, and a policy's
+    action."""
     action = (
         []
         if step.action is None or not step.action.size

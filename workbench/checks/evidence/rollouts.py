@@ -58,7 +58,7 @@ class SeenOutlier:
     """1-based control step."""
     seed: int
     reason: str
-    """As `Outlier.reason`."""
+    """Text as in `Outlier.reason`."""
     body: str
     """Name of the body, as in `SceneIndex.names`; empty for an outlier that is no body."""
 
