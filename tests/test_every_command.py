@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.sweeps.every_command import EXAMPLES, FROM_TEMPLATES, Ran, built_in, fails_in_partial_resets, walk
-from workbench.checks.rules import RULES as ALL_RULES
-from workbench.checks.rules import SOLVE_RULES
+from workbench.checks.rule_table import RULES as ALL_RULES
+from workbench.checks.rule_table import SOLVE_RULES
 
 WITHOUT_SUCCESS, WITHOUT_REWARD, SEVERAL_ROBOTS = "swing_up", "Empty-v1", "two_robots"
 NO_TABLE, FAILS_IN_PARTIAL_RESETS = "template minimal", "MS-HopperHop-v1"

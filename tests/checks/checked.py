@@ -14,7 +14,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from workbench.checks import run_rules as run
 from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.results import RuleResult, by_rule
-from workbench.checks.rules import CHECK_RULES, RULES
+from workbench.checks.rule_table import RULES, gpu_rules_of
 from workbench.envs.gpu_rules import Finding
 from workbench.task.load import load_task, undo_load
 
@@ -81,9 +81,9 @@ def results_of(checkup: Checkup, degrees: Mapping[str, Any]) -> list[RuleResult]
         for rule, check in group.checks.items():
             if degrees.get(rule, "off") != "off":
                 results += run.check_rule(rule, check, checkup, degrees)
-    if any(rule not in CHECK_RULES and degree != "off" for rule, degree in degrees.items()):
-        results += run.check_core(checkup, degrees)
-    return [*results, *run.core_results(run.findings_of(checkup), checkup.silenced, degrees)]
+    if gpu_rules_of(degrees):
+        results += run.check_gpu_rules(checkup, degrees)
+    return [*results, *run.gpu_results(run.findings_of(checkup), checkup.silenced, degrees)]
 
 
 def the_finding(result: RuleResult) -> Finding:

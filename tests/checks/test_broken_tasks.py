@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.checks.checked import check_rules, the_finding
-from workbench.checks.rules import RULES, SOLVE_RULES
+from workbench.checks.rule_table import RULES, SOLVE_RULES
 
 FOLDER = Path(__file__).parents[2] / "tasks" / "broken"
 BROKEN = {

@@ -8,7 +8,7 @@ import pytest
 
 from tests.checks.checked import EXAMPLE, Checked, check_rules, results_of, the_finding
 from workbench.checks.evidence.checkup import Checkup
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.task.load import load_task, undo_load
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.checks.checked import check_rules
-from workbench.checks.rules import RULES, SOLVE_RULES
+from workbench.checks.rule_table import RULES, SOLVE_RULES
 
 TASKS = Path(__file__).parents[2] / "tasks"
 NOT_ASKED = {

@@ -12,7 +12,7 @@ from mani_skill.utils import assets
 from workbench.checks.job import CheckReport, check, report_of
 from workbench.checks.job_items import CheckOptions, ItemOutcome
 from workbench.checks.results import RuleResult, merged
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.envs.gpu_rules import Finding
 from workbench.jobs.local_processes import Processes
 from workbench.jobs.results_file import JobFile, Kept, job_of, read_parts

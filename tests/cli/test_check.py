@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.cli.main import main
 
 pytestmark = pytest.mark.thorough

@@ -2,33 +2,39 @@
 
     python -m tests.docs.generate          # `test_generated.py` fails where a page says something else
 
-Keys are those of the list of commands, commands what ``--help`` prints, rules what `checks.rules` and `envs.gpu_rules`
-list.
+Keys are those of the list of commands, commands what ``--help`` prints. Rules are read where they are declared: in the decorators
+and docstrings of `checks.rules`, in `envs.gpu_rules` and in `envs.outliers`. Their pages and the table that the package reads
+(`checks.rule_table`) are made from there.
 """
 
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
+import textwrap
 from collections.abc import Sequence
 from contextlib import redirect_stdout
+from dataclasses import fields
 from pathlib import Path
 from unittest.mock import patch
 
 from tests.docs.pages import DOCS
 from workbench.cameras import commands as cameras
-from workbench.checks.rules import CHECK_RULES
+from workbench.checks.rule_table import RULES_FILE
+from workbench.checks.run_rules import DECLARED
 from workbench.cli import main
 from workbench.commands import COMMANDS
-from workbench.envs.gpu_rules import RULES, Rule
+from workbench.envs.gpu_rules import GPU_RULES, DeclaredRule, Rule
 from workbench.page.command import Command
 from workbench.page.widgets.hotkeys import key_rows
 
 KEYS = DOCS / "reference" / "keys.md"
 CLI = DOCS / "reference" / "cli.md"
-RULES_PAGE = DOCS / "batched_env.md"
+GPU_RULES_PAGE = DOCS / "batched_env.md"
 ALL_RULES = DOCS / "reference" / "rules.md"
+RULE_PAGES = DOCS / "rules"
 CLI_COMMANDS = (
     "start",
     "new",
@@ -119,10 +125,56 @@ def help_of(command: str) -> str:
 # --- rules --------------------------------------------------------------------------------------------
 
 
-def rules_table() -> str:
+HOOKS = (
+    "class",
+    "_load_agent",
+    "_load_scene",
+    "_default_sim_config",
+    "_initialize_episode",
+    "evaluate",
+    "compute_dense_reward",
+    "compute_normalized_dense_reward",
+    "_get_obs_extra",
+    "get_state_dict",
+    "step",
+    "_default_sensor_configs",
+    "_default_human_render_camera_configs",
+)
+"""The hooks in the order of the page of all rules, about the order in which an author writes them."""
+
+
+def declared_rules() -> list[DeclaredRule]:
+    """All rules in the order of `checks.rule_table.RULES`."""
+    return [*GPU_RULES.values(), *(each.rule for checks in DECLARED.values() for each in checks)]
+
+
+def rules_json() -> str:
+    """All rules without their pages."""
+    names = [field.name for field in fields(Rule)]
+    rows = [{name: getattr(rule, name) for name in names} for rule in declared_rules()]
+    return json.dumps(rows, indent=1, ensure_ascii=False) + "\n"
+
+
+def rule_page(rule: DeclaredRule) -> str:
+    parts = [
+        f"# {rule.id}",
+        wrapped(code(rule.asks)),
+        wrapped(f"Otherwise: {code(rule.otherwise)}"),
+        f"*{rule.degree}* · `{rule.hook}`",
+        rule.page,
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def wrapped(sentence: str) -> str:
+    """In lines of at most 110 characters."""
+    return textwrap.fill(sentence, 110, break_long_words=False, break_on_hyphens=False)
+
+
+def gpu_rules_table() -> str:
     rows = [
         f"| {linked(rule.id, 'rules')} | {rule.degree} | {code(rule.asks)} | {code(rule.otherwise)} |"
-        for rule in RULES.values()
+        for rule in GPU_RULES.values()
     ]
     return "\n".join(
         [
@@ -134,10 +186,11 @@ def rules_table() -> str:
 
 
 def all_rules_page() -> str:
-    """A table for each hook; links to the pages that there are (`test_rule_pages.py` asks for all of them)."""
-    by_hook: dict[str, list[Rule]] = {}
-    for rule in (*CHECK_RULES.values(), *RULES.values()):
-        by_hook.setdefault(rule.hook, []).append(rule)
+    """A table for each hook."""
+    by_hook: dict[str, list[Rule]] = {hook: [] for hook in HOOKS}
+    # Those of GPU simulation come last.
+    for rule in sorted(declared_rules(), key=lambda rule: rule.id in GPU_RULES):
+        by_hook[rule.hook].append(rule)
     lines = [
         "# Rules",
         "",
@@ -155,8 +208,7 @@ def all_rules_page() -> str:
 
 
 def linked(rule: str, folder: str = "../rules") -> str:
-    page = DOCS / "rules" / f"{rule}.md"
-    return f"[{rule}]({folder}/{rule}.md)" if page.is_file() else rule
+    return f"[{rule}]({folder}/{rule}.md)"
 
 
 def code(sentence: str) -> str:
@@ -173,21 +225,28 @@ def with_rules(text: str) -> str:
     before, begin, rest = text.partition("<!-- rules -->\n")
     _, end, after = rest.partition("<!-- /rules -->")
     assert begin and end
-    return f"{before}{begin}{rules_table()}\n{end}{after}"
+    return f"{before}{begin}{gpu_rules_table()}\n{end}{after}"
 
 
 def pages() -> dict[Path, str]:
-    """The text of every page that is made here."""
+    """The text of every file that is made here."""
     return {
         KEYS: keys_page(),
         CLI: cli_page(),
-        RULES_PAGE: with_rules(RULES_PAGE.read_text()),
+        GPU_RULES_PAGE: with_rules(GPU_RULES_PAGE.read_text()),
         ALL_RULES: all_rules_page(),
+        RULES_FILE: rules_json(),
+        **{RULE_PAGES / f"{rule.id}.md": rule_page(rule) for rule in declared_rules()},
     }
 
 
 if __name__ == "__main__":
-    for path, text in pages().items():
+    made = pages()
+    for path, text in made.items():
         if not path.exists() or path.read_text() != text:
             path.write_text(text)
             print(f"wrote {path}")
+    for path in RULE_PAGES.iterdir():
+        if path not in made:
+            path.unlink()
+            print(f"removed {path}")

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 from workbench.checks.results import RuleResult, State, counts, state_text
 from workbench.checks.rule_pages import RulePage, rule_page
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.checks.state import ChecksView
 from workbench.envs.gpu_rules import DEGREES, Degree, Finding, Rule
 from workbench.envs.outliers import OUTLIER_RULES
 
 _SUMMED: tuple[State, ...] = ("kept", "silenced", "not_known", "not_applicable", "failed")
 _UNDECIDED: tuple[State, ...] = ("not_known", "not_applicable")
-MOST_SHOWN = 5
+MAX_SHOWN = 5
 """Maximum number of findings of one rule that are shown."""
 
 
@@ -48,7 +48,7 @@ class Card:
 
     @property
     def silence(self) -> str:
-        """The comment that silences it; without a reason after it it silences nothing."""
+        """The comment that silences the rule, up to the reason, which the author has to add."""
         return f"# workbench: off[{self.rule.id}] "
 
 
@@ -109,7 +109,7 @@ class Undecided:
 
 
 def undecided(results: Iterable[RuleResult]) -> list[Undecided]:
-    """What is not known, then what is not applicable, by reason."""
+    """Rules that are not known, then rules that are not applicable, grouped by reason."""
     found: dict[tuple[State, str], list[str]] = {}
     for state in _UNDECIDED:
         for result in results:

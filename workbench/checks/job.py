@@ -18,8 +18,8 @@ from workbench.checks.job_items import (
 )
 from workbench.checks.job_worker import check_items
 from workbench.checks.results import RuleResult, State, by_rule, failed, merged
-from workbench.checks.rules import RULES
-from workbench.checks.run_rules import RULES_OVER_SEEDS, core_results, over_seeds
+from workbench.checks.rule_table import RULES
+from workbench.checks.run_rules import RULES_OVER_SEEDS, gpu_results, over_seeds
 from workbench.checks.silencing import Comment, comments_without_effect
 from workbench.envs.gpu_rules import DEGREES, FailOn, Finding, fails
 from workbench.jobs.local_processes import Processes
@@ -46,7 +46,7 @@ class CheckReport:
     ignored: tuple[str, ...] = ()
     """Rules that would have been checked without `CheckOptions.ignore`."""
     comments: tuple[Comment, ...] = ()
-    """Silencing comments that silence nothing."""
+    """Silencing comments without effect."""
     missing: int = 0
     """Number of rules that were not checked, counted for each part of the seeds."""
 
@@ -226,7 +226,7 @@ class _Results:
         return by_rule(
             (
                 *(result for outcome in outcomes for result in outcome.results),
-                *core_results(found, silenced, self._degrees),
+                *gpu_results(found, silenced, self._degrees),
             )
         )
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from workbench.actions.choose import SOLVE
 from workbench.checks.results import RuleResult, Silenced
-from workbench.checks.rules import core_rules_of, degree_of_each
-from workbench.checks.run_rules import CORE, GROUPS, RULES_OVER_SEEDS, RuleGroup
+from workbench.checks.rule_table import degree_of_each, gpu_rules_of
+from workbench.checks.run_rules import GPU_SIMULATION, GROUPS, RULES_OVER_SEEDS, RuleGroup
 from workbench.envs.gpu_rules import Degree, Finding
 from workbench.task.description import TaskOptions
 
@@ -18,7 +18,7 @@ SEEDS_OF_PART = 32
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """What to check, and how."""
+    """Options of a check."""
 
     task: str
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=8))
@@ -76,13 +76,13 @@ class ItemOutcome:
 
 
 def groups_of(degrees: Mapping[str, Degree]) -> list[RuleGroup]:
-    """The groups with a rule that is not off, without the rules that are; `CORE` last."""
+    """The groups with a rule that is not off, without the rules that are; `GPU_SIMULATION` last."""
     groups = [
         RuleGroup(group.name, {rule: check for rule, check in group.checks.items() if degrees[rule] != "off"})
         for group in GROUPS
     ]
-    # Whether the task runs is known from the last one too.
-    core = [CORE] if core_rules_of(degrees) or degrees["runs"] != "off" else []
+    # The last group also shows whether the task runs.
+    core = [GPU_SIMULATION] if gpu_rules_of(degrees) or degrees["runs"] != "off" else []
     return [*(group for group in groups if group.checks), *core]
 
 
@@ -111,7 +111,7 @@ class Item:
     part: int
     group: RuleGroup
     rules: tuple[str, ...]
-    """A single rule of the group, or all rules of GPU simulation for `CORE`."""
+    """A single rule of the group, or all rules of GPU simulation for `GPU_SIMULATION`."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,8 @@ def plan_of(what: CheckOptions, degrees: Mapping[str, Degree]) -> CheckPlan:
     for k in range(parts):
         for g, group in enumerate(groups):
             first = (k * len(groups) + g) * width
-            if group is CORE and k == 0:
-                items[first] = Item(k, group, tuple(core_rules_of(degrees)))
+            if group is GPU_SIMULATION and k == 0:
+                items[first] = Item(k, group, tuple(gpu_rules_of(degrees)))
             for r, rule in enumerate(group.checks):
                 if k == 0 or rule in RULES_OVER_SEEDS:
                     items[first + r] = Item(k, group, (rule,))

@@ -1,4 +1,4 @@
-"""One process of a check: runs the rules that it is dealt, on an env of its own."""
+"""One process of a check: runs the rules of its chunks on separate envs."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from workbench.actions.choose import STEPS_WITHOUT_LIMIT, RecordActionChooser, find_actions, plain_chooser
 from workbench.checks.evidence.checkup import CheckEnded, Checkup
 from workbench.checks.job_items import CheckedTask, CheckOptions, CheckUpdate, Item, ItemOutcome, plan_of
-from workbench.checks.rules import degree_of_each
-from workbench.checks.run_rules import CORE, check_core, check_rule, findings_of
+from workbench.checks.rule_table import degree_of_each
+from workbench.checks.run_rules import GPU_SIMULATION, check_gpu_rules, check_rule, findings_of
 from workbench.envs.assets import require_assets, robots_of
 from workbench.envs.recorded_run import RecordedRun
 from workbench.envs.step_result import StepResult
@@ -118,8 +118,8 @@ class _Worker:
 
     def _checked(self, item: Item, checkup: Checkup, task: CheckedTask | None) -> ItemOutcome:
         known, silenced = len(checkup.findings), len(checkup.silenced)
-        if item.group is CORE:
-            results = check_core(checkup, self._degrees)
+        if item.group is GPU_SIMULATION:
+            results = check_gpu_rules(checkup, self._degrees)
         else:
             (rule,) = item.rules
             results = check_rule(rule, item.group.checks[rule], checkup, self._degrees)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import viser
 
 from workbench.checks.commands import CheckAfterSave, CheckNow, StopChecks, ToggleRule
-from workbench.checks.findings import MOST_SHOWN, Card, cards, count, summary, undecided, without_finding
-from workbench.checks.rules import RULES
+from workbench.checks.findings import MAX_SHOWN, Card, cards, count, summary, undecided, without_finding
+from workbench.checks.rule_table import RULES
 from workbench.checks.silencing import Comment, comments_without_effect
 from workbench.checks.state import RUNNING, ChecksView
 from workbench.live.view import SessionView
@@ -144,7 +144,7 @@ def list_html(
         "opened": opened,
         "toggle": toggle,
         "link": link,
-        "most": MOST_SHOWN,
+        "most": MAX_SHOWN,
     }
     rest = without_finding(checks, found)
     failed = [result for result in rest if result.state == "failed"]

@@ -39,7 +39,7 @@ class ProfileView:
     why: str = ""
     """Why the profile failed, as text."""
     problem: Problem | None = None
-    """What the code raised."""
+    """The error that the code raised."""
 
 
 # --- events and effects -----------------------------------------------------------------------------

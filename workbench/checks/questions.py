@@ -1,4 +1,4 @@
-"""Questions to a worker about rules and the time of a step. Only for a worker that does not play: it makes envs of its own."""
+"""Questions to a worker about rules and the time of a step. Only for a worker that does not play: they make separate envs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What checks and the profile of a step come to, as data. Imports no simulator."""
+"""Results of checks, and the profile of a step, as data. Imports no simulator."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from workbench.envs.gpu_rules import Finding
 from workbench.task.problem import Problem
 
 State = Literal["broken", "failed", "silenced", "not_known", "kept", "not_applicable"]
-"""What a rule came to; where it came to several in one check, the first of these counts.
+"""Result of a rule; of several results in one check, the first in this order counts.
 
 - ``broken``: it has findings. ``silenced``: comments in the source silence all of them.
-- ``kept``: what it speaks of was tried, and it held.
-- ``not_known``: what it speaks of was not tried, or not to the end: no episode succeeded, the task raised, and so on.
-- ``not_applicable``: it says nothing about this task.
+- ``kept``: the rule was tried and has no finding.
+- ``not_known``: the rule was not tried, or not to the end: no episode succeeded, the task raised, and so on.
+- ``not_applicable``: the rule says nothing about this task.
 - ``failed``: the check of the rule itself raised, or its process died.
 """
 STATES: tuple[State, ...] = get_args(State)
@@ -34,30 +34,30 @@ class Silenced:
     finding: Finding
     reason: str
     line: int
-    """Of the comment, 1-based."""
+    """1-based line of the comment."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What one rule saw of one thing in some episodes. What several parts of the seeds give is put together by
-    `evidence.over_seeds`."""
+    """A row of what a check saw of one thing in some episodes. `evidence.over_seeds` puts the rows of several parts of the seeds
+    together."""
 
     names: tuple[str, ...] = ()
-    """Of the thing, such as a body; empty for the episodes as a whole."""
+    """Names of the thing, such as a body; empty for the episodes as a whole."""
     place: tuple[str, int, str] | None = None
-    """File, line and function that a breach is told at."""
+    """File, line and function at which a breach is reported."""
     tried: int = 0
-    """Episodes, or what else the rule counts, that were looked at."""
+    """Number of episodes, or of other things that the rule counts, that were looked at."""
     seeds: tuple[int, ...] = ()
-    """Of the episodes in which it is broken."""
+    """Seeds of the episodes that break the rule."""
     count: int = 0
-    """Breaches, where they are not counted by episodes."""
+    """Number of breaches, if they are not counted by episodes."""
     size: float = 0.0
-    """The worst breach."""
+    """Size of the worst breach, in the unit of the rule."""
     numbers: tuple[float, ...] = ()
-    """What else the rule decides by."""
+    """Further numbers that decide the result."""
     texts: tuple[str, ...] = ()
-    """For its sentence."""
+    """Texts for the message."""
     code: str = ""
     """The text of the line of `place`."""
     silence: tuple[str, int] | None = None
@@ -66,36 +66,36 @@ class Seen:
 
 @dataclass(frozen=True)
 class RuleResult:
-    """What the check of one rule came to."""
+    """The result of the check of one rule."""
 
     rule: str
     state: State
     findings: tuple[Finding, ...] = ()
     silenced: tuple[Silenced, ...] = ()
     notes: tuple[str, ...] = ()
-    """Worth knowing, and no breach."""
+    """Notes that are no breach."""
     why: str = ""
-    """The reason why it is not known, not applicable or failed; for a broken rule, why not all was looked at."""
+    """The reason why the rule is not known, not applicable or failed; for a broken rule, why the check did not end."""
     seconds: float = 0.0
     seen: tuple[Seen, ...] = ()
-    """Of a rule that looks at all seeds: by this the results of further seeds are put together with it."""
+    """Rows of a check over all seeds, by which results of further seeds are put together with this one."""
     problem: Problem | None = None
-    """What was raised: by the author's code, or by the check where it failed."""
+    """The error that the author's code raised, or the check if it failed."""
 
     @property
     def is_crash(self) -> bool:
-        """Whether the check raised. Of a process that ended nobody knows the cause."""
+        """Whether the check itself raised; false if its process died, whose cause is not known."""
         return self.state == "failed" and self.problem is not None and bool(self.problem.traceback)
 
 
 def failed(rule: str, problem: Problem, seconds: float = 0.0) -> RuleResult:
-    """The result of a rule whose check raised, or whose process died."""
+    """A failed result: the check raised, or its process died."""
     at = "" if problem.file is None else f", at {problem.file}:{problem.line}"
     return RuleResult(rule, "failed", why=f"{problem.message}{at}", seconds=seconds, problem=problem)
 
 
 def by_rule(results: Iterable[RuleResult]) -> dict[str, RuleResult]:
-    """One result a rule."""
+    """One result for each rule."""
     found: dict[str, list[RuleResult]] = {}
     for one in results:
         found.setdefault(one.rule, []).append(one)
@@ -103,16 +103,16 @@ def by_rule(results: Iterable[RuleResult]) -> dict[str, RuleResult]:
 
 
 def merged(results: Iterable[RuleResult], other_seeds: bool = False) -> RuleResult:
-    """One result of those that one rule has.
+    """One result from several results of one rule.
 
     Args:
-        other_seeds: each is of other seeds: the breaches of all are counted. Else they are of several rules' checks, which
-            look at the same seeds, and the same breach counts once.
+        other_seeds: whether each result has other seeds; then the breaches of all are counted. Else the results come from
+            the checks of several rules, which look at the same seeds, and the same breach counts once.
     """
     results = sorted(results, key=lambda result: STATES.index(result.state))
     findings: dict[object, Finding] = {}
     for finding in (finding for result in results for finding in result.findings):
-        # Two things may be wrong at one line; of other seeds the same thing has other numbers in its message.
+        # One line may have two mistakes; with other seeds, the message about one mistake has other numbers.
         key = finding.key if other_seeds else (finding.key, finding.message)
         known = findings.setdefault(key, finding)
         if known is not finding and other_seeds:
@@ -131,7 +131,7 @@ def merged(results: Iterable[RuleResult], other_seeds: bool = False) -> RuleResu
 
 
 def counts(results: Iterable[RuleResult]) -> Counter[State]:
-    """How many rules came to each state."""
+    """Number of rules by state."""
     return Counter(result.state for result in results)
 
 
@@ -140,42 +140,42 @@ def counts(results: Iterable[RuleResult]) -> Counter[State]:
 
 @dataclass(frozen=True)
 class HookTime:
-    """What a hook, or a part of ManiSkill's own, takes of a control step; without the hooks that it calls."""
+    """Time of a hook, or of a part of ManiSkill, in a control step, without the hooks that it calls."""
 
     name: str
-    """As ``evaluate``, or ``physics``."""
+    """Name such as ``evaluate`` or ``physics``."""
     milliseconds: float
     share: float
-    """Of the step, 0 to 1."""
+    """Share of the step, 0 to 1."""
     place: tuple[str, int, str] | None = None
-    """File, line and name where the author defines it; None for ManiSkill's own."""
+    """File, line and name of the author's definition; None for ManiSkill's parts."""
 
 
 @dataclass(frozen=True)
 class LineTime:
-    """What a line of the author's takes of a control step, with what it calls outside the author's files."""
+    """Time of one of the author's lines in a control step, with what it calls outside the author's files."""
 
     hook: str
-    """The hook that ran it."""
+    """The hook that ran the line."""
     file: str
     line: int
     """1-based."""
     code: str
-    """Its text, stripped."""
+    """Text of the line, stripped."""
     milliseconds: float
     share: float
-    """Of the step, 0 to 1."""
+    """Share of the step, 0 to 1."""
 
 
 @dataclass(frozen=True)
 class StepProfile:
-    """The mean of some control steps."""
+    """Mean times over some control steps."""
 
     num_envs: int
     steps: int
     milliseconds: float
-    """Of one step of all envs."""
+    """Time of one step of all envs."""
     hooks: tuple[HookTime, ...]
-    """Longest first; their shares add up to 1."""
+    """Hooks, longest first; their shares add up to 1."""
     lines: tuple[LineTime, ...]
-    """Longest first."""
+    """Lines, longest first."""

@@ -1,4 +1,4 @@
-"""Runs the checks, a rule at a time, and gives what each came to."""
+"""Runs the checks, one rule at a time, and gives the result of each."""
 
 from __future__ import annotations
 
@@ -11,19 +11,6 @@ from pathlib import Path
 import numpy as np
 
 import workbench
-from workbench.checks.by_hook import (
-    cameras,
-    devices,
-    evaluate,
-    files,
-    observation,
-    placement,
-    reproduce,
-    reward,
-    scene,
-    solved,
-    source,
-)
 from workbench.checks.evidence.checkup import (
     Check,
     CheckEnded,
@@ -37,7 +24,23 @@ from workbench.checks.evidence.checkup import (
 )
 from workbench.checks.evidence.over_seeds import OverSeeds
 from workbench.checks.results import RuleResult, Seen, Silenced, State, failed, merged
-from workbench.checks.rules import core_rules_of
+from workbench.checks.rule_check import RuleCheck, checks_in
+from workbench.checks.rule_table import gpu_rules_of
+from workbench.checks.rules import (
+    cameras,
+    devices,
+    evaluate,
+    files,
+    observation,
+    placement,
+    reproduce,
+    reward,
+    scene,
+    solved,
+    source,
+    step,
+    visual_modes,
+)
 from workbench.envs import action_vector as actions
 from workbench.envs.broken_rule import NeedsOneEnv
 from workbench.envs.gpu_rules import Degree, Finding, silence_of
@@ -51,34 +54,37 @@ _PACKAGE = Path(workbench.__file__).parent
 
 @dataclass(frozen=True)
 class RuleGroup:
-    """Rules that look at the same evidence, checked by one process."""
+    """Rules with the same evidence, checked by one process."""
 
     name: str
-    """What is being looked at, for a status line."""
+    """Name for a status line."""
     checks: Mapping[str, Check]
 
 
-GROUPS: tuple[RuleGroup, ...] = (
-    RuleGroup("source", {**source.CHECKS, **files.CHECKS}),
-    RuleGroup("resets", placement.CHECKS),
-    RuleGroup("success", {**evaluate.CHECKS, **placement.RUN_CHECKS}),
-    RuleGroup("rewards", reward.CHECKS),
-    RuleGroup("tensors", devices.CHECKS),
-    RuleGroup("the same again", reproduce.CHECKS),
-    RuleGroup("observations", observation.CHECKS),
-    RuleGroup("the scene", scene.CHECKS),
-    RuleGroup("pictures", {**observation.PICTURE_CHECKS, **cameras.CHECKS}),
-    RuleGroup("planned episodes", solved.CHECKS),
+DECLARED: Mapping[str, tuple[RuleCheck, ...]] = {
+    "source": checks_in(source, files),
+    "resets": checks_in(placement),
+    "success": checks_in(evaluate, step),
+    "rewards": checks_in(reward),
+    "tensors": checks_in(devices),
+    "the same again": checks_in(reproduce),
+    "observations": checks_in(observation),
+    "the scene": checks_in(scene),
+    "pictures": checks_in(visual_modes, cameras),
+    "planned episodes": checks_in(solved),
+}
+"""The checks of `checks.rules` by the name of their group, in the order in which they run: common mistakes first."""
+GROUPS = tuple(
+    RuleGroup(name, {each.rule.id: each.check for each in checks}) for name, checks in DECLARED.items()
 )
-"""In the order in which they run: what people meet most first."""
 RULES_OVER_SEEDS: Mapping[str, OverSeeds] = {
     rule: check for group in GROUPS for rule, check in group.checks.items() if isinstance(check, OverSeeds)
 }
-"""The rules whose results depend on which seeds are looked at, and on how many. All others look at the source, at what is
-built, or at the first batch."""
-CORE = RuleGroup("GPU simulation", {})
-"""All rules of GPU simulation: the env under check reports them, whatever runs."""
+"""The rules whose results depend on the seeds. All others look at the source, at what is built, or at the first batch."""
+GPU_SIMULATION = RuleGroup("GPU simulation", {})
+"""The group of all rules of GPU simulation: the envs under check report breaches of them, whichever check runs."""
 _OF_RETURNS = ("evaluate-rows", "reward-rows")
+"""Rules of GPU simulation about the values that hooks return."""
 _OF_SEVERAL = frozenset(
     (
         *(*_OF_RETURNS, "observation-rows"),
@@ -86,13 +92,13 @@ _OF_SEVERAL = frozenset(
     )
 )
 """Rules of GPU simulation about the other envs: one env alone cannot break them."""
-CORE_RESETS = 6
-"""Resets of random envs, with steps between them."""
+GPU_RESETS = 6
+"""Number of resets of random envs, with steps between them."""
 ONE_ENV = "With one env it runs: --num-envs 1."
 
 
 def check_rule(rule: str, check: Check, checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
-    """The result of a rule; where the task raises, that of the rule `runs` too. Raises CheckEnded."""
+    """The result of a rule; if the task raises, that of the rule `runs` too. Raises CheckEnded."""
     began = time.perf_counter()
     rows: list[Seen] = []
     further: list[RuleResult] = []
@@ -100,7 +106,7 @@ def check_rule(rule: str, check: Check, checkup: Checkup, degrees: Mapping[str, 
         result = _checked(rule, check, checkup, degrees[rule], rows)
         error = result.problem
         if error is not None and error.stage != "policy" and degrees["runs"] != "off":
-            # What a policy raised is no fault of the task.
+            # An error of a policy is no fault of the task.
             if not _is_known(error, checkup, degrees):
                 cause = result_of("runs", degrees["runs"], [raised(error, checkup)])
                 result, further = (cause, []) if rule == "runs" else (result, [cause])
@@ -113,7 +119,7 @@ def check_rule(rule: str, check: Check, checkup: Checkup, degrees: Mapping[str, 
 
 
 def _checked(rule: str, check: Check, checkup: Checkup, degree: Degree, rows: list[Seen]) -> RuleResult:
-    """The result of a rule, with what it saw in `rows`."""
+    """The result of a rule; what the check saw is added to `rows`."""
     seen: list[Found | Note] = []
 
     def look() -> None:
@@ -127,14 +133,14 @@ def _checked(rule: str, check: Check, checkup: Checkup, degree: Degree, rows: li
 
     ended = ended_as(lambda: _of_task(look, checkup))
     if ended.problem is not None and isinstance(check, OverSeeds):
-        # What it had found before that is true all the same.
+        # Breaches that were found before the error are true all the same.
         seen.extend(check.so_far(rows))
     return _ended(result_of(rule, degree, seen), ended)
 
 
 @dataclass(frozen=True)
 class LookEnd:
-    """How looking at a rule ended, without regard to what was found."""
+    """How a check ended, apart from its findings."""
 
     state: State = "kept"
     why: str = ""
@@ -142,7 +148,7 @@ class LookEnd:
 
 
 def ended_as(look: Callable[[], None]) -> LookEnd:
-    """Call it, and say how it ended. Other exceptions pass."""
+    """Run a check, and say how it ended. Other exceptions pass."""
     try:
         look()
     except NotApplicable as reason:
@@ -155,8 +161,8 @@ def ended_as(look: Callable[[], None]) -> LookEnd:
 
 
 def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
-    """Call it; again with one env where the task does what exists for one only, as opening it does. What the author's code
-    raises in it, a robot's property say, is a TaskError."""
+    """Run a check; again with one env if the task uses something that exists for one env only, as opening a task does. Errors of
+    the author's code, such as a robot's property, become TaskErrors."""
     try:
         look()
     except TaskError as error:
@@ -174,7 +180,7 @@ def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
 
 
 def _is_of_task(error: Exception, checkup: Checkup) -> bool:
-    """Whether the last line of the traceback that is the author's or the workbench's is the author's."""
+    """Whether the innermost line of the traceback, without those of libraries, is the author's and not the workbench's."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if frame.filename in checkup.files:
             return True
@@ -184,15 +190,15 @@ def _is_of_task(error: Exception, checkup: Checkup) -> bool:
 
 
 def _ended(result: RuleResult, ended: LookEnd) -> RuleResult:
-    """The result, where looking at it ended so: what was found counts most."""
+    """The result of a check that ended so; findings count most."""
     if result.state != "kept":
-        # That the task raised then is told too: not all was looked at.
+        # The error is reported too: the check did not see everything.
         return replace(result, why=ended.why, problem=ended.problem) if ended.problem is not None else result
     return replace(result, state=ended.state, why=ended.why, problem=ended.problem)
 
 
 def problem_of_crash(error: Exception) -> Problem:
-    """What a check raised: the innermost line of the workbench's, with the whole traceback."""
+    """The error of a check, at the innermost line of the workbench, with the whole traceback."""
     frames = traceback.extract_tb(error.__traceback__)
     at = next((frame for frame in reversed(frames) if Path(frame.filename).is_relative_to(_PACKAGE)), None)
     file = None if at is None else str(Path(at.filename).relative_to(_PACKAGE.parent))
@@ -202,8 +208,8 @@ def problem_of_crash(error: Exception) -> Problem:
 
 
 def as_sent(result: RuleResult) -> RuleResult:
-    """The result as another process reads it. Raises TypeError or Unreadable for a value of another type than it says: here
-    it is this rule's failure, there it would end the whole check."""
+    """The result as another process reads it. Raises TypeError or Unreadable for a value of a wrong type, so that only this rule
+    fails; in the other process the error would end the whole check."""
     return Unpacker().unpack(pack(result), RuleResult)
 
 
@@ -211,7 +217,7 @@ def over_seeds(results: Sequence[RuleResult], degree: Degree) -> RuleResult:
     """The result of a rule of `RULES_OVER_SEEDS` over all seeds.
 
     Args:
-        results: what it came to for each part of them, in their order.
+        results: the results for each part of the seeds, in order.
     """
     rule, rows = results[0].rule, [row for result in results for row in result.seen]
     check, seconds = RULES_OVER_SEEDS[rule], sum(result.seconds for result in results)
@@ -233,7 +239,7 @@ def over_seeds(results: Sequence[RuleResult], degree: Degree) -> RuleResult:
 
 
 def _with_code(rule: str, row: Seen) -> Seen:
-    """The row with what is known of its line here: it may be judged where the file is another one."""
+    """The row with code and silencing comment of its line: the process that judges it may have another version of the file."""
     if row.place is None:
         return row
     file, line, _ = row.place
@@ -246,13 +252,13 @@ def _with_code(rule: str, row: Seen) -> Seen:
 
 
 def _is_known(error: Problem, checkup: Checkup, degrees: Mapping[str, Degree]) -> bool:
-    """Whether a rule tells it, with its line: the type or shape of what a hook returned."""
+    """Whether another rule reports the error with its line: the type or shape of a value that a hook returned."""
     returned = (each.rule for each in checkup.findings if each.rule in _OF_RETURNS)
     return error.stage == "returns" and any(degrees[rule] != "off" for rule in returned)
 
 
 def raised(error: Problem, checkup: Checkup) -> Found:
-    """What the task raised, as a breach of the rule `runs`."""
+    """An error of the task as a breach of the rule `runs`."""
     file, line = error.file, error.line
     place = None if file is None or line is None else (file, line, error.stage)
     early = checkup.fails_with_several
@@ -267,13 +273,13 @@ def raised(error: Problem, checkup: Checkup) -> Found:
     )
 
 
-def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
-    """Step, and reset random envs among them, while the rules of GPU simulation look. Gives what each came to, but for breaches:
-    those are in `Checkup.findings`, of all that ran, and `core_results` makes results of them. Raises CheckEnded."""
+def check_gpu_rules(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
+    """Step, and reset random envs, under the rules of GPU simulation. Gives the result of each without breaches: `gpu_results`
+    makes results from the breaches in `Checkup.findings`, which all checks add to. Raises CheckEnded."""
     further: list[RuleResult] = []
     not_applicable: dict[str, str] = {}
     try:
-        ended = ended_as(lambda: _of_task(lambda: _run_core(checkup), checkup))
+        ended = ended_as(lambda: _of_task(lambda: _run_gpu_rules(checkup), checkup))
         error = ended.problem
         if error is None:
             not_applicable = _nothing_there(checkup.task)
@@ -283,9 +289,9 @@ def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResu
         raise
     except Exception as error:
         problem = problem_of_crash(error)
-        return [failed(rule, problem) for rule in core_rules_of(degrees)]
+        return [failed(rule, problem) for rule in gpu_rules_of(degrees)]
     results: list[RuleResult] = []
-    for rule in core_rules_of(degrees):
+    for rule in gpu_rules_of(degrees):
         of_rule = ended
         if rule in not_applicable:
             of_rule = LookEnd("not_applicable", not_applicable[rule])
@@ -295,10 +301,10 @@ def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResu
     return [*results, *further]
 
 
-def _run_core(checkup: Checkup) -> None:
+def _run_gpu_rules(checkup: Checkup) -> None:
     rng, task = np.random.default_rng(0), checkup.task
     checkup.reset(task, checkup.seeds[0])
-    for _ in range(CORE_RESETS):
+    for _ in range(GPU_RESETS):
         for _ in range(2):
             checkup.step(task, actions.random_action(task.parts, task.num_envs, rng))
         count = int(rng.integers(1, max(2, task.num_envs)))
@@ -306,7 +312,7 @@ def _run_core(checkup: Checkup) -> None:
 
 
 def _nothing_there(task: TaskEnv) -> dict[str, str]:
-    """Rules of GPU simulation that say nothing about this task, with the reason."""
+    """Reason by rule of GPU simulation that says nothing about this task."""
     found: dict[str, str] = {}
     if task.env.reward_mode == "none":
         found["reward-rows"] = "it has no reward"
@@ -315,12 +321,12 @@ def _nothing_there(task: TaskEnv) -> dict[str, str]:
     return found
 
 
-def core_results(
+def gpu_results(
     findings: Iterable[Finding], silenced: Iterable[Silenced], degrees: Mapping[str, Degree]
 ) -> Iterator[RuleResult]:
-    """The results of the rules of GPU simulation that were broken while all others were checked."""
+    """The results of the rules of GPU simulation that have breaches or silenced breaches."""
     findings, silenced = list(findings), list(silenced)
-    for rule in core_rules_of(degrees):
+    for rule in gpu_rules_of(degrees):
         of_rule = [replace(each, degree=degrees[rule]) for each in findings if each.rule == rule]
         once = {each.key: each for each in of_rule}
         off = {
@@ -333,8 +339,8 @@ def core_results(
 
 
 def findings_of(checkup: Checkup, first: int = 0) -> tuple[Finding, ...]:
-    """Breaches of the rules of GPU simulation that were seen so far, from the `first` on; those of a task that is written for
-    one env say so."""
+    """Breaches of the rules of GPU simulation so far, from index `first` on; their messages say so if the task is written for one
+    env."""
     return tuple(
         replace(each, message=f"{each.message} {ONE_ENV}")
         if each.rule in _OF_RETURNS and checkup.fails_with_several is not None
@@ -350,10 +356,10 @@ def _state(findings: Sized, silenced: Sized) -> State:
 def result_of(
     rule: str, degree: Degree, seen: Sequence[Found | Note], rows: Sequence[Seen] = ()
 ) -> RuleResult:
-    """The result of a rule whose check gave this.
+    """The result of a rule, from what its check gave.
 
     Args:
-        rows: with what is known of their lines, where the files may be others here.
+        rows: rows with code and silencing comment, if this process may have other versions of the files.
     """
     known = {row.place: row for row in rows if row.place is not None}
     findings: list[Finding] = []

@@ -1,4 +1,4 @@
-"""Silencing comments that silence nothing: no reason, no such rule, or nothing there to silence. Imports no simulator."""
+"""Finds silencing comments without effect: no reason, no such rule, or no finding. Imports no simulator."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from workbench.checks.results import RuleResult, State
-from workbench.checks.rules import RULES, did_you_mean
+from workbench.checks.rule_table import RULES, did_you_mean
 from workbench.envs.gpu_rules import Silence, silences
 from workbench.machine.parse_python import parse_python
 
@@ -16,7 +16,7 @@ _DECIDED: tuple[State, ...] = ("kept", "broken", "silenced")
 
 @dataclass(frozen=True)
 class Comment:
-    """A comment in the source that was to silence a rule and silences none."""
+    """A silencing comment in the source without effect."""
 
     file: str
     line: int
@@ -29,13 +29,13 @@ def comments_without_effect(
     class_name: str = "",
     others: Collection[str] = (),
 ) -> list[Comment]:
-    """The silencing comments that lack a reason, name no rule that there is, or silenced no finding.
+    """The silencing comments that lack a reason, name an unknown rule, or silence no finding.
 
     Args:
         sources: path to text of the author's files.
-        results: what the checked rules came to, once all are; a rule that is not among them, or not decided, is not told.
-        class_name: the class that was checked. Comments in other tasks are not told: nothing looked there.
-        others: further tasks of its file.
+        results: results of all checked rules, once the check is done. Comments on rules without a decided result are left out.
+        class_name: the class that was checked. Comments in other tasks are left out: those were not checked.
+        others: further tasks of the file.
     """
     found: list[Comment] = []
     by_rule = {result.rule: result for result in results if result.state in _DECIDED}

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from workbench.checks.commands import CheckAfterSave, CheckNow, StopChecks
 from workbench.checks.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.checks.results import RuleResult, by_rule, failed
-from workbench.checks.rules import core_rules_of, degree_of_each
+from workbench.checks.rule_table import degree_of_each, gpu_rules_of
 from workbench.envs.gpu_rules import Finding
 from workbench.live.effects import Asked
 from workbench.live.events import FileSaved, LoadDone, VersionLoaded
@@ -23,11 +23,11 @@ from workbench.machine.loop import do
 from workbench.page.command import Command, Refused
 from workbench.task.problem import Problem
 
-AHEAD = 2.0
+AHEAD_SECONDS = 2.0
 """Seconds of checking at low priority; then at the lowest, since a person waits more for the rescored history than
 for the last rule."""
-MOST_DEATHS = 5
-"""Most processes that may die in one check; the rule that was running fails, and the next process checks the others."""
+MAX_DEATHS = 5
+"""Maximum number of processes that may die in one check; the running rule fails, and the next process checks the others."""
 ChecksState = Literal["none", "off", "loading", "checking", "done", "stopped", "failed"]
 RUNNING: tuple[ChecksState, ...] = ("loading", "checking")
 DOES: frozenset[type[Command]] = frozenset({CheckNow, StopChecks, CheckAfterSave})
@@ -56,7 +56,7 @@ class ChecksView:
     why: str = ""
     """Why the check stopped or failed, as text."""
     problem: Problem | None = None
-    """What the code raised when it was loaded."""
+    """The error that the code raised when it was loaded."""
     seconds: float = 0.0
     """Seconds since the version was loaded in the background process."""
     after_each_save: bool = True
@@ -310,17 +310,17 @@ class CheckJobs:
 
         group, groups = 0, 1
         while group < groups:
-            ahead = began is None or time.monotonic() - began < AHEAD
+            ahead = began is None or time.monotonic() - began < AHEAD_SECONDS
             priority: Priority = "low" if ahead else "lowest"
             try:
                 answer = await self._process.in_turns(job, partial(ask, group), priority)
             except ProcessDied as died:
                 deaths += 1
-                if began is None or deaths > MOST_DEATHS:
+                if began is None or deaths > MAX_DEATHS:
                     raise
-                # What it was at fails, and the rest is asked of another process.
+                # The running rule fails, and another process checks the rest.
                 problem = Problem("worker", str(died), None, None, None, "")
-                rules = core_rules_of(degrees) if under_way == "" else filter(None, [under_way])
+                rules = gpu_rules_of(degrees) if under_way == "" else filter(None, [under_way])
                 for rule in rules:
                     checked(failed(rule, problem))
                 group += under_way == ""  # that is the last one
@@ -354,7 +354,7 @@ async def load_version(process: Background, job: Job, load: Load) -> None:
 
 
 def _still_there(finding: Finding, source: Mapping[str, str] | None) -> bool:
-    """Whether the line that it is about stands in this version; true where it is about none."""
+    """Whether the line of the finding still stands in this version; true for a finding without a line."""
     if source is None or finding.file is None or not finding.code:
         return True
     text = source.get(finding.file)

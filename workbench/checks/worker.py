@@ -21,7 +21,7 @@ OnProgress = Callable[[int, int, RuleProgress], None]
 """Callback for progress: gets the number of results so far in this group, the number of rules in all, and what is
 begun or done."""
 NUM_ENVS, SEEDS = 8, 32
-"""Envs of a check (one where the page has one), and number of seeds."""
+"""Number of envs of a check (one if the page has one), and number of seeds."""
 
 
 class WorkerChecks:
@@ -70,9 +70,16 @@ class WorkerChecks:
         self._checkup = self._of = None
 
     def _check(self, checkup: Checkup, question: CheckGroup, on_progress: OnProgress) -> CheckedGroup:
-        from workbench.checks.run_rules import CORE, GROUPS, check_core, check_rule, core_results, findings_of
+        from workbench.checks.run_rules import (
+            GPU_SIMULATION,
+            GROUPS,
+            check_gpu_rules,
+            check_rule,
+            findings_of,
+            gpu_results,
+        )
 
-        degrees, groups = question.degrees, (*GROUPS, CORE)
+        degrees, groups = question.degrees, (*GROUPS, GPU_SIMULATION)
         total = sum(degree != "off" for degree in degrees.values())
         done = 0
 
@@ -90,10 +97,10 @@ class WorkerChecks:
             if degrees[rule] != "off" and rule not in question.known:
                 begin(rule)
                 tell(rule, check_rule(rule, check, checkup, degrees))
-        if group is CORE:
+        if group is GPU_SIMULATION:
             begin("")
-            tell("", check_core(checkup, degrees))
-            tell("", core_results(findings_of(checkup), checkup.silenced, degrees))
+            tell("", check_gpu_rules(checkup, degrees))
+            tell("", gpu_results(findings_of(checkup), checkup.silenced, degrees))
             self.close()  # the memory is wanted elsewhere
         following = question.group + 1
         return CheckedGroup(len(groups), total, groups[following].name if following < len(groups) else "")

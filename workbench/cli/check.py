@@ -23,7 +23,7 @@ from workbench.checks.job_items import (
     degrees_of_request,
 )
 from workbench.checks.results import RuleResult, state_text
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.cli.arguments import JobArguments
 from workbench.cli.check_reports import (
     REPORT_IT,

@@ -18,7 +18,7 @@ from workbench.app.help_pages import find_topic
 from workbench.checks.job import CheckReport
 from workbench.checks.job_items import CheckOptions
 from workbench.checks.results import RuleResult, State, state_text
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.envs.gpu_rules import FailOn, Finding, fails
 from workbench.task.problem import Problem, place_text
 

@@ -114,7 +114,7 @@ def check(
     reports = json or any(file is not None for file in (json_file, junit, sarif))
     if (why := why_missing(task)) is not None and not reports:
         return refuse(why)
-    from workbench.checks.rules import degree_of_each
+    from workbench.checks.rule_table import degree_of_each
 
     try:
         options = envs.options()

@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.cli.arguments import ONE_WORKER, JobArguments
 from workbench.cli.check_reports import json_text, xml_text
 from workbench.cli.output import (

@@ -1,8 +1,8 @@
-"""What no healthy task does: numbers that are not finite, bodies that fly off or fall, rewards out of range."""
+"""Finds outliers in control steps: numbers that are not finite, bodies that fly off or fall, rewards out of range."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.envs.gpu_rules import Rule
+from workbench.envs.gpu_rules import DeclaredRule, declared_rule
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.envs.step_result import StepResult
 
-FASTEST = 20.0
-"""m/s, as a mean over a control step; robots of the field move at a tenth of it."""
-UNDER_EVERYTHING = 0.2
-"""Metres under the lowest point of all static bodies."""
-DEEPEST_DROP = 0.5
-"""Metres below the start of the episode, of a body that is not part of an articulation: more than off a block, less than
-off a table."""
+MAX_SPEED = 20.0
+"""Maximum speed of a body in m/s, as a mean over a control step; robots move at a tenth of it."""
+UNDER_FLOOR_METRES = 0.2
+"""Depth in metres below the lowest point of all static bodies from which on a body is under the floor."""
+MAX_DROP_METRES = 0.5
+"""Maximum drop in metres since the start of the episode, of a body that is not part of an articulation: more than the height
+of a block, less than that of a table."""
 REWARD_RANGES: dict[str, tuple[float, float]] = {"sparse": (-1.0, 1.0), "normalized_dense": (-1.0, 1.0)}
-"""By reward mode, where ManiSkill defines a range: sparse is success minus fail, normalized is divided by its maximum (some
-tasks take penalties, so it may be negative). A plain dense reward has none."""
+"""Range of the reward modes for which ManiSkill defines one: sparse is success minus fail, normalized is divided by its maximum
+(some tasks take penalties, so it may be negative). A plain dense reward has no range."""
 ROUNDING = 1e-4
-"""3.0000002 / 3 is not out of range."""
+"""Tolerance of the range: 3.0000002 / 3 is not out of range."""
 
 
 class OutlierKind(Enum):
@@ -50,43 +50,150 @@ class OutlierKind(Enum):
         return made
 
 
-OUTLIER_RULES = {
+OUTLIER_RULES: Mapping[str, DeclaredRule] = {
     rule.id: rule
     for rule in (
-        Rule(
+        declared_rule(
             "bodies-stay",
             "warn",
-            "While the task runs, bodies neither fly off nor fall out of the scene.",
-            "An episode without the body cannot be solved, and its numbers leave the range of all others.",
             "step",
+            """While the task runs, bodies neither fly off nor fall out of the scene.
+
+            An episode without the body cannot be solved, and its numbers leave the range of all others.
+
+            ## Why
+            An episode without its body cannot be solved, and runs to the time limit. Its observations and
+            rewards are many times larger than all others: among thousands of envs a few such episodes spoil
+            running means and the value function. Most often bodies overlap, or a force is too high. The same
+            scene explodes more often on the GPU.
+
+            ## Mend
+            Let nothing overlap and nothing be thrown. If a body may be lost, end the episode there.
+
+            ```python fragment
+            def evaluate(self):
+                fallen = self.cube.pose.p[:, 2] < -0.1
+                return {"success": self.reached() & ~fallen, "fail": fallen}
+            ```
+
+            ## How it is checked
+            The rule looks at random rollouts of all seeds, of up to 50 steps, and at episodes that you play.
+            It reports a body that is faster than 20 m/s, that is 20 cm below everything that stands still,
+            that is half a metre below where its episode began (if it belongs to no articulation), or whose
+            pose is NaN. Bodies without a shape are left out, and so is what happens after the end of an
+            episode. The limits are wide: the rule does not see a cube that rolls off a low block.
+            """,
         ),
-        Rule(
+        declared_rule(
             "entries-finite",
             "warn",
-            "Numbers that evaluate() returns are finite.",
-            "A mean over envs or episodes is NaN as soon as one of them is, and a comparison with NaN is false.",
             "evaluate",
+            """Numbers that evaluate() returns are finite.
+
+            One NaN makes a mean over envs or episodes NaN, and a comparison with NaN is false.
+
+            ## Why
+            Trainers and loggers take the mean of an entry over envs and episodes: one NaN among 4096 envs
+            makes it NaN. A comparison with NaN is false, so a success that is computed from it is never
+            reached. The reward often uses the same number.
+
+            ## Mend
+            Clamp divisors and the arguments of roots. For a value that is not known, return 0 and a bool that
+            says so.
+
+            ```python fragment
+            height = self.block.pose.p[:, 2]
+            tilt = self.rise / self.run.abs().clamp(min=1e-6)
+            return {"tilt": tilt, "lifted": height > 0.1}
+            ```
+
+            ## How it is checked
+            The rule reads each floating entry after the resets of all seeds, at each step of random rollouts
+            of up to 50 steps, and in those of `--actions`. While you play, it looks at each step and flags an
+            env with such an entry. It does not see other states.
+            """,
         ),
-        Rule(
+        declared_rule(
             "reward-finite",
             "stop",
-            "Rewards are finite, also at the edges of joints and table.",
-            "One NaN makes the whole network NaN.",
             "compute_dense_reward",
+            """Rewards are finite, even at the limits of joints and the edges of the table.
+
+            One NaN makes the whole network NaN.
+
+            ## Why
+            One NaN in a batch of 4096 envs makes the loss NaN, then every weight of the network. Training
+            ends there, often after hours, since the state that gives NaN is rare.
+
+            ## Mend
+            Clamp divisors and the arguments of roots and logarithms.
+
+            ```python fragment
+            speed = torch.linalg.norm(velocity, dim=1)
+            straight = velocity[:, 0] / speed.clamp(min=1e-6)
+            ```
+
+            ## How it is checked
+            The rule reads the reward in random rollouts of all seeds, and in those of `--actions`. Then, for
+            the first two batches of seeds, it puts joints at random places and at their limits, and bodies at
+            random places around their start and at each goal mark, and calls the reward hook without a step.
+            While you play, it looks at each step and flags an env that breaks the rule. It does not see other
+            states.
+            """,
         ),
-        Rule(
+        declared_rule(
             "reward-normalized",
             "warn",
-            "The normalized dense reward and the sparse one lie within -1 and 1.",
-            "Learning rates and clipping of trainers expect that range.",
             "compute_normalized_dense_reward",
+            """The normalized dense reward and the sparse reward lie between -1 and 1.
+
+            Learning rates and clipping of trainers expect that range.
+
+            ## Why
+            Trainers are tuned for rewards of about 1 per step. Larger rewards scale the value loss and the
+            gradients, or are clipped, so that the best states look alike.
+
+            ## Mend
+            Divide by the largest dense reward of one step.
+
+            ```python fragment
+            def compute_normalized_dense_reward(self, obs, action, info):
+                return self.compute_dense_reward(obs, action, info) / 3
+            ```
+
+            ## How it is checked
+            The rule reads the normalized or sparse reward, whichever the task is made with, in random
+            rollouts of all seeds and in those of `--actions`. While you play, it flags an env with a reward
+            outside the range. It also reads the reward of states with success: of the states that
+            `reward-finite` makes, and what the reward hook returns when it is told that all envs succeed, if
+            that is one number. The result is *not known* if no success was seen, since success pays the
+            largest reward. It is *not applicable* for a plain dense reward.
+            """,
         ),
-        Rule(
+        declared_rule(
             "observation-finite",
             "stop",
-            "Observations are finite.",
-            "One NaN makes the whole network NaN.",
             "_get_obs_extra",
+            """Observations are finite.
+
+            One NaN makes the whole network NaN.
+
+            ## Why
+            One NaN in a batch of 4096 envs makes the network's output NaN, then its weights, even if the
+            reward is finite. Running means of a normaliser stay NaN forever.
+
+            ## Mend
+            Clamp divisors, or leave the number out.
+
+            ```python fragment
+            direction = offset / torch.linalg.norm(offset, dim=1, keepdim=True).clamp(min=1e-6)
+            ```
+
+            ## How it is checked
+            The rule reads each number of the observation in random rollouts of all seeds, and in the states
+            that `reward-finite` makes. Pictures are left out. While you play, it looks at each step and flags
+            an env that breaks the rule. It does not see other states.
+            """,
         ),
     )
 }
@@ -95,7 +202,7 @@ OUTLIER_RULES = {
 
 @dataclass(frozen=True)
 class Outlier:
-    """The first outlier of a kind in an env's episode."""
+    """The first outlier of a kind in one episode of an env."""
 
     kind: OutlierKind
     step: int
@@ -105,7 +212,7 @@ class Outlier:
 
     @property
     def text(self) -> str:
-        """The reason after its rule."""
+        """The rule, then the reason."""
         return self.reason if self.kind.rule is None else f"{self.kind.rule}: {self.reason}"
 
 
@@ -123,8 +230,8 @@ class OutlierSighting:
 
 
 class OutlierWatch:
-    """Checks the control steps of one task, in order, for what no healthy task does: NaN and infinite numbers, bodies that
-    fly off or fall, rewards out of range. The limits are meant to report nothing on every task that works."""
+    """Checks the control steps of one task, in order, for outliers: NaN and infinite numbers, bodies that fly off or fall,
+    rewards out of range. The limits are wide, so that a working task has none."""
 
     def __init__(
         self, geometry: SceneGeometry, first: StepResult, control_dt: float, reward_mode: str
@@ -136,13 +243,13 @@ class OutlierWatch:
         kinds = np.array(geometry.body_kinds)
         self._names = geometry.body_names
         self._present = np.isfinite(first.poses).all(axis=2)
-        # The links without a shape that a free root is made of may be anywhere.
+        # A free root is made of links without a shape, which may be anywhere.
         shaped = np.isin(np.arange(len(kinds)), [body for each in geometry.visuals for body in each.bodies])
         self._moves = self._present & shaped & np.isin(kinds, ("dynamic", "link"))
         self._loose = self._present & shaped & (kinds == "dynamic")
         self._dt = control_dt
         self._low, self._high = REWARD_RANGES.get(reward_mode, (-np.inf, np.inf))
-        self._floor = lowest_still_point(geometry, first.poses) - UNDER_EVERYTHING
+        self._floor = lowest_still_point(geometry, first.poses) - UNDER_FLOOR_METRES
         self._before = first.poses[..., :3].copy()
         self._start = self._before[..., 2].copy()
 
@@ -185,13 +292,13 @@ class OutlierWatch:
 
     def _check_poses(self, step: StepResult) -> list[OutlierSighting]:
         place = step.poses[..., :3]
-        # An env that blew up has NaN and 1e30 in its poses: these are to be found, not to warn about.
+        # An env that exploded has NaN and 1e30 in its poses; numpy must not warn about them.
         with np.errstate(invalid="ignore", over="ignore"):
             speed = np.where(self._moves, np.linalg.norm(place - self._before, axis=2) / self._dt, 0.0)
             drop = np.where(self._loose, self._start - place[..., 2], 0.0)
             lost: Any = self._present & ~np.isfinite(step.poses).all(axis=2)
-            fast: Any = speed > FASTEST
-            dropped: Any = drop > DEEPEST_DROP
+            fast: Any = speed > MAX_SPEED
+            dropped: Any = drop > MAX_DROP_METRES
             under: Any = self._moves & (place[..., 2] < self._floor)
         self._before = place.copy()
 
@@ -203,7 +310,7 @@ class OutlierWatch:
             say: Callable[[int, int], str],
             most: NDArray | None = None,
         ) -> OutlierSighting:
-            """`say` gets env and body: the one that has the most of `most`, or the first."""
+            """`say` gets the env and the body: the one with the largest value in `most`, or the first one."""
 
             def body(env: int) -> int:
                 return int(wrong[env].argmax() if most is None else np.nanargmax(most[env]))
@@ -237,7 +344,7 @@ class OutlierWatch:
 
 
 def _nan_text(values: NDArray) -> str:
-    """Which kind of not finite: some of `values` is NaN or infinite."""
+    """Text that says whether `values` have NaN or infinite numbers."""
     return "is NaN" if np.isnan(values).any() else "is infinite"
 
 
@@ -249,7 +356,7 @@ def lowest_still_point(geometry: SceneGeometry, poses: NDArray[np.float32]) -> f
         instances = np.flatnonzero(static[visual.bodies])
         if not len(instances) or not len(visual.mesh.vertices):
             continue
-        # All envs have the same ground; they differ in what is on it. So one env is enough.
+        # One env is enough: all envs have the same ground, and differ in what is on it.
         p, (w, x, y, z) = np.split(poses[visual.envs[instances[0]], visual.bodies[instances[0]]], [3])
         up = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
         lowest.append(float((visual.mesh.vertices @ up).min() + p[2]))
@@ -258,7 +365,8 @@ def lowest_still_point(geometry: SceneGeometry, poses: NDArray[np.float32]) -> f
 
 
 def _numbers(step: StepResult) -> list[tuple[OutlierKind, str, NDArray]]:
-    """Numbers that the author's code computes: reward, float entries of ``evaluate``, and a policy's action."""
+    """Kind, name and values of the numbers that the author's code computes: reward, float entries of ``evaluate``, and a policy's
+    action."""
     action = (
         []
         if step.action is None or not step.action.size

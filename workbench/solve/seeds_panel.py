@@ -10,7 +10,7 @@ import viser
 from workbench.checks.commands import ChooseSeeds, ShowSolved, SolveSeeds, StopSolving, ToggleVerdict
 from workbench.checks.findings import Card, Row
 from workbench.checks.panel import list_html
-from workbench.checks.rules import RULES
+from workbench.checks.rule_table import RULES
 from workbench.checks.state import ChecksView
 from workbench.envs.gpu_rules import Finding
 from workbench.live.session_protocol import LiveSession

@@ -1,4 +1,4 @@
-"""What a task builds and where it puts it, noted while its hooks run."""
+"""Notes what a task builds and which poses it sets, while its hooks run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from workbench.envs.broken_rule import Place
 
 _BUILDERS = ("mani_skill.utils.building", "sapien.", "workbench.")
-"""Modules whose lines build for whoever calls them."""
+"""Modules whose lines build for their caller."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Shape:
     kind: str
     """``box sphere capsule cylinder plane file convex_mesh nonconvex_mesh multiple_convex_meshes``"""
     file: str
-    """Of a mesh, else empty."""
+    """File of a mesh; empty for other shapes."""
     numbers: tuple[float, ...]
-    """Sizes, pose in the body, colour or friction."""
+    """Sizes in metres, pose in the body, colour or friction."""
 
 
 @dataclass(frozen=True)
@@ -76,16 +76,16 @@ class PoseSet:
 
 @contextmanager
 def noting_builds(built: list[Built], merged: list[Merged], files: Collection[str]) -> Iterator[None]:
-    """Within this, add to the lists what is built and merged.
+    """Context in which builds and merges are added to the lists.
 
     Args:
-        files: the author's.
+        files: paths of the author's files.
     """
 
     def note(stock: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(stock)
         def build(builder: Any, *args: Any, **kwargs: Any) -> Any:
-            # Building replaces a pose that is missing.
+            # Read before the build, which sets a missing pose.
             pose = builder.initial_pose
             made = stock(builder, *args, **kwargs)
             built.append(_built(builder, made, pose, files))
@@ -118,7 +118,7 @@ def noting_builds(built: list[Built], merged: list[Merged], files: Collection[st
 
 @contextmanager
 def noting_poses(placed: list[PoseSet], files: Collection[str]) -> Iterator[None]:
-    """Within this, add to `placed` each pose that is set on an actor or a root link."""
+    """Context in which each pose that is set on an actor or a root link is added to `placed`."""
 
     def note(stock: Any) -> Any:
         @wraps(stock.fset)
@@ -144,7 +144,7 @@ def _replaced(owner: type, name: str, by: Callable[[Any], Any]) -> Iterator[None
 
 
 def author_place(files: Collection[str]) -> Place | None:
-    """The author's line that runs now; None if other code, a scene builder or a robot, calls from within it."""
+    """The author's line that runs now; None if other code, such as a scene builder or a robot, builds."""
     frame = sys._getframe(1)
     while frame is not None:
         code = frame.f_code
@@ -158,7 +158,7 @@ def author_place(files: Collection[str]) -> Place | None:
 
 
 def shapes_of_env(built: list[Built], env: int) -> tuple[tuple[str, tuple[Shape, ...]], ...]:
-    """Kind and shapes of each body of one env, in the order in which they were built; equal if the envs look the same."""
+    """Kind and shapes of each body of one env, in the order of the build; equal for two envs that look the same."""
     return tuple((each.kind, each.collision + each.visual) for each in built if env in each.envs)
 
 

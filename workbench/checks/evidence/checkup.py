@@ -1,4 +1,4 @@
-"""What the checks look at: envs of one version of a task, and what was seen of them, each seen once."""
+"""Envs of one version of a task, and the evidence that checks read from them. Each piece of evidence is collected once."""
 
 from __future__ import annotations
 
@@ -48,16 +48,17 @@ from workbench.task.load import LoadedTask
 from workbench.task.problem import Problem, TaskError
 
 ROLLOUT_STEPS = 50
-"""Most control steps of an episode that is rolled out."""
+"""Maximum number of control steps of a random episode."""
 STILL_SECONDS = 1.0
-"""How long the robot holds still."""
+"""Simulated seconds for which the robot holds still."""
 PICTURED_ENVS = 2
-"""Envs that observe pictures: a reset renders all of their cameras."""
+"""Number of envs that observe pictures: a reset renders all of their cameras."""
 FIRST_BUILT_SEED = 2022
-"""With which BaseEnv's constructor builds env 0; env i with the i-th after it."""
+"""Seed with which BaseEnv's constructor builds env 0; env i has this seed plus i."""
 SEEDS_ALONE = 2
-MOST_OBS = 4096
-"""Leaves of an observation with more numbers per env are pictures."""
+"""Number of seeds for which one env is built."""
+MAX_LEAF_NUMBERS = 4096
+"""Maximum numbers per env of a leaf of the observation; larger leaves are pictures."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Found:
     place: Place | None
     """File, line and function; None if no line is at fault."""
     count: int = 1
-    """In how many envs, seeds or steps."""
+    """Number of envs, seeds or steps with the breach."""
 
 
 @dataclass(frozen=True)
@@ -80,24 +81,25 @@ class Note:
 
 
 Check = Callable[["Checkup"], Iterator[Found | Note]]
-"""Looks whether one rule is kept: without a breach it is, unless NotApplicable or NotKnown is raised, in the end too."""
+"""Gives the breaches of one rule. Without one the rule is kept, unless the check raises NotApplicable or NotKnown, which it may
+do at the end too."""
 _Value = TypeVar("_Value")
 
 
 class NotApplicable(Exception):
-    """The rule says nothing about this task; the text is the reason: it has no dense reward, say."""
+    """The rule says nothing about this task. The text is the reason, such as "it has no reward"."""
 
 
 class NotKnown(Exception):
-    """What the rule speaks of was not tried; the text is the reason: no tried episode succeeds, say."""
+    """The rule was not tried, or not to the end. The text is the reason, such as "no tried episode succeeds"."""
 
 
 class CheckEnded(Exception):
-    """No result is needed any more: `keep_going` of a `Checkup` raises it."""
+    """No result is needed any more. `keep_going` of a `Checkup` raises this."""
 
 
 def evidence(see: Callable[[Checkup], _Value]) -> cached_property[_Value]:
-    """A property of a `Checkup` that is seen once; if it raises, it raises the same error each time."""
+    """A property of a `Checkup` that is computed once; if it raises, it raises the same error each time."""
 
     @wraps(see)
     def once(self: Checkup) -> _Value:
@@ -111,29 +113,30 @@ class Overlap:
     """Two bodies inside each other."""
 
     bodies: tuple[str, str]
-    """As in `SceneIndex.names`."""
+    """Names as in `SceneIndex.names`."""
     depth: float
     """Metres."""
 
 
 @dataclass(frozen=True)
 class Alone:
-    """What one env alone builds."""
+    """What a single env builds."""
 
     shapes: dict[int, tuple[Any, ...]]
     """`shapes_of_env` by seed."""
     rebuilds: bool
-    """Whether it is rebuilt at resets."""
+    """Whether the env is rebuilt at resets."""
     overlaps: tuple[Overlap, ...]
-    """Where everything is built, before the first reset."""
+    """Overlaps of the bodies as they are built, before the first reset."""
     seeds: tuple[int, ...]
-    """With which it was built."""
+    """Seeds with which the env was built."""
 
 
 class Checkup:
-    """One version of a task under check. Close it in the end.
+    """One version of a task under check. The caller closes it.
 
-    All that calls the author's code raises `TaskError` with their line. Of one env no set of envs is made that is larger.
+    Every method that calls the author's code raises `TaskError` with the author's line. If `num_envs` is 1, all envs of the
+    checkup are single.
     """
 
     def __init__(
@@ -149,7 +152,8 @@ class Checkup:
     ) -> None:
         """
         Args:
-            actors: act in further episodes, beside random actions.
+            seeds: number of seeds.
+            actors: actors of further episodes, in addition to random actions.
             keep_going: called between steps; raises CheckEnded to end the checks.
         """
         self.loaded = loaded
@@ -159,15 +163,15 @@ class Checkup:
         self.actors = tuple(actors)
         self.places = Places(loaded)
         self.findings: list[Finding] = []
-        """Breaches of the rules of GPU simulation, seen in all that ran so far."""
+        """Breaches of the rules of GPU simulation so far."""
         self.failed: dict[Callable[[Checkup], Any], Exception] = {}
-        """What each piece of evidence raised."""
+        """Error of each piece of evidence that raised."""
         self.files = frozenset(str(file) for file in loaded.source_files)
         self.builds: list[Built] = []
-        """What `task` has built."""
+        """Bodies that `task` has built."""
         self.merges: list[Merged] = []
         self.picture_seconds = 0.0
-        """For the first pictures of the process."""
+        """Seconds that the first pictures of the process took."""
         self._keep_going = keep_going
         self._open: list[TaskEnv] = []
         self._built_with_renderer = False
@@ -177,7 +181,7 @@ class Checkup:
 
     def close(self) -> None:
         while self._open:
-            # Rules that make an env of their own tell what its close raises; here the results are known already.
+            # What closing raises is no result: all results are known.
             with suppress(TaskError):
                 self._close(self._open.pop())
         self._looked.clear()
@@ -186,7 +190,7 @@ class Checkup:
                 self.__dict__.pop(name, None)
 
     def go_on_with_one_env(self) -> None:
-        """Forget what several envs have shown, but for breaches: the task does what exists for one env only."""
+        """Forget all evidence from several envs except breaches: the task uses something that exists for one env only."""
         self._silenced_before = self.silenced
         self.close()
         self.num_envs, self._rules = 1, None
@@ -194,7 +198,7 @@ class Checkup:
             seen.clear()
 
     def _once(self, see: Callable[[Checkup], _Value]) -> _Value:
-        """What `see` gives; if it raised before, the same error."""
+        """The value of `see`; if it raised before, raises the same error."""
         if (known := self.failed.get(see)) is not None:
             raise known
         try:
@@ -208,7 +212,7 @@ class Checkup:
     # --- envs ---------------------------------------------------------------------------------------------
 
     def require_several(self) -> None:
-        """Raise NotKnown for one env."""
+        """Raise NotKnown if there is one env only."""
         if self.num_envs == 1:
             raise NotKnown("it needs several envs, and one was looked at")
 
@@ -218,29 +222,29 @@ class Checkup:
             raise NotKnown("its source is not known")
 
     def require_task(self) -> None:
-        """Raise NotApplicable for a robot that is shown in a scene of ManiSkill: the task is not the author's."""
+        """Raise NotApplicable for a robot that is shown in a scene of ManiSkill: the author wrote no task."""
         if self.loaded.robot is not None:
             raise NotApplicable("it is a robot in a scene of ManiSkill's")
 
     def at_most(self, wanted: int) -> int:
-        """So many envs; one where one was asked for."""
+        """The number of envs to make for a wish of `wanted`: 1 if the checkup has one env."""
         return wanted if self.num_envs > 1 else 1
 
     @contextmanager
     def env(
         self, num_envs: int | None = None, *, render: bool = False, rules: Degree = "off", **kwargs: Any
     ) -> Iterator[TaskEnv]:
-        """Another env of the task, for a `with`.
+        """Context with another env of the task.
 
         Args:
-            render: False makes no renderer, unless the task needs one to be built.
-            kwargs: keyword arguments of the task class in place of the given ones.
+            render: whether to make a renderer; one is made anyway if the task needs it to be built.
+            kwargs: keyword arguments of the task class, which replace those of `env_kwargs`.
         """
         task = self._made(num_envs or self.num_envs, render or self._needs_renderer, rules, kwargs)
         try:
             yield task
         except BaseException:
-            with suppress(TaskError):  # the first error is told
+            with suppress(TaskError):  # the first error is raised
                 self._close(task)
             raise
         self._close(task)
@@ -252,10 +256,10 @@ class Checkup:
     @evidence
     def task(self) -> TaskEnv:
         """`num_envs` envs, which check the rules of GPU simulation, without a renderer unless the task needs one to be
-        built. Whoever uses it resets it first."""
+        built. Reset it before use."""
         with noting_builds(self.builds, self.merges, self.files):
             made = self._without_renderer()
-            # Outside of any `except`: what fails for want of a renderer is no cause of what fails with one.
+            # Outside of any `except`: an error without a renderer is no cause of an error with one.
             if made is None:
                 for noted in (self.findings, self.builds, self.merges):
                     noted.clear()
@@ -266,11 +270,11 @@ class Checkup:
         return made
 
     def _without_renderer(self) -> TaskEnv | None:
-        """None where the build fails and another one, with a renderer, may succeed."""
+        """The envs without a renderer; None if the build fails and may succeed with one."""
         try:
             return self._made(self.num_envs, False, "warn", {})
         except TaskError as error:
-            # What a task wants of a renderer can fail in many ways: only trying says whether that was it.
+            # A missing renderer raises errors of many kinds: only another try shows whether that was the cause.
             if isinstance(error.__cause__, (MissingAssets, ImportError)):
                 raise
             if not self._may_render:
@@ -280,19 +284,19 @@ class Checkup:
 
     @property
     def silenced(self) -> list[Silenced]:
-        """Breaches of the rules of GPU simulation that a comment silences, seen so far."""
+        """Breaches of the rules of GPU simulation so far that a comment silences."""
         known = () if self._rules is None else self._rules.silenced
         of_task = [Silenced(finding, silence.reason, silence.line) for finding, silence in known]
         return [*self._silenced_before, *of_task]
 
     @property
     def _needs_renderer(self) -> bool:
-        """Whether the task cannot be built without one."""
+        """Whether the task cannot be built without a renderer."""
         return bool(self.task) and self._built_with_renderer
 
     @property
     def _may_render(self) -> bool:
-        """Whether a build without a renderer can be made with one: an argument may name one, or none."""
+        """Whether a failed build can be tried again with a renderer: an argument may name a renderer, or none."""
         return self._render_backend == "found" and find_renderer() is not None
 
     @property
@@ -303,14 +307,14 @@ class Checkup:
 
     @property
     def _render_backend(self) -> Any:
-        """As it was given: ``none``, or a name; ``found`` if it was not."""
+        """The given render backend: ``none`` or a name; ``found`` if none was given."""
         given = {**self.loaded.default_kwargs, **self.env_kwargs}
         # ManiSkill also takes None for "none".
         return given.get("render_backend", "found") or "none"
 
     @evidence
     def pictured(self) -> TaskEnv:
-        """`PICTURED_ENVS` envs that observe pictures. Whoever uses it resets it first.
+        """`PICTURED_ENVS` envs that observe pictures. Reset them before use.
 
         Raises:
             NotApplicable: the task has no such observations.
@@ -331,7 +335,7 @@ class Checkup:
         return made
 
     def look(self, see: Callable[[Checkup], _Value]) -> _Value:
-        """What `see` gives, seen once: evidence of a module's own rules. If it raises, it raises the same error again."""
+        """The value of `see`, computed once: evidence that a module of rules defines. If it raises, it raises the same error again."""
         if see not in self._looked:
             self._looked[see] = self._once(see)
         return self._looked[see]
@@ -349,21 +353,21 @@ class Checkup:
                 default_kwargs=self.loaded.default_kwargs,
             )
             if isinstance(env, BatchedCpuMixin):
-                # Physics that has a past differs by its last bits with what was looked at before, and a touch sensor reads
-                # the contacts of the last episode.
+                # Otherwise earlier episodes change the last bits of the physics, and a touch sensor reads the contacts of the
+                # last episode.
                 env.begins_anew = True
             return TaskEnv(env, self.loaded.max_episode_steps, check=returns_check(self.loaded, num_envs))
 
     def reset(
         self, task: TaskEnv, seed: int | list[int] | None, env_idx: list[int] | None = None
     ) -> StepResult:
-        """As `TaskEnv.reset`."""
+        """Reset envs, as `TaskEnv.reset`."""
         self._keep_going()
         with blamed("reset", self.loaded, task):
             return task.reset(seed, env_idx)
 
     def step(self, task: TaskEnv, action: NDArray[np.float32] | None) -> StepResult:
-        """As `TaskEnv.step`."""
+        """Make a control step, as `TaskEnv.step`."""
         self._keep_going()
         with blamed("step", self.loaded, task):
             return task.step(action)
@@ -376,24 +380,24 @@ class Checkup:
     # --- what was seen ------------------------------------------------------------------------------------
 
     def batches(self) -> Iterator[list[int]]:
-        """The seeds, `num_envs` at a time; beyond the last one they go on counting so that every batch is full."""
+        """The seeds, `num_envs` at a time; the last batch is filled up with further seeds."""
         count, n = len(self.seeds), self.num_envs
         for first in range(0, count, n):
             yield [self.seeds[0] + first + i for i in range(n)]
 
     @evidence
     def starts(self) -> Episodes:
-        """All seeds, right after their reset (T = 0)."""
+        """Episodes of all seeds, right after their reset (T = 0)."""
         hold = _FromSeeds(self, "still", 0, lambda task, step: actions.hold_action(task.parts, task.num_envs))
         return self._episodes(hold)
 
     @evidence
     def still(self) -> Episodes:
-        """All seeds, while the robot holds the pose of the reset for `STILL_SECONDS`."""
+        """Episodes of all seeds in which the robot holds the pose of the reset for `STILL_SECONDS`."""
         held: dict[int, NDArray[np.float32]] = {}
 
         def hold(task: TaskEnv, step: int) -> NDArray[np.float32]:
-            # Of the pose at the reset: the present one would follow a robot that sags.
+            # The action that holds the pose of the reset: one for the present pose would follow a robot that sags.
             if step == 0:
                 held[0] = actions.hold_action(task.parts, task.num_envs)
             return held[0]
@@ -403,7 +407,7 @@ class Checkup:
 
     @evidence
     def random(self) -> Episodes:
-        """All seeds, under random actions, to the end of the episode or `ROLLOUT_STEPS`."""
+        """Episodes of all seeds with random actions, to their end or `ROLLOUT_STEPS`."""
         rng = np.random.default_rng(0)
         steps = min(self.loaded.max_episode_steps or ROLLOUT_STEPS, ROLLOUT_STEPS)
         actor = _FromSeeds(
@@ -424,7 +428,7 @@ class Checkup:
 
     @evidence
     def overlaps(self) -> dict[int, tuple[Overlap, ...]]:
-        """The bodies that are inside each other right after a reset, for each seed."""
+        """Overlapping bodies right after a reset, by seed."""
         found: dict[int, tuple[Overlap, ...]] = {}
         for seeds in self.batches():
             self.reset(self.task, seeds)
@@ -436,10 +440,10 @@ class Checkup:
 
     @evidence
     def tensor_uses(self) -> TensorUses:
-        """What the author's lines do with tensors: at a build, a reset and three steps."""
+        """Uses of tensors in the author's lines, in a build, a reset and three steps."""
         count = self.at_most(NUM_ENVS)
         watch = TensorWatch({str(file) for file in self.loaded.source_files}, count)
-        render = self._needs_renderer  # it builds `task`, which is not to be watched here
+        render = self._needs_renderer  # outside the watch: this builds `task`
         with watch, self.env(count, render=render) as task:
             self.reset(task, self.seeds[0])
             rng = np.random.default_rng(0)
@@ -451,11 +455,11 @@ class Checkup:
 
     @evidence
     def alone(self) -> Alone:
-        """Of the seeds with which the first envs of `task` were built."""
+        """Builds of a single env, for the seeds with which the first envs of `task` were built."""
         seeds = [FIRST_BUILT_SEED + i for i in range(SEEDS_ALONE)]
         built: list[Built] = []
         shapes: dict[int, tuple[Any, ...]] = {}
-        render = self._needs_renderer  # it builds `task`, which is not to be noted here
+        render = self._needs_renderer  # before the builds are noted: this builds `task`
         with noting_builds(built, [], self.files), self.env(1, render=render) as task:
             rebuilds = task.env.reconfiguration_freq != 0
             for seed in seeds:
@@ -470,7 +474,7 @@ class Checkup:
 
     @evidence
     def fails_with_several(self) -> Problem | None:
-        """What several envs raise in a reset and three steps that one env does; None if they do not, or one raises too."""
+        """The error that several envs raise in a reset and three steps; None if they raise none, or one env raises too."""
         several, alone = (self._raises_early(count) for count in (self.num_envs, 1))
         return several if alone is None and self.num_envs > 1 else None
 
@@ -478,7 +482,7 @@ class Checkup:
         rng, task = np.random.default_rng(0), None
         built = "task" in self.__dict__
         try:
-            # Not by `env`: that asks `task`, which several envs may not build.
+            # Not by `env`, which builds `task`: with several envs that may fail.
             task = self._made(num_envs, self._built_with_renderer if built else self._may_render, "off", {})
             self.reset(task, self.seeds[0])
             for _ in range(3):
@@ -493,7 +497,7 @@ class Checkup:
 
     @evidence
     def placed(self) -> list[PoseSet]:
-        """The poses that are set in a reset of the first seeds."""
+        """Poses that a reset of the first seeds sets."""
         placed: list[PoseSet] = []
         task = self.task
         with noting_poses(placed, self.files):
@@ -501,7 +505,7 @@ class Checkup:
         return placed
 
     def first_substep(self, task: TaskEnv) -> None:
-        """One substep of physics: the contacts that it finds are those of the state before it."""
+        """Make one substep of physics, which finds the contacts of the state before it."""
         with blamed("step", self.loaded, task):
             task.env.scene.step()
             fetch(task.env)
@@ -514,7 +518,7 @@ class Checkup:
             chosen = range(first, min(first + n, len(actor.seeds)))
             seeds, lengths = ([of[k] for k in chosen] for of in (actor.seeds, actor.lengths))
             self._keep_going()
-            # Every env needs an episode: the last one again, which is not looked at.
+            # Every env needs an episode: the others run the last one again, and are ignored.
             states = [actor.begin(task, [min(first + i, chosen[-1]) for i in range(n)])]
             seen = None
             if watched:
@@ -542,7 +546,7 @@ class Checkup:
 
 @dataclass(frozen=True)
 class _FromSeeds:
-    """Acts in an episode of each seed, alike in all envs."""
+    """Actor in an episode of each seed, with the same kind of actions in all envs."""
 
     checkup: Checkup
     kind: str
@@ -577,7 +581,7 @@ def put_where_built(task: TaskEnv) -> None:
 
 
 def read_obs(task: TaskEnv) -> dict[str, NDArray[np.float64]]:
-    """`leaf_rows` of the present observation; of a flat one, a single leaf ``obs``."""
+    """`leaf_rows` of the present observation; a flat observation is a single leaf ``obs``."""
     return leaf_rows(task.obs, task.num_envs)
 
 
@@ -587,14 +591,14 @@ def leaf_rows(value: Any, num_envs: int) -> dict[str, NDArray[np.float64]]:
     for name, leaf in flat_entries(value):
         if not isinstance(leaf, torch.Tensor) or leaf.ndim == 0 or len(leaf) != num_envs:
             continue
-        if leaf.numel() <= MOST_OBS * num_envs and not leaf.is_complex():
+        if leaf.numel() <= MAX_LEAF_NUMBERS * num_envs and not leaf.is_complex():
             read[name or "obs"] = leaf.reshape(num_envs, -1).double().numpy(force=True).copy()
     return read
 
 
 def overlaps_of(task: TaskEnv, env: int) -> tuple[Overlap, ...]:
-    """The bodies that were inside each other at the begin of the last substep, deepest first. Links of one articulation
-    that touch are left out: its joints hold them."""
+    """Bodies that overlapped at the begin of the last substep, deepest first. Links of one articulation that touch are left out,
+    since joints hold them."""
     deepest: dict[tuple[str, str], float] = {}
     for contact in list_contacts(task.env, env):
         first, second = sorted(contact.bodies)
@@ -607,12 +611,12 @@ def overlaps_of(task: TaskEnv, env: int) -> tuple[Overlap, ...]:
 
 
 def finding_of(rule: str, degree: Degree, found: Found) -> Finding:
-    """The finding, with the text of its line."""
+    """A finding with the text of its line."""
     file, line, function = found.place or (None, None, "")
     code = "" if found.place is None else code_of(found.place)
     return Finding(rule, degree, found.message, file, line, code, function, found.count, 0)
 
 
 def code_of(place: Place) -> str:
-    """The text of its line, stripped."""
+    """The text of the line of a place, stripped."""
     return linecache.getline(place[0], place[1]).strip()

@@ -1,4 +1,4 @@
-"""What was seen of many episodes of a task, rolled out in batches, and who acts in them."""
+"""Episodes of a task that are rolled out in batches, and the actors in them."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ class Actor(Protocol):
 
     @property
     def kind(self) -> str:
-        """For a sentence: ``random``, ``given``."""
+        """Word for a sentence: ``random``, ``given``."""
         ...
 
     @property
     def seeds(self) -> Sequence[int]:
-        """(K,) with which each episode begins."""
+        """(K,) seed of each episode."""
         ...
 
     @property
     def lengths(self) -> Sequence[int]:
-        """(K,) the most control steps of each episode."""
+        """(K,) maximum number of control steps of each episode."""
         ...
 
     def begin(self, task: TaskEnv, episodes: Sequence[int]) -> StepResult:
-        """Reset all envs to the start of these episodes, one for each env. The last may be there several times.
+        """Reset all envs to the start of these episodes, one for each env. The last one may occur several times.
 
         Raises:
             TaskError: the task raised.
@@ -41,7 +41,7 @@ class Actor(Protocol):
         ...
 
     def next_action(self, task: TaskEnv, step: int) -> NDArray[np.float32]:
-        """(N, A) in the episodes that were begun last; any for one that is over.
+        """(N, A) actions for the episodes that were begun last; the actions of an episode that is over are ignored.
 
         Raises:
             TaskError: the actor raised; the problem's stage is ``policy``.
@@ -58,34 +58,34 @@ class SeenOutlier:
     """1-based control step."""
     seed: int
     reason: str
-    """As `Outlier.reason`."""
+    """Text as in `Outlier.reason`."""
     body: str
-    """Its name, as in `SceneIndex.names`; empty if it is of no body."""
+    """Name of the body, as in `SceneIndex.names`; empty for an outlier that is no body."""
 
 
 @dataclass
 class Episodes:
-    """What was seen of K episodes over T control steps; episode k began with seed ``seeds[k]``. Leading dimension T + 1 for
-    states, T for rewards. An episode that has ended goes on, as in stock ManiSkill: `length` says where it ended. Of one
-    whose actions are over, the last state and reward are repeated."""
+    """K episodes over T control steps; episode k has the seed ``seeds[k]``. The leading dimension is T + 1 for states, T for
+    rewards. An episode that has ended goes on, as in stock ManiSkill: `length` says where it ended. If its actions are over,
+    the last state and reward are repeated."""
 
     kind: str = "random"
-    """As `Actor.kind`."""
+    """Kind of the actor, as `Actor.kind`."""
     seeds: list[int] = field(default_factory=list)
     poses: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0, 0, 7), np.float32))
     """(T + 1, K, B, 7) position in metres, quaternion wxyz; bodies as `Checkup.bodies`."""
     qpos: NDArray[np.float32] | None = None
     """(T + 1, K, J); None without joints."""
     evaluate: dict[str, NDArray] = field(default_factory=dict)
-    """(T + 1, K, ...) each."""
+    """Entries of ``evaluate()``, each (T + 1, K, ...)."""
     reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """(T, K)"""
     obs: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    """(T + 1, K, D) by leaf, pictures left out."""
+    """Observations, (T + 1, K, D) by leaf, without pictures."""
     length: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(K,) control steps until the episode ended; T if it did not."""
+    """(K,) number of control steps until the episode ended; T if it did not."""
     outliers: tuple[SeenOutlier, ...] = ()
-    """Of each kind the first of an episode before its end; of random rollouts only."""
+    """The first outlier of each kind in each episode, before the end of the episode; in random rollouts only."""
 
 
 class SeenOutliers:
@@ -99,7 +99,7 @@ class SeenOutliers:
         """Look at a control step.
 
         Args:
-            over: (N,) episodes that have ended, which may end as they like.
+            over: (N,) whether the episode has ended; outliers after that do not count.
         """
         for sight in self._watch.check(now):
             for env in np.flatnonzero(sight.envs & ~over).tolist():
@@ -123,10 +123,10 @@ def stacked(
     ended: NDArray[np.int64],
     outliers: Iterable[SeenOutlier],
 ) -> Episodes:
-    """The episodes of one batch: of the first ``len(seeds)`` envs.
+    """The episodes of one batch, which ran in the first ``len(seeds)`` envs.
 
     Args:
-        lengths: control steps for which each episode had actions; at most as many were made.
+        lengths: number of control steps for which each episode had actions.
         steps: T.
         ended: (N,) as `Episodes.length`.
     """

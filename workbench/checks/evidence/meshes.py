@@ -1,4 +1,4 @@
-"""Mesh files: how many triangles they have, and whether a hull would close them."""
+"""Counts the triangles of mesh files, and finds hollow meshes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ import trimesh
 from numpy.typing import NDArray
 
 _BYTES_PER_TRIANGLE = 3.0
-"""No format of a mesh stores a triangle in less, unless it is compressed."""
+"""Minimum size of a triangle in an uncompressed mesh file."""
 _RAYS = 162
-_MOST_TRIANGLES = 50_000
-_LEAST_WALL, _LEAST_OPEN = 0.6, 0.03
-"""Shares of all directions, seen from within a hollow, in which there is a wall, and in which it is open."""
+"""Number of directions in which walls are looked for."""
+_MAX_TRIANGLES = 50_000
+_MIN_WALL_SHARE, _MIN_OPEN_SHARE = 0.6, 0.03
+"""Minimum shares of the directions from within a hollow mesh with a wall, and without one."""
 
 
 def triangles_in(file: str, more_than: int) -> int | None:
-    """Triangles of a mesh file; 0 if it is too small to have `more_than`, None if it cannot be read."""
+    """Number of triangles of a mesh file; 0 if the file is too small for `more_than`, None if it cannot be read."""
     if not Path(file).is_file() or Path(file).stat().st_size < _BYTES_PER_TRIANGLE * more_than:
         return 0
     mesh = _read(file)
@@ -27,10 +28,10 @@ def triangles_in(file: str, more_than: int) -> int | None:
 
 @lru_cache(maxsize=256)
 def is_hollow(file: str) -> bool | None:
-    """Whether something could be put into it: from the middle of its convex hull, walls are seen in most directions and
-    nothing in some, on one side. None if that cannot be said: it cannot be read, or has too many triangles."""
+    """Whether a mesh is hollow, so that things could be put into it: rays from the middle of its convex hull meet walls in most
+    directions and nothing in some, on one side. None if it cannot be read or has too many triangles."""
     mesh = _read(file)
-    if mesh is None or len(mesh.faces) > _MOST_TRIANGLES:
+    if mesh is None or len(mesh.faces) > _MAX_TRIANGLES:
         return None
     if len(mesh.faces) < 4:
         return False
@@ -41,7 +42,7 @@ def is_hollow(file: str) -> bool | None:
     directions = trimesh.creation.icosphere(subdivisions=2).vertices[:_RAYS]
     hits = _crossings(np.asarray(mesh.triangles), np.asarray(hull.center_mass), np.asarray(directions))
     through = hits == 0
-    if not _LEAST_OPEN <= through.mean() <= 1 - _LEAST_WALL:
+    if not _MIN_OPEN_SHARE <= through.mean() <= 1 - _MIN_WALL_SHARE:
         return False
     # An opening is on one side; gaps of a ring, a frame or a star are on several.
     return float(np.linalg.norm(directions[through].mean(axis=0))) > 0.5
@@ -50,7 +51,7 @@ def is_hollow(file: str) -> bool | None:
 def _crossings(
     triangles: NDArray[np.float64], origin: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """(R,) how many of the triangles (F, 3, 3) each ray from `origin` meets (Moeller and Trumbore)."""
+    """(R,) number of the triangles (F, 3, 3) that each ray from `origin` meets (Moeller and Trumbore)."""
     first = triangles[:, 0]
     one, two = triangles[:, 1] - first, triangles[:, 2] - first
     to_origin = origin - first
@@ -72,6 +73,6 @@ def _crossings(
 def _read(file: str) -> trimesh.Trimesh | None:
     try:
         mesh = trimesh.load(file, force="mesh")
-    except Exception:  # any of a dozen readers; a file that is missing has a rule of its own
+    except Exception:  # any of a dozen readers; the rule missing-file reports a missing file
         return None
     return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None

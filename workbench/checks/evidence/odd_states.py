@@ -1,4 +1,4 @@
-"""States that random actions seldom reach: joints and bodies are put there, and the task's hooks are asked again."""
+"""Puts joints and bodies into states that random actions seldom reach, and calls the task's hooks there."""
 
 from __future__ import annotations
 
@@ -24,19 +24,21 @@ from workbench.episodes.recorded_state import read_states, write_states
 from workbench.task.blame import blamed, returns_check
 
 BATCHES = 2
-"""Batches of seeds whose states are changed."""
-AROUND = 0.15
-"""Metres beyond where bodies begin."""
-HIGHEST = 0.3
-"""Metres above where a body begins."""
+"""Number of batches of seeds whose states are changed."""
+MARGIN_METRES = 0.15
+"""Metres around the start of bodies in x and y within which they are placed."""
+HEIGHT_METRES = 0.3
+"""Metres above the start of a body within which it is placed."""
 KINDS = ("right after the reset", "with joints and bodies at random places", "with joints at their limits")
-MOST_GOALS = 4
-"""A drawing has hundreds of marks."""
+"""Descriptions of the states of each batch, for a sentence."""
+MAX_GOALS = 4
+"""Maximum number of goal marks at which bodies are placed: a drawing has hundreds of marks."""
 AT_GOAL = "with bodies at the place of {}"
 SHORT = "on the way back from a success to the reset"
 HALVINGS = 6
-"""Of the way back: the last states are within a 64th of it from where success ends."""
+"""Halvings of the way back: the last states are within 1/64 of the way from where success ends."""
 DENSE_HOOKS = {"dense": "compute_dense_reward", "normalized_dense": "compute_normalized_dense_reward"}
+"""Hook of each dense reward mode."""
 
 States = dict[str, NDArray[np.float32]]
 """(N, D) by name, as `read_states` gives them."""
@@ -44,21 +46,21 @@ States = dict[str, NDArray[np.float32]]
 
 @dataclass
 class OddStates:
-    """What the hooks gave in R rounds of N envs. Rounds of one seed are of one episode: its goal stays."""
+    """Results of the hooks in R rounds of N envs. Rounds with the same seeds belong to the same episodes, with the same goals."""
 
     seeds: list[list[int]] = field(default_factory=list)
     """(R, N)"""
     kinds: list[str] = field(default_factory=list)
-    """(R,) where joints and bodies were, for a sentence."""
+    """(R,) description of the states, for a sentence."""
     evaluate: list[dict[str, NDArray]] = field(default_factory=list)
-    """(R,) of (N, ...) each."""
+    """(R,) entries of ``evaluate()``, each (N, ...)."""
     reward: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
-    """(R, N) by reward mode: the present one, and the dense ones that the class has."""
+    """(R, N) by reward mode: the mode of the env, and the dense modes that the class has."""
     obs: list[dict[str, NDArray[np.float64]]] = field(default_factory=list)
-    """(R,) of (N, D) by leaf, pictures left out."""
+    """(R,) observations, (N, D) by leaf, without pictures."""
     told: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
-    """As `reward`, where evaluate() is said to have reported success in all envs; NaN where the reward raised then. Empty where
-    evaluate() has no success."""
+    """As `reward`, with ``info["success"]`` set to true in all envs; NaN where the reward raised. Empty if evaluate() has no
+    entry success."""
 
 
 def odd_states(checkup: Checkup) -> OddStates:
@@ -68,7 +70,7 @@ def odd_states(checkup: Checkup) -> OddStates:
         checkup.reset(task, seeds)
         begun = read_states(task.env)
         rounds = [(kind, _changed(task.env, begun, kind, rng)) for kind in KINDS]
-        for goal in _goals(task.env)[:MOST_GOALS]:
+        for goal in _goals(task.env)[:MAX_GOALS]:
             rounds.append((AT_GOAL.format(goal.partition("/")[2]), _at(task.env, begun, goal)))
         for kind, states in rounds:
             succeeded = _put(checkup, kind, states, seeds, rng, seen)
@@ -85,7 +87,7 @@ def odd_states(checkup: Checkup) -> OddStates:
 def _put(
     checkup: Checkup, kind: str, states: States, seeds: list[int], rng: np.random.Generator, seen: OddStates
 ) -> NDArray[np.bool_]:
-    """Put all envs into these states and ask the hooks; (N,) where that is a success."""
+    """Put all envs into these states and call the hooks; (N,) whether each env has success."""
     task = checkup.task
     write_all(task.env, states)
     action = actions.random_action(task.parts, task.num_envs, rng)
@@ -131,7 +133,7 @@ def _tell_success(
     try:
         rows = _rows(hook(obs=obs, action=action, info=told), num_envs)
     except Exception:
-        # No fault of the task: this state has no success. What else a success means may be missing in it.
+        # No fault of the task: the state has no success, so other conditions of a success may not hold.
         rows = np.full(num_envs, np.nan)
     seen.told.setdefault(mode, []).append(rows)
 
@@ -142,7 +144,7 @@ def _rows(reward: Any, num_envs: int) -> NDArray[np.float64]:
 
 
 def reward_modes(checkup: Checkup) -> list[str]:
-    """The present reward mode, then the dense ones that the class has."""
+    """The reward mode of the env, then the dense modes that the class has."""
     cls, present = checkup.loaded.cls, checkup.task.env.reward_mode
     own = [mode for mode, hook in DENSE_HOOKS.items() if getattr(cls, hook) is not getattr(BaseEnv, hook)]
     return [present, *(mode for mode in own if mode != present and mode in cls.SUPPORTED_REWARD_MODES)]
@@ -163,7 +165,7 @@ def _changed(env: BaseEnv, begun: States, kind: str, rng: np.random.Generator) -
             rows[:, BODY:] = _joints(struct, len(rows), rng, at_limits=kind == KINDS[2])
         elif struct is not None and struct.px_body_type == "dynamic" and kind == KINDS[1]:
             here = np.isfinite(rows).all(axis=1)
-            highest = rows[:, 2:3] + HIGHEST
+            highest = rows[:, 2:3] + HEIGHT_METRES
             places = np.concatenate([np.tile(low[:2], (len(rows), 1)), rows[:, 2:3]], axis=1)
             spans = np.concatenate([np.tile(high[:2], (len(rows), 1)), highest], axis=1) - places
             turned = rng.normal(size=(len(rows), 4))
@@ -174,20 +176,20 @@ def _changed(env: BaseEnv, begun: States, kind: str, rng: np.random.Generator) -
 
 
 def _box(env: BaseEnv, begun: States) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(3,) lowest and highest place of what moves, and `AROUND` it."""
+    """(3,) corners of the box around the bodies that move, with a margin of `MARGIN_METRES`."""
     places = [
         rows[np.isfinite(rows).all(axis=1), :3]
         for name, rows in begun.items()
         if name.startswith("actors/") and scene_index(env).states[name].px_body_type == "dynamic"
     ]
     if not places:
-        return np.full(3, -AROUND, np.float32), np.full(3, AROUND, np.float32)
+        return np.full(3, -MARGIN_METRES, np.float32), np.full(3, MARGIN_METRES, np.float32)
     together = np.concatenate(places)
-    return together.min(axis=0) - AROUND, together.max(axis=0) + AROUND
+    return together.min(axis=0) - MARGIN_METRES, together.max(axis=0) + MARGIN_METRES
 
 
 def _joints(articulation: Any, count: int, rng: np.random.Generator, at_limits: bool) -> NDArray[np.float32]:
-    """(N, 2 J) positions within the limits, and no velocity. A joint without limits turns or slides by up to pi."""
+    """(N, 2 J) joint positions within the limits, and zero velocities. A joint without limits gets up to pi (rad or m)."""
     limits = np.array(articulation.get_qlimits().numpy(force=True), np.float32)
     low, high = np.clip(np.broadcast_to(limits, (count, *limits.shape[1:])), -np.pi, np.pi).transpose(2, 0, 1)
     share = rng.random(low.shape)
@@ -196,7 +198,7 @@ def _joints(articulation: Any, count: int, rng: np.random.Generator, at_limits: 
 
 
 def _goals(env: BaseEnv) -> list[str]:
-    """Kinematic bodies without collision shapes: marks of where something is to go."""
+    """Names of kinematic bodies without collision shapes, which mark a goal."""
     return [
         name
         for name, struct in scene_index(env).states.items()
@@ -208,13 +210,13 @@ def _goals(env: BaseEnv) -> list[str]:
 
 
 def _collides(entity: Any) -> bool:
-    # Of a merged actor ManiSkill's `has_collision_shapes` raises.
+    # ManiSkill's `has_collision_shapes` raises for a merged actor.
     body = entity.find_component_by_type(sapien.physx.PhysxRigidBaseComponent)
     return body is not None and len(body.collision_shapes) > 0
 
 
 def _at(env: BaseEnv, begun: States, goal: str) -> States:
-    """Dynamic bodies above or below the goal, as high as they began in every other env, and at its height in the others."""
+    """States with all dynamic bodies at the goal: at its height in odd envs, at the height of their start in even envs."""
     states: States = {}
     for name, rows in begun.items():
         states[name] = rows = rows.copy()
@@ -228,10 +230,10 @@ def _at(env: BaseEnv, begun: States, goal: str) -> States:
 
 
 def _between(states: States, begun: States, shares: NDArray[np.float64]) -> States:
-    """Part of the way back to where the episode began, at rest.
+    """States at rest on the way back to where the episode began.
 
     Args:
-        shares: (N,) from 0 on, where 1 is where it began.
+        shares: (N,) share of the way; 0 is `states`, 1 is `begun`.
     """
     found: States = {}
     share = shares[:, None]
@@ -244,6 +246,6 @@ def _between(states: States, begun: States, shares: NDArray[np.float64]) -> Stat
         between[:, 3:7] = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
         joints = (rows.shape[1] - BODY) // 2
         between[:, 7:BODY], between[:, BODY + joints :] = 0, 0
-        # A body that an env lacks is NaN, and one that does not move stays as it is.
+        # A body that an env lacks is NaN; a body that does not move keeps its state.
         found[name] = np.where(np.isfinite(rows) & (rows != first), between, rows).astype(np.float32)
     return found

@@ -1,4 +1,4 @@
-"""Rules that look at all seeds: what they see is data, so that parts of the seeds can be seen by several processes."""
+"""Checks over all seeds, in two parts: several processes look at parts of the seeds, one judges what all saw."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from workbench.checks.results import Seen
 
 @dataclass(frozen=True)
 class OverSeeds:
-    """A `Check` in two parts. What is decided over all seeds must not be decided for a part of them: a reward that is the
-    same at all steps of 32 seeds may differ in the next ones."""
+    """A `Check` in two parts. A part of the seeds must not decide the result: a reward that is the same at all steps of 32 seeds
+    may differ in the next seeds."""
 
     see: Callable[[Checkup], Iterator[Seen]]
-    """What is there, of the seeds of a checkup."""
+    """Looks at the seeds of a checkup, and gives what it saw as rows."""
     judge: Callable[[Sequence[Seen]], Iterator[Found | Note]]
-    """What that comes to, of one or several of them in the order of their seeds. Raises as a `Check`."""
+    """Gives the breaches for the rows of one or several checkups, in the order of their seeds. Raises as a `Check`."""
 
     def __call__(self, checkup: Checkup) -> Iterator[Found | Note]:
         return self.judge([*self.see(checkup)])
 
     def so_far(self, seen: Sequence[Seen]) -> Iterator[Found | Note]:
-        """What can be said where the task raised before all was seen."""
+        """The breaches that are known if the task raised before all seeds were seen."""
         if not seen:
             return
         try:
@@ -33,10 +33,10 @@ class OverSeeds:
 
 
 def together(seen: Iterable[Seen], worst: bool = False) -> list[Seen]:
-    """One row for each thing with a name, in the order in which they come.
+    """One row for each name, in the order in which names first occur; rows without a name are left out.
 
     Args:
-        worst: take the texts, numbers and place of the row of the largest size, in place of the first row's that has them.
+        worst: take texts, numbers and place of the row with the largest size, instead of the first row that has texts.
     """
     found: dict[tuple[str, ...], Seen] = {}
     for row in seen:
@@ -59,10 +59,10 @@ def together(seen: Iterable[Seen], worst: bool = False) -> list[Seen]:
 
 
 def tried(seen: Iterable[Seen], *names: str) -> int:
-    """How many episodes were looked at, as the rows of these names say."""
+    """Number of episodes that were looked at, over the rows with these names."""
     return sum(row.tried for row in seen if row.names == names)
 
 
 def first_kind(seen: Iterable[Seen]) -> Seen | None:
-    """Of rows whose name is a kind of episodes, the first one that has breaches."""
+    """The first kind of episodes that has breaches; the names of the rows are kinds."""
     return next((row for row in together(seen) if row.count), None)

@@ -1,4 +1,4 @@
-"""Where in the author's source a finding belongs."""
+"""Finds the line of the author's source at which a finding is reported."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Module:
 
     @cached_property
     def classes(self) -> dict[str, ast.ClassDef]:
-        """By qualified name."""
+        """Classes by qualified name."""
         found: dict[str, ast.ClassDef] = {}
         waiting: list[tuple[str, ast.AST]] = [("", self.tree)]
         while waiting:
@@ -48,7 +48,7 @@ class Module:
 
     @cached_property
     def imports(self) -> dict[str, str]:
-        """``np`` to ``numpy``, ``uniform`` to ``random.uniform``."""
+        """Imported names, such as ``np`` to ``numpy`` and ``uniform`` to ``random.uniform``."""
         found: dict[str, str] = {}
         for node in ast.walk(self.tree):
             if isinstance(node, ast.Import):
@@ -75,7 +75,7 @@ class Places:
 
     @cached_property
     def modules(self) -> tuple[Module, ...]:
-        """The task's file first. Files that are no Python are left out: they were executed, so there are none."""
+        """The author's files, the task's file first."""
         texts = {str(file): self._text(str(file)) for file in self._loaded.source_files}
         return tuple(Module(file, parse_python(text)) for file, text in texts.items())
 
@@ -83,7 +83,7 @@ class Places:
         return self._loaded.source.get(file) or "".join(linecache.getlines(file))
 
     def hook(self, *names: str) -> Place | None:
-        """The ``def`` of the first of these hooks that the author's files have; else the class."""
+        """The ``def`` line of the first of these hooks that the author's files have; else the class."""
         found = hook_definition(self._loaded.cls, names, self._loaded.source_files)
         return self.task if found is None else (*found[1], found[0])
 
@@ -94,7 +94,7 @@ class Places:
         return None if found is None else (found[0].file, found[1].lineno, found[1].name)
 
     def class_definition(self, cls: type) -> tuple[Module, ast.ClassDef] | None:
-        """Where a class is defined, if that is in the author's files."""
+        """The definition of a class in the author's files; None if it is elsewhere."""
         file, name = _identity(cls)
         for module in self.modules:
             if module.file == file and name in module.classes:
@@ -113,8 +113,8 @@ class Places:
         )
 
     def functions(self, *names: str) -> Iterator[tuple[Module, ast.FunctionDef]]:
-        """The functions of these names in the author's files, all if none is named: the task's methods first, none of other
-        tasks."""
+        """The functions with these names in the author's files (all if no name is given): the task's methods first, without methods
+        of other tasks."""
         methods = {function for _, function in self.methods}
         others = (
             (module, function)
@@ -127,7 +127,7 @@ class Places:
                 yield module, function
 
     def reached_from(self, *hooks: str) -> Iterator[tuple[Module, ast.FunctionDef]]:
-        """These hooks of the task, and the author's functions that they name, directly or not."""
+        """These hooks of the task, and the author's functions that they name directly or through others."""
         known: dict[str, list[tuple[Module, ast.FunctionDef]]] = {}
         for module, function in self.functions():
             known.setdefault(function.name, []).append((module, function))
@@ -156,7 +156,7 @@ class Places:
         )
 
     def entry(self, name: str, hook: str = "evaluate") -> Place | None:
-        """Where a hook makes this entry, as a key or a keyword; else its ``def``."""
+        """The line of a hook that has this entry as a key or a keyword; else its ``def`` line."""
         for module, function in self.functions(hook):
             for node in ast.walk(function):
                 if isinstance(node, ast.Constant) and node.value == name:
@@ -166,12 +166,12 @@ class Places:
         return self.hook(hook)
 
     def body(self, name: str, *hooks: str) -> Place | None:
-        """Where a body is made or placed.
+        """The line that makes or places a body.
 
         Args:
             name: as in `SceneIndex.names`.
-            hooks: the functions to search, in order; then the hook's ``def``. First for a line that places
-                the attribute that holds the body, then for one that names it.
+            hooks: the functions that are searched for a line that places the attribute which holds the body. Without one,
+                the line of any function that names the body is taken; else the ``def`` line of a hook.
         """
         owner = name.split("/", 1)[0]
         attributes = set(self._attributes_of(owner))
@@ -204,7 +204,7 @@ class Places:
 
 
 def _places(node: ast.AST, attributes: set[str]) -> bool:
-    """Whether it is ``self.<attribute>....set_...(...)``."""
+    """Whether the node is a call ``self.<attribute>....set_...(...)``."""
     if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
         return False
     if not node.func.attr.startswith("set_"):

@@ -9,8 +9,9 @@ from workbench.checks.evidence.places import Module, Places
 from workbench.envs.broken_rule import Place
 
 _SEEDED = {"RandomState", "default_rng", "Generator", "SeedSequence", "PCG64", "Philox", "MT19937", "Random"}
-"""They are random of their own accord only without an argument."""
+"""Generators that are random only if no seed is given."""
 _NO_DRAW = {"seed", "get_state", "set_state", "getstate", "setstate"}
+"""Functions of the random modules that draw nothing."""
 _TORCH = {
     "bernoulli", "multinomial", "normal", "poisson", "rand", "rand_like", "randint", "randint_like", "randn", "randn_like",
     "randperm",
@@ -27,12 +28,12 @@ _IN_PLACE = {
 }
 """Methods of a tensor that draw."""
 _MANISKILL = "mani_skill.envs.utils.randomization."
-"""Draws from torch."""
+"""Module whose functions draw from torch."""
 
 
 def global_draw(node: ast.AST, module: Module) -> str | None:
-    """``np.random.rand()`` if the node is a call that draws from numpy's or Python's global generator, or from a new one
-    without a seed; no reset seeds it."""
+    """The call as text, such as ``np.random.rand()``, if the node draws from NumPy's or Python's global generator, or from a
+    new one without a seed; no reset seeds these."""
     if not isinstance(node, ast.Call):
         return None
     written, full = _names(node, module)
@@ -51,8 +52,7 @@ def global_draw(node: ast.AST, module: Module) -> str | None:
 
 
 def torch_draw(node: ast.AST, module: Module) -> str | None:
-    """``torch.rand()`` if the node is a call that draws from torch's global generator, which is seeded within a reset
-    alone."""
+    """The call as text, such as ``torch.rand()``, if the node draws from torch's global generator, which only a reset seeds."""
     if not isinstance(node, ast.Call) or any(keyword.arg == "generator" for keyword in node.keywords):
         return None
     written, full = _names(node, module)
@@ -65,7 +65,7 @@ Draws = Callable[[ast.AST, Module], str | None]
 
 
 def first_draw(places: Places, draws: Draws, *hooks: str) -> tuple[Place, str] | None:
-    """The first such call in these hooks and in the author's functions that they name, and how it is written."""
+    """Place and text of the first such call in these hooks and the author's functions that they name."""
     for module, function in places.reached_from(*hooks):
         for node in ast.walk(function):
             if (written := draws(node, module)) is not None:
@@ -74,7 +74,7 @@ def first_draw(places: Places, draws: Draws, *hooks: str) -> tuple[Place, str] |
 
 
 def _names(node: ast.Call, module: Module) -> tuple[str, str]:
-    """The called name as it is written, and with what its first part was imported as."""
+    """The called name as written, and with its first part replaced by what it was imported from."""
     written = ast.unparse(node.func)
     first, *rest = written.split(".")
     return written, ".".join([module.imports.get(first, first), *rest])

@@ -1,4 +1,4 @@
-"""Watches what the author's lines do with tensors: which device they would be on, and what is copied to the host."""
+"""Watches what the author's lines do with tensors: the device of each on a GPU, and copies to the host."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torch.utils._device import DeviceContext
 from workbench.envs.broken_rule import Place
 
 NUM_ENVS = 5
-"""No vector that a task iterates has this length: positions have 3, quaternions 4, poses 7."""
+"""Number of envs: no vector that a task iterates has this length (positions have 3, quaternions 4, poses 7)."""
 
 _TORCH = f"{Path(torch.__file__).parent}/"
 _FACTORIES: frozenset[Any] = frozenset(
@@ -30,20 +30,21 @@ _FACTORIES: frozenset[Any] = frozenset(
 )  # fmt: skip
 _MOVES = {"to", "cpu", "cuda", "type_as"}
 _MIXES = {"copy_", "type_as", "to", "expand_as", "view_as", "reshape_as", "set_", "is_set_to"}
-"""They take tensors of two devices."""
+"""Operations that accept tensors of two devices."""
 _COPIES = {
     "item": ".item()", "cpu": ".cpu()", "numpy": ".numpy()", "tolist": ".tolist()", "__bool__": "if tensor:",
     "__float__": "float(tensor)", "__int__": "int(tensor)", "__index__": "tensor as a Python number",
     "__array__": "np.array(tensor)", "equal": "torch.equal()", "allclose": "torch.allclose()",
 }  # fmt: skip
 _PASSED_THROUGH = ("mani_skill.utils.common", "mani_skill.utils.structs.pose")
-"""A copy that these make is made by the line that calls them: ``pose.sp``, ``common.to_numpy(x)``."""
+"""Modules whose copies count for the line that calls them: ``pose.sp``, ``common.to_numpy(x)``."""
 _STATE = "_workbench_device"
 _OWN = "own"
-"""State of a tensor that is on the env's device. Of one that would stay on the host: the `Place` that made it. Of one
-whose origin was not seen (``torch.Tensor([1])``): no state."""
+"""State of a tensor on the env's device. The state of a tensor that would stay on the host is the `Place` that made it. A
+tensor of unknown origin (``torch.Tensor([1])``) has no state."""
 _HOST = torch.device("cpu", 0)
-"""The device that a host tensor says, so that a tensor made on it is a host tensor too; the env's has no number."""
+"""Value of ``tensor.device`` for a host tensor, so that a tensor made on it is a host tensor too. The env's device has no
+index."""
 
 
 @dataclass(frozen=True)
@@ -51,39 +52,39 @@ class Mix:
     """A host tensor and one of the env's device in one operation."""
 
     made: Place
-    """Where the host tensor was made."""
+    """Line that made the host tensor."""
     operation: str
 
 
 @dataclass
 class TensorUses:
-    """What the author's lines did with tensors."""
+    """Uses of tensors in the author's lines."""
 
     num_envs: int = NUM_ENVS
     steps: int = 0
-    """Control steps that were watched."""
+    """Number of control steps that were watched."""
     copies: Counter[Place] = field(default_factory=Counter)
-    """Copies to the host in these steps."""
+    """Number of copies to the host in these steps, by line."""
     written: dict[Place, str] = field(default_factory=dict)
-    """How these lines copy."""
+    """Text of the copy, such as ``.item()``, by line."""
     iterated: Counter[Place] = field(default_factory=Counter)
-    """Iterations over the rows of a tensor of `NUM_ENVS` rows in these steps."""
+    """Number of iterations over the rows of a tensor of `NUM_ENVS` rows in these steps, by line."""
     mixes: dict[Place, Mix] = field(default_factory=dict)
-    """The first of each line, also while the env was built and reset."""
+    """First mix by line, also while the env was built and reset."""
 
 
 class TensorWatch(TorchFunctionMode):
-    """A context in which `uses` is filled.
+    """Context that fills `uses`.
 
-    On the CPU all tensors are on one device. Which of them a GPU would have on the host is followed from where they are
-    made: without a device, they stay on the host until they are moved.
+    On the CPU all tensors are on one device. The watch follows which of them would be on the host with a GPU: a tensor that is
+    made without a device is on the host until it is moved.
     """
 
     def __init__(self, files: Collection[str], num_envs: int = NUM_ENVS) -> None:
         """
         Args:
-            files: the author's.
-            num_envs: of the env that is watched; a loop over envs is seen with `NUM_ENVS` only.
+            files: paths of the author's files.
+            num_envs: number of envs that are watched; loops over envs are seen with `NUM_ENVS` only.
         """
         super().__init__()
         self.uses = TensorUses(num_envs)
@@ -92,7 +93,7 @@ class TensorWatch(TorchFunctionMode):
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """Within this, a control step is made."""
+        """Context of one control step."""
         self._in_step = True
         try:
             yield
@@ -101,7 +102,7 @@ class TensorWatch(TorchFunctionMode):
             self.uses.steps += 1
 
     def __enter__(self) -> Any:
-        # Of all ways to make a tensor this one alone passes no mode.
+        # The only way to make a tensor that passes no TorchFunctionMode.
         self._from_numpy = torch.from_numpy
         torch.from_numpy = self._made_from_numpy
         return super().__enter__()
@@ -134,7 +135,7 @@ class TensorWatch(TorchFunctionMode):
             if any(made is each for each in tensors):
                 if name not in _MOVES or getattr(made, _STATE, _OWN) == state:
                     continue
-                # Where there is nothing to move torch returns the tensor itself, which a GPU leaves where it is.
+                # With nothing to move, torch returns the tensor itself; the original must keep its state.
                 result = made = made.view(made.shape)
             if state is None:
                 continue
@@ -161,7 +162,7 @@ class TensorWatch(TorchFunctionMode):
         frame: FrameType | None,
         author: bool,
     ) -> Any:
-        """The state of what the operation gives."""
+        """State of the result of an operation."""
         device = _device_of(args, kwargs) if name in ("to", "new_tensor") or "device" in kwargs else None
         follows = frame is not None and (
             author or frame.f_globals.get("__name__", "").startswith("mani_skill.")
@@ -202,7 +203,7 @@ class TensorWatch(TorchFunctionMode):
         if name == "__getitem__" and not _is_host(args[0]):
             return  # an index may come from the host
         if name == "__setitem__":
-            # A value is copied over; only with a tensor as index it must be where the target is.
+            # torch copies the value to the target's device, unless the index is a tensor.
             rows = list(_tensors((args[1],)))
             indexed_by_own = _is_host(args[0]) and any(not _is_host(each) and each.ndim for each in rows)
             put = any(each.ndim for each in rows) and isinstance(args[2], torch.Tensor) and args[2].ndim > 0
@@ -233,7 +234,7 @@ def _is_host(tensor: torch.Tensor) -> bool:
 
 
 def _place_of(hosts: list[torch.Tensor], frame: FrameType | None) -> Any:
-    """Where a tensor that is on the host was made: at first, or now."""
+    """The line that made a host tensor: that of the first one given, else the line that runs."""
     return getattr(hosts[0], _STATE) if hosts else _OWN if frame is None else _place(frame)
 
 

@@ -1,4 +1,4 @@
-"""Where the time of a control step goes: by hook, and by line of the author's files."""
+"""Times a control step by hook, and by line of the author's files."""
 
 from __future__ import annotations
 
@@ -26,23 +26,26 @@ EVERY_STEP = (
 """Hooks that run at every step."""
 
 STEPS = 200
+"""Number of control steps that are timed."""
 NUM_ENVS = 64
-_WARM_UP = 5
+"""Number of envs whose steps are timed."""
+_WARM_UP_STEPS = 5
 _REST = "the rest of step"
+"""Name of what `step` takes without hooks and `_PARTS`."""
 _PARTS = (
     ("scene", "step", "physics"),
     ("agent", "set_action", "controller"),
     ("agent", "before_simulation_step", "controller"),
     ("agent", "get_proprioception", "the robot's observation"),
 )
-"""Object of the env, its method, and how it is called here."""
+"""Attribute of the env, method of that object, and name in the profile."""
 
 
 def profile_step(checkup: Checkup, num_envs: int | None = None, steps: int = STEPS) -> StepProfile:
-    """Time steps with random actions on envs of their own; on `NUM_ENVS` if no number is given.
+    """Time steps with random actions, on separate envs (`NUM_ENVS` by default).
 
     Hooks are timed in every second step and lines in the others, which a tracer slows: the times of a hook's lines are
-    scaled to add up to the hook's. Raises TaskError as the steps of a checkup do.
+    scaled so that their sum is the time of the hook. Raises TaskError as the steps of a checkup do.
     """
     num_envs = num_envs or checkup.at_most(NUM_ENVS)
     with checkup.env(num_envs) as task:
@@ -51,8 +54,8 @@ def profile_step(checkup: Checkup, num_envs: int | None = None, steps: int = STE
         clock = _Clock({str(file) for file in checkup.loaded.source_files})
         own = [hook for hook in EVERY_STEP if _is_authors(checkup, hook)]
         _wrap(clock, task, own)
-        for step in range(_WARM_UP + steps):
-            clock.begin_step(measured=step >= _WARM_UP, traced=step % 2 == 1)
+        for step in range(_WARM_UP_STEPS + steps):
+            clock.begin_step(measured=step >= _WARM_UP_STEPS, traced=step % 2 == 1)
             checkup.step(task, actions.random_action(task.parts, num_envs, rng))
     return _profile_of(checkup, clock, num_envs, steps, own)
 
@@ -95,13 +98,13 @@ def _profile_of(checkup: Checkup, clock: _Clock, num_envs: int, steps: int, own:
 
 
 class _Clock:
-    """Adds up the time of wrapped functions, each without those that it calls, and of lines."""
+    """Adds up the time of wrapped functions, each without the wrapped functions that it calls, and of lines."""
 
     def __init__(self, files: set[str]) -> None:
         self.hooks: defaultdict[str, float] = defaultdict(float)
         """Seconds in the steps without a tracer."""
         self.lines: defaultdict[tuple[str, str, int], float] = defaultdict(float)
-        """Seconds by hook, file and line in the steps with one."""
+        """Seconds by hook, file and line in the steps with a tracer."""
         self.timed_steps = 0
         self._files = files
         self._measured = self._traced = False
@@ -119,7 +122,7 @@ class _Clock:
         """The function, timed under a name.
 
         Args:
-            traces: whether it is the author's, whose lines are timed too.
+            traces: whether its lines are timed too: it is the author's.
         """
 
         def timed(*args: Any, **kwargs: Any) -> Any:

@@ -4,36 +4,62 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mani_skill.utils.structs.actor import Actor
 
-from workbench.checks.by_hook.placement import immovable
 from workbench.checks.evidence.builds import Built
-from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.meshes import is_hollow, triangles_in
-from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
+from workbench.checks.evidence.over_seeds import together, tried
 from workbench.checks.results import Seen
+from workbench.checks.rule_check import rule
+from workbench.checks.rules.placement import immovable
 from workbench.envs.broken_rule import Place
 from workbench.envs.maniskill_private import envs_of, named_to_hide, objects_of
 from workbench.envs.scene.scene_index import scene_index
 from workbench.envs.simulation.hiding import why_not_hidden
 from workbench.machine.text import listed
 
-DEEP_AT_LOAD = 0.005
-"""Metres."""
-MOST_LINKS = 64
-MOST_TRIANGLES = 100_000
+OVERLAP_METRES = 0.005
+"""Depth in metres from which on an overlap counts."""
+MAX_LINKS = 64
+"""Maximum number of links of an articulation in PhysX on the GPU."""
+MAX_TRIANGLES = 100_000
+"""Maximum number of triangles of a drawn mesh."""
 _RESETS = ("_initialize_episode", "_load_scene", "_load_agent", "set_state_dict", "set_state")
-STILL = 1e-5
-"""Metres, and numbers of a quaternion."""
+STILL_TOLERANCE = 1e-5
+"""Maximum difference of poses that count as equal, in metres and numbers of a quaternion."""
 
 
+@rule("robot-pose", "warn", "_load_agent")
 def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of what was built."""
+    """_load_agent gives the robot an initial pose.
+
+    The robot is built at the origin, inside whatever stands there, and the GPU simulation starts with the
+    collision.
+
+    ## Why
+    Without a pose, ManiSkill builds the robot at the origin and prints a warning. The GPU simulation makes a
+    first step before `_initialize_episode` is called. A robot that stands in the table or in a cube at that
+    moment is pushed out with great force, in each of 4096 envs.
+
+    ## Mend
+    Give the robot the place where it stands, or any other place where it touches nothing.
+
+    ```python fragment
+    def _load_agent(self, options: dict):
+        super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))
+    ```
+
+    ## How it is checked
+    The rule notes the builders of robots while the task is built, and reports a robot whose builder has no
+    `initial_pose`. The result is *not applicable* for a task without a robot. The rule does not see whether
+    the given pose is a good one ([overlap-at-load](overlap-at-load.md) does).
+    """
     robots = [each for each in _builds(checkup) if each.of_robot and each.kind == "articulation"]
     if not robots:
         raise NotApplicable("it has no robot")
@@ -45,8 +71,35 @@ def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
+@rule("initial-pose", "warn", "_load_scene")
 def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of what was built: bodies that collide and are somewhere else later, or inside something. Others cannot hurt."""
+    """Every builder has an initial_pose before its body is built.
+
+    Bodies are built inside each other at the origin, and the GPU simulation makes its first step there.
+
+    ## Why
+    A builder without `initial_pose` puts its body at the origin, and ManiSkill prints a warning. Several such
+    bodies are inside each other there. The GPU simulation makes a first step before `_initialize_episode` is
+    called: the collision takes memory for contacts and can throw bodies away.
+
+    ## Mend
+    Set a pose before the body is built, a different one for each body.
+
+    ```python fragment
+    builder = self.scene.create_actor_builder()
+    builder.add_box_collision(half_size=[0.02] * 3)
+    builder.initial_pose = sapien.Pose(p=[0, 0, 0.02])
+    self.cube = builder.build(name="cube")
+    ```
+
+    ## How it is checked
+    The rule notes the builders that the author's files use while the task is built, including those of
+    `actors.build_cube` and the like. It leaves out bodies without a collision shape, and bodies that stay at
+    the origin for good: static bodies, and kinematic ones and articulations without a movable joint that no
+    reset moves. [overlap-at-load](overlap-at-load.md) reports what is inside them. It also leaves out a
+    kinematic body that a reset moves, if the body is built inside nothing. Robots have their own rule
+    ([robot-pose](robot-pose.md)).
+    """
     unposed: dict[Place | None, list[str]] = {}
     own = [*_own(checkup)]
     if not own:
@@ -64,8 +117,8 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _is_unposed(checkup: Checkup, each: Built) -> bool:
-    """Whether it should have an initial pose and has none. What stays at the origin is where it belongs, and a kinematic body
-    harms only what it is inside of."""
+    """Whether a body should have an initial pose and has none. A body that stays at the origin needs none, and a kinematic body
+    harms only a body that it is inside of."""
     if each.quaternion is not None or each.kind == "static":
         return False
     if each.kind == "kinematic" and each.name not in _inside_others(checkup):
@@ -74,7 +127,7 @@ def _is_unposed(checkup: Checkup, each: Built) -> bool:
 
 
 def _stay_at_origin(checkup: Checkup) -> set[str]:
-    """Evidence: names of what no contact moves, and that is at the origin after a reset."""
+    """Evidence: names of the bodies that no contact moves and that are at the origin after a reset."""
     task = checkup.task
     checkup.reset(task, next(checkup.batches()))
     index, fixed = scene_index(task.env), immovable(checkup)
@@ -84,27 +137,55 @@ def _stay_at_origin(checkup: Checkup) -> set[str]:
     return {
         name
         for name, struct in structs.items()
-        if name not in moved and (np.abs(struct.pose.raw_pose.numpy(force=True) - origin) < STILL).all()
+        if name not in moved
+        and (np.abs(struct.pose.raw_pose.numpy(force=True) - origin) < STILL_TOLERANCE).all()
     }
 
 
 def _inside_others(checkup: Checkup) -> set[str]:
-    """Names of the bodies that are built inside others, and of the parts of what they were merged to."""
+    """Names of the bodies that are built inside others, and of the parts of merged bodies among them."""
     names = {body.split("/", 1)[0] for overlap in checkup.alone.overlaps for body in overlap.bodies}
     return names.union(*(merge.parts for merge in _merges(checkup) if merge.name in names))
 
 
+@rule("overlap-at-load", "warn", "_load_scene")
 def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
-    """With one env, all bodies where they are built and all joints at zero."""
+    """Bodies do not overlap where they are built, before the first reset.
+
+    The GPU simulation makes its first step there: it may begin with an explosion, and it needs more memory
+    for contacts.
+
+    ## Why
+    The GPU simulation makes a first step with all bodies where their builders put them and all joints at
+    zero, before `_initialize_episode` is called. Bodies inside each other get large velocities and many
+    contacts in that step. With 4096 envs the buffers for contacts may overflow, and a body may be far away
+    when training begins.
+
+    ## Mend
+    Choose initial poses that are apart; the reset moves the bodies to where an episode begins.
+
+    ```python fragment
+    builder.initial_pose = sapien.Pose(p=[0, 0, 0.02])  # on the table, not in it
+    self.cube_a = builder.build(name="cube_a")
+    other.initial_pose = sapien.Pose(p=[1, 0, 0.02])  # far from the first
+    self.cube_b = other.build(name="cube_b")
+    ```
+
+    ## How it is checked
+    The rule builds one env, puts all bodies to their initial poses with joints at zero, and reads the
+    contacts of one substep. Overlaps of 5 mm and more count. The rule leaves out links of one articulation,
+    pairs in which neither body can move, and what [initial-pose](initial-pose.md) reports. It does not see
+    bodies of other envs that are built with other shapes.
+    """
     builds = _builds(checkup)
-    # Those have a rule of their own.
+    # The rule initial-pose reports these.
     unposed = {each.name for each in builds if _is_unposed(checkup, each)}
     unposed |= {str(merge.name) for merge in _merges(checkup) if not unposed.isdisjoint(merge.parts)}
     places = {each.name: each.place for each in builds}
     fixed = immovable(checkup)
     for overlap in checkup.alone.overlaps:
         owners = [body.split("/", 1)[0] for body in overlap.bodies]
-        harmless = overlap.depth < DEEP_AT_LOAD or fixed.issuperset(overlap.bodies)
+        harmless = overlap.depth < OVERLAP_METRES or fixed.issuperset(overlap.bodies)
         if harmless or not unposed.isdisjoint(owners):
             continue
         own = [places[owner] for owner in owners if places.get(owner) is not None]
@@ -117,7 +198,8 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def see_kinematic_never_moved(checkup: Checkup) -> Iterator[Seen]:
-    """Over the resets of all seeds and random episodes, where no hook of a step sets a pose: it may do so later."""
+    """A row for each kinematic body, with the range of its pose over resets and random episodes. Raises NotKnown if a hook of a
+    step sets a pose, which it may do later."""
     if any(
         _sets_a_pose(function) for _, function in checkup.places.functions() if function.name not in _RESETS
     ):
@@ -132,8 +214,30 @@ def see_kinematic_never_moved(checkup: Checkup) -> Iterator[Seen]:
             yield Seen((name,), own[name].place, numbers=tuple(np.concatenate(ends).tolist()))
 
 
+@rule("kinematic-never-moved", "warn", "_load_scene", see=see_kinematic_never_moved)
 def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    """Bodies that are at the same pose for all seeds."""
+    """A body that is never moved is built static.
+
+    A kinematic body costs GPU memory and time in each of thousands of envs.
+
+    ## Why
+    A kinematic body has a row in the state of each env, and PhysX looks at it in each step. A static body has
+    neither cost. With thousands of envs the difference in memory and time is large.
+
+    ## Mend
+    Build the body static. Its place is its initial pose; a static body cannot be moved afterwards.
+
+    ```python fragment
+    builder.initial_pose = sapien.Pose(p=[0.3, 0, 0.1])
+    self.wall = builder.build_static(name="wall")
+    ```
+
+    ## How it is checked
+    The rule compares the poses of all seeds after their reset and of random episodes. It reports a kinematic
+    body that the author's files build and that has one pose in all of them. The result is *not known* if a
+    hook of a step, or any function except `_initialize_episode`, sets a pose, since it might do so in an
+    episode that was not seen. It is also *not known* with one seed. Hidden bodies are left out.
+    """
     if not any(row.names for row in rows):
         raise NotApplicable("its own lines build no kinematic body that is seen")
     if tried(rows) < 2:
@@ -142,7 +246,7 @@ def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     for row in together(rows):
         ends = np.array([one.numbers for one in rows if one.names == row.names])
         apart = ends[:, :7].max(axis=0) - ends[:, 7:].min(axis=0)
-        if not (np.nan_to_num(apart) > STILL).any():
+        if not (np.nan_to_num(apart) > STILL_TOLERANCE).any():
             still.setdefault(row.place, []).append(row.names[0])
     for place, names in still.items():
         yield Found(
@@ -153,8 +257,30 @@ def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         )
 
 
+@rule("body-names", "warn", "_load_scene")
 def body_names(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of what was built and merged. ManiSkill's builders refuse a name that is taken; merging does not."""
+    """Each body has its own name.
+
+    The second body that is merged under a name replaces the first one, in the scene and in the state.
+
+    ## Why
+    A scene finds bodies by name, and so does its state. `Actor.merge` accepts a name that is taken, and None:
+    the second body replaces the first one in `scene.actor_views`, and the state of one of them is neither
+    saved nor restored.
+
+    ## Mend
+    Give each merged body its own name.
+
+    ```python fragment
+    self.pegs = Actor.merge(pegs, name="peg")
+    self.boxes = Actor.merge(boxes, name="box_with_hole")
+    ```
+
+    ## How it is checked
+    The rule notes calls of `Actor.merge` and `Articulation.merge` while the task is built. ManiSkill itself
+    refuses two builders with one name, at the line that builds the second body. The rule does not see a body
+    that is renamed later.
+    """
     merges = {merge.parts: merge for merge in _merges(checkup)}.values()
     taken = Counter(merge.name for merge in merges)
     built = {each.name for each in _builds(checkup)}
@@ -171,21 +297,66 @@ def body_names(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+@rule("too-many-links", "warn", "_load_scene")
 def too_many_links(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of what was built."""
+    """An articulation has at most 64 links.
+
+    PhysX on the GPU refuses more.
+
+    ## Why
+    PhysX on the GPU takes articulations of at most 64 links. A longer one works on the CPU, so the task fails
+    only where it is to train.
+
+    ## Mend
+    Weld links that need no joint into one, or divide the articulation.
+
+    ```python fragment
+    base = builder.create_link_builder(None)
+    for box in boxes:  # one link with many shapes, not a link for each
+        base.add_box_collision(pose=box.pose, half_size=box.half_size)
+    ```
+
+    ## How it is checked
+    The rule counts the links of each articulation after the task is built. Links with a fixed joint count
+    too.
+    """
     places = _places_of(checkup)
     if not checkup.task.env.scene.articulations:
         raise NotApplicable("it has no articulation")
     for name, articulation in checkup.task.env.scene.articulations.items():
-        if (count := len(articulation.links)) > MOST_LINKS:
+        if (count := len(articulation.links)) > MAX_LINKS:
             yield Found(
                 f"{name} has {count} links. Join those with fixed joints between them, or divide it.",
                 places.get(name) or checkup.places.hook("_load_agent", "_load_scene"),
             )
 
 
+@rule("hull-fills-hollow", "warn", "_load_scene")
 def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of the mesh files that bodies of the task collide as one convex hull."""
+    """A hollow mesh is not replaced by its convex hull for collisions.
+
+    Nothing can be put into a bowl or a box: an invisible lid is in the way.
+
+    ## Why
+    `add_convex_collision_from_file` collides as the convex hull of the mesh. A bowl, a cup or a box then has
+    a lid that is not drawn: what is put into it lies on top, and no policy can solve the task.
+
+    ## Mend
+    Collide as several convex parts, or as the mesh itself if the body never moves.
+
+    ```python fragment
+    builder.add_multiple_convex_collisions_from_file("bowl.coacd.ply")
+    builder.add_visual_from_file("bowl.glb")
+    self.bowl = builder.build(name="bowl")
+    ```
+
+    ## How it is checked
+    For each mesh file that a body of the author's files collides with as one hull, the rule casts rays from
+    the middle of the hull in 162 directions. The mesh is hollow if the rays meet a wall in most directions
+    and nothing in some, on one side. The result is *not applicable* without such a mesh, and *not known* for
+    meshes of more than 50,000 triangles. Flat plates and rings do not count as hollow. The rule does not know
+    whether the task puts anything into the body.
+    """
     files = _mesh_files(checkup, "convex_mesh")
     if not files:
         raise NotApplicable("no body of its own collides as the convex hull of a mesh file")
@@ -203,8 +374,33 @@ def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
     _require_read(unknown)
 
 
+@rule("decomposition-at-load", "warn", "_load_scene")
 def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of the source: building would need the package that decomposes."""
+    """Convex decompositions are made once, not in every build.
+
+    The first process on each machine waits for the decomposition, seconds to minutes for a mesh, and needs
+    the package coacd.
+
+    ## Why
+    A convex decomposition takes seconds to minutes for each mesh. The first process on each machine makes it,
+    and writes it to a file next to the mesh. On a cluster each node waits for it and several processes write
+    the same file; where the folder is read-only, it is made again each time. It also needs the package coacd
+    on each machine.
+
+    ## Mend
+    Make the decomposition once, ship the file that it writes, and load that file.
+
+    ```python fragment
+    builder.add_multiple_convex_collisions_from_file(
+        "bowl.ply.coacd.ply",  # written by decomposition="coacd", once
+        decomposition="none",
+    )
+    ```
+
+    ## How it is checked
+    The rule reads the author's source for calls with `decomposition=` and a constant other than "none". It
+    does not see a value that is computed.
+    """
     checkup.require_source()
     for module, function in checkup.places.functions():
         for node in ast.walk(function):
@@ -222,16 +418,39 @@ def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
                     )
 
 
+@rule("heavy-mesh", "warn", "_load_scene")
 def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of the mesh files that bodies of the task are drawn with."""
+    """Drawn meshes have at most 100,000 triangles.
+
+    Pictures are slow, and the mesh takes memory of the GPU renderer.
+
+    ## Why
+    A mesh from a scanner or a CAD program may have millions of triangles. Each picture of each env draws
+    them, and a renderer on the GPU keeps them in memory. A picture of 128 x 128 pixels shows none of that
+    detail.
+
+    ## Mend
+    Reduce the mesh once, and draw the reduced one.
+
+    ```python fragment
+    import trimesh
+
+    mesh = trimesh.load("engine.glb", force="mesh")
+    mesh.simplify_quadric_decimation(face_count=20_000).export("engine_small.glb")
+    ```
+
+    ## How it is checked
+    The rule counts the triangles of each file that a body of the author's files is drawn with, and reports
+    more than 100,000. It does not read files that are too small to have so many. Robots are left out.
+    """
     files = _mesh_files(checkup, "file")
     if not files:
         raise NotApplicable("no body of its own is drawn from a mesh file")
     unknown: list[str] = []
     for file, each in files.items():
-        if (count := triangles_in(file, MOST_TRIANGLES)) is None:
+        if (count := triangles_in(file, MAX_TRIANGLES)) is None:
             unknown.append(Path(file).name)
-        elif count > MOST_TRIANGLES:
+        elif count > MAX_TRIANGLES:
             yield Found(
                 f"{each.name} is drawn with {count:,} triangles ({Path(file).name}). Reduce the mesh "
                 "(trimesh: mesh.simplify_quadric_decimation(face_count=20_000)).",
@@ -245,8 +464,33 @@ def _require_read(unknown: list[str]) -> None:
         raise NotKnown(f"cannot be read, or has too many triangles to look at: {listed(unknown)}")
 
 
+@rule("merged-actors", "warn", "_load_scene")
 def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of the structs in the state dict."""
+    """If actors are made for each env and merged, only the merged actor is in the state.
+
+    The state dict has leaves with another batch size: it cannot be saved, sliced or restored.
+
+    ## Why
+    Objects that differ from env to env are built one by one and merged. The state dict then still has a leaf
+    of one row for each part, next to leaves of N rows. Such a state cannot be sliced by env, written to a
+    trajectory file of all envs, or restored in another env. If the merged body is not in the state at all,
+    replays do not restore its pose.
+
+    ## Mend
+    Take the parts out of the state, and put the merged body in.
+
+    ```python fragment
+    self.peg = Actor.merge(pegs, name="peg")
+    for part in pegs:
+        self.remove_from_state_dict_registry(part)
+    self.add_to_state_dict_registry(self.peg)
+    ```
+
+    ## How it is checked
+    The rule compares the number of rows of each body in the state with the N envs of the check, and looks for
+    each dynamic body in the state. It also reports bodies that only some envs have. The result is *not known*
+    with one env, since each body then has as many rows as there are envs.
+    """
     index, count = scene_index(checkup.task.env), checkup.num_envs
     places = _places_of(checkup)
     part = {name: merge for merge in _merges(checkup) for name in merge.parts}
@@ -278,12 +522,39 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
             )
             return
     if not partial:
-        # One that stands in each env alone has as many rows then as all others.
+        # With one env each body has as many rows as there are envs.
         checkup.require_several()
 
 
+@rule("hidden-objects", "warn", "_load_scene")
 def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of ``_hidden_objects``, and of the actors that those are merged into."""
+    """_hidden_objects has actors without collision shapes, and the merged actor instead of its parts.
+
+    Poses are wrong and sensors see what should be hidden, or every picture fails.
+
+    ## Why
+    GPU simulation hides an actor by moving it 99999 m away; ManiSkill keeps the real pose on that actor. A
+    merged actor does not know that its parts are hidden: its `pose` is 99999 m off, in `evaluate()` and in
+    the observation, and setting its pose brings the parts back into the view of the sensors for good. The CPU
+    backends, stock and batched, do not show this, since they hide an actor by its visibility.
+
+    An articulation, a static actor, an actor with collision shapes, and a merged actor that may have some
+    cannot be hidden at all: every picture of a sensor fails.
+
+    ## Mend
+    Hide the merged actor, and declare that it does not collide, since ManiSkill does not find that out by
+    itself.
+
+    ```python fragment
+    self.goal = Actor.merge(goals, name="goal")
+    self.goal.has_collision_shapes = False
+    self._hidden_objects.append(self.goal)
+    ```
+
+    ## How it is checked
+    The rule reads `_hidden_objects` after a reset. It reports an entry that cannot be hidden, and an actor
+    whose merged actor is not in the list. The result is *not applicable* if nothing is hidden.
+    """
     env: Any = checkup.task.env
     hidden = named_to_hide(env)
     if not hidden:
@@ -315,12 +586,12 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _name_on(env: Any, thing: Any) -> str:
-    """``self.goal`` of what the task keeps as that; empty if it does not."""
+    """The attribute that holds a body, such as ``self.goal``; empty if none does."""
     return next((f"self.{name}" for name, value in vars(env).items() if value is thing), "")
 
 
 def _hiding_line(checkup: Checkup, thing: Any) -> Place | None:
-    """The line that puts it into ``_hidden_objects``: one that names it, else the first."""
+    """The line that puts a body into ``_hidden_objects``: one that names the body, else the first."""
     name = _name_on(checkup.task.env, thing)
     lines = [
         (name != "" and name in ast.unparse(statement), module.place(statement))
@@ -335,8 +606,34 @@ def _hiding_line(checkup: Checkup, thing: Any) -> Place | None:
     return lines[0][1] if lines else checkup.places.hook("_load_scene")
 
 
+@rule("reconfigures", "warn", "_load_scene")
 def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
-    """With one env, built for several seeds."""
+    """A scene that is built at random is rebuilt now and then (reconfiguration_freq); with one env, at each
+    reset.
+
+    A single env trains on the same objects forever.
+
+    ## Why
+    A scene is built when the env is made, and again only if `reconfiguration_freq` says so. With thousands of
+    envs each one has another object, and that is enough. One env, as in evaluation and in data collection,
+    has the same object forever.
+
+    ## Mend
+    Rebuild one env at each reset, and many envs never.
+
+    ```python fragment
+    def __init__(self, *args, num_envs=1, reconfiguration_freq=None, **kwargs):
+        if reconfiguration_freq is None:
+            reconfiguration_freq = 1 if num_envs == 1 else 0
+        super().__init__(*args, num_envs=num_envs, reconfiguration_freq=reconfiguration_freq, **kwargs)
+    ```
+
+    ## How it is checked
+    The rule builds one env for two seeds. It reports a task whose shapes, sizes, colours, frictions or mesh
+    files differ between the seeds and whose `reconfiguration_freq` is 0 with one env. The result is *not
+    applicable* if the two builds are equal. Two seeds may be equal by chance, and the rule does not look at
+    what is drawn in a reset.
+    """
     alone = checkup.alone
     if len(set(alone.shapes.values())) > 1 and not alone.rebuilds:
         yield Found(
@@ -349,7 +646,7 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def see_env_spacing(checkup: Checkup) -> Iterator[Seen]:
-    """Over the resets of all seeds and random episodes: a row for each body that comes too far."""
+    """A row for each body that leaves its env's space in resets and random episodes."""
     index, half = scene_index(checkup.task.env), checkup.task.env.sim_config.spacing / 2
     moving = [i for i, kind in enumerate(index.kinds) if kind in ("dynamic", "link") and not index.hidden[i]]
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])[:, :, moving]
@@ -367,7 +664,31 @@ def see_env_spacing(checkup: Checkup) -> Iterator[Seen]:
             )
 
 
+@rule("env-spacing", "warn", "_default_sim_config", see=see_env_spacing)
 def env_spacing(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    """Bodies that move stay within half of the spacing between envs (scene_config, sim_config.spacing).
+
+    All envs of a GPU simulation share one space: bodies of neighbours meet.
+
+    ## Why
+    All envs of a GPU simulation are in one space, `spacing` metres apart (5 by default). A body that is
+    further than half of the spacing from the middle of its env meets the bodies of a neighbour: it is pushed
+    out of nowhere, and episodes depend on each other. On the CPU each env has its own space, so nothing shows
+    there.
+
+    ## Mend
+    Raise the spacing, or keep the bodies nearer.
+
+    ```python fragment
+    @property
+    def _default_sim_config(self):
+        return SimConfig(spacing=12)
+    ```
+
+    ## How it is checked
+    The rule follows the x and y of all moving bodies over the resets of all seeds and random episodes of 50
+    steps. It looks at the middle of a body, not at its edge, and does not see how far a trained policy goes.
+    """
     found = together(rows)
     if found:
         row = max(found, key=lambda row: row.size)
@@ -381,7 +702,7 @@ def env_spacing(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def _sets_a_pose(function: ast.FunctionDef) -> bool:
-    """Whether it calls set_pose or set_state, or assigns a pose."""
+    """Whether a function calls set_pose or set_state, or assigns a pose."""
     for node in ast.walk(function):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             if node.func.attr in ("set_pose", "set_state", "set_state_dict"):
@@ -411,7 +732,7 @@ def _merges(checkup: Checkup) -> list:
 
 
 def _own(checkup: Checkup) -> Iterator[Built]:
-    """What the author's files build, of bodies of one kind for each env only the first; without robots."""
+    """Bodies that the author's files build, without robots; of a body that is built for each env only the first."""
     lines = set()
     for each in _builds(checkup):
         if each.place is not None and not each.of_robot and (each.place, each.name) not in lines:
@@ -431,20 +752,3 @@ def _mesh_files(checkup: Checkup, kind: str) -> dict[str, Built]:
             if shape.kind == kind and shape.file:
                 found.setdefault(shape.file, each)
     return found
-
-
-CHECKS: Mapping[str, Check] = {
-    "robot-pose": robot_pose,
-    "initial-pose": initial_pose,
-    "overlap-at-load": overlap_at_load,
-    "kinematic-never-moved": OverSeeds(see_kinematic_never_moved, kinematic_never_moved),
-    "body-names": body_names,
-    "too-many-links": too_many_links,
-    "hull-fills-hollow": hull_fills_hollow,
-    "decomposition-at-load": decomposition_at_load,
-    "heavy-mesh": heavy_mesh,
-    "merged-actors": merged_actors,
-    "hidden-objects": hidden_objects,
-    "reconfigures": reconfigures,
-    "env-spacing": OverSeeds(see_env_spacing, env_spacing),
-}

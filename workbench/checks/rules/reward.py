@@ -2,38 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.checks.by_hook.evaluate import flags
-from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.episode_batches import Episodes
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, SHORT, OddStates, odd_states
-from workbench.checks.evidence.over_seeds import OverSeeds, first_kind, tried
+from workbench.checks.evidence.over_seeds import first_kind, tried
 from workbench.checks.results import Seen
+from workbench.checks.rule_check import outlier_check, rule
+from workbench.checks.rules.evaluate import flags
 from workbench.envs.broken_rule import Place
 from workbench.envs.outliers import REWARD_RANGES, ROUNDING
 from workbench.machine.text import of
 
 REWARD_HOOKS = {**DENSE_HOOKS, "sparse": "compute_sparse_reward"}
-LARGEST = 1.0 + 1e-4
-"""Of a normalized reward, with room for rounding."""
-ALL_THERE_IS = 0.999
-"""A normalized reward from here on counts as the largest."""
-SAME_RATIO = 1e-3
-"""Largest difference from the dense reward over a constant, as a share of the largest normalized reward."""
-TELLING = 0.05
-"""The ratio is taken where the dense reward has this share of its largest, since rounding decides it near 0."""
-CLEARLY_LOWER = 0.05
-"""As a share of all rewards' range."""
+"""Hook of each reward mode."""
+MAX_NORMALIZED = 1.0 + 1e-4
+"""Maximum of a normalized reward, with room for rounding."""
+FULL_REWARD = 0.999
+"""Normalized reward from which on it counts as the largest."""
+RATIO_TOLERANCE = 1e-3
+"""Maximum difference from the dense reward over a constant, as a share of the largest normalized reward."""
+RATIO_SHARE = 0.05
+"""Share of the largest dense reward from which on the ratio is taken, since rounding decides it near 0."""
+CLEARLY_LOWER_SHARE = 0.05
+"""Difference of rewards, as a share of the range of all rewards, from which on it counts."""
 
 
 def see_reward_finite(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts, up to the kind with a breach; else over odd states."""
+    """A row for each kind of rollouts up to the first breach; without one, a row for the odd states."""
     _require_reward(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     for episodes in checkup.rollouts:
@@ -57,6 +59,7 @@ def see_reward_finite(checkup: Checkup) -> Iterator[Seen]:
     yield Seen(("", "odd states"), place, bad.size, count=int(bad.sum()), texts=texts)
 
 
+@outlier_check("reward-finite", see=see_reward_finite)
 def reward_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     if (row := first_kind(sorted(rows, key=lambda row: len(row.names)))) is None:
         return
@@ -73,7 +76,7 @@ def reward_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_reward_changes(checkup: Checkup) -> Iterator[Seen]:
-    """Over random rollouts: the largest and the smallest."""
+    """One row: the largest and the smallest reward of random rollouts."""
     _require_dense(checkup)
     reward = _rewards(checkup, checkup.random)
     known = np.nan_to_num(reward)
@@ -85,8 +88,28 @@ def see_reward_changes(checkup: Checkup) -> Iterator[Seen]:
     )
 
 
+@rule("reward-changes", "warn", "compute_dense_reward", see=see_reward_changes)
 def reward_changes(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    """One step with another reward than all others is enough."""
+    """A dense reward changes while the robot moves.
+
+    The policy has nothing to learn from.
+
+    ## Why
+    A reward that is the same everywhere gives no direction: the policy stays random.
+
+    ## Mend
+    Let the reward depend on a distance that the robot changes.
+
+    ```python fragment
+    distance = torch.linalg.norm(self.cube.pose.p - self.agent.tcp.pose.p, dim=1)
+    return 1 - torch.tanh(5 * distance)
+    ```
+
+    ## How it is checked
+    The rule reads the dense reward in random rollouts of all seeds (up to 50 steps), and reports it if it is
+    one number throughout. The result is *not applicable* for sparse rewards. The rule does not see a reward
+    that changes but leads nowhere.
+    """
     most, least = max(row.numbers[0] for row in rows), min(row.numbers[1] for row in rows)
     if most - least < 1e-7:
         yield Found(
@@ -97,8 +120,8 @@ def reward_changes(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_reward_normalized(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts, where the reward is the normalized or the sparse one, up to the kind with a breach; then over the odd
-    states with success."""
+    """A row for each kind of rollouts up to the first breach; without one, a row for the odd states with success. For a
+    normalized or sparse reward only."""
     mode = checkup.task.env.reward_mode
     if mode not in REWARD_RANGES:
         raise NotApplicable("its reward is neither normalized nor sparse")
@@ -139,6 +162,7 @@ def see_reward_normalized(checkup: Checkup) -> Iterator[Seen]:
     yield of("success", "in states with success", paid, len(paid))
 
 
+@outlier_check("reward-normalized", see=see_reward_normalized)
 def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     if (row := first_kind(rows)) is not None:
         ranges = [one.numbers for one in rows if one.names == row.names and one.numbers]
@@ -160,15 +184,37 @@ def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def paid_at_success(seen: OddStates, mode: str) -> float | None:
-    """What the reward is wherever evaluate() reports success, as far as it is one number; None if that is not so."""
+    """The reward at success if it is the same number in all states; else None."""
     told = np.concatenate([*seen.told.get(mode, ()), np.zeros(0)])
     if not len(told) or not np.isfinite(told).all() or np.ptp(told) > ROUNDING:
         return None
     return float(told[0])
 
 
+@rule("reward-ratio", "warn", "compute_normalized_dense_reward")
 def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
-    """Both hooks, called on the same odd states, and again with success."""
+    """The normalized dense reward is the dense reward divided by a constant.
+
+    The two modes train different tasks.
+
+    ## Why
+    People choose between the two modes for the scale, not for the task. If one is not the other divided by a
+    constant, results with one say little about the other.
+
+    ## Mend
+    Compute the normalized reward from the dense reward.
+
+    ```python fragment
+    def compute_normalized_dense_reward(self, obs, action, info):
+        return self.compute_dense_reward(obs, action, info) / 3
+    ```
+
+    ## How it is checked
+    The rule calls both hooks on the same states, those that `reward-finite` makes, with the same action, and
+    again with `info["success"]` true in all envs. It restores the task's memory between the calls. A rising
+    straight line with an offset is noted, and is no finding. The result is *not applicable* without both
+    rewards.
+    """
     seen = checkup.look(odd_states)
     if not DENSE_HOOKS.keys() <= seen.reward.keys():
         raise NotApplicable("it lacks a dense or a normalized dense reward")
@@ -177,12 +223,12 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
     )
     finite = np.isfinite(dense) & np.isfinite(normalized)
     size = float(np.abs(dense[finite]).max(initial=0))
-    telling = finite & (np.abs(dense) > TELLING * size)
+    telling = finite & (np.abs(dense) > RATIO_SHARE * size)
     if not telling.any():
         raise NotKnown("its dense reward is 0 or not finite in all states that were tried")
     constant = float(np.median(normalized[telling] / dense[telling]))
     wrong = np.abs(normalized - constant * dense)
-    off = finite & (wrong > SAME_RATIO * np.abs(normalized[finite]).max())
+    off = finite & (wrong > RATIO_TOLERANCE * np.abs(normalized[finite]).max())
     if off.any() and (line := _straight_line(dense[finite], normalized[finite])) is not None:
         yield Note(f"the normalized reward is the dense one times {line[0]:.4g} plus {line[1]:.4g}")
     elif off.any():
@@ -197,17 +243,17 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] | None:
-    """Slope and offset with which the dense reward becomes the normalized one; None if it is no rising line."""
+    """Slope and offset of the line from the dense to the normalized reward; None if it is no rising line."""
     if np.ptp(dense) == 0:
         return None
     slope, offset = (float(number) for number in np.polyfit(dense, normalized, 1))
     wrong = np.abs(slope * dense + offset - normalized).max()
-    return (slope, offset) if slope > 0 and wrong <= SAME_RATIO * np.abs(normalized).max() else None
+    return (slope, offset) if slope > 0 and wrong <= RATIO_TOLERANCE * np.abs(normalized).max() else None
 
 
 def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts and odd states: a row for each episode that has success and a higher reward elsewhere; and one for what
-    is paid at success, where that is one number."""
+    """A row for each episode, in rollouts and odd states, that has success and a higher reward elsewhere; and one for the reward
+    at success, if that is one number."""
     _require_dense(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     every = _scored(checkup)
@@ -241,8 +287,38 @@ def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
         yield Seen(("paid",), place, numbers=numbers, texts=(where,))
 
 
+@rule("reward-order", "warn", "compute_dense_reward", see=see_reward_order)
 def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    """By the range of all rewards of the same kind of episodes."""
+    """The dense reward at success is not lower than elsewhere in the same episode.
+
+    Policies learn to avoid success.
+
+    ## Why
+    If the way to success earns more than success, a policy that maximises the reward stops just before it.
+    The reward curve rises and the success rate does not.
+
+    ## Mend
+    Give success the most, after all other terms.
+
+    ```python fragment
+    reward = reach + place
+    reward[info["success"]] = 3  # more than reach + place can be
+    ```
+
+    ## How it is checked
+    For each episode that has states with and without success, the rule compares the largest rewards of both:
+    in random rollouts, in those of `--actions`, and in the states that `reward-finite` makes. A body at the
+    goal is often a success; from there the rule moves all bodies and joints back towards the reset until
+    success ends, so that states just short of success are compared too. A difference below 5% of the rewards'
+    range does not count.
+
+    The rule also calls the reward hook once more for each of these states, with `info["success"]` true in all
+    envs. If the reward is then one number, as after `reward[info["success"]] = 0.5`, that number is what
+    success pays, and no state without success may earn more. This finds the mistake even if no episode
+    succeeds.
+
+    Without either, the result is *not known*.
+    """
     ends: dict[str, list[tuple[float, ...]]] = {}
     for row in rows:
         if row.names[0] == "all":
@@ -254,7 +330,7 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     for row in rows:
         if row.names[0] == "episode":
             at_success, elsewhere = row.numbers
-            if elsewhere > at_success + CLEARLY_LOWER * ranges[row.names[1]]:
+            if elsewhere > at_success + CLEARLY_LOWER_SHARE * ranges[row.names[1]]:
                 lower.append((elsewhere - at_success, at_success, elsewhere, row.texts[0]))
                 place = row.place
     advice = 'Give success the most: `reward[info["success"]] = LARGEST_REWARD`.'
@@ -270,7 +346,7 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     for row in rows:
         if row.names == ("paid",):
             paid, elsewhere, least, most = row.numbers
-            if elsewhere > paid + CLEARLY_LOWER * (most - least):
+            if elsewhere > paid + CLEARLY_LOWER_SHARE * (most - least):
                 yield Found(
                     f'the reward is {paid:.4g} wherever info["success"] is true, and {elsewhere:.4g} without success '
                     f"({row.texts[0]}). {advice}",
@@ -282,11 +358,11 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_reward_needs_success(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts and odd states, where the reward is the normalized one."""
+    """A row for each kind of rollouts and each batch of odd states. For a normalized reward only."""
     if checkup.task.env.reward_mode != "normalized_dense":
         raise NotApplicable("its reward is not the normalized dense one")
     for scored in _scored(checkup):
-        most = (scored.reward >= ALL_THERE_IS) & ~scored.success
+        most = (scored.reward >= FULL_REWARD) & ~scored.success
         tried = sum(scored.tried(column) for column in range(scored.reward.shape[1]))
         places = [scored.where(int(row), int(column)) for row, column in np.argwhere(most)[:1]]
         yield Seen(
@@ -298,8 +374,32 @@ def see_reward_needs_success(checkup: Checkup) -> Iterator[Seen]:
         )
 
 
+@rule("reward-needs-success", "warn", "compute_dense_reward", see=see_reward_needs_success)
 def reward_needs_success(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    if any(row.size > LARGEST for row in rows):
+    """Only success earns the largest normalized reward.
+
+    Policies learn to wait where they earn as much as at success.
+
+    ## Why
+    If a state without success earns the largest reward, waiting there earns as much as success, and more if
+    success ends the episode.
+
+    ## Mend
+    Leave the largest reward to success.
+
+    ```python fragment
+    reward = reach + place  # at most 2
+    reward[info["success"]] = 3
+    return reward / 3
+    ```
+
+    ## How it is checked
+    The rule reports a normalized reward of 0.999 or more in a state without success, in random rollouts, in
+    those of `--actions`, and in the states that `reward-finite` makes. The result is *not applicable* without
+    a normalized reward or an entry `success`. It is *not known* if the reward goes beyond 1, or if no episode
+    or state that was tried succeeds, since the rule then did not see what is paid near success.
+    """
+    if any(row.size > MAX_NORMALIZED for row in rows):
         raise NotKnown("its normalized reward goes beyond 1")
     given, places = sum(row.count for row in rows), [text for row in rows for text in row.texts]
     if given:
@@ -325,14 +425,14 @@ class _Scored:
     success: NDArray[np.bool_]
     """(T, K)"""
     places: list[list[str]]
-    """(1, K) or (T, K) which state that is, for a sentence."""
+    """(1, K) or (T, K) description of each state, for a sentence."""
     of: str
     """The kind of episodes, or which odd states."""
     short: NDArray[np.bool_] | None = None
-    """(T,) the odd states that are short of a success; None for episodes, which come there by steps."""
+    """(T,) whether an odd state is short of a success; None for episodes, which reach success by steps."""
 
     def tried(self, column: int) -> bool:
-        """Whether an episode has a success, and states without one that are near it."""
+        """Whether an episode has a success, and states near it without success."""
         success = self.success[:, column]
         near = success if self.short is None else success[self.short]
         return bool(success.any()) and not bool(near.all())
@@ -344,7 +444,7 @@ class _Scored:
 
 
 def _scored(checkup: Checkup) -> list[_Scored]:
-    """Of all rollouts, then of the odd states of each batch."""
+    """Rewards and success of all rollouts, then of the odd states of each batch."""
     found: list[_Scored] = []
     for episodes in checkup.rollouts:
         rewards = np.nan_to_num(_rewards(checkup, episodes))
@@ -372,7 +472,7 @@ def _scored(checkup: Checkup) -> list[_Scored]:
 
 
 def _rewards(checkup: Checkup, episodes: Episodes) -> NDArray:
-    """(T, K)"""
+    """(T, K). Raises NotApplicable without a reward, and NotKnown without a step."""
     _require_reward(checkup)
     if not episodes.reward.size:
         raise NotKnown("no step was made")
@@ -391,16 +491,6 @@ def _require_dense(checkup: Checkup) -> None:
 
 
 def _hooks(checkup: Checkup) -> tuple[str, ...]:
-    """The hooks that make the present reward, as a person would look for them."""
+    """The hooks that make the present reward, in the order in which a person would look for them."""
     mode = checkup.task.env.reward_mode
     return ("compute_dense_reward", REWARD_HOOKS[mode]) if "dense" in mode else (REWARD_HOOKS[mode],)
-
-
-CHECKS: Mapping[str, Check] = {
-    "reward-finite": OverSeeds(see_reward_finite, reward_finite),
-    "reward-changes": OverSeeds(see_reward_changes, reward_changes),
-    "reward-normalized": OverSeeds(see_reward_normalized, reward_normalized),
-    "reward-ratio": reward_ratio,
-    "reward-order": OverSeeds(see_reward_order, reward_order),
-    "reward-needs-success": OverSeeds(see_reward_needs_success, reward_needs_success),
-}

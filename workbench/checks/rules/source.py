@@ -6,7 +6,7 @@ import ast
 import difflib
 import inspect
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from types import CodeType
 from typing import Any
 
@@ -14,10 +14,11 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.building import ActorBuilder, ArticulationBuilder
 
-from workbench.checks.by_hook.devices import EVERY_STEP
-from workbench.checks.by_hook.reward import REWARD_HOOKS
-from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note
+from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note
 from workbench.checks.evidence.random_calls import global_draw
+from workbench.checks.rule_check import rule
+from workbench.checks.rules.devices import EVERY_STEP
+from workbench.checks.rules.reward import REWARD_HOOKS
 from workbench.envs.assets import robots_of
 from workbench.envs.broken_rule import Place
 from workbench.task import registry
@@ -25,8 +26,9 @@ from workbench.task import registry
 HOOKS = tuple(
     name for name, member in vars(BaseEnv).items() if callable(member) or isinstance(member, property)
 )
+"""All methods and properties of BaseEnv."""
 AT_RESETS = ("_initialize_episode", "reset", *EVERY_STEP)
-"""Hooks that run after the GPU's simulation has begun."""
+"""Hooks that run after the GPU simulation has begun."""
 _BUILDERS = {"create_actor_builder": ActorBuilder, "create_articulation_builder": ArticulationBuilder}
 _GPU_CALLS = {"_gpu_apply_all", "_gpu_fetch_all"}
 _STATE = re.compile(r"(get_|set_)?(\w+_)?(pose|qpos|qvel|velocity|global_pose)$")
@@ -44,8 +46,32 @@ _GUARDS = {
 # --- the class and its registration --------------------------------------------------------------------
 
 
+@rule("registered", "warn", "class")
 def registered(checkup: Checkup) -> Iterator[Found | Note]:
-    """In ManiSkill's table."""
+    """The class inherits BaseEnv and is registered with @register_env.
+
+    ManiSkill's own commands, its trainers and its time limit for many envs do not know the task; without any
+    id, gym.make cannot make it.
+
+    ## Why
+    `gym.make`, ManiSkill's demos, its recording tools and every trainer make a task by its id. A class
+    without an id can be opened here and nowhere else: a job on a cluster that is given the id finds nothing.
+    Gymnasium's own `register` makes an id that only `gym.make` knows, with a time limit for one env. The rule
+    reports that too; the workbench uses that id and limit.
+
+    ## Mend
+    Write the decorator above the class.
+
+    ```python fragment
+    @register_env("PushCup-v1", max_episode_steps=100)
+    class PushCupEnv(BaseEnv): ...
+    ```
+
+    ## How it is checked
+    The rule reads ManiSkill's table of ids after the file was imported; nothing runs. The result is *not
+    applicable* for a robot that is shown in one of ManiSkill's scenes. The rule does not see an id that
+    another file registers for the class, unless that file is imported too.
+    """
     if _spec(checkup) is not None:
         return
     other = registry.gymnasium_spec_of(checkup.loaded.cls)
@@ -58,8 +84,29 @@ def registered(checkup: Checkup) -> Iterator[Found | Note]:
     )
 
 
+@rule("versioned-id", "warn", "class")
 def versioned_id(checkup: Checkup) -> Iterator[Found | Note]:
-    """The registered id."""
+    """The registered id ends in a version (-v1).
+
+    Results from before and after a change of the task cannot be told apart.
+
+    ## Why
+    A task changes: the goal becomes smaller, the reward gets another term. With a version in the id, results
+    of the earlier and of the later task stay apart in papers, logs and recordings. Without a version, a
+    number does not say which of the two tasks it belongs to.
+
+    ## Mend
+    End the id in `-v1`, and increase the number when results are no longer comparable.
+
+    ```python fragment
+    @register_env("PushCup-v1", max_episode_steps=100)
+    class PushCupEnv(BaseEnv): ...
+    ```
+
+    ## How it is checked
+    The rule reads the registered id. The result is *not applicable* for a class that is not registered. The
+    rule does not look at whether a change of the task needs a new version.
+    """
     _needs_id(checkup)
     env_id = checkup.loaded.env_id
     if re.search(r"-v\d+$", env_id) is None:
@@ -70,8 +117,30 @@ def versioned_id(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
+@rule("time-limit", "warn", "class")
 def time_limit(checkup: Checkup) -> Iterator[Found | Note]:
-    """The registered limit."""
+    """@register_env has max_episode_steps.
+
+    Episodes end at success or failure only: a policy that reaches neither never resets.
+
+    ## Why
+    Without a time limit an episode ends at success or failure only. A policy that reaches neither, as every
+    policy does in the beginning, never resets: 4096 GPU envs then collect the same dead ends, and the return
+    of an episode is never logged.
+
+    ## Mend
+    Give as many control steps as a slow success needs, and half of that again.
+
+    ```python fragment
+    @register_env("PushCup-v1", max_episode_steps=100)
+    class PushCupEnv(BaseEnv): ...
+    ```
+
+    ## How it is checked
+    The rule reads the registration. The result is *not applicable* for a class without `@register_env`. The
+    rule does not see a limit that a trainer gives to `gym.make(max_episode_steps=...)`, and does not judge
+    whether the limit is long enough.
+    """
     _needs_id(checkup)
     if checkup.loaded.max_episode_steps is None:
         yield Found(
@@ -81,8 +150,29 @@ def time_limit(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
+@rule("id-taken", "warn", "class")
 def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
-    """What was registered before this file was loaded."""
+    """No other task or robot has a name that the file registers, unless the file overrides it on purpose.
+
+    Stock ManiSkill skips the registration, and gym.make gives the other task.
+
+    ## Why
+    The first class that registers an id keeps it. Stock ManiSkill logs a line and skips the second class, and
+    `gym.make` makes the first one without an error: a training run goes on for hours on another task. The
+    workbench opens the class of the file instead, so the mistake shows on a cluster only.
+
+    ## Mend
+    Choose an id that no other task has.
+
+    ```python fragment
+    @register_env("MyPushCube-v1", max_episode_steps=100)  # not PushCube-v1
+    class PushCubeEnv(BaseEnv): ...
+    ```
+
+    ## How it is checked
+    The rule compares the table of registered ids before and after the file is imported. It sees the tasks of
+    ManiSkill and of the packages that the process has imported, and no others.
+    """
     _needs_id(checkup)
     for made in checkup.loaded.replaced:
         of, gives = ("robot", "robot_uids=") if made.is_robot else ("task", "gym.make of ")
@@ -93,8 +183,33 @@ def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
+@rule("supported-robots", "warn", "class")
 def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of the class, with the constructor's default."""
+    """SUPPORTED_ROBOTS lists the robots, including the default of robot_uids.
+
+    ManiSkill logs a warning for each env, and the file does not say which robots were tried.
+
+    ## Why
+    ManiSkill makes a task with any robot that it is asked for. `SUPPORTED_ROBOTS` tells people, and the log,
+    that a robot was never tried: rewards, reach and cameras were made for the listed robots. If the default
+    robot is not listed, each env logs a warning that hides other messages.
+
+    ## Mend
+    List the robots, including the default one; a tuple stands for several robots at once.
+
+    ```python fragment
+    class PushCupEnv(BaseEnv):
+        SUPPORTED_ROBOTS = ["panda", "fetch"]
+
+        def __init__(self, *args, robot_uids="panda", **kwargs):
+            super().__init__(*args, robot_uids=robot_uids, **kwargs)
+    ```
+
+    ## How it is checked
+    The rule reads the class and the default of its constructor's `robot_uids`. The result is *not applicable*
+    if the class lists no robots and its constructor names none. The rule does not try whether the task works
+    with each of the listed robots.
+    """
     checkup.require_task()
     cls = checkup.loaded.cls
     robot = robots_of(cls, checkup.loaded.default_kwargs)
@@ -114,8 +229,30 @@ def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
+@rule("reward-modes", "warn", "class")
 def reward_modes(checkup: Checkup) -> Iterator[Found | Note]:
-    """Of the class, with the methods that it overrides."""
+    """Each mode in SUPPORTED_REWARD_MODES has its method.
+
+    The first step in that mode raises NotImplementedError.
+
+    ## Why
+    `SUPPORTED_REWARD_MODES` is what `gym.make` accepts, and its first entry is the default. A mode without
+    its method fails at the first step with a bare `NotImplementedError`, after the job on the cluster has
+    waited in the queue. A class that does not declare its modes claims all four.
+
+    ## Mend
+    List the modes that the class has methods for; `sparse` needs only `success` or `fail` in `evaluate`.
+
+    ```python fragment
+    class PushCupEnv(BaseEnv):
+        SUPPORTED_REWARD_MODES = ("sparse", "none")  # no compute_dense_reward yet
+    ```
+
+    ## How it is checked
+    The rule reads the class. `sparse` and `none` need no method. The result is *not applicable* for a task
+    with its own `get_reward`. The rule `success-stays-possible` checks that `evaluate` returns what the
+    sparse reward is made of.
+    """
     checkup.require_task()
     cls = checkup.loaded.cls
     if cls.get_reward is not BaseEnv.get_reward:
@@ -140,8 +277,33 @@ def reward_modes(checkup: Checkup) -> Iterator[Found | Note]:
 # --- names and calls in the source -----------------------------------------------------------------------
 
 
+@rule("unknown-name", "warn", "class")
 def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
-    """By the source, with the names that the classes have."""
+    """Attributes that are set on builders, and methods that are called on self and the scene, exist.
+
+    A typo on a builder (inital_pose) is ignored silently; a call that does not exist fails when it is
+    reached.
+
+    ## Why
+    Python sets any attribute on a builder: `builder.inital_pose = ...` raises nothing, and the body is built
+    at the origin, in all 4096 envs, inside whatever stands there. A call of a method that does not exist
+    fails only when its line runs, perhaps in a branch that runs first after hours.
+
+    ## Mend
+    Write the name that the finding proposes.
+
+    ```python fragment
+    builder.initial_pose = sapien.Pose(p=[0, 0, 0.02])
+    forces = self.scene.get_pairwise_contact_forces(self.cube, self.goal)
+    ```
+
+    ## How it is checked
+    The rule reads the source of the hooks and of the functions that they call; nothing runs. It looks up
+    attributes that are set on variables made by `create_actor_builder` and `create_articulation_builder`, and
+    methods that are called on `self` and `self.scene`. A name counts as known if the files set it, read it on
+    a builder or ask for it with `hasattr`. The rule does not look at builders that a function gets as an
+    argument, nor at objects such as `self.agent`.
+    """
     checkup.require_source()
     read = {
         node.attr
@@ -181,8 +343,36 @@ def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+@rule("unseeded-random", "warn", "class")
 def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
-    """By the source of the hooks and what they call."""
+    """Random numbers come from torch in _initialize_episode, and from self._batched_episode_rng where the scene
+    is built.
+
+    The same seed gives another episode each time: nothing can be reproduced.
+
+    ## Why
+    ManiSkill seeds torch for a reset and gives each env a generator for the build. Numbers from NumPy's or
+    Python's own generator are not seeded: `reset(seed=3)` gives another episode each time. Runs,
+    demonstrations and the one episode that failed cannot be repeated.
+
+    ## Mend
+    Draw from torch at a reset, and from `self._batched_episode_rng` where the scene is built.
+
+    ```python fragment
+    def _load_scene(self, options: dict):
+        sizes = self._batched_episode_rng.uniform(0.02, 0.04)  # a number for each env
+
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict):
+        with torch.device(self.device):
+            place = torch.rand((len(env_idx), 2)) * 0.2 - 0.1
+    ```
+
+    ## How it is checked
+    The rule reads the source of the hooks and of the functions that they call, and looks for calls into
+    `numpy.random`, `random` and SciPy's `Rotation.random`. A generator that is made with a seed is accepted.
+    The rule does not see random numbers inside other libraries; the rule `same-seed` compares whole episodes.
+    """
     checkup.require_source()
     at_resets = {function for _, function in checkup.places.reached_from(*AT_RESETS)}
     for module, function in checkup.places.reached_from(*HOOKS):
@@ -201,8 +391,33 @@ def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+@rule("backend-only-call", "warn", "class")
 def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
-    """By the source of the hooks and what they call."""
+    """Calls that exist in one backend only stand behind `if self.gpu_sim_enabled:` or its opposite.
+
+    The task runs on the CPU or on the GPU, and fails on the other.
+
+    ## Why
+    A task is written on the CPU and trained on the GPU, or evaluated the other way round. `get_contacts()`
+    and the state of a single SAPIEN object exist, or are up to date, in the CPU simulation only; `px.gpu_...`
+    and `_gpu_apply_all()` exist in the GPU simulation only. The task runs on one of them, and on the other it
+    raises or reads old state.
+
+    ## Mend
+    Use ManiSkill's batched calls, or put the call behind the condition.
+
+    ```python fragment
+    if self.gpu_sim_enabled:
+        self.scene._gpu_apply_all()
+    forces = self.scene.get_pairwise_contact_forces(self.cube, self.goal)  # (N, 3), on both
+    ```
+
+    ## How it is checked
+    The rule reads the source of the hooks and of the functions that they call. It accepts a call behind a
+    condition that names the backend, and a call after an early return by such a condition. It also accepts
+    reads of a SAPIEN object while the scene is built. The rule does not follow objects that were put into
+    variables first.
+    """
     checkup.require_source()
     after_begin = {function for _, function in checkup.places.reached_from(*AT_RESETS)}
     for module, function in checkup.places.reached_from(*HOOKS):
@@ -259,7 +474,7 @@ def _decorator(checkup: Checkup) -> Place | None:
 
 
 def _class_value(checkup: Checkup, name: str) -> Place | None:
-    """Where the class, or one that it inherits in the author's files, assigns this; else the class."""
+    """The line of the class, or of a base class in the author's files, that assigns this name; else the class."""
     owner = next((cls for cls in checkup.loaded.cls.__mro__ if name in vars(cls)), None)
     if owner is not None and (found := checkup.places.class_definition(owner)) is not None:
         module, node = found
@@ -279,7 +494,7 @@ def _as_tuple(robot: Any) -> Any:
 
 
 def _implemented(cls: type[BaseEnv]) -> tuple[str, ...]:
-    """Those of its reward modes that it has."""
+    """The declared reward modes that the class has methods for."""
     have = [
         mode
         for mode in cls.SUPPORTED_REWARD_MODES
@@ -307,8 +522,8 @@ def _builders(function: ast.FunctionDef) -> dict[str, set[str]]:
 
 
 def _names_of(checkup: Checkup, cls: type) -> set[str]:
-    """All names that an object of this class may have: of its classes, those that the author's files assign or ask for
-    by ``hasattr``, and those that code outside these files reads or sets."""
+    """All names that an object of this class may have: those of its classes, those that the author's files assign or name in a
+    string, and those that code outside these files reads or sets."""
     own = {module.file for module in checkup.places.modules}
     names = set(dir(cls))
     for module in checkup.places.modules:
@@ -329,7 +544,7 @@ def _names_of(checkup: Checkup, cls: type) -> set[str]:
 
 
 def _guarded(body: list[ast.stmt]) -> Iterator[ast.AST]:
-    """What stands behind a condition about the backend, in these statements and below."""
+    """The nodes behind a condition about the backend, in these statements and below."""
     behind = False
     for statement in body:
         if behind:
@@ -362,20 +577,7 @@ def _ends_in(node: ast.expr, name: str) -> bool:
 
 
 def _is_one_object(node: ast.expr) -> bool:
-    """``self.cube._objs[0]``."""
+    """Whether the expression is one SAPIEN object, such as ``self.cube._objs[0]``."""
     return isinstance(node, ast.Subscript) and (
         _ends_in(node.value, "_objs") or _ends_in(node.value, "_bodies")
     )
-
-
-CHECKS: Mapping[str, Check] = {
-    "registered": registered,
-    "versioned-id": versioned_id,
-    "time-limit": time_limit,
-    "id-taken": id_taken,
-    "supported-robots": supported_robots,
-    "reward-modes": reward_modes,
-    "unknown-name": unknown_name,
-    "unseeded-random": unseeded_random,
-    "backend-only-call": backend_only_call,
-}

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.rule_check import rule
 from workbench.envs import maniskill_private
 from workbench.envs.broken_rule import Place
 from workbench.envs.camera_data import CameraKey, CameraKind
@@ -33,22 +34,46 @@ from workbench.task.blame import blamed
 
 RESETS = 4
 """Resets of `Checkup.pictured` whose pictures are measured."""
-MOST_OBJECTS = 30
-"""Objects that are looked for: each takes a picture of its own."""
+MAX_OBJECTS = 30
+"""Maximum number of objects that are looked for: each takes an extra picture."""
 MISSED_SHARE = 0.25
-"""Of the pictures in which an object may be out of view."""
+"""Share of the pictures in which an object may be out of view."""
 BACKGROUND_SHARE = 0.5
-MOST_PIXELS = 512 * 512
+"""Share of the pixels that may be empty background."""
+MAX_PIXELS = 512 * 512
+"""Maximum number of pixels of a sensor camera."""
 HOOKS: Mapping[CameraKind, str] = {
     "sensor": "_default_sensor_configs",
     "human": "_default_human_render_camera_configs",
 }
-UNIT = 1e-3
-"""Largest difference of a quaternion's length from 1."""
+UNIT_TOLERANCE = 1e-3
+"""Maximum difference between the length of a quaternion and 1."""
 
 
+@rule("camera-sees", "warn", "_default_sensor_configs")
 def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over the pictures of all sensor cameras after some resets."""
+    """A sensor camera sees each object of the task, and each fixed sensor camera sees at least one object.
+
+    The pictures do not show what a policy must act on.
+
+    ## Why
+    A policy from pictures cannot act on what is in none of them. Training runs without an error and learns
+    the mean.
+
+    ## Mend
+    Aim the camera at where the objects begin.
+
+    ```python fragment
+    pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])
+    return [CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]
+    ```
+
+    ## How it is checked
+    Two envs are reset four times. The rule renders every sensor camera, also with each object alone. It
+    reports an object that is out of view of all cameras in more than a quarter of the resets. It leaves out
+    scenery, the robot, hidden bodies and bodies with nothing to see, and looks for at most 30 objects. It
+    notes objects that others cover in every picture. It does not look at later steps.
+    """
     reports = checkup.look(sensor_reports)
     in_view: dict[str, list[Any]] = {}
     uncovered: dict[str, list[Any]] = {}
@@ -76,7 +101,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     env = checkup.pictured.env
     for key, report in reports.items():
         things = report.wanted_objects(None)
-        # Where it is the only one, each object says so.
+        # With one camera, each object that it misses is a finding already.
         one_of_several = len(reports) > 1 and mount_of(env, cameras_of(env)[key]) is None
         if one_of_several and not any((thing.alone > 0).any() for thing in things):
             found = True
@@ -88,12 +113,31 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
             )
     if covered:
         yield Note(f"covered by other things in every picture after a reset: {listed(covered)}")
-    if not found and (count := len(_drawn(env))) > MOST_OBJECTS:
-        raise NotKnown(f"{MOST_OBJECTS} of {count} objects were looked for")
+    if not found and (count := len(_drawn(env))) > MAX_OBJECTS:
+        raise NotKnown(f"{MAX_OBJECTS} of {count} objects were looked for")
 
 
+@rule("camera-background", "warn", "_default_sensor_configs")
 def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over the pictures of sensor cameras that are not mounted on a body."""
+    """At most half of the pixels of a sensor camera are empty background.
+
+    Background pixels have depth 0, and cost memory and time for nothing.
+
+    ## Why
+    A ray that meets nothing has depth 0, which a network reads as very near. Pixels of sky cost as much
+    memory and time as all others, in each of thousands of envs.
+
+    ## Mend
+    Aim the camera down at the scene.
+
+    ```python fragment
+    pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])
+    ```
+
+    ## How it is checked
+    The rule uses the pictures of `camera-sees`, and reports a camera whose pictures are, on average, more
+    than half empty background. It leaves out cameras that are mounted on a body.
+    """
     reports = checkup.look(sensor_reports)
     env = checkup.pictured.env
     fixed = {key: report for key, report in reports.items() if mount_of(env, cameras_of(env)[key]) is None}
@@ -109,8 +153,34 @@ def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+@rule("camera-pose", "warn", "_default_sensor_configs")
 def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
-    """The poses that the hooks return, for sensors of the task and for people."""
+    """The quaternion of a camera has length 1.
+
+    The picture is turned and zoomed, and extrinsics are scaled. look_at straight down or up gives such a
+    quaternion (tilt the view a little).
+
+    ## Why
+    SAPIEN does not normalise the quaternion of a camera: a shorter one turns and zooms the picture. It also
+    scales the camera's matrices: points that are computed from depth lie elsewhere, and point clouds are
+    wrong without an error. ManiSkill's `look_at` gives a quaternion of length 0.707 if it looks straight up
+    or down.
+
+    ## Mend
+    Move the eye aside by a millimetre.
+
+    ```python fragment
+    pose = sapien_utils.look_at(eye=[0.001, 0, 0.6], target=[0, 0, 0])
+    ```
+
+    ## How it is checked
+    The rule reads the configs that `_default_sensor_configs` and `_default_human_render_camera_configs`
+    return; it renders no picture. It reports a length that differs from 1 by more than 0.001. Cameras of the
+    robot are left out.
+
+    The page shows the picture that ManiSkill renders. *Studio* writes a unit quaternion, with which the
+    camera looks where the call of `look_at` aims.
+    """
     configs = checkup.look(hook_configs)
     robots = {config.uid for config in checkup.look(sensor_configs)[1]}
     own = {key: config for key, config in configs.items() if key[0] == "human" or key[1] not in robots}
@@ -118,7 +188,7 @@ def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
         raise NotApplicable("it has no camera of its own")
     for (kind, _), config in own.items():
         lengths = np.linalg.norm(rows_of_pose(config)[:, 3:], axis=1)
-        if np.abs(lengths - 1).max() > UNIT:
+        if np.abs(lengths - 1).max() > UNIT_TOLERANCE:
             yield Found(
                 f"the quaternion of camera {config.uid!r} has length {lengths[0]:.3g}: its picture is turned and zoomed, and "
                 "its extrinsics are scaled. Give a unit quaternion; if look_at() looks straight up or down, move the eye "
@@ -127,8 +197,31 @@ def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+@rule("camera-names", "warn", "_default_sensor_configs")
 def camera_names(checkup: Checkup) -> Iterator[Found | Note]:
-    """The configs that the hooks of task and robot return."""
+    """Sensor cameras of the task and of its robot have different names.
+
+    The last camera with a name replaces the others silently.
+
+    ## Why
+    ManiSkill keeps sensor cameras in a dict by name: of two cameras with one name it makes the last one, and
+    a camera of the robot replaces the task's. Observations lack a picture without an error.
+
+    ## Mend
+    Give each camera its own name.
+
+    ```python fragment
+    return [
+        CameraConfig("left_camera", pose=left, width=128, height=128, fov=1.0),
+        CameraConfig("right_camera", pose=right, width=128, height=128, fov=1.0),
+    ]
+    ```
+
+    ## How it is checked
+    The rule compares the configs that the hooks of task and robot return; it renders no picture. A sensor and
+    a camera for people may have the same name. The rule does not compare the names of the robot's own cameras
+    with each other.
+    """
     of_task, of_robot = checkup.look(sensor_configs)
     if not of_task and not of_robot:
         raise NotApplicable("it has no sensor camera")
@@ -143,10 +236,29 @@ def camera_names(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+@rule("camera-size", "warn", "_default_sensor_configs")
 def camera_size(checkup: Checkup) -> Iterator[Found | Note]:
-    """The configs that the task's hook returns."""
+    """A sensor camera has at most 512 x 512 pixels.
+
+    Thousands of envs do not fit into the GPU's memory.
+
+    ## Why
+    Every env has its own textures: at 1920 x 1080 pixels, 4096 envs need far more memory than a GPU has, and
+    the renderer fails when training begins.
+
+    ## Mend
+    Keep sensor cameras small, and give people a separate camera.
+
+    ```python fragment
+    return [CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0)]
+    ```
+
+    ## How it is checked
+    The rule reads the configs that `_default_sensor_configs` returns; it renders no picture. It reports more
+    than 512 x 512 pixels. It does not add up several cameras.
+    """
     for config in _own_configs(checkup):
-        if config.width * config.height > MOST_PIXELS:
+        if config.width * config.height > MAX_PIXELS:
             megabytes = config.width * config.height * 16 / 1e6
             yield Found(
                 f"sensor camera {config.uid!r} has {config.width} x {config.height} pixels: its textures take about "
@@ -155,8 +267,34 @@ def camera_size(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+@rule("ray-traced", "warn", "_default_human_render_camera_configs")
 def ray_traced(checkup: Checkup) -> Iterator[Found | Note]:
-    """The configs that the hooks return, for sensors and for people."""
+    """No camera is ray traced: shader_pack is minimal or default.
+
+    render() of several envs raises "ray tracing shaders do not work with parallel rendering".
+
+    ## Why
+    ManiSkill renders the cameras of all envs of a GPU simulation together, and refuses ray tracing there:
+    `render()` raises "ray tracing shaders do not work with parallel rendering". A ray-traced sensor cannot be
+    used for training. A machine whose driver does not trace rays in hardware, such as one with Mesa's
+    software driver, cannot render these pictures in a useful time.
+
+    ## Mend
+    Let the task render with `minimal` or `default`. Trace rays for a film only, with one env.
+
+    ```python fragment
+    env = gym.make("MyTask-v1", render_mode="rgb_array", human_render_camera_configs={"shader_pack": "rt"})
+    ```
+
+    ## How it is checked
+    The rule reads the configs that the camera hooks of the task and its robot return; it renders no picture.
+    It reports a `shader_pack` that begins with `rt`.
+
+    On a machine that does not trace rays, the workbench renders such a camera with `default`, which has the
+    same modalities. It says so when a task is opened, under the camera's name on the *Cameras* tab, and in
+    recordings (`replaced_shader` of the camera in the `.json`). `workbench doctor` says whether this machine
+    traces rays.
+    """
     configs = checkup.look(hook_configs)
     if not configs:
         raise NotApplicable("it has no camera")
@@ -216,13 +354,13 @@ def _measured(env: Any, e: int, key: CameraKey, objects: list[SceneObject]) -> C
 
 
 def _objects(env: Any) -> list[SceneObject]:
-    """Robots and scenery, and the first of the others."""
+    """The robots, the scenery and the first other objects."""
     scenery = [thing for thing in list_objects(env) if thing.robot or thing.scenery]
-    return [*scenery, *_drawn(env)[:MOST_OBJECTS]]
+    return [*scenery, *_drawn(env)[:MAX_OBJECTS]]
 
 
 def _drawn(env: Any) -> list[SceneObject]:
-    """Objects that are neither robot nor scenery and have anything to see: a body may only carry a camera."""
+    """Objects that are neither robot nor scenery and that are drawn: a body may only carry a camera."""
     index = scene_index(env)
     return [
         thing
@@ -233,6 +371,7 @@ def _drawn(env: Any) -> list[SceneObject]:
 
 
 def _own_configs(checkup: Checkup) -> list[Any]:
+    """Configs of the task's sensor cameras. Raises NotApplicable without one."""
     of_task, _ = checkup.look(sensor_configs)
     if not of_task:
         raise NotApplicable("it has no sensor camera of its own")
@@ -240,6 +379,7 @@ def _own_configs(checkup: Checkup) -> list[Any]:
 
 
 def _place(checkup: Checkup, key: CameraKey) -> Place | None:
+    """The author's line that makes a sensor camera."""
     of_task, of_robot = checkup.look(sensor_configs)
     for config in (*of_task, *of_robot):
         if config.uid == key[1]:
@@ -248,18 +388,8 @@ def _place(checkup: Checkup, key: CameraKey) -> Place | None:
 
 
 def _site(checkup: Checkup, config: Any, hook: str = "_default_sensor_configs") -> Place | None:
-    """Where the author's code makes a config; else the hook."""
+    """The author's line that makes a config; the hook if other code makes it."""
     site = maniskill_private.camera_site(config)
     if site is None or site.file not in map(str, checkup.loaded.source_files):
         return checkup.places.hook(hook)
     return site.file, site.line, site.function.rpartition(".")[2]
-
-
-CHECKS: Mapping[str, Check] = {
-    "camera-sees": camera_sees,
-    "camera-background": camera_background,
-    "camera-pose": camera_pose,
-    "camera-names": camera_names,
-    "camera-size": camera_size,
-    "ray-traced": ray_traced,
-}

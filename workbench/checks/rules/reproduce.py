@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.checks.evidence.builds import shapes_of_env
-from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown, read_obs
+from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown, read_obs
 from workbench.checks.evidence.random_calls import first_draw, global_draw, torch_draw
 from workbench.checks.evidence.time_step import EVERY_STEP
+from workbench.checks.rule_check import rule
 from workbench.envs.action_vector import random_action
 from workbench.envs.maniskill_private import apply_and_fetch
 from workbench.envs.state_columns import env_states, flat_names, split_flat
@@ -21,26 +22,51 @@ from workbench.envs.task_env import TaskEnv
 from workbench.machine.text import listed
 from workbench.task.blame import blamed
 
-ROUNDS = 6
-"""Partial resets, with a step between them."""
+PARTIAL_RESETS = 6
+"""Number of partial resets, with a step between them."""
 REPLAYED_STEPS = 10
-SAME = 1e-4
-"""Largest difference of two numbers that are equal: poses come back rounded."""
-RESTORED = 1e-3
-"""The same after a state dict, whose link poses are computed from joints again; of larger numbers, relative."""
+"""Number of steps that are made twice."""
+SAME_TOLERANCE = 1e-4
+"""Maximum difference of two numbers that count as equal: poses come back rounded."""
+RESTORED_TOLERANCE = 1e-3
+"""Maximum difference after a state dict is restored, which computes link poses from joints; relative for numbers above 1."""
 _RESET_HOOKS = ("_initialize_episode", "reset")
 _RESULT_HOOKS = ("evaluate", "_get_obs_extra", "_get_obs_agent", "get_info", "get_obs")
-"""They give what a reset returns."""
+"""Hooks that make the result of a reset."""
 Numbers = dict[str, NDArray[np.float64]]
-"""(N, ...) by name."""
+"""Arrays (N, ...) by name."""
 
 
+@rule("runs", "stop", "_initialize_episode")
 def runs(checkup: Checkup) -> Iterator[Found | Note]:
-    """Resets at random subsets, with and without seeds, and steps with random actions, the largest among them."""
+    """Resets of any subset of envs with any seed, and steps with any action, work.
+
+    Training ends with an error.
+
+    ## Why
+    A trainer resets any of its envs at any step, with and without seeds, and tries actions that no person
+    would. An error then ends the training, after minutes or hours.
+
+    ## Mend
+    Work on the rows of `env_idx`; it may be a single row.
+
+    ```python fragment
+    def _initialize_episode(self, env_idx, options):
+        b = len(env_idx)
+        self.target[env_idx] = torch.rand((b, 3), device=self.device)
+    ```
+
+    ## How it is checked
+    The rule resets random subsets of the envs six times, half of the times with seeds, and makes a step of
+    random actions after each reset; in the first step all actions are at their bounds. What any other check
+    raises in the task is reported under this rule too. If several envs raise and one env does not, the
+    finding says so. With one env no partial reset can be tried, and the result is *not known* unless
+    something raises. The rule does not see what fails in a state that random actions do not reach.
+    """
     task, rng = checkup.task, np.random.default_rng(1)
     every = range(checkup.num_envs)
     checkup.reset(task, None)
-    for turn in range(ROUNDS):
+    for turn in range(PARTIAL_RESETS):
         count = int(rng.integers(1, checkup.num_envs + 1))
         chosen = sorted(int(i) for i in rng.choice(every, count, replace=False))
         checkup.reset(task, None if turn % 2 else [1000 * turn + i for i in chosen], chosen)
@@ -51,8 +77,34 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
     return iter(())
 
 
+@rule("same-seed", "stop", "_initialize_episode")
 def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
-    """After a reset, and again after resets and steps of other seeds."""
+    """The same seed gives the same state after a reset, whatever came before.
+
+    Runs, demonstrations and bugs cannot be reproduced.
+
+    ## Why
+    `reset(seed=s)` promises a certain episode. If numbers come from a generator that the reset does not seed,
+    or if something keeps its value from the last episode, then runs, bugs and demonstrations cannot be
+    reproduced, and evaluations on fixed seeds measure luck.
+
+    ## Mend
+    Draw with torch in `_initialize_episode`, where it is seeded, and set everything that an episode changes.
+
+    ```python fragment
+    def _initialize_episode(self, env_idx, options):
+        b = len(env_idx)
+        xy = torch.rand((b, 2), device=self.device)  # not np.random.rand
+        self.steps_near[env_idx] = 0
+    ```
+
+    ## How it is checked
+    The rule resets the first seeds, then resets other seeds, makes three random steps and a partial reset,
+    and resets the first seeds again. State, `evaluate()` and observation must agree to 0.0001. Readings of
+    the robot's own sensors are left out: a touch sensor shows the contacts of the last substep. If the hooks
+    of a reset, or the functions that they call, have a call that no reset seeds, the rule reports its line:
+    calls of `np.random` and `random`, and calls of torch in `evaluate` and the observation.
+    """
     checkup.require_task()
     task, seeds = checkup.task, next(checkup.batches())
     first = _seen(task, checkup.reset(task, seeds))
@@ -64,10 +116,10 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     if checkup.num_envs > 1:
         checkup.reset(task, None, [checkup.num_envs - 1])
     again = _seen(task, checkup.reset(task, seeds))
-    differing = _differing(first, again, SAME)
+    differing = _differing(first, again, SAME_TOLERANCE)
     if differing:
         drawn = first_draw(checkup.places, global_draw, *_RESET_HOOKS, *_RESULT_HOOKS)
-        # Within the reset torch is seeded, and what comes of its result is asked for after it.
+        # torch is seeded within the reset; the hooks of its result run after it.
         drawn = drawn or first_draw(checkup.places, torch_draw, *_RESULT_HOOKS)
         place, called = drawn or (checkup.places.hook("_initialize_episode"), "")
         yield Found(
@@ -83,26 +135,38 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
-def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
-    """What one env builds for a seed, beside what the batch built for it."""
-    checkup.require_several()
-    assert checkup.task
-    wrong = [
-        seed
-        for env, (seed, alone) in zip(range(checkup.num_envs), checkup.alone.shapes.items(), strict=False)
-        if alone != shapes_of_env(checkup.builds, env)
-    ]
-    if wrong:
-        yield Found(
-            f"one env alone is built with other shapes or colours for seed {listed(wrong)} than the env of that seed among "
-            f"{checkup.num_envs}. Draw from self._batched_episode_rng[i] for env i, not from torch or numpy.",
-            checkup.places.hook("_load_scene"),
-            len(wrong),
-        )
-
-
+@rule("state-restores", "warn", "get_state_dict")
 def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
-    """The state right after a reset, put back after a reset with other seeds. No step is made: contacts are in no state."""
+    """The state dict restores evaluate(), reward and observation.
+
+    Replayed demonstrations, state-based resets and planners see another goal than the recorded one.
+
+    ## Why
+    Replayed demonstrations, planners and resets to recorded states call `set_state_dict`. It restores bodies
+    and joints. It does not restore a goal that the task keeps as a tensor: reward and success are then those
+    of another goal, and labels of a dataset are wrong.
+
+    ## Mend
+    Give the goal a body, or add it to the state.
+
+    ```python fragment
+    def get_state_dict(self):
+        return {**super().get_state_dict(), "goal": self.goal_pos.clone()}
+
+
+    def set_state_dict(self, state, env_idx=None):
+        rest = {key: value for key, value in state.items() if key != "goal"}
+        super().set_state_dict(rest, env_idx)
+        self.goal_pos[:] = state["goal"]
+    ```
+
+    ## How it is checked
+    The rule resets at most four seeds, keeps the state, resets other seeds, and sets the state. `evaluate()`,
+    the reward for an action of zeros and the observation must be as before, to 0.001. The rule leaves out
+    what also differs if only the simulation is moved away and back (velocities of links, noise), and the
+    robot's own sensors. It makes no step, since contacts are in no state; so it does not see counters that
+    only grow in steps.
+    """
     seeds = next(checkup.batches())[: min(4, checkup.num_envs)]
     others = [seed + 5000 for seed in seeds]
     with checkup.env(len(seeds)) as task:
@@ -114,17 +178,17 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
             state = _copied(task.env.get_state_dict())
             before = _rescored(task)
             noisy = _differing(before, _rescored(task), 0)
-            # Only the simulation was elsewhere, not the task: velocities of links, say, come back otherwise.
+            # Only the simulation moves away and back here: numbers that differ now, such as velocities of links, are noise.
             for each in (elsewhere, state):
                 task.env.set_state_dict(each)
                 apply_and_fetch(task.env)
-            noisy |= _differing(before, _rescored(task), RESTORED)
+            noisy |= _differing(before, _rescored(task), RESTORED_TOLERANCE)
         checkup.reset(task, others)
         with blamed("reset", checkup.loaded, task):
             task.env.set_state_dict(state)
             apply_and_fetch(task.env)
             after = _rescored(task)
-    differing = _differing(before, after, RESTORED)
+    differing = _differing(before, after, RESTORED_TOLERANCE)
     lost = {name: by for name, by in differing.items() if name not in noisy}
     if lost:
         yield Found(
@@ -134,8 +198,32 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
+@rule("actions-replay", "warn", "step")
 def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
-    """Twice from the same seeds. Each reset begins with physics that has no past, so only the task's code can differ."""
+    """The same actions from the same seed give the same episode.
+
+    Demonstrations cannot be replayed.
+
+    ## Why
+    Demonstrations are stored as a seed and actions. If a step draws random numbers that no seed decides, or
+    depends on something that a reset does not set, the same actions lead elsewhere.
+
+    ## Mend
+    Draw in the reset, or in the step from the generators of the episodes.
+
+    ```python fragment
+    def _before_control_step(self):
+        push = np.stack([rng.normal(size=3) for rng in self._batched_episode_rng.rngs])
+        self.cube.apply_force(torch.from_numpy(push).float().to(self.device))
+    ```
+
+    ## How it is checked
+    The rule makes ten random steps twice from the same seeds. Each reset begins with physics that has no
+    contacts from before, so that only the task's code can make a difference. Poses, rewards and `evaluate()`
+    must agree to 0.0001. If a call draws in a step, the rule reports its line. The result is *not known* if
+    the reset itself differs ([same-seed](same-seed.md)), and *not applicable* if the task takes no actions.
+    The rule does not look at observations, since noise may be wanted there.
+    """
     checkup.require_task()
     seeds = next(checkup.batches())
     task = checkup.task
@@ -143,7 +231,7 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
         raise NotApplicable("it takes no actions")
     first, second = (_episode(checkup, task, seeds) for _ in range(2))
     for step, (one, other) in enumerate(zip(first, second, strict=True)):
-        if not (differing := _differing(one, other, SAME)):
+        if not (differing := _differing(one, other, SAME_TOLERANCE)):
             continue
         if step == 0:
             raise NotKnown("the same seed gives another start")
@@ -164,6 +252,49 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
             drawn[0],
         )
         return
+
+
+@rule("same-for-any-batch", "warn", "_load_scene")
+def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
+    """The scene that is built for a seed does not depend on the number of envs.
+
+    A demonstration that was recorded with one env shows other objects when it is replayed among many.
+
+    ## Why
+    A demonstration is recorded with one env and replayed, or rendered again, among many. If the objects of a
+    seed depend on the number of envs, the replay shows a hand that grasps where nothing is.
+
+    ## Mend
+    Draw what is built from the generator of each env.
+
+    ```python fragment
+    def _load_scene(self, options):
+        for i in range(self.num_envs):
+            size = 0.02 + 0.01 * self._batched_episode_rng[i].rand()
+            builder = self.scene.create_actor_builder()
+            builder.add_box_collision(half_size=[size] * 3)
+    ```
+
+    ## How it is checked
+    The rule compares what the first two envs of the batch are built of with one env alone, built for the same
+    two seeds: kinds, sizes, poses in the body, colours, frictions and mesh files. It does not compare where a
+    reset places bodies, since ManiSkill seeds the whole batch with the seed of its first env there. The
+    result is *not known* with one env.
+    """
+    checkup.require_several()
+    assert checkup.task
+    wrong = [
+        seed
+        for env, (seed, alone) in zip(range(checkup.num_envs), checkup.alone.shapes.items(), strict=False)
+        if alone != shapes_of_env(checkup.builds, env)
+    ]
+    if wrong:
+        yield Found(
+            f"one env alone is built with other shapes or colours for seed {listed(wrong)} than the env of that seed among "
+            f"{checkup.num_envs}. Draw from self._batched_episode_rng[i] for env i, not from torch or numpy.",
+            checkup.places.hook("_load_scene"),
+            len(wrong),
+        )
 
 
 # --- what is compared ------------------------------------------------------------------------------------
@@ -189,13 +320,13 @@ def _of_result(result: StepResult) -> Numbers:
 def _rescored(task: TaskEnv) -> Numbers:
     """Reward, evaluate() and observation of the present state, for an action of zeros."""
     action = np.zeros((task.num_envs, sum(len(part.names) for part in task.parts)), np.float32)
-    # Of a task without a reward, it would raise.
+    # The reward of a task without one would raise.
     result = task.rescore(None if task.env.reward_mode == "none" else action)
     return {**_of_result(result), **_observed(task)}
 
 
 def _observed(task: TaskEnv) -> Numbers:
-    """The leaves of the observation, of a flat one too."""
+    """The leaves of the observation; a flat one is split by its names."""
     found: Numbers = {}
     for name, value in read_obs(task).items():
         names = flat_names(task, task.obs) if name == "obs" else None
@@ -215,7 +346,7 @@ def _episode(checkup: Checkup, task: TaskEnv, seeds: list[int]) -> list[Numbers]
 
 
 def _differing(one: Numbers, other: Numbers, tolerance: float) -> dict[str, float]:
-    """By how much at most, of what differs. Infinite where shapes differ."""
+    """Largest difference by name of the numbers that differ; infinite if their shapes differ."""
     found: dict[str, float] = {}
     for name in one.keys() & other.keys():
         a, b = one[name], other[name]
@@ -243,12 +374,3 @@ def _copied(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _copied(item) for key, item in value.items()}
     return value.clone() if isinstance(value, torch.Tensor) else value
-
-
-CHECKS: Mapping[str, Check] = {
-    "runs": runs,
-    "same-seed": same_seed,
-    "state-restores": state_restores,
-    "actions-replay": actions_replay,
-    "same-for-any-batch": same_for_any_batch,
-}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,10 @@ from typing import Any
 from mani_skill import ASSET_DIR
 from mani_skill.utils import assets
 
-from workbench.checks.by_hook.source import HOOKS
-from workbench.checks.evidence.checkup import Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Checkup, Found, Note
 from workbench.checks.evidence.places import Module
+from workbench.checks.rule_check import rule
+from workbench.checks.rules.source import HOOKS
 from workbench.envs.assets import assets_at
 from workbench.envs.broken_rule import Place
 
@@ -40,7 +41,7 @@ _WRITES_OR_ASKS = {
     "savez_compressed", "savetxt", "dump", "export", "imwrite", "to_csv", "glob", "listdir", "iterdir",
 }  # fmt: skip
 _DATASET_IDS = {"ycb:": "ycb"}
-"""How ``get_actor_builder(scene, id="ycb:...")`` names a model, and the download that has it."""
+"""Prefix of a model's id, as in ``get_actor_builder(scene, id="ycb:...")``, to the download that has the model."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,36 @@ class NamedFile:
     path: Path
     place: Place
     relative: bool
-    """Found from the folder of the process only."""
+    """Whether it depends on the current folder of the process."""
     always: bool
-    """In no branch of an ``if``."""
+    """Whether it stands in no branch of an ``if``."""
 
 
+@rule("missing-file", "stop", "class")
 def missing_file(checkup: Checkup) -> Iterator[Found | Note]:
-    """By the source, as far as its paths can be worked out."""
+    """Files that the task names exist.
+
+    The task cannot be built on another machine.
+
+    ## Why
+    A path that exists on one machine only, a mesh that was not committed or a name with a typo stops the
+    build on every other machine. On a cluster that happens after the job was scheduled.
+
+    ## Mend
+    Keep files next to the task's file, and find them from there.
+
+    ```python fragment
+    FOLDER = Path(__file__).parent
+    builder.add_visual_from_file(str(FOLDER / "meshes" / "cup.glb"))
+    ```
+
+    ## How it is checked
+    The rule reads the source of the hooks and of the functions that they call. It works out paths made of
+    constants, `__file__`, `Path`, `os.path` and variables that are assigned once, without calling the
+    author's code. It leaves out functions that write files or ask whether a file exists, and paths in
+    ManiSkill's folder of downloads (see the rule `undeclared-assets`). If part of a path is known only while
+    the task runs, the rule checks the folders before that part.
+    """
     for named in _named_files(checkup):
         if ASSET_DIR in named.path.parents or named.path.exists():
             continue
@@ -74,8 +98,30 @@ def missing_file(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+@rule("undeclared-assets", "warn", "class")
 def undeclared_assets(checkup: Checkup) -> Iterator[Found | Note]:
-    """By the source: paths below ManiSkill's folder of downloads, and ids of its datasets."""
+    """Assets that need a download are named in asset_download_ids.
+
+    ManiSkill asks for the download at a prompt, which a cluster does not have, or does not find the files.
+
+    ## Why
+    `asset_download_ids` tells ManiSkill what to fetch before the task is made. Without it, the build fails on
+    a machine that has not downloaded the set, or waits at a prompt that a cluster does not have.
+
+    ## Mend
+    Name the download in the registration.
+
+    ```python fragment
+    @register_env("PickBowl-v1", max_episode_steps=100, asset_download_ids=["ycb"])
+    class PickBowlEnv(BaseEnv): ...
+    ```
+
+    ## How it is checked
+    The rule reads the source of the hooks and of the functions that they call, and looks for paths below
+    ManiSkill's folder of downloads and for ids such as `ycb:024_bowl`. It leaves out what stands in a branch
+    of an `if`, since the task may work without it. It does not see downloads that one of ManiSkill's scene
+    builders uses, or that a robot needs.
+    """
     env_id = checkup.loaded.env_id
     declared = set(checkup.loaded.asset_ids)
     for name in checkup.loaded.asset_ids:
@@ -115,7 +161,7 @@ def _named_files(checkup: Checkup) -> Iterator[NamedFile]:
 
 
 def _branches(function: ast.FunctionDef) -> set[ast.AST]:
-    """What runs under a condition."""
+    """The nodes that run under a condition."""
     return {
         part
         for node in ast.walk(function)
@@ -125,7 +171,7 @@ def _branches(function: ast.FunctionDef) -> set[ast.AST]:
 
 
 def _paths_in(node: ast.AST, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
-    """The longest expressions that are paths."""
+    """The outermost expressions that are paths, with their values."""
     if isinstance(node, ast.Call):
         yield from _loaded_by(node, values)
     value = (
@@ -143,7 +189,7 @@ def _paths_in(node: ast.AST, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
 
 
 def _loaded_by(call: ast.Call, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
-    """What a call reads: its first argument or ``filename=``, where it is a name, a constant or relative."""
+    """The file that a call reads: its first argument or ``filename=``, if that is a name, a constant or a relative path."""
     name = getattr(call.func, "attr", getattr(call.func, "id", ""))
     if name not in _LOADS and not name.endswith("_from_file"):
         return
@@ -192,7 +238,7 @@ class _Values:
         self._open: set[str] = set()
 
     def of(self, node: ast.AST) -> Any:
-        """Its value, if that is a str, a Path, a number or a module; else None."""
+        """The value of the expression if it is a str, a Path, a number or a module; else None."""
         if isinstance(node, ast.Constant):
             return node.value
         if isinstance(node, ast.Name):
@@ -269,9 +315,3 @@ class _Values:
         if name == "Path" and given:
             return Path(*given)
         return str(given[0]) if name in ("str", "fspath") and len(given) == 1 else None
-
-
-CHECKS: Mapping[str, Check] = {
-    "missing-file": missing_file,
-    "undeclared-assets": undeclared_assets,
-}

@@ -1,1 +1,0 @@
-"""The rules, one function each, by the hook that they guard."""
