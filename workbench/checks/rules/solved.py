@@ -13,17 +13,22 @@ from workbench.planning.planned_episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
 from workbench.planning.rollouts import NotAlike, NothingToPlan, control_mode_to_plan, require_plannable
 from workbench.planning.seeds_report import few_seeds_text
-from workbench.planning.verdicts import ENOUGH_SEEDS, MOST_OF, PlannedEpisodes
+from workbench.planning.verdicts import MIN_EPISODES, MIN_SEEDS, PlannedEpisodes
 from workbench.planning.verdicts import RULES as VERDICTS
 from workbench.task.blame import blamed
 
-MAX_SEEDS = ENOUGH_SEEDS
+MAX_SEEDS = MIN_SEEDS
 """Maximum number of seeds that are planned: each takes seconds."""
 STEPS_WITHOUT_LIMIT = 200
 """Maximum number of control steps of an episode whose task has no time limit."""
 STEPS_AFTER_SUCCESS = 5
 """Number of control steps that an episode goes on after its success."""
-_MIN_SOLVED = {"reward-exploited": 1, "reward-stuck": 0, "reward-against": MOST_OF, "success-lost": MOST_OF}
+_MIN_SOLVED = {
+    "reward-exploited": 1,
+    "reward-stuck": 0,
+    "reward-against": MIN_EPISODES,
+    "success-lost": MIN_EPISODES,
+}
 """Rules about success, with the minimum number of solved seeds that shows that they are kept."""
 
 
@@ -57,7 +62,7 @@ def reward_exploited(checkup: Checkup) -> Iterator[Found | Note]:
     solved = [one.solved_at for one in episodes.solved]
     steps = f", in {np.median(solved):g} control steps (median)" if solved else ""
     yield Note(f"planning solved {len(solved)} of {len(episodes.all)} seeds{steps}")
-    if len(episodes.all) < ENOUGH_SEEDS:
+    if len(episodes.all) < MIN_SEEDS:
         yield Note(few_seeds_text(len(episodes.all)))
     yield from _verdict(checkup, "reward-exploited", "compute_dense_reward")
 
@@ -265,7 +270,7 @@ def _require_tried(rule_id: str, episodes: PlannedEpisodes) -> None:
         raise NotApplicable("evaluate() has no entry success")
     if rule_id == "failing-pays" and "fail" not in entries:
         raise NotApplicable("evaluate() has no entry fail")
-    if len(episodes.all) < ENOUGH_SEEDS:
-        raise NotKnown(f"fewer than {ENOUGH_SEEDS} seeds were planned")
+    if len(episodes.all) < MIN_SEEDS:
+        raise NotKnown(f"fewer than {MIN_SEEDS} seeds were planned")
     if len(episodes.solved) < _MIN_SOLVED.get(rule_id, 0):
         raise NotKnown(f"planning solved {len(episodes.solved)} of {len(episodes.all)} seeds")

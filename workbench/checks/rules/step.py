@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note
+from workbench.checks.evidence.episode_batches import SeenOutlier
 from workbench.checks.evidence.over_seeds import together, tried
-from workbench.checks.evidence.rollouts import SeenOutlier
 from workbench.checks.results import Seen
 from workbench.checks.rule_check import outlier_check
 from workbench.checks.rules.placement import where_placed

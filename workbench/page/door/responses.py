@@ -218,7 +218,7 @@ def _scripts() -> str:
     return " ".join(f"'sha256-{one}'" for one in known)
 
 
-# Everything that is not listed is forbidden, and each exception is needed: `tests/ui/server/test_page_policy.py` removes
+# Everything that is not listed is forbidden, and each exception is needed: `tests/page/door/test_page_policy.py` removes
 # them one by one and finds the page broken.
 # - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not unsafe-inline: HTML
 #   from a name, a note or a file that slipped past escaping still would not run. wasm-unsafe-eval is for the program that

@@ -18,7 +18,7 @@ class PagePart(Generic[View]):
     """One part of a page, drawn from an immutable view.
 
     It is redrawn when its `key` changes, at most once per `every` seconds, and at once when `urgent` changes. By default
-    every view is drawn: viser does not send equal values (``tests/ui/test_assigning.py``), so a part needs a key only if
+    every view is drawn: viser does not send equal values (``tests/page/test_assigning.py``), so a part needs a key only if
     its content is expensive to make.
     """
 
