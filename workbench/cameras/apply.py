@@ -192,7 +192,7 @@ def _place(studio: Studio, placed: CameraPlaced, run: Run, now: Now) -> Change:
 
 
 def _moved(studio: Studio, placements: Placements, key: CameraKey) -> Change:
-    """Send the placement of this camera, if it is another."""
+    """Send the placement of this camera to the worker if it changed."""
     before, studio = studio.placements.placed, replace(studio, placements=placements)
     return (studio, []) if placements.placed.get(key) == before.get(key) else _send(studio, key)
 

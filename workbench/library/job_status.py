@@ -71,7 +71,7 @@ class JobStatus:
         return left / self.rate if self.state == "running" and self.rate > 0 else None
 
     def is_silent(self, now: float) -> bool:
-        """Whether it was ended without a word."""
+        """Whether the job stopped reporting progress."""
         return self.state == "running" and now - self.written_at > SILENT_SECONDS
 
 
