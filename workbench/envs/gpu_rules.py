@@ -81,7 +81,7 @@ class Finding:
     """Breaches of one rule at one place."""
 
     rule: str
-    """Its id."""
+    """Id of the rule."""
     degree: Degree
     message: str
     """Message of the first breach: what was done, its effect, and what to write instead."""
@@ -101,7 +101,7 @@ class Finding:
 
     @property
     def key(self) -> tuple[str, str | None, str, str]:
-        """Stays the same when lines around it move."""
+        """Identity of the finding, which stays the same when lines around it move."""
         return self.rule, self.file, self.function, self.code
 
 
@@ -114,18 +114,18 @@ _COMMENT = re.compile(r"#\s*workbench:\s*off\[([\w\s,-]*)\]\s*(.*)")
 
 @dataclass(frozen=True)
 class Silence:
-    """One comment."""
+    """One silencing comment."""
 
     line: int
-    """1-based."""
+    """1-based line of the comment."""
     rules: frozenset[str]
     reason: str
     alone: bool
-    """Whether nothing else is in its line."""
+    """Whether the line has nothing else."""
 
 
 def silences(text: str) -> tuple[Silence, ...]:
-    """The comments of a file's text; none of a text that Python cannot read."""
+    """The silencing comments in a file's text; none if Python cannot parse it."""
     return _read(text)[0]
 
 
