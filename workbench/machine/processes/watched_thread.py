@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 FIRST_BACKOFF_SECONDS, MAX_BACKOFF_SECONDS = 0.05, 5.0
 """Backoff before a thread is restarted; doubled at each failure."""
 _POLL_SECONDS = 0.05
-"""Interval between checks whether the work is wanted."""
+"""Interval between checks whether a caller waits."""
 
 _listeners: list[Callable[[str], None]] = []
 _lock = threading.Lock()
