@@ -59,7 +59,7 @@ def test_what_has_changed_or_gone_since_is_said(task: Path) -> None:
     (task.parent / "meshes/part.obj").write_text("v 9 9 9 9")
     (task.parent / "notes.txt").unlink()
     said = side_files_text(str(task), recorded)
-    assert "meshes/part.obj has changed since; notes.txt is not there." in said
+    assert "meshes/part.obj has changed since; notes.txt is missing." in said
     assert "is missing" in side_files_text("task.py", recorded), "read where the task is not"
     assert "is missing" in side_files_text(str(task), {"../../etc/hostname": "0" * 12})
     assert side_files_text(str(task), {}) == ""

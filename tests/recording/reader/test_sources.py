@@ -40,5 +40,5 @@ def test_an_empty_folder_is_passed_over_beside_others_and_a_file_that_is_none_is
         find_all_sources([empty, empty])
     with pytest.raises(FileNotFoundError, match=f"{tmp_path / 'none'} does not exist:"):
         find_all_sources([folder, tmp_path / "none"])
-    with pytest.raises(UnreadableRecording, match="No recording is named"):
+    with pytest.raises(UnreadableRecording, match="No recording given"):
         find_all_sources([])
