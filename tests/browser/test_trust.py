@@ -71,6 +71,6 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
         live.click()
         expect(window).to_contain_text("every save of this file")
         page.get_by_role("button", name=ONCE).click()
-        expect(page.get_by_text("every body is where it was")).to_be_visible(timeout=PATIENT)
+        expect(page.get_by_text("every body has its recorded pose")).to_be_visible(timeout=PATIENT)
         assert mark.exists()
         assert not [error for error in errors if "non-existent component" not in error]

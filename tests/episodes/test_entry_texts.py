@@ -83,9 +83,9 @@ def test_numbers_texts_and_both_come_back(child_process: None, make_episode: Mak
     log = entities["/logs/evaluate"]["TextLog:text"]
     assert [value[0] for value in log.values] == [
         "best: None",
-        "best is not returned any more",
+        "best is no longer returned",
         "map: 9",
-        "map is not returned any more",
+        "map is no longer returned",
         "word: b",
     ]
 

@@ -158,10 +158,10 @@ def numbers(*shape: int, kind: str = "f4") -> NDArray:
         (of_episode(texts={"a": ((0, None),) * (MAX_TEXT_LINES + 1)}), "too many entries"),
         (of_scene(body_kinds=("static",)), "other bodies"),
         (of_first("visuals", shape=10**9), "without a shape"),
-        (of_first("visuals", bodies=np.array([B])), "bodies that are not there"),
-        (of_first("visuals", bodies=np.array([-1])), "bodies that are not there"),
+        (of_first("visuals", bodies=np.array([B])), "bodies that do not exist"),
+        (of_first("visuals", bodies=np.array([-1])), "bodies that do not exist"),
         (of_first("shapes", "mesh", vertices=numbers(3, 2)), "vertices of shape"),
-        (of_first("shapes", "mesh", faces=np.array([[0, 1, 3]])), "vertices that are not there"),
+        (of_first("shapes", "mesh", faces=np.array([[0, 1, 3]])), "vertices that do not exist"),
         (of_first("shapes", "mesh", normals=numbers(2, 3)), "normals of shape"),
         (of_first("shapes", "material", texture=numbers(2, 2, 3, kind="u1")), "a texture of shape"),
         (of_first("cameras", frame=numbers(T + 1)), "eye: frames of shape"),
@@ -207,7 +207,7 @@ def test_a_picture_that_is_none_is_said(picture: NDArray | None) -> None:
     episode = unpack_episode(read, lambda *_: PictureRead(picture), 1, SharedShapes(), {})
     pictures = episode.cameras[0].rgb
     assert pictures is not None
-    with pytest.raises(OSError, match="the reader gave"):
+    with pytest.raises(OSError, match="the reader returned"):
         pictures[0]
     with pytest.raises(OSError, match="no picture"):
         pictures.blob(0)

@@ -59,9 +59,9 @@ def test_what_has_changed_or_gone_since_is_said(task: Path) -> None:
     (task.parent / "meshes/part.obj").write_text("v 9 9 9 9")
     (task.parent / "notes.txt").unlink()
     said = side_files_text(str(task), recorded)
-    assert "meshes/part.obj has changed since; notes.txt is not there." in said
-    assert "is not there" in side_files_text("task.py", recorded), "read where the task is not"
-    assert "is not there" in side_files_text(str(task), {"../../etc/hostname": "0" * 12})
+    assert "meshes/part.obj has changed since; notes.txt is missing." in said
+    assert "is missing" in side_files_text("task.py", recorded), "read where the task is not"
+    assert "is missing" in side_files_text(str(task), {"../../etc/hostname": "0" * 12})
     assert side_files_text(str(task), {}) == ""
 
 
@@ -71,8 +71,8 @@ def test_a_file_outside_is_not_said_to_be_as_then(task: Path) -> None:
     outside.write_text("mine")
     try:
         hashed = side_files(str(outside.with_name("task.py")), {"": "load('outside.txt')"})["outside.txt"]
-        assert "is not there" in side_files_text(str(task), {"../outside.txt": hashed})
-        assert "is not there" in side_files_text(str(task), {str(outside): hashed})
+        assert "is missing" in side_files_text(str(task), {"../outside.txt": hashed})
+        assert "is missing" in side_files_text(str(task), {str(outside): hashed})
     finally:
         outside.unlink()
 

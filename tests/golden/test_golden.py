@@ -183,7 +183,7 @@ def test_an_unfinished_one_is_mended_by_the_next_that_records_there(
         *("record", task, "--out", folder, "--no-pictures", "--episodes", 1, "--num-envs", 1),
         *("--max-steps", 2, "--env", "render_backend=none"),
     )
-    assert code == Exit.DONE and "1 episode that an earlier recording left half written: recovered" in err
+    assert code == Exit.DONE and "recovered 1 episode that an earlier recording left unfinished" in err
     assert not (folder / ".writing").exists()
     ((_, recovered),) = expected["recovered"].items()
     found = [facts for facts in read_folder(folder).values() if facts["recovered"]]

@@ -219,6 +219,6 @@ def test_a_folder_that_a_machine_does_not_see_is_refused(
     # As on a machine that has a folder of this name of its own.
     monkeypatch.setattr(Path, "touch", lambda path: None)
     with pytest.raises(
-        PoolError, match="does not see the folder .*there of this machine: name one that all machines"
+        PoolError, match="does not see the folder .*there of this machine: give one that all machines"
     ):
         record(wanted("there"), executor=Cluster(address, 1))

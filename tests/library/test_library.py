@@ -133,7 +133,7 @@ def test_a_trajectory_with_pictures_has_a_thumbnail(
     ("files", "said"),
     [
         ({"x.json": b'{"workbench": {"task": '}, "x.json is not JSON, or was cut short."),
-        ({"x.rrd": b""}, "x.rrd is no recording that rerun can read"),
+        ({"x.rrd": b""}, "x.rrd is not a recording that rerun can read"),
         ({"x.json": b'{"episodes": [{"episode_id": 0}], "env_info": {"env_id": "A-v1"}}'}, "is missing"),
         (
             {"x.json": b'{"episodes": [{"episode_id": 0}], "env_info": {"env_id": "A-v1"}}', "x.h5": b"HDF"},
@@ -316,7 +316,7 @@ def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
         wait_for(["a"], problem=False)
         shutil.rmtree(folder)
         wait_for([], problem=True)
-        assert "is not there" in str(library.view().problem)
+        assert "does not exist" in str(library.view().problem)
     finally:
         library.close()
 

@@ -151,7 +151,7 @@ def test_what_came_before_an_unseen_reset_is_kept(tmp_path: Path) -> None:
     for _ in range(3):
         env.step(env.action_space.sample())
     env.unwrapped.reset(seed=5)
-    with pytest.warns(UserWarning, match="step 4 was expected and step 1 came"):
+    with pytest.warns(UserWarning, match="step 4 was expected, but step 1 arrived"):
         env.step(env.action_space.sample())
     assert env.problem is not None
     env.close()

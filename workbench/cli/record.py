@@ -149,7 +149,7 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
             try_folder(what.out)
         requested, _ = with_given_actions(what)
         if recovered := recover_confined(what.out):
-            err.print(f"{_episodes(len(recovered))} that an earlier recording left half written: recovered")
+            err.print(f"recovered {_episodes(len(recovered))} that an earlier recording left unfinished")
         # Before the task is opened: the error of a failed import would not name this cause.
         hidden = hidden_modules_text(what.task)
         for notice in hidden:

@@ -1,1 +1,1 @@
-"""Episodes on disk: their columns and documents, replay, films, and the results of a sweep."""
+"""Episodes on disk: columns, documents, replay, films, and sweep results."""

@@ -1,4 +1,4 @@
-"""Packs the rows of a running episode into bytes, and turns them into columns when it is over."""
+"""Packs the rows of a running episode into bytes, and converts them to columns when it ends."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from workbench.envs.step_result import OtherEntry
 
 EVALUATE = "evaluate/"
 BATCH = "batch/"
-"""Numbers that ``evaluate()`` returned of the whole batch."""
+"""Prefix of numbers that ``evaluate()`` returned for the whole batch."""
 STATE = "state/"
 OBS = "obs/"
 FIXED = ("poses", "action", "reward", "terminated", "truncated")
-"""Names of the columns that every row has; `EVALUATE`, `BATCH`, `STATE` and `OBS` begin those of the others."""
+"""Names of the columns that every row has; the names of the others begin with `EVALUATE`, `BATCH`, `STATE` or `OBS`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Names, types and shapes of the arrays that a row consists of.
+    """Names, types and shapes of the arrays in a row.
 
     A control step of one env is thirty to fifty small arrays, and writing each with its name and type would cost more
     than the step. Names and types stay the same from step to step, so a row is only the bytes of its arrays, and a
-    layout, kept once, describes them. It is a numpy structured type: a thousand rows become columns by one call.
+    layout, stored once, describes them. It is a numpy structured type: one call converts a thousand rows to columns.
 
-    A packer makes one object per key: compare by identity.
+    A packer makes one object per key: compare layouts by identity.
     """
 
     key: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]
@@ -42,7 +42,7 @@ class Layout:
         return json.dumps([[name, dtype.str, shape] for name, dtype, shape in self.key])
 
     def check(self, bodies: int, actions: int) -> None:
-        """Raises ValueError when its rows do not fit a scene of so many bodies and actions, or hold anything but numbers."""
+        """Raise ValueError if its rows do not fit a scene of so many bodies and actions, or hold anything but numbers."""
         shapes = {name: shape for name, _, shape in self.key}
         if shapes["poses"] != (bodies, 7):
             raise ValueError(
@@ -68,7 +68,7 @@ class BatchPacker:
         self._last: Layout | None = None
         self._rows = np.zeros(0, np.uint8)
         self._parts: list[NDArray] = []
-        """Where in `_rows` each column goes."""
+        """Position of each column in `_rows`."""
 
     def pack(self, columns: Sequence[tuple[str, NDArray]]) -> tuple[Layout, list[bytes]]:
         """Layout and N rows of `columns`, each a name and an array (N, ...): those of `FIXED` first."""
@@ -86,7 +86,7 @@ class BatchPacker:
 
 
 def layout_type(text: str) -> np.dtype:
-    """The structured type of rows of the layout `text`. Raises ValueError or TypeError when it is invalid."""
+    """The structured type of rows of the layout `text`. Raises ValueError or TypeError if it is invalid."""
     return np.dtype([(name, dtype, tuple(shape)) for name, dtype, shape in json.loads(text)])
 
 
@@ -128,20 +128,20 @@ def _column(parts: Sequence[NDArray | int]) -> NDArray:
 
 # --- entries of evaluate() that are not numbers ----------------------------------------------------
 #
-# A string or None rarely changes from state to state, so the journal gets a line only where it does. These lines go
+# A string or None rarely changes from state to state, so the journal gets a line only at changes. These lines go
 # into the recording's description, which a library reads for thousands of recordings: their size is bounded.
 
 TEXT = "entry"
 """Kind of a journal entry that holds a text."""
 MAX_TEXT_BYTES = 64 << 10
-"""Limit of one episode's texts, in bytes."""
+"""Maximum size of one episode's texts."""
 MAX_TEXT_LINES = MAX_TEXT_BYTES
-"""A line has at least a byte; a recording with more was not written by the workbench."""
+"""Maximum number of lines: a line has at least a byte, so the workbench writes no recording with more."""
 CUT_MESSAGE = "not recorded from here on: it changes too often"
 
 TextLine = tuple[int, bytes]
-"""First state of a text, and its value in the journal. A plain pair: a reader of rows must not import the journal's
-module, since Arrow would start a thread in the process that forks."""
+"""First state of a text, and its value in the journal. A plain pair, because a reader of rows must not import the journal's
+module: Arrow would start a thread in the process that forks."""
 
 
 class TextEntry(Struct, frozen=True, array_like=True):
@@ -154,11 +154,11 @@ class TextEntry(Struct, frozen=True, array_like=True):
 
 
 TextTrack = tuple[tuple[int, TextEntry | None], ...]
-"""First state and value of each change; None where ``evaluate()`` did not return the entry, or as numbers."""
+"""First state and value of each change; None from a state on in which ``evaluate()`` returned no such entry, or numbers."""
 
 
 class TextWriter:
-    """Makes the journal's lines for the texts of one episode."""
+    """Converts the texts of one episode to lines of the journal."""
 
     def __init__(self) -> None:
         self._last: dict[str, TextEntry] = {}
@@ -171,7 +171,7 @@ class TextWriter:
         return not self._last
 
     def changes(self, state: int, others: Mapping[str, OtherEntry]) -> list[TextLine]:
-        """Lines for the entries that differ from the previous state; `others` as in an `EpisodeRow`."""
+        """Lines for the entries that differ from the previous state."""
         if not others and not self._last:
             return []
         now = {
@@ -201,7 +201,7 @@ def _line(state: int, name: str, entry: TextEntry | None) -> TextLine:
 
 
 def text_tracks(lines: Sequence[TextLine]) -> dict[str, TextTrack]:
-    """The tracks of an episode whose journal has these lines."""
+    """Convert the lines of an episode's journal to text tracks."""
     found: dict[str, list[tuple[int, TextEntry | None]]] = {}
     for state, value in lines:
         name, entry = convert(json.loads(value), tuple[str, TextEntry | None])

@@ -1,4 +1,4 @@
-"""Makes the description of an episode that goes into its files."""
+"""Makes the description of an episode for its files."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def describe(episode: Episode) -> Description:
 
 
 def describe_json(episode: Episode, folder: Path, files: Sequence[Path], sealed: bool) -> Description:
-    """`describe`, with what belongs into the ``.json`` alone.
+    """`describe`, with the fields that only the ``.json`` has.
 
     Args:
-        folder: of the recording.
-        files: its other two files.
+        folder: folder of the recording.
+        files: the other two files of the recording.
         sealed: add this installation's seal.
     """
     info = episode.info
@@ -72,7 +72,7 @@ def describe_json(episode: Episode, folder: Path, files: Sequence[Path], sealed:
 
 
 def _sample(episode: Episode) -> bytes | None:
-    """Its last picture (JPEG), from a human-render camera if there is one."""
+    """The episode's last picture (JPEG), from a human-render camera if there is one."""
     seen = [camera for camera in episode.cameras if camera.rgb is not None]
     if not seen:
         return None
@@ -93,7 +93,7 @@ def _columns(columns: dict[str, NDArray]) -> dict[str, ColumnType]:
 
 
 def _relative(path: str, folder: str) -> str:
-    """`path` relative to `folder`: a recording must not publish the folders above the task's."""
+    """`path` relative to `folder`: a recording must not reveal the folders above the task's folder."""
     if not folder:
         return os.path.basename(path)
     return os.path.relpath(path, folder)

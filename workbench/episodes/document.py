@@ -44,13 +44,13 @@ from workbench.machine.files import (
 )
 
 FORMAT = 2
-"""Since 2 the ``.json`` ends with a checksum of itself (`with_checksum`)."""
+"""Version of the format; from 2 on, the ``.json`` ends with a checksum of itself (`with_checksum`)."""
 MAX_BYTES = 64 << 20
-"""ManiSkill's ``.json`` of 100,000 episodes has 40 MB."""
+"""Maximum size of a ``.json``; ManiSkill's for 100,000 episodes has 40 MB."""
 _BLOCK_BYTES = 1 << 20
 _ESCAPED_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 MAX_PATH_PARTS = 40
-"""Parts of a recorded path that are tried: the path comes from an untrusted file."""
+"""Maximum number of parts of a recorded path that are tried: the path comes from an untrusted file."""
 
 T = TypeVar("T")
 Vector = tuple[float, float, float]
@@ -60,7 +60,7 @@ Columns = Annotated[dict[Name, ColumnType], Entries]
 
 
 class WrongDocument(ValueError):
-    """Unreadable JSON, or a field that is missing or of another type; the message follows the file's name."""
+    """Unreadable JSON, or a field that is missing or has a wrong type; the message follows the file's name."""
 
 
 class CameraJson(Struct, frozen=True):
@@ -77,7 +77,7 @@ class CameraJson(Struct, frozen=True):
     mount: Name | None
     modalities: Annotated[tuple[Name, ...], Entries]
     replaced_shader: Name = ""
-    """Shader pack of the task's config, if another one drew the pictures; see `CameraInfo.replaced_shader`."""
+    """Shader pack of the task's config, if another one rendered the pictures; see `CameraInfo.replaced_shader`."""
 
     @classmethod
     def of(cls, camera: CameraInfo) -> CameraJson:
@@ -120,13 +120,13 @@ class SealJson(Struct, frozen=True):
 
 
 MAX_SEGMENTS = 1_000_000
-"""Ids of a segmentation."""
+"""Maximum number of ids of a segmentation."""
 
 
 class Description(Struct, frozen=True, kw_only=True):
     """Metadata of a recording, in the ``.json`` and in the ``.rrd``; fields with a default may be missing.
 
-    A library lists thousands of episodes by this alone. It also holds what the ``.rrd`` and ``.h5`` do not: types of
+    A library lists thousands of episodes from this alone. It also holds what the ``.rrd`` and ``.h5`` lack: types of
     the entries of ``evaluate()``, names and kinds of bodies, camera parameters.
     """
 
@@ -150,9 +150,9 @@ class Description(Struct, frozen=True, kw_only=True):
     source_file: PathText | None
     """The name of the task's file."""
     source: Annotated[dict[PathText, str], Entries] | None
-    """Path relative to the task's folder, to text. None in the ``.rrd``, which holds the texts separately."""
+    """Text by path relative to the task's folder. None in the ``.rrd``, which holds the texts separately."""
     side_files: Annotated[dict[PathText, Name], Entries] = {}
-    """Other files that the task reads, not included: path relative to the task's folder, to hash."""
+    """Hash by path (relative to the task's folder) of other files that the task reads; they are not included."""
     acted_by: ActedBy = ()
     pictures: PictureDegree = "exact"
     moved_cameras: tuple[MovedCamera, ...] = ()
@@ -161,7 +161,7 @@ class Description(Struct, frozen=True, kw_only=True):
     total_reward: float | None = msgspec.field(name="return")
     """None for a task without a reward."""
     success: bool | None
-    """In the last state (`success_once`: in any). None if the task has no such entry."""
+    """Success in the last state (`success_once`: in any). None if the task has no such entry."""
     success_once: bool | None
     fail: bool | None
     fail_once: bool | None
@@ -177,18 +177,18 @@ class Description(Struct, frozen=True, kw_only=True):
     obs: Columns
     # Only in the .json:
     files: dict[str, Checksum] | UnsetType = UNSET
-    """Suffix of the other two files to checksum."""
+    """Checksum of the other two files by suffix."""
     source_path: PathText | None | UnsetType = UNSET
     """Path of the task's file relative to the recording's folder."""
     thumbnail: str | None | UnsetType = UNSET
     """Base64 of a JPEG; None without cameras."""
     made_here: SealJson | None | UnsetType = UNSET
-    """None when no seal could be made."""
+    """None if no seal could be made."""
     tags: list[str] | UnsetType = UNSET
     note: str | UnsetType = UNSET
 
     def info(self, folder: Path | None = None) -> EpisodeInfo:
-        """The episode's info; the task's file is searched for only when the recording's `folder` is given."""
+        """The episode's info. Searches the task's file only if the recording's `folder` is given."""
         found = None if folder is None else task_file(self.source_path or None, self.task, folder)
         made = self.made_here or None
         files = as_json(self.files or {})
@@ -279,10 +279,11 @@ class Document:
 
 
 def read_document(path: Path) -> Document:
-    """
+    """Read the ``.json`` of a recording.
+
     Raises:
         OSError: it cannot be read.
-        WrongDocument: as `read_json`, or it was changed since the workbench wrote it.
+        WrongDocument: as `read_json` does, or it was changed since the workbench wrote it.
     """
     content = _read_content(path, MAX_BYTES)
     data = parse_json(content)
@@ -302,7 +303,7 @@ def read_json(path: Path, most_bytes: int = MAX_BYTES) -> Any:
 
     Raises:
         OSError: it cannot be read.
-        WrongDocument: not JSON, not a regular file, or longer than `most_bytes`.
+        WrongDocument: it is not JSON, not a regular file, or longer than `most_bytes`.
     """
     return parse_json(_read_content(path, most_bytes))
 
@@ -323,7 +324,7 @@ def parse_json(content: bytes | str) -> Any:
         # msgspec's parser refuses NaN, which a sum of rewards may be.
         data = json.loads(content)
         if _ESCAPED_SURROGATE.search(content if isinstance(content, bytes) else content.encode()):
-            json.dumps(data, ensure_ascii=False).encode()  # half of a pair can be neither sent nor printed
+            json.dumps(data, ensure_ascii=False).encode()  # a lone surrogate can be neither sent nor printed
         return data
     except (ValueError, RecursionError) as error:
         raise WrongDocument("is not JSON, or was cut short") from error
@@ -335,14 +336,14 @@ def json_text(value: object, indent: int | None = None) -> str:
     if indent is None:
         return text
     try:
-        # json's own indentation is in Python, and takes six times as long.
+        # json indents in Python, which takes six times as long.
         return msgspec.json.format(text, indent=indent)
-    except msgspec.DecodeError:  # it refuses NaN
+    except msgspec.DecodeError:  # msgspec refuses NaN
         return json.dumps(value, indent=indent, default=_plain)
 
 
 def seen_otherwise(info: EpisodeInfo) -> dict[str, Any]:
-    """What an export says of an episode whose pictures or observations are not what its source gives; else empty."""
+    """Metadata of an export about pictures or observations that differ from those of the episode's source; else empty."""
     said = {"moved_cameras": as_json(info.moved_cameras), "observed_by": info.observed_by}
     return {name: value for name, value in said.items() if value}
 
@@ -360,7 +361,7 @@ def fields_of(struct: Struct) -> dict[str, Any]:
 
 @cache
 def _names_of(kind: type[Struct]) -> tuple[tuple[str, str], ...]:
-    """Name and name in the file of each field. msgspec evaluates the annotations at every call."""
+    """(name, name in the file) of each field, cached because msgspec evaluates the annotations at every call."""
     return tuple((field.name, field.encode_name) for field in msgspec.structs.fields(kind))
 
 
@@ -390,12 +391,12 @@ def _typed(data: object, kind: type[T], place: str) -> T:
 def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     """The task's file at `source_path` relative to the recording's `folder`; None if it is not found.
 
-    A copied recording has lost that path and is mostly opened from the task's own folder. So the end of the path is
-    also tried below the current folder and the folders above the recording; such a file must contain the task's name.
+    That path is wrong for a copied recording, which is usually opened from the task's own folder. So the end of the path
+    is also tried below the current folder and the folders above the recording; such a file must contain the task's name.
     """
     if not source_path:
         return None
-    # Not `Path.is_file`, which raises for a name that no file can have.
+    # Not `Path.is_file`, which raises for an invalid file name.
     if os.path.isfile(there := folder / source_path):
         return os.fspath(there.resolve())
     parts = [part for part in Path(source_path).parts if part not in ("..", os.sep)]
@@ -415,9 +416,9 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
 # --- checksums --------------------------------------------------------------------------------------
 #
 # Neither format detects a changed byte: HDF5 has checksums for chunks only, and most columns of an episode are too small
-# to be chunked; rerun has none. Rescoring such a file would be silently wrong. So the `.json` holds size and hash of the
-# other two. Both are in the page cache when just written: hashing takes a hundredth of the time of writing (measured).
-# The `.json` itself ends with a hash of all that is before it.
+# to be chunked; rerun has none. Rescoring a changed file would be silently wrong. So the `.json` holds size and hash of the
+# other two files. These are in the page cache when just written: hashing takes a hundredth of the time of writing
+# (measured). The `.json` itself ends with a hash of everything before it.
 #
 # This detects damage, not forgery. After an intended change (`rerun rrd optimize`), remove the file's entry from
 # `workbench.files` in the `.json`; after one of the `.json`, set its hash to null.
@@ -426,15 +427,15 @@ _OWN = "workbench_checksum"
 
 
 def with_checksum(text: bytes) -> bytes:
-    """The JSON object `text`, with a hash of all of it as its last member."""
+    """The JSON object `text`, with a hash of its content as the last member."""
     body = text.rstrip().removesuffix(b"}").rstrip()
     return b'%s,\n  "%s": "%s"\n}' % (body, _OWN.encode(), xxhash.xxh3_128_hexdigest(body).encode())
 
 
 def _require_unchanged(content: bytes, document: Document) -> None:
-    """Raises WrongDocument if it was changed since that got its checksum."""
+    """Raise WrongDocument if it was changed since it got its checksum."""
     if _OWN not in document.data:
-        # A changed byte in the name of the hash must not pass for an old recording, which has none.
+        # A recording with a damaged checksum key must not pass for an old recording, which has no checksum.
         if document.is_ours and document.data["workbench"].get("format", 1) != 1:
             raise WrongDocument("was changed since it was written: it has lost its checksum")
     elif document.data[_OWN] is not None:
@@ -478,14 +479,14 @@ def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str
 
 # --- tags and notes -----------------------------------------------------------------------------------
 #
-# They are the only part of a library that a person typed, and the index is discarded without asking, so they are stored with
-# the recordings: in the `.json` of ours; of other programs' files, which they rewrite themselves (ManiSkill's recorder
-# after each episode), in `NAME.notes`, which `mv NAME.*` moves along.
+# Tags and notes are the only part of a library that a person typed, and the index is discarded without asking, so they are
+# stored with the recordings: for ours in the `.json`; for other programs' files, which these programs rewrite (ManiSkill's
+# recorder after each episode), in `NAME.notes`, which `mv NAME.*` moves along.
 
 
 MAX_NOTES_BYTES = 16 << 20
-"""Limit in bytes of a ``.notes``, and of the workbench's own ``.json`` files, which hold the task's source and one
-small picture."""
+"""Maximum size of a ``.notes``, and of the workbench's own ``.json`` files, which hold the task's source and one small
+picture."""
 _NOTES = "workbench_notes"
 
 
@@ -501,7 +502,7 @@ def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note:
     """Write tags and note of one trajectory into a ``.notes``; delete the file when none are left.
 
     Raises:
-        OSError: the file cannot be read, or the folder not written to.
+        OSError: the file cannot be read, or the folder cannot be written to.
         ValueError: the file holds something else, which is not overwritten. The message ends a sentence.
     """
     try:
@@ -531,11 +532,12 @@ def _notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
 
 
 def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None:
-    """Write tags and note into the ``.json`` of a workbench recording, by replacing the file at once.
+    """Write tags and note into the ``.json`` of a workbench recording, replacing the file atomically.
 
     Raises:
         OSError: it cannot be read or written.
-        ValueError: it is not a workbench recording, or was changed: sealing that would hide it. The message ends a sentence.
+        ValueError: it is not a workbench recording, or was changed, which a new checksum would hide. The message ends a
+            sentence.
     """
     content = _read_content(path, MAX_NOTES_BYTES)
     described = parse_json(content)

@@ -20,7 +20,7 @@ MODALITIES: tuple[Modality, ...] = ("rgb", "depth", "segmentation")
 JPEG_QUALITY = 85
 MILLIMETRES_PER_METRE = 1000.0
 MAX_PIXELS = 1 << 24
-"""Limit of one picture: 4096 x 4096 pixels. A PNG of 100 kB can claim a hundred times as many."""
+"""Maximum size of one picture: 4096 x 4096. A PNG of 100 kB can claim a hundred times as many pixels."""
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREYSCALE = 0
 _UP = 2
@@ -34,13 +34,13 @@ class EncodedPictures:
     """Pictures of one camera in one modality; ``pictures[i]`` decodes picture `i`.
 
     Ten thousand steps with four cameras are a few hundred megabytes encoded and several gigabytes as arrays, so
-    pictures stay encoded from the camera through the journal into the recording, and only a shown one is decoded.
+    pictures stay encoded from the camera through the journal into the recording, and are decoded only when shown.
     """
 
     modality: Modality
     blobs: Sequence[bytes]
     decoded: Callable[[int], NDArray] | None = None
-    """Returns picture `i` decoded, when another process decodes it; raises OSError."""
+    """Returns picture `i` decoded, if another process decodes it; raises OSError."""
 
     def __len__(self) -> int:
         return len(self.blobs)
@@ -86,13 +86,13 @@ def encode(modality: Modality, picture: NDArray) -> bytes:
 
 
 def decode(modality: Modality, blob: bytes) -> NDArray:
-    """The inverse of `encode`, up to the loss of JPEG and whole millimetres. Raises OSError when it cannot be decoded."""
+    """The inverse of `encode`, up to the loss of JPEG and the rounding to millimetres. Raises OSError if it cannot decode."""
     with open_picture(blob) as image:
         if modality == "rgb":
             return np.array(image.convert("RGB"))
         pixels = np.array(image)
     if pixels.ndim == 3 and (pixels.shape[2] != 4 or modality != "segmentation"):
-        raise OSError(f"it is a picture of {pixels.shape[2]} colours, and no {modality}")
+        raise OSError(f"it is a picture with {pixels.shape[2]} channels, not {modality}")
     if modality == "depth":
         return (pixels / MILLIMETRES_PER_METRE).astype(np.float32)
     return pixels.view(np.int32)[..., 0] if pixels.ndim == 3 else pixels.astype(np.int32)
@@ -100,16 +100,16 @@ def decode(modality: Modality, blob: bytes) -> NDArray:
 
 @contextlib.contextmanager
 def open_picture(blob: bytes) -> Iterator[Image.Image]:
-    """Open a JPEG, PNG or WebP of at most `MAX_PIXELS`. Raises OSError when it is invalid, also while the block decodes it."""
+    """Open a JPEG, PNG or WebP of at most `MAX_PIXELS`. Raises OSError if it is invalid, also while the block decodes it."""
     try:
         with Image.open(io.BytesIO(blob), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise OSError(f"it claims {image.width} x {image.height} pixels")
             yield image
     except UnidentifiedImageError as error:
-        raise OSError("it is no picture") from error
+        raise OSError("it is not a picture") from error
     except (ValueError, SyntaxError, struct.error, zlib.error, Image.DecompressionBombError) as error:
-        raise OSError(f"it is no picture ({error})") from error
+        raise OSError(f"it is not a picture ({error})") from error
 
 
 def encode_jpeg(image: NDArray[np.uint8]) -> bytes:
@@ -131,15 +131,15 @@ def small_jpeg(image: Image.Image, longest: int) -> bytes:
 def encode_depth_png(depth: NDArray[np.float32]) -> bytes:
     """(H, W) metres as 16-bit PNG in millimetres.
 
-    NaN, infinite and negative values become 0, "nothing"; distances beyond 65.535 m, the farthest that 16 bits hold,
-    become 65.535 m.
+    NaN, infinite and negative values become 0 ("nothing"); distances beyond the maximum of 16 bits, 65.535 m, become
+    65.535 m.
     """
     millimetres = np.nan_to_num(depth * MILLIMETRES_PER_METRE, nan=0.0, posinf=0.0, neginf=0.0)
     return encode_png16(np.rint(np.clip(millimetres, 0, 0xFFFF)).astype(np.uint16))
 
 
 def encode_segmentation_png(ids: NDArray[np.int32]) -> bytes:
-    """(H, W) ids as 16-bit PNG, or as the four bytes of RGBA when one of them is negative or beyond 65535."""
+    """(H, W) ids as 16-bit PNG, or as the four bytes of RGBA if one of them is negative or beyond 65535."""
     if ids.min() >= 0 and ids.max() <= 0xFFFF:
         return encode_png16(ids.astype(np.uint16))
     buffer = io.BytesIO()
@@ -152,8 +152,8 @@ def encode_png16(pixels: NDArray[np.uint16]) -> bytes:
     """(H, W), both above 0, as greyscale PNG of 16 bits.
 
     Libraries try five filters per line, byte by byte: 0.2 to 0.5 ms for 128 x 128, more than everything else that
-    recording a step costs, and a step has two such pictures per camera. Here every line is the difference to the one
-    above, in one numpy call: a fifth of the time, smaller files, and zlib releases the interpreter's lock.
+    recording a step costs, and a step has two such pictures per camera. Here every line is the difference from the line
+    above, in one numpy call: a fifth of the time, smaller files, and zlib releases the GIL.
 
     PNG specification (third edition): signature, IHDR, one IDAT, IEND, each chunk with its length and CRC-32
     (section 5); filter type 2, "up", before each line (section 9); numbers big-endian (7.1).

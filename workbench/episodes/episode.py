@@ -19,7 +19,7 @@ from workbench.episodes.columns import TextTrack, entry_at
 from workbench.episodes.encoded_pictures import EncodedPictures, Modality
 from workbench.episodes.row import UnreadableRecording
 
-# --- what a recording may hold: the .json and the reader are held to it, since both may come from anybody -----------
+# --- limits of a recording, which the .json and the reader's answers must meet, since both are untrusted ------------
 
 Name = Annotated[str, Meta(max_length=1000)]
 PathText = Annotated[str, Meta(max_length=4096)]
@@ -27,17 +27,17 @@ SmallInt = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Seconds = Annotated[float, Meta(ge=1e-4, le=1e3)]
 """Duration of a control step; the frame rates of films are in the same range."""
 MAX_ENTRIES = 10_000
-"""Limit of every list in a recording: entries of ``evaluate()``, files, actions."""
+"""Maximum length of every list in a recording: entries of ``evaluate()``, files, actions."""
 MAX_BODIES = 20_000
-"""Limit of the bodies of a scene; a reader takes some seconds for so many."""
+"""Maximum number of bodies of a scene; a reader takes some seconds for so many."""
 MAX_DEPTH = 32
-"""Nesting of keywords and options."""
+"""Maximum nesting of keyword arguments and options."""
 Entries = Meta(max_length=MAX_ENTRIES)
 ActedBy = Annotated[tuple[tuple[SmallInt, PathText], ...], Entries]
 
 
 def is_shallow(value: object) -> bool:
-    """Whether lists and dicts in `value` are nested at most `MAX_DEPTH` deep: Python's ``repr`` ends at some hundreds."""
+    """Whether lists and dicts in `value` are nested at most `MAX_DEPTH` deep: Python's ``repr`` fails at a few hundred."""
     level = [value]
     for _ in range(MAX_DEPTH):
         inside = (
@@ -52,7 +52,7 @@ def _now() -> str:
 
 
 NO_SEED = -1
-"""Seed of an episode that was begun without one."""
+"""Seed of an episode that began without one."""
 
 
 @dataclass(frozen=True)
@@ -69,25 +69,25 @@ class Seal:
 
 @dataclass(frozen=True)
 class EpisodeInfo:
-    """Identity of an episode, and what is needed to make it again."""
+    """Identity of an episode, and what is needed to repeat it."""
 
     task: Name
     env_index: SmallInt
     seed: SmallInt
-    """Episode seed; `NO_SEED` when none was given or it is unknown."""
+    """Episode seed; `NO_SEED` if there was none or it is unknown."""
     source_file: PathText | None
     """The task's file. When read from a recording: its path if the file exists, else its name alone."""
     source_hash: Name
     source: Annotated[dict[PathText, str], Entries]
-    """Path to text of the task's Python files; when read from a recording, relative to `source_file`'s folder."""
+    """Text of the task's Python files by path; when read from a recording, relative to `source_file`'s folder."""
     control_dt: Seconds
     """Seconds of simulated time per step."""
     control_mode: PathText | None
     backend: Name
     versions: Annotated[dict[Name, Name], Entries] = field(default_factory=dict)
-    """Package name to version."""
+    """Version by package name."""
     env_kwargs: Annotated[dict[Name, Any], Entries] = field(default_factory=dict)
-    """Keywords of ``gym.make`` for this env (``robot_uids``, ``obs_mode``, ``control_mode`` ...), as JSON values."""
+    """Keyword arguments of ``gym.make`` for this env (``robot_uids``, ``obs_mode``, ``control_mode`` ...), as JSON values."""
     reset_options: Annotated[dict[Name, Any], Entries] = field(default_factory=dict)
     """``options`` of the reset that began the episode."""
     max_episode_steps: SmallInt | None = None
@@ -96,24 +96,24 @@ class EpisodeInfo:
     id: Name = field(default_factory=lambda: uuid.uuid4().hex)
     """Globally unique, independent of file names."""
     recovered: bool = False
-    """Its writer was killed; the episode ends there."""
+    """Whether its writer was killed, and the episode ends there."""
     side_files: Annotated[dict[PathText, Name], Entries] = field(default_factory=dict)
-    """Other files that the task reads and the recording lacks: path relative to `source_file`'s folder, to hash."""
+    """Hash by path (relative to `source_file`'s folder) of other files that the task reads and the recording lacks."""
     acted_by: ActedBy = ()
-    """Source of the actions: index of its first action, and its name (``random``, ``policy act.py:act``). Empty if
+    """Sources of the actions: (index of the first action, name such as ``random`` or ``policy act.py:act``). Empty if
     unknown."""
     pictures: PictureDegree = "exact"
-    """What degree the pictures of its cameras are of. Recordings of earlier versions are exact."""
+    """Quality of its camera pictures; exact if the recording does not name one."""
     moved_cameras: tuple[MovedCamera, ...] = ()
-    """Cameras that did not stand where `source` says, in order; empty if all did."""
+    """Cameras that were not where `source` places them, in order; empty if all were."""
     observed_by: Name = ""
-    """`source_hash` of the version that made the observations and pictures, where that is a later one than `source`."""
+    """`source_hash` of the version that made the observations and pictures, if it is later than `source`."""
     seal: Seal | None = field(default=None, compare=False)
     """Set when read from a recording."""
 
     @property
     def has_reward(self) -> bool:
-        """False for a task without a reward: ManiSkill's is 0 then."""
+        """False for a task without a reward, for which ManiSkill returns 0."""
         return self.env_kwargs.get("reward_mode") != "none"
 
 
@@ -162,9 +162,9 @@ class BrokenFile:
     """A broken file of a recording."""
 
     file: str
-    """Its name."""
+    """Name of the file."""
     what: str
-    """What is wrong and what is missing; follows the name in a sentence."""
+    """The problem and what is missing; follows the name in a sentence."""
 
     @property
     def sentence(self) -> str:
@@ -175,13 +175,13 @@ class BrokenFile:
 class Episode:
     """T actions and T + 1 states of one env. State 0 is the reset; action t leads to state t + 1.
 
-    Whole columns, since every format and every reader wants them; rerun takes columns forty times faster than one call
-    per step (measured). Only pictures are not plain arrays: an hour of four cameras does not fit into memory.
+    Stored as whole columns, since every format and every reader uses them; rerun writes columns forty times faster than
+    with one call per step (measured). Only pictures are not plain arrays: an hour of four cameras does not fit into memory.
     """
 
     info: EpisodeInfo
     geometry: SceneGeometry | None
-    """When read from a recording: of this env alone, as env 0 of 1; None if the recording holds no scene."""
+    """When read from a recording, the geometry of this env alone, as env 0 of 1; None if the recording holds no scene."""
     segmentation: dict[int, str]
     poses: NDArray[np.float32] | None
     """(T + 1, B, 7) position and wxyz of every body; NaN rows for bodies this env lacks. None without a scene."""
@@ -215,7 +215,7 @@ class Episode:
         return len(self.reward)
 
     def flag(self, name: str) -> NDArray[np.bool_] | None:
-        """(T + 1,) of an entry of ``evaluate()`` with one value per state, False where it is NaN; None if there is none."""
+        """(T + 1,) an entry of ``evaluate()`` with one value per state, False where it is NaN; None if there is none."""
         values = self.evaluate.get(name)
         if values is None or values.ndim != 1:
             return None
@@ -229,7 +229,7 @@ class Episode:
 
     @property
     def solved_at(self) -> int | None:
-        """Control steps until the first state with success; None if there is none. The reset's counts as 0."""
+        """Control steps until the first state with success (0 for the state after the reset); None if there is none."""
         success = self.flag("success")
         return None if success is None or not success.any() else int(np.argmax(success))
 
@@ -261,10 +261,10 @@ class Episode:
 
 
 def read_whole(name: str, read: Callable[[], Episode]) -> Episode:
-    """The episode that `read` returns, for a dataset: of files none of which is damaged or missing.
+    """Read an episode for a dataset, which accepts no damaged or missing files.
 
     Args:
-        name: of the recording, for messages.
+        name: name of the recording, for messages.
 
     Raises:
         UnreadableRecording: it cannot be read, or not all of it; the message names the recording.
@@ -283,7 +283,7 @@ def _is_nan(value: NDArray | None) -> bool:
 
 
 def movable_bounds(poses: NDArray, kinds: Sequence[BodyKind]) -> tuple[NDArray, NDArray]:
-    """Lowest and highest corner (3,), in metres, of the positions of movable bodies; the origin if there are none.
+    """Minimum and maximum corner (3,), in metres, of the positions of movable bodies; the origin if there are none.
 
     Args:
         poses: (..., B, 7).

@@ -1,4 +1,4 @@
-"""Which numbers of two runs count as equal."""
+"""Tolerances for comparing the numbers of two runs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
-"""Numbers are equal within this share of the largest recorded one, or within this absolute difference."""
+"""Relative tolerance (fraction of the largest recorded number) and absolute tolerance of equal numbers."""
 
 
 def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:
@@ -24,7 +24,7 @@ def numbers_differ(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> ND
     """True where numbers differ.
 
     Args:
-        least: absolute difference that still counts as equal.
+        least: absolute difference up to which numbers count as equal.
     """
     return too_far(old, gap(old, new), least)
 

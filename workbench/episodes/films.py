@@ -1,4 +1,4 @@
-"""Films of episodes: mp4 files, frames taken out of them, contact sheets, and frames of the 3-D view."""
+"""Films of episodes: mp4 files, frames extracted from them, contact sheets, and frames of the 3-D view."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ from workbench.machine.files import new_file, open_regular_file
 from workbench.pictures.camera_conventions import quaternion_from_axes, quaternion_of, triple, upright
 
 MAX_FRAMES = 100_000
+"""Maximum number of frames of one part."""
 MAX_BYTES = 1 << 29
-"""Limit of all encoded frames of one part, in bytes."""
+"""Maximum size of all encoded frames of one part."""
 FFMPEG_TIMEOUT_SECONDS = 60.0
-"""Time limit of ffmpeg for one part."""
+"""Timeout of ffmpeg for one part."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,9 @@ class Encoding:
     crf: int = 18
     """H.264's quality, lower is better; 18 is visually almost lossless."""
     key_every: int | None = None
-    """Interval of key frames; None leaves it to the encoder. A long interval makes seeking slow."""
+    """Interval of key frames, in frames; None for the encoder's default. A long interval makes seeking slow."""
     exact_size: bool = False
-    """Keep an odd width or height, in a pixel format that not every player supports; else pad by a pixel."""
+    """Keep an odd width or height, in a pixel format that some players do not support; else pad by a pixel."""
 
 
 def write_mp4(
@@ -52,16 +53,16 @@ def write_mp4(
     encoding: Encoding = Encoding(),
     comment: str = "",
 ) -> int:
-    """Write the frames to a new file at `path`; returns how many there were.
+    """Write the frames to a new file at `path`; returns their number.
 
     Args:
         path: must not exist.
-        frames: (H, W, 3) each, all of one size.
+        frames: (H, W, 3) each, all of the same size.
         fps: frames per second.
-        comment: in the file's metadata.
+        comment: comment in the file's metadata.
 
     Raises:
-        ValueError: there is no frame, or one has another size.
+        ValueError: there is no frame, or one has a different size.
         OSError: the file cannot be written.
     """
     coming = iter(frames)
@@ -76,12 +77,12 @@ def write_mp4(
 
 
 class FilmWriter:
-    """Writes frames to an mp4 (H.264) by an ffmpeg process; raises as `write_mp4`.
+    """Writes frames to an mp4 (H.264) with an ffmpeg process; raises as `write_mp4` does.
 
     ffmpeg comes with imageio-ffmpeg, a dependency of ManiSkill. As a process it encodes on another core, and its error
     messages can be read. Frames go through a pipe, so memory use does not grow with the film.
 
-    As a context manager it closes at the end of the block, and kills ffmpeg when the block raised.
+    As a context manager it closes at the end of the block, and kills ffmpeg if the block raised.
     """
 
     def __init__(
@@ -115,7 +116,7 @@ class FilmWriter:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._stderr,
-            # On Ctrl-C ffmpeg would finish the file as if it were complete.
+            # In its own session: on Ctrl-C ffmpeg would finish the file as if it were complete.
             start_new_session=True,
         )
 
@@ -137,14 +138,14 @@ class FilmWriter:
         self._count += 1
 
     def __len__(self) -> int:
-        """Frames added so far."""
+        """Number of frames added so far."""
         return self._count
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         self.close(abandoned=error is not None)
 
     def close(self, abandoned: bool = False) -> None:
-        """Finish the file, or with `abandoned` kill ffmpeg. Can be called twice."""
+        """Finish the file, or with `abandoned` kill ffmpeg. May be called twice."""
         if self._stderr.closed:
             return
         assert self._process.stdin is not None
@@ -175,7 +176,7 @@ class FilmPart:
     """The frames of a part of a film as JPEG; all are extracted on the first access."""
 
     def __init__(self, film: Path, begin: float, count: int, fps: float) -> None:
-        """`begin` in seconds, `count` in frames. Raises ValueError when they are out of range."""
+        """`begin` in seconds, `count` in frames. Raises ValueError if they are out of range."""
         if not 0 <= count <= MAX_FRAMES or not 0 <= begin < 1e9 or not 0 < fps < 1e6:
             raise ValueError(f"it claims {count} frames from {begin} s on, {fps} a second, of {film.name}")
         self._film, self._begin, self._count, self._fps = film, begin, count, fps
@@ -183,7 +184,7 @@ class FilmPart:
         self._taking = threading.Lock()
 
     def one(self, number: int) -> bytes:
-        """Frame `number`. Raises UnreadableRecording when the film cannot be read."""
+        """Frame `number`. Raises UnreadableRecording if the film cannot be read."""
         with self._taking:
             if self._blobs is None:
                 self._blobs = self._extract()
@@ -212,15 +213,15 @@ def film_frames(film: Path, begin: float, count: int) -> Iterator[NDArray[np.uin
     """At most `count` frames (H, W, 3) from `begin` seconds on.
 
     An untrusted ``.mp4`` may be a playlist that names other files and addresses, or claim pictures of any size. So
-    ffmpeg is given the format, may open files only, and has limits on pixels, frames and time. It outputs PPM, which
-    states the size of each frame.
+    ffmpeg gets a fixed format, may open files only, and has limits on pixels, frames and time. It outputs PPM, which
+    contains the size of each frame.
 
     Raises:
         OSError: it cannot be read as MP4, or takes too long.
     """
     open_regular_file(film).close()
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-max_alloc", str(1 << 29)]
-    # "mov" is MP4's demuxer: it refuses a playlist that is named .mp4.
+    # "mov" is MP4's demuxer: it refuses a playlist that has the suffix .mp4.
     command += ["-protocol_whitelist", "file", "-f", "mov", "-threads", "1", "-max_pixels", str(MAX_PIXELS)]
     command += ["-ss", f"{begin:.6f}", "-i", f"file:{film}", "-map", "0:v:0", "-frames:v", str(count)]
     command += ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
@@ -264,7 +265,7 @@ def _read_ppm(stream: io.BufferedReader) -> NDArray[np.uint8] | None:
 
 def _failure(stderr: BinaryIO, status: int) -> str:
     if status < 0:
-        return f"ffmpeg was ended by signal {-status}, after {FFMPEG_TIMEOUT_SECONDS:.0f} s at most"
+        return f"ffmpeg was killed by signal {-status} (its timeout is {FFMPEG_TIMEOUT_SECONDS:.0f} s)"
     stderr.seek(0)
     lines = stderr.read(4096).decode(errors="replace").strip().splitlines()
     return lines[-1][:200] if lines else f"ffmpeg ended with {status}"
@@ -273,10 +274,10 @@ def _failure(stderr: BinaryIO, status: int) -> str:
 # --- pictures of an episode's cameras ---------------------------------------------------------------
 
 MIN_SIDE_PIXELS = 256
-"""Pixels. Policies often see 128 pixels, which players blur; pixels are repeated up to this size."""
+"""Minimum side of a film: players blur the 128 pixels that policies often see, so pixels are repeated up to this size."""
 COLUMNS = 8
 CELL_PIXELS = 176
-"""Pixels of a picture's longer side."""
+"""Longer side of a picture on the sheet."""
 GAP, HEAD, CAPTION = 8, 34, 18
 PAPER, INK, PALE = (255, 255, 255), (33, 37, 41), (110, 118, 126)
 GOOD, BAD = (43, 138, 62), (201, 42, 42)
@@ -293,7 +294,7 @@ def camera_of(episode: Episode, name: str) -> CameraTrack:
     """The camera of that name.
 
     Raises:
-        ValueError: there is none with pictures; the message lists those that have some.
+        ValueError: there is none with pictures; the message lists the cameras with pictures.
     """
     cameras = cameras_by_name(episode)
     if name not in cameras:
@@ -308,8 +309,8 @@ def picture_index(camera: CameraTrack, state: int) -> int:
 
 
 def frames(episode: Episode, camera: CameraTrack) -> Iterator[NDArray[np.uint8]]:
-    """One picture (H, W, 3) per state; a state without one repeats the last."""
-    assert camera.rgb is not None, "`cameras_by_name` gives only cameras that have colour"
+    """One picture (H, W, 3) per state; a state without one repeats the previous picture."""
+    assert camera.rgb is not None, "`cameras_by_name` returns only cameras with colour pictures"
     last, picture = -1, None
     for state in range(episode.length + 1):
         index = picture_index(camera, state)
@@ -319,7 +320,7 @@ def frames(episode: Episode, camera: CameraTrack) -> Iterator[NDArray[np.uint8]]
 
 
 def enlarged(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """`picture` with every pixel repeated until its smaller side has `MIN_SIDE_PIXELS` pixels or more."""
+    """`picture` with every pixel repeated until its smaller side has at least `MIN_SIDE_PIXELS` pixels."""
     times = -(-MIN_SIDE_PIXELS // min(picture.shape[:2]))
     return picture if times <= 1 else picture.repeat(times, axis=0).repeat(times, axis=1)
 
@@ -390,7 +391,7 @@ def chosen_states(episode: Episode, columns: int) -> list[int]:
 
 
 def _first(episode: Episode, name: str) -> int | None:
-    """The first state at which this entry of ``evaluate()`` was true."""
+    """The first state in which this entry of ``evaluate()`` is true; None if there is none."""
     flag = episode.flag(name)
     return None if flag is None or not flag.any() else int(flag.argmax())
 
@@ -407,11 +408,11 @@ def _title(episode: Episode) -> str:
 # --- frames of the 3-D view ------------------------------------------------------------------------
 
 SIZE_PIXELS = (960, 720)
-"""Width and height in pixels."""
+"""Width and height."""
 FOVY_RADIANS = 0.75
-"""Radians, vertical; as in the page's 3-D view."""
+"""Vertical field of view, as in the page's 3-D view."""
 FROM_THE_FRONT = np.array([1.0, 0.55, 0.75])
-"""Direction to the camera: ManiSkill's robots face +x."""
+"""Direction from the scene to the camera: ManiSkill's robots face +x."""
 
 
 @dataclass(frozen=True)
@@ -435,7 +436,7 @@ class FilmEye:
 
 
 def default_eye(episode: Episode) -> FilmEye:
-    """The recorded human-render camera's, or else one that sees all movable bodies."""
+    """The recorded human-render camera, or else a camera that sees all movable bodies."""
     for camera in episode.cameras:
         if camera.info.kind == "human" and len(camera.pose):
             position, forward = camera.pose[0, :3], quat2mat(camera.pose[0, 3:])[:, 0]
@@ -453,7 +454,7 @@ def default_eye(episode: Episode) -> FilmEye:
 def scene_frames(episode: Episode, eye: FilmEye | None = None) -> Iterator[NDArray[np.uint8]]:
     """One picture (H, W, 3) per state, rendered by SAPIEN from the recorded meshes and poses.
 
-    Call it in a job process: the server imports no renderer.
+    Must be called in a job process: the server imports no renderer.
 
     Raises:
         ValueError: the recording holds no scene.
@@ -464,7 +465,7 @@ def scene_frames(episode: Episode, eye: FilmEye | None = None) -> Iterator[NDArr
     if episode.geometry is None or episode.poses is None:
         raise ValueError(f"The recording of {episode.info.task} holds no 3-D scene to film.")
     eye = eye or default_eye(episode)
-    # Read from a file, the scene holds this env alone as env 0 of 1; in memory it may hold the batch.
+    # A scene from a file holds this env alone, as env 0 of 1; a scene in memory may hold the batch.
     env = 0 if episode.geometry.num_envs == 1 else episode.info.env_index
     scene = RecordedScene(episode.geometry, env, *SIZE_PIXELS, eye.fovy)
     for poses in episode.poses:

@@ -1,4 +1,4 @@
-"""The task, options, source and run of a recorded episode, and what changed in its source since."""
+"""Task, options, source and run of a recorded episode, and the changes of its source since."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class NoRecordedSource(ValueError):
 
 
 def relative_sources(main: str, source: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """The name of the task's own file, and all texts by relative name. No name leads out of the folder, since a recording
-    may come from anybody.
+    """The name of the task's own file, and all texts by relative name. No name leads out of the folder: recordings are
+    untrusted.
 
     Raises:
-        NoRecordedSource
+        NoRecordedSource: the source of the task's own file is missing.
     """
     names = {path: PurePath(path) for path in source}
     # Absolute when recorded; relative to the main file's folder when read.
@@ -55,7 +55,7 @@ def relative_sources(main: str, source: Mapping[str, str]) -> tuple[str, dict[st
 
 
 def recorded_version(info: EpisodeInfo) -> str:
-    """`source_hash` computed from the recorded text, not the recorded hash; empty if there is no text."""
+    """`source_hash` computed from the recorded text, instead of the recorded hash; empty if there is no text."""
     try:
         _, texts = relative_sources(info.source_file or "", info.source)
     except NoRecordedSource:
@@ -71,10 +71,10 @@ def changed_since(
 ) -> str:
     """Names of the symbols that differ, as ``CUBE_HALF_SIZE, evaluate``; empty if none does, or if a text is missing.
 
-    Compares symbol by symbol, as a save does: lines would also report comments, layout and moved code.
+    Compares symbol by symbol, as a save does: comparing lines would also report comments, layout and moved code.
 
     Args:
-        then_file, now_file: of the task.
+        then_file, now_file: the task's file.
         then, now: texts by path, of that file and the modules in its folder.
     """
     if then_file is None or now_file is None:
@@ -83,7 +83,7 @@ def changed_since(
         (old_main, old), (new_main, new) = relative_sources(then_file, then), relative_sources(now_file, now)
     except NoRecordedSource:
         return ""
-    # The file may have another name now, as a copy has.
+    # The file may have a new name, such as a copy.
     old = {new_main if name == old_main else name: text for name, text in old.items()}
     if old == new:
         return ""
@@ -97,7 +97,7 @@ def changed_since(
 
 
 def changed_on_disk(info: EpisodeInfo) -> str:
-    """`changed_since` for the recording's file and modules as they are on disk now."""
+    """`changed_since` for the recording and the current state of its files on disk."""
     file = None if info.source_file is None else Path(info.source_file)
     if file is None or not file.is_absolute() or not os.path.isfile(file):
         return ""
@@ -108,7 +108,7 @@ def changed_on_disk(info: EpisodeInfo) -> str:
     now = {}
     for name in then:
         path = file.parent / name
-        # Not `Path.is_file`, which raises for a name that no file can have.
+        # Not `Path.is_file`, which raises for an invalid file name.
         if os.path.isfile(path):
             try:
                 now[str(path)] = read_source(path)
@@ -123,11 +123,11 @@ def _symbol_text(path: str, name: str, main: str) -> str:
 
 
 _IMPORTED = (".py", ".pyc", ".pyo", ".so", ".pyd", ".pth", ".zip", ".egg")
-"""Suffixes of files that Python imports or reads at an import."""
+"""Suffixes of files that Python reads during an import."""
 
 
 class CannotEnterRecording(ValueError):
-    """A recording cannot be entered; the message says why, and what to do."""
+    """A recording cannot be entered; the message gives the reason and advice."""
 
 
 def run_of(episode: Episode, state: int | None = None) -> RecordedRun:
@@ -137,7 +137,7 @@ def run_of(episode: Episode, state: int | None = None) -> RecordedRun:
         CannotEnterRecording: it has no such state.
     """
     if state is not None and not 0 <= state <= episode.length:
-        raise CannotEnterRecording(f"this episode has states 0 to {episode.length}, and not {state}")
+        raise CannotEnterRecording(f"this episode has states 0 to {episode.length}, not {state}")
     info = episode.info
     run = RecordedRun(
         name=episode_name(info),
@@ -164,9 +164,9 @@ def why_not_enter(task: TaskDescription, info: EpisodeInfo) -> str:
 
 
 def reference_of(info: EpisodeInfo) -> RecordedTask:
-    """Today's code of a recording's task; `Clearances` decides whether it may be opened.
+    """Reference to the current code of a recording's task; `Clearances` decides whether it may be opened.
 
-    Its file if that still exists, with the class; else the id, which may be one of ManiSkill's own.
+    Names the task's file if it still exists, with the class; else the id, which may be one of ManiSkill's own.
     """
     file = None if info.source_file is None else Path(info.source_file)
     if (
@@ -195,7 +195,7 @@ def class_in(file: Path, env_id: str) -> str | None:
 def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None) -> TaskOptions:
     """Options of the recording's task: its own robot, modes and control."""
     kwargs = dict(info.env_kwargs)
-    # Earlier recordings of several robots have the text of a dict there.
+    # Recordings of several robots from older versions have the text of a dict there.
     if info.control_mode is not None and info.control_mode.isidentifier():
         kwargs.setdefault("control_mode", info.control_mode)
     for name in (*RUN_KEYWORDS, "human_render_camera_configs"):
@@ -206,7 +206,7 @@ def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None
 
 @contextmanager
 def recorded_source(info: EpisodeInfo) -> Iterator[str]:
-    """The recorded source in a folder that is removed at the end; gives the reference to open.
+    """Context manager that writes the recorded source to a temporary folder; yields the reference to open.
 
     Raises:
         CannotEnterRecording: the recording holds no text, or the folder cannot be written.
@@ -219,13 +219,13 @@ def recorded_source(info: EpisodeInfo) -> Iterator[str]:
 
 
 def write_source(info: EpisodeInfo) -> tuple[Path, str]:
-    """A new folder with the recorded text, which the caller removes, and the reference to open.
+    """Write the recorded source to a new folder, which the caller removes; returns the folder and the reference to open.
 
-    Other files of the task's folder (meshes, say) are not in a recording but named there; those that still exist are
-    linked into the new folder as they are today.
+    Other files of the task's folder, such as meshes, are not in a recording, but their names are; those that still exist
+    are linked into the new folder in their current state.
 
     Raises:
-        CannotEnterRecording: as for `recorded_source`.
+        CannotEnterRecording: as `recorded_source` does.
     """
     if not info.source or info.source_file is None:
         raise CannotEnterRecording("this recording does not hold the text of its task")
@@ -248,10 +248,10 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
 
 
 def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
-    """Link the side files that exist. The page warns of missing and changed ones where it offers the recorded text."""
+    """Link the side files that exist. The page, where it offers the recorded text, warns of missing and changed ones."""
     for name in info.side_files:
         if name.endswith(_IMPORTED):
-            continue  # importable, and none of the texts that the person has trusted
+            continue  # importable, but not among the texts that the person trusted
         there, here = side_file_path(folder_of(info.source_file), name), side_file_path(folder, name)
         if there is not None and here is not None and os.path.isfile(there) and not os.path.lexists(here):
             here.parent.mkdir(parents=True, exist_ok=True)
@@ -259,7 +259,7 @@ def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
 
 
 def _class_of(text: str, env_id: str) -> str | None:
-    """The class that is registered under this id, or has it as its name; None if there is none."""
+    """The class that is registered under this id, or has this name; None if there is none."""
     try:
         tree = parse_python(text)
     except (SyntaxError, ValueError, RecursionError, MemoryError):

@@ -1,4 +1,4 @@
-"""Writes a recorded state into a running env, and measures how far an env is from one."""
+"""Writes a recorded state into a running env, and measures an env's distance from a recorded state."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _POSE = 7
 
 
 def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
-    """What of a recorded state does not fit this env, and what of the env the state lacks: name and reason.
+    """Parts of a recorded state that do not fit this env, and parts of the env that the state lacks: reason by name.
 
     Args:
         env: an unwrapped ManiSkill env, batched.
-        state: (D,) by name, as `RecordedRun.state` gives it.
+        state: (D,) by name, as returned by `RecordedRun.state`.
     """
     missed: dict[str, str] = {}
     structs = scene_index(env).states
@@ -37,7 +37,7 @@ def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> di
             continue
         value, width = state.get(name), BODY + 2 * maniskill_private.joints_of(struct)
         if value is None or np.isnan(value).any():
-            missed[name] = "the recording has none of this name: it is as the reset left it"
+            missed[name] = "the recording has none of this name: it keeps its state after the reset"
         elif value.shape != (width,):
             missed[name] = f"it has {width} numbers now, and {value.shape[-1]} in the recording"
     for name, value in state.items():
@@ -48,15 +48,15 @@ def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> di
 
 
 def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
-    """Put a recorded state into each of these envs, except its `state_mismatches`; the other envs are not touched.
+    """Write a recorded state into each of these envs, except its `state_mismatches`; the other envs are not touched.
 
-    The env may have other code (an actor gone, an arm with another joint), so states are matched by name and shape and
-    written by ManiSkill's own setters. Fetches the tensors.
+    The env's code may differ (an actor removed, an arm with another joint), so states are matched by name and shape and
+    written with ManiSkill's own setters. Fetches the tensors.
     """
     missed = {i: state_mismatches(env, i, state) for i, state in states.items()}
     px = batched_system(env.scene)
     maniskill_private.fetch(env)
-    # Only what differs is written: a root pose that is set once more reads back with another rounding.
+    # Writes only what differs: a root pose that is set again reads back with a different rounding.
     with nullcontext() if px is None else px.holding_back():
         for name, struct in scene_index(env).states.items():
             fitting = [
@@ -71,10 +71,10 @@ def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
 
 
 def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
-    """Set controllers and drive targets of these envs' robots to the present joint positions.
+    """Set controllers and drive targets of these envs' robots to the current joint positions.
 
-    ``get_state_dict`` has controllers only if they keep their own target. The others would drive a restored robot
-    back to where it was before.
+    ``get_state_dict`` includes controllers only if they keep their own target. The others would drive a restored robot
+    back to its old position.
     """
     chosen = [int(i) for i in env_idx]
     if env.agent is None or not chosen:
@@ -94,7 +94,7 @@ def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
 
 
 def new_physics(env: Any, env_idx: Sequence[int]) -> None:
-    """Give these envs a PhysX scene without a past (`renew_physics`); does nothing on a GPU, where there is no way."""
+    """Give these envs a fresh PhysX scene (`renew_physics`); does nothing on a GPU, where that is impossible."""
     if batched_system(env.scene) is not None:
         renew_physics(env.scene, [int(i) for i in env_idx])
 
@@ -106,7 +106,7 @@ def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
 
 def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
     """Distance of one env's state from a recorded one: metres of the farthest body, and radians of the body or joint
-    (metres of a sliding joint) that turned most. What only one of them has does not count.
+    (metres of a sliding joint) that turned most. Ignores entries that only one of them has.
 
     Args:
         now, was: (D,) by name.
@@ -114,11 +114,11 @@ def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tu
     both = [
         (value, was[name])
         for name, value in now.items()
-        # A controller's state is no pose.
+        # A controller's state is not a pose.
         if name.startswith(("actors/", "articulations/"))
         and name in was
         and was[name].shape == value.shape
-        # An env that lacks it has NaN throughout.
+        # An env that lacks the body has only NaN.
         and not np.isnan(value).all()
         and not np.isnan(was[name]).all()
     ]
@@ -133,7 +133,7 @@ def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tu
 
 
 def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
-    """Whether all that both have is equal to the last bit, including velocities."""
+    """Whether all entries that both have are equal to the last bit, including velocities."""
     both = [name for name in was if name in now and now[name].shape == was[name].shape]
     return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
 

@@ -29,14 +29,14 @@ from workbench.task.load import LoadedTask
 from workbench.task.open import OpenedTask
 
 PARTED_METRES, PARTED_RADIANS = 1e-4, 1e-3
-"""A state further than this from the recorded one is corrected."""
+"""Maximum distance of a state from the recorded one; beyond it the state is corrected."""
 
 Way = Literal["re-simulated", "corrected", "put there"]
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """How an env came to a recorded state."""
+    """How an env reached a recorded state."""
 
     way: Way
     steps: int
@@ -47,25 +47,26 @@ class ReplayResult:
     corrected: int = 0
     """Number of steps after which the recorded state was restored."""
     start_differs: bool = False
-    """Whether the reset with its seed gave another state, and the recorded one was restored."""
+    """Whether the reset with its seed gave a different state, and the recorded one was restored."""
     missed: dict[str, str] = field(default_factory=dict)
     """Name and reason of each part of the state that could not be restored."""
 
 
 @dataclass(frozen=True)
 class Beginning:
-    """How an env came to the first state of a run."""
+    """How an env reached the first state of a run."""
 
     differs: bool
-    """Whether the reset gave another state, and the recorded one was restored."""
+    """Whether the reset gave a different state, and the recorded one was restored."""
     missed: dict[str, str]
     """Name and reason of each part of the state that could not be restored."""
 
 
 def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
-    """Put these envs into the first state of their runs: reset with the seed, then restore the state where it differs.
+    """Put these envs into the first state of their runs: reset with the seed, then restore the state if it differs.
 
-    It may differ: envs that were reset together shared torch's generator, so their numbers depend on more than the seed.
+    It may differ because envs that were reset together shared torch's generator, so their random numbers depend on more
+    than the seed.
 
     Raises:
         TaskError: a reset raised.
@@ -79,9 +80,9 @@ def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]
         if options.pop("reconfigure", False):
             missed[i]["reset option reconfigure"] = "the scene is not built again for one env of a batch"
         if run.seed < 0:
-            missed[i]["what is random beside the states"] = "the recording has no seed, so it is drawn again"
+            missed[i]["randomness outside the states"] = "the recording has no seed, so it is drawn again"
         seed = [run.seed] if run.seed >= 0 else None
-        # One by one: envs that are reset together draw other numbers than each alone.
+        # One by one: envs that are reset together draw different numbers than each alone.
         with blamed("reset", loaded, task):
             task.reset(seed, [i], options)
     now = read_states(env)
@@ -100,7 +101,7 @@ def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]
 def restore_recorded(
     opened: OpenedTask, states: Mapping[int, Mapping[str, NDArray]], action: NDArray[np.float32] | None = None
 ) -> StepResult:
-    """Put a recorded state into each of these envs; returns the task's result for it, as `TaskEnv.rescore`.
+    """Write a recorded state into each of these envs; returns the task's result for it, as `TaskEnv.rescore` does.
 
     Raises:
         TaskError: the task's code raised.
@@ -119,11 +120,11 @@ def replay_to(
 ) -> tuple[StepResult, ReplayResult]:
     """Put envs into one state of a recorded run, all into the same; the other envs are not disturbed.
 
-    A state that is only restored (`episodes.recorded_state`) has all bodies in place, but not what no recording holds:
-    contacts, drive targets, the task's own counters. A replay from the recorded seed by the recorded actions gives all of
-    it to the last bit with the same code, and another state with other code. So the run is replayed, the bodies are
-    compared with the recording after each step, and where they are too far apart the recorded state is restored; the
-    result counts that.
+    A state that is only restored (`episodes.recorded_state`) has all bodies in place, but lacks what no recording holds:
+    contacts, drive targets, the task's own counters. A replay from the recorded seed with the recorded actions reproduces
+    all of it to the last bit with the same code, and reaches a different state with different code. So the run is replayed,
+    the bodies are compared with the recording after each step, and if they are too far apart the recorded state is
+    restored; the result counts these steps.
 
     The other envs do not move (`step_only`), and what the task keeps for them is restored afterwards.
 
@@ -131,8 +132,8 @@ def replay_to(
         on_step: called with the number of replayed steps.
 
     Raises:
-        TaskError: the task's code raised on the way; the envs are left there.
-        IndexError: the run has no such state, or the task no such env.
+        TaskError: the task's code raised during the replay; the envs are left in that state.
+        IndexError: the run has no such state, or the task has no such env.
     """
     task, env = opened.env, opened.env.env
     chosen = [int(i) for i in env_idx]
@@ -193,12 +194,12 @@ def why_not_replayable(opened: OpenedTask, run: RecordedRun) -> str:
 
 
 def _snapshot_of(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None, str]:
-    """Snapshot of the envs that do not take part; if it cannot be made, the reason why no step is allowed."""
+    """(snapshot of the envs that do not take part, ""), or (None, reason why no step is allowed)."""
     if not others:
         return None, ""
     try:
         return opened.env.snapshot(others), ""
-    except Exception as error:  # a task may keep anything on itself
+    except Exception as error:  # a task may have attributes that cannot be copied
         return (
             None,
             f"the other envs cannot be restored after steps, because this task's state cannot be kept ({error})",
@@ -226,7 +227,7 @@ def _distance(
 
 
 def replay_text(replay_result: ReplayResult) -> str:
-    """One sentence: how the state was reached, and how close it is."""
+    """A sentence on how the state was reached, and how close it is."""
     if replay_result.way == "put there":
         text = "the recorded state was restored; contacts and the task's own counters start over"
     elif replay_result.way == "corrected":
@@ -242,7 +243,7 @@ def replay_text(replay_result: ReplayResult) -> str:
     if replay_result.metres is None:
         text += "; it holds no states to compare with"
     elif replay_result.metres == 0 and not replay_result.radians:
-        text += "; every body is where it was, to the last bit"
+        text += "; every body has its recorded pose, to the last bit"
     else:
-        text += f"; bodies are within {length(replay_result.metres)} of where they were"
+        text += f"; bodies are within {length(replay_result.metres)} of their recorded positions"
     return text + "."

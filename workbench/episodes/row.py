@@ -1,4 +1,4 @@
-"""A recording before it is read: its source, and its row in the library."""
+"""Where a recording is (`Source`), and its row in the library."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SourceKind = Literal["workbench", "maniskill", "lerobot"]
 
 
 class UnreadableRecording(ValueError):
-    """A broken recording, or a file that is not a recording; the message is a sentence that says what is wrong."""
+    """A broken recording, or a file that is not a recording; the message is a sentence with the reason."""
 
 
 @dataclass(frozen=True)
@@ -24,17 +24,17 @@ class Source:
     path: Path
     """A file of a workbench recording, ManiSkill's ``.h5``, or the folder of a LeRobot dataset."""
     part: str | None = None
-    """Which of several: ``traj_3``, or the number of the dataset's episode."""
+    """Which one of several: ``traj_3``, or the number of the dataset's episode."""
     id: str = ""
     """The caller's id."""
     name: str = ""
     """Name to show."""
     problem: str | None = None
-    """A sentence, if it is so damaged that nothing of it can be read."""
+    """A sentence, if it is too damaged to be read at all."""
 
     @property
     def stem(self) -> str:
-        """Stem for the names of files that are made from it."""
+        """Stem for the names of files that are exported from it."""
         stem = self.path.name if self.kind == "lerobot" else self.path.stem
         return stem if self.part is None else f"{stem}_{self.part}"
 
@@ -53,16 +53,16 @@ MAX_TAGS = 20
 
 @dataclass(frozen=True)
 class Facts:
-    """Metadata of a recording, as its file states it. None is: unknown."""
+    """Metadata of a recording from its file. None means unknown."""
 
     kind: RecordingKind
     task: str = ""
     trajectory: str | None = None
-    """Which recording of a file with several (ManiSkill's), or of a LeRobot dataset."""
+    """Name of the recording within a file with several (ManiSkill's) or a LeRobot dataset."""
     uid: str = ""
     """The recording's own id; empty if it has none."""
     copy_of: str = ""
-    """Id of the recording that it was exported from; empty if unknown, and for what was recorded."""
+    """Id of the recording that it was exported from; empty if unknown or not exported."""
     written: float | None = None
     """Unix seconds."""
     seed: int | None = None
@@ -70,10 +70,10 @@ class Facts:
     length: int | None = None
     """Actions."""
     max_episode_steps: int | None = None
-    """The task's time limit, if it is known."""
+    """The task's time limit in control steps, if known."""
     total_reward: float | None = None
     success: bool | None = None
-    """In the last state; None for a task without success."""
+    """Success in the last state; None for a task without success."""
     success_once: bool | None = None
     fail: bool | None = None
     control_mode: str = ""
@@ -84,9 +84,9 @@ class Facts:
     tags: tuple[str, ...] = ()
     note: str = ""
     recovered: bool = False
-    """Its writer was killed; it ends there."""
+    """Whether its writer was killed, and the recording ends there."""
     problem: str | None = None
-    """A sentence, if something is wrong with the files."""
+    """A sentence, if the files have a problem."""
 
 
 LibraryEntry = tuple[Facts, bytes | None]
@@ -98,20 +98,20 @@ class LibraryRow(Facts):
     """A recording in the table."""
 
     id: str
-    """Letters, digits and ``-``; unique in its library and constant while the recording stays there: its own id, or
-    one made from its path."""
+    """Letters, digits and ``-``; unique in its library and constant while the recording stays there: the recording's own id,
+    or an id derived from its path."""
     name: str
     """Path below the library's folder without suffix, and ``#traj_3`` for a file with several."""
     place: tuple[str, int]
     """Key of its files (`scan.RecordingFiles.key`), and its number among the recordings in them."""
     paths: tuple[Path, ...]
-    """Its files, the one to open first. *Delete* takes all of them."""
+    """Its files, the one to open first. *Delete* removes all of them."""
     size: int
-    """Bytes of `paths` together."""
+    """Total size of `paths` in bytes."""
 
     @property
     def source(self) -> Source:
-        """Where to read it."""
+        """Source to read it from."""
         path = self.paths[0]
         if self.trajectory is not None:
             path = path.parents[1] if self.kind == "lerobot" else path.with_suffix(".h5")
@@ -125,12 +125,12 @@ class LibraryRow(Facts):
 
 
 def is_stopped(length: int | None, max_episode_steps: int | None) -> bool:
-    """Whether an episode without success was ended before the task's time limit: what would have come is unknown."""
+    """Whether an episode without success was ended before the task's time limit, so that its outcome is unknown."""
     return length is not None and max_episode_steps is not None and length < max_episode_steps
 
 
 def clean_facts(facts: Facts) -> Facts:
-    """`facts` with valid types and bounded lengths: they come from a confined reader or from an older index."""
+    """`facts` with valid types and bounded lengths: they come from a confined reader or an older index, which are untrusted."""
     texts = ("task", "uid", "copy_of", "control_mode", "acted_by", "source_hash")
     wholes = ("env_index", "length")
     return replace(
@@ -147,7 +147,7 @@ def clean_facts(facts: Facts) -> Facts:
     )
 
 
-# --- values from untrusted files: converted, or None when of another type ---------------------------
+# --- values from untrusted files: converted, or None if they have another type ----------------------
 
 
 def clean_text(value: object, longest: int = 200) -> str:
@@ -160,7 +160,7 @@ def clean_text(value: object, longest: int = 200) -> str:
 
 
 def integer(value: object) -> int | None:
-    """An integer of 64 bits; a list of one (a batched env's seed) counts as its item."""
+    """A 64-bit integer; a list of one (a batched env's seed) counts as its item."""
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     if isinstance(value, float) and value.is_integer():
@@ -171,7 +171,7 @@ def integer(value: object) -> int | None:
 
 
 def known_seed(value: object) -> int | None:
-    """A seed; one below 0 is written where none is known."""
+    """A seed; None for a negative one, which stands for an unknown seed."""
     seed = integer(value)
     return None if seed is None or seed < 0 else seed
 
@@ -212,7 +212,7 @@ def unix_seconds(value: object) -> float | None:
         seconds = date.timestamp()
     except (ValueError, OverflowError):
         return None
-    # Up to the year 3000: a date in 9999 can overflow in another time zone.
+    # Up to the year 3000, because a date in 9999 can overflow in another time zone.
     return seconds if 0 <= seconds < 32503680000 else None
 
 

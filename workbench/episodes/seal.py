@@ -1,4 +1,4 @@
-"""The seal by which this installation recognizes its own recordings."""
+"""Seals by which this installation recognizes its own recordings."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ log = logging.getLogger(__name__)
 KEY_FILE = "recordings.key"
 _KEY_BYTES = 32
 _COVERED = {*SHARED, "seed", "source"} - {"acted_by", "pictures", "moved_cameras", "observed_by"}
-"""Fields that a seal covers, without the fields that earlier versions did not seal: their seals stay valid."""
+"""Fields that a seal covers. The excluded ones are not sealed by older versions, whose seals stay valid."""
 _logged: set[str] = set()
 
 
 class InstallationSeal(Enum):
-    """Who made a recording, by its seal: a keyed hash (HMAC-SHA256) with a random key that only this user can read.
+    """Whether this installation made a recording, judged by its seal: a keyed hash (HMAC-SHA256) with a random key that only
+    this user can read.
 
-    It covers what decides which code runs when the recording is rescored or entered (task, text, keywords), and the
-    checksums of its files. Tags and notes may change, and a moved recording keeps it. The path of the task's file has a
-    hash of its own: a recording that comes back with a different file next to it must not run that one.
+    The seal covers what decides which code runs when the recording is rescored or entered (task, text, keyword arguments),
+    and the checksums of its files. Tags and notes may change, and a moved recording keeps its seal. The path of the task's
+    file has its own hash: a recording that comes back with a different file next to it must not run that file.
     """
 
     NO = "no"
-    """It came from elsewhere, was changed, or the key is lost."""
+    """It is foreign, was changed, or the key is lost."""
     CONTENT = "content"
     """This installation recorded it, but the task's file is at another path, or missing."""
     CONTENT_AND_PLACE = "content and place"
-    """This installation recorded it, and the task's file is the one that was open then, with possibly another text."""
+    """This installation recorded it, and the task's file is at the recorded path; its text may have changed."""
 
 
 def seal(description: Description, source_file: str | None) -> SealJson | None:
@@ -105,7 +106,7 @@ def _mac(key: bytes, what: str, text: str) -> str:
 
 
 def _any_key() -> bytes | None:
-    """The key, a new one if there is none; None, logged once, where it cannot be read or written."""
+    """The key, which is created if there is none; None, logged once, if it cannot be read or written."""
     try:
         return _key() or _new_key()
     except OSError as error:
@@ -114,7 +115,7 @@ def _any_key() -> bytes | None:
 
 
 def _key() -> bytes | None:
-    """None when there is none, or it is broken."""
+    """The key; None if there is none or it is broken."""
     written = read_private(KEY_FILE)
     try:
         key = None if written is None else bytes.fromhex(written.decode("ascii"))
@@ -129,7 +130,7 @@ def _new_key() -> bytes:
         _log_once(
             f"The key of this installation's recordings was broken and was moved to {broken}; there is a new one."
         )
-    create_private(KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())  # or another process did, a moment ago
+    create_private(KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())  # unless another process just did
     key = _key()
     if key is None:
         raise OSError("the key that was written cannot be read back")

@@ -1,4 +1,4 @@
-"""Names and hashes of the files besides Python that a task reads: meshes, textures, tables."""
+"""Names and hashes of the non-Python files that a task reads: meshes, textures, tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workbench.machine.parse_python import parse_python
 
 MAX_FILES = 200
 MAX_LISTED_FILES = 5000
-"""Files below the task's folder that are considered: it may be a home folder."""
+"""Maximum number of files below the task's folder that are considered: it may be a home folder."""
 NAMING_SUFFIXES = (".urdf", ".xml", ".srdf", ".obj", ".mtl", ".gltf", ".dae")
 """Suffixes of files that name other files."""
 MAX_NAMING_BYTES = 4_000_000
@@ -25,16 +25,16 @@ _hashes: dict[tuple[str, int, int], str] = {}
 
 
 def side_files(task: str | None, source: Mapping[str, str]) -> dict[str, str]:
-    """Path relative to the task's folder, to hash.
+    """Hash of each side file, by path relative to the task's folder.
 
-    A recording holds the task's text but not its meshes, which may be larger than all recordings together. Which of
-    them the task reads cannot be observed, since native libraries open many. So this lists what the text names: files
-    and folders below the task's folder that appear in one of its strings, and what those files name in turn (a URDF its
-    meshes). A name that the code composes is missed unless its folder is named, and a named folder includes unread
-    files; so a change here is reported and never refused.
+    A recording holds the task's text but not its meshes, which may be larger than all recordings together. The files that
+    a task reads cannot be observed, since native libraries open many. So this lists the files and folders below the task's
+    folder that appear in strings of the text, and the files that those name in turn (a URDF its meshes). A path that the
+    code composes is missed unless its folder is named, and a named folder includes unread files; so a change is reported
+    and never refused.
 
     Args:
-        task: the task's file; an installed package gives nothing, since its version identifies its files.
+        task: the task's file; empty result for an installed package, whose version identifies its files.
         source: texts of its Python files.
     """
     if task is None or not os.path.isabs(task) or _INSTALLED & set(Path(task).parts):
@@ -50,7 +50,7 @@ def side_files(task: str | None, source: Mapping[str, str]) -> dict[str, str]:
         try:
             found[name] = hash_of(below[name])
             pending += sorted(_named(below, _names_in(below[name])) - {name})
-        except OSError:  # removed meanwhile, or not readable for the task either
+        except OSError:  # removed meanwhile, or unreadable for the task too
             continue
     return dict(sorted(found.items()))
 
@@ -67,10 +67,10 @@ def hash_of(path: Path) -> str:
 
 
 def side_files_text(task: str | None, recorded: Mapping[str, str]) -> str:
-    """A sentence on the files that the recorded task needs and their present state; empty if there are none.
+    """A sentence on the files that the recorded task needs and their current state; empty if there are none.
 
     Args:
-        task: its file, if it exists.
+        task: the task's file, if it exists.
         recorded: result of `side_files`.
     """
     if not recorded:
@@ -85,13 +85,13 @@ def side_files_text(task: str | None, recorded: Mapping[str, str]) -> str:
 
 
 def _changed_files(folder: Path | None, recorded: Mapping[str, str]) -> dict[str, str]:
-    """Files of `recorded` that differ now, each with the difference."""
+    """The difference of each file of `recorded` that differs now."""
     changed = {}
     for name, hashed in recorded.items():
         path = side_file_path(folder, name)
         try:
             if path is None or not os.path.isfile(path):
-                changed[name] = "is not there"
+                changed[name] = "is missing"
             elif hash_of(path) != hashed:
                 changed[name] = "has changed since"
         except OSError as error:
@@ -105,7 +105,7 @@ def folder_of(task: str | None) -> Path | None:
 
 
 def side_file_path(folder: Path | None, name: str) -> Path | None:
-    """Path of a side file; None for a name that leaves `folder`: names come from untrusted recordings."""
+    """Path of a side file; None for a name that leads out of `folder`: names come from untrusted recordings."""
     pure = PurePosixPath(name)
     if folder is None or pure.is_absolute() or ".." in pure.parts or not pure.parts:
         return None
@@ -128,7 +128,7 @@ def _files_below(folder: Path) -> Iterator[Path]:
 
 
 def _strings(texts: Iterable[str]) -> set[str]:
-    """String constants of these programs without docstrings; none from one that does not parse."""
+    """String constants of these programs, without docstrings; skips a program that does not parse."""
     found: set[str] = set()
     for text in texts:
         try:
@@ -154,7 +154,7 @@ def _names_in(path: Path) -> set[str]:
 
 
 def _named(below: Mapping[str, Path], strings: Iterable[str]) -> set[str]:
-    """The files of `below` that one of the strings names, by the end of their path or by a folder above them."""
+    """The files of `below` that a string names, by the end of their path or by a folder above them."""
     names = {string.strip().strip("/").removeprefix("./") for string in strings}
     names = {name for name in names if name and "\n" not in name}
     lasts = {PurePosixPath(name).name for name in names}

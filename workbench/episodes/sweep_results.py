@@ -1,4 +1,4 @@
-"""The results of a sweep: a row for each episode in ``results.parquet``, and what the rows of each point tell together."""
+"""The results of a sweep: a row for each episode in ``results.parquet``, and a summary for each point."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from workbench.machine.files import open_regular_file, replace_file
 
 RESULTS = "results.parquet"
 SET, MEAN = "set.", "mean."
-"""Prefixes of columns: of the set values, and of means over an episode."""
+"""Prefixes of the columns of set values, and of means over an episode."""
 MAX_POINTS = 1000
 MAX_NAMES = 100
-"""Set names, and likewise entries with a mean."""
+"""Maximum number of set names, and of entries with a mean."""
 MAX_ROWS = 1_000_000
 MAX_BYTES = 256 << 20
 MAX_TEXT_CHARACTERS = 2000
-"""Characters of a text."""
+"""Length to which a text is cut."""
 _ABOUT = b"workbench.sweep"
 _FORMAT = 1
 _Z = 1.959964
@@ -32,20 +32,20 @@ T = TypeVar("T")
 
 
 class NoSweep(ValueError):
-    """A file is not the results of a sweep; the text follows its name."""
+    """A file does not hold the results of a sweep; the message follows its name."""
 
 
 @dataclass(frozen=True)
 class SweepEpisode:
-    """An episode of a point; or why there is none."""
+    """An episode of a point, or the reason why there is none."""
 
     point: int
     """Its index in `SweepResults.points`."""
     seed: int
     success: bool | None = None
-    """In any state; None for a task without ``success``, and without an episode."""
+    """Success in any state; None for a task without ``success``, and without an episode."""
     success_at_end: bool | None = None
-    """In the last state."""
+    """Success in the last state."""
     solved_at: int | None = None
     """Control steps until the first state with success."""
     steps: int | None = None
@@ -54,7 +54,7 @@ class SweepEpisode:
     means: Mapping[str, float] = field(default_factory=dict)
     """Mean of each entry over the episode; see `Episode.means`."""
     recording: str = ""
-    """Its .rrd, relative to the results' folder."""
+    """Path of its .rrd, relative to the results' folder."""
     failure: str = ""
     """Why there is no episode; empty if there is one."""
 
@@ -112,7 +112,7 @@ class PointSummary:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """The interval that holds the success rate of all seeds with 95 %."""
+        """95 % confidence interval of the success rate."""
         return wilson(self.solved, self.episodes) if self.solved is not None and self.episodes else None
 
 
@@ -121,7 +121,7 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     rate, part = successes / count, _Z * _Z / count
     middle = (rate + part / 2) / (1 + part)
     half = _Z / (1 + part) * math.sqrt(rate * (1 - rate) / count + part / (4 * count))
-    # Exactly 0 and 1 where none or all succeeded, which rounding would miss.
+    # Exactly 0 or 1 if none or all succeeded, which rounding would miss.
     return (middle - half if successes else 0.0), (middle + half if successes < count else 1.0)
 
 
@@ -152,12 +152,12 @@ def _summary(index: int, values: Mapping[str, str], rows: Sequence[SweepEpisode]
 
 
 def _mean(values: Sequence[float]) -> float:
-    # In order, without an error for infinities of both signs, as `math.fsum` has it.
+    # Not `math.fsum`, which raises for infinities of both signs.
     return sum(values) / len(values)
 
 
 def value_text(json_text: str) -> str:
-    """A set value for a person: a text without its quotes, all else as JSON has it."""
+    """A set value for display: a text without its quotes, all else as JSON."""
     try:
         value = json.loads(json_text)
     except ValueError:
@@ -169,7 +169,7 @@ def value_text(json_text: str) -> str:
 
 
 def write_results(path: Path, results: SweepResults) -> None:
-    """Write the table, in place of one that is there. Raises OSError."""
+    """Write the table, replacing an existing one. Raises OSError."""
     # Arrow takes 0.2 s to import.
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -203,7 +203,7 @@ def write_results(path: Path, results: SweepResults) -> None:
 
 
 def _column(texts: Sequence[str]) -> list[Any]:
-    """Values in JSON as they are if one column can hold them, else as their text."""
+    """Values of these JSON texts if one column can hold them, else the texts."""
     values = [json.loads(text) for text in texts]
     for kinds in ((bool,), (int,), (int, float), (str,)):
         if all(type(value) in kinds for value in values):
@@ -212,10 +212,10 @@ def _column(texts: Sequence[str]) -> list[Any]:
 
 
 def read_results(path: Path) -> SweepResults:
-    """The results in a file, which may come from anybody: in a process that may end. `clean_results` follows.
+    """Read results from an untrusted file, so only in a confined process; validate them with `clean_results`.
 
     Raises:
-        NoSweep: it is not the results of a sweep.
+        NoSweep: it does not hold the results of a sweep.
         OSError: it cannot be read.
     """
     import pyarrow as pa
@@ -226,7 +226,7 @@ def read_results(path: Path) -> SweepResults:
             parquet = pq.ParquetFile(file)
             about = json.loads((parquet.schema_arrow.metadata or {}).get(_ABOUT, b"null"))
             if not isinstance(about, dict) or about.get("format") != _FORMAT:
-                raise NoSweep("is not the results of a sweep, or of a later version")
+                raise NoSweep("does not hold the results of a sweep, or comes from a later version")
             names = parquet.schema_arrow.names
             if parquet.metadata.num_rows > MAX_ROWS or len(names) > 2 * MAX_NAMES + 20:
                 raise NoSweep("has more rows or columns than a sweep")
@@ -235,7 +235,7 @@ def read_results(path: Path) -> SweepResults:
             return _results(about, columns)
         except NoSweep:
             raise
-        # Arrow raises OSError for bytes that are no parquet.
+        # Arrow raises OSError for bytes that are not parquet.
         except (
             pa.ArrowException,
             ValueError,
@@ -278,7 +278,7 @@ def _known(kind: Callable[[Any], T], value: Any) -> T | None:
 
 
 def clean_results(results: SweepResults) -> SweepResults:
-    """Results from a file, with each value such as a sweep writes it; rows that no sweep writes are left out.
+    """Validate results from a file: values are converted to those that a sweep writes, and invalid rows are left out.
 
     Raises:
         NoSweep: there are no points, too many, or points with different names.
@@ -321,7 +321,7 @@ def _finite(number: float | None) -> float | None:
 
 
 def _is_inside(recording: str) -> bool:
-    """Whether a path of a row is one below the results' folder."""
+    """Whether a row's path stays below the results' folder."""
     path = PurePosixPath(recording)
     plain = bool(recording) and len(recording) < MAX_TEXT_CHARACTERS and recording.isprintable()
     return plain and not path.is_absolute() and ".." not in path.parts and str(path) == recording

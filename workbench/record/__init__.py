@@ -1,1 +1,1 @@
-"""Records episodes: while they run, from the history, in a job, or from a script."""
+"""Records episodes: live, from the history, in a job, or from a script."""

@@ -1,4 +1,4 @@
-"""Commands of the recorder: record the running envs, or save steps of the history."""
+"""Commands that record running or past episodes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class StopRecording(Command, frozen=True):
 
 
 class ToggleSavePast(Command, frozen=True):
-    """Save what I just saw; again: stop saving it."""
+    """Save the episode at the shown moment; while that is saved, stop."""
 
     key = "shift+k"
     context = "live"
@@ -30,14 +30,14 @@ class RecordNextEpisode(Command, frozen=True):
 
 
 class SavePreviousEpisode(Command, frozen=True):
-    """Save the episode before the shown one."""
+    """Save the episode that precedes the shown one."""
 
 
 class ChooseRecordedEnvs(Command, frozen=True):
-    """Choose which envs are recorded and saved."""
+    """Choose the envs that are recorded and saved."""
 
     envs: Literal["selected", "all"]
 
 
 class SaveSolved(Command, frozen=True):
-    """Save the solved episode to the recordings, from where it can be exported as a demonstration."""
+    """Save the solved episode as a recording, which can be exported as a demonstration."""

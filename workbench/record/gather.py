@@ -1,4 +1,4 @@
-"""Gathers the episodes of each env from the steps of a batch, and writes their files."""
+"""Splits the steps of a batch into episodes of each env, and writes their files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class GatheredEpisode:
     placed: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
     """Cameras that are placed by hand, at its last state."""
     begun: bool = False
-    """Whether it has its first state."""
+    """Whether it already has its first state."""
 
     @classmethod
     def of(
@@ -66,8 +66,8 @@ class GatheredEpisode:
         origin: Mapping[str, str] = NOWHERE,
         observed_by: str = "",
     ) -> GatheredEpisode:
-        """A new episode with a writer into `folder`; `id` if not a random one, `origin` as of `EpisodeGatherer`. Raises
-        RecordingError."""
+        """A new episode with a writer into `folder`; an empty `id` is replaced by a random one, `origin` is as in
+        `EpisodeGatherer`. Raises RecordingError."""
         info = relocated(episode_info(task, env, seed, reset_options, acted_by), origin)
         info = replace(info, observed_by=observed_by)
         writer = EpisodeWriter(
@@ -92,7 +92,7 @@ class GatheredEpisode:
         """Set the cameras that are placed by hand from the next state on. Raises RecordingError.
 
         Args:
-            in_file: what the recorded source says of cameras for which the task's description says something else.
+            in_file: settings in the recorded source, for cameras whose settings in the task's description differ.
         """
         for key in self.placed.keys() | placed.keys() | in_file.keys():
             if key in in_file or self.placed.get(key) != placed.get(key):
@@ -107,8 +107,8 @@ class GatheredEpisode:
         columns: Mapping[str, NDArray],
         pictures: Sequence[Picture],
     ) -> None:
-        """Append row `row` of a batch as the next state; the first is that after a reset. Raises as
-        `EpisodeWriter.append`."""
+        """Append row `row` of a batch as the next state; the first state is that after a reset. Raises as
+        `EpisodeWriter.append` does."""
         if not self.begun:
             self.state_names = frozenset(states_of(columns, row))
             count = len(step.reward)
@@ -129,8 +129,8 @@ class EpisodeGatherer:
     An episode begins with a reset and ends when its env terminates, is truncated or is reset. `on_episode` then decides
     whether it becomes files (`EpisodeWriter.finish` takes a fraction of a second, and may run on another thread).
 
-    It also checks the stream: `elapsed_steps` counts 0, 1, 2 ...; with a lost step or an unseen reset the file would look
-    right and be wrong.
+    It also checks that `elapsed_steps` counts 0, 1, 2 ...; after a lost step or an unseen reset the file would look right
+    and be wrong.
     """
 
     def __init__(
@@ -147,18 +147,18 @@ class EpisodeGatherer:
     ) -> None:
         """
         Args:
-            on_episode: called with each episode that is over, and its writer.
-            ends: ``over`` ends an episode also where it terminates or is truncated; ``reset`` only where its env is
-                reset, for callers that continue after that.
-            one_each: only the next episode of each env.
-            origin: as `pool.deal.ItemQueue.origin`: an episode names the author's files where they came from.
+            on_episode: called with each finished episode, including its writer.
+            ends: ``over`` also ends an episode when it terminates or is truncated; ``reset`` only when its env is reset, for
+                callers that continue after termination.
+            one_each: gather only the next episode of each env.
+            origin: as in `jobs.scheduler.ItemQueue.origin`: an episode names the original paths of the author's files.
         """
         self._task, self._folder, self._on_episode = task, folder, on_episode
         self._ends, self._one_each, self._origin = ends, one_each, origin
         self.reset_options: Mapping[str, Any] = reset_options or {}
         """Options of the next resets."""
         self.acted_by = ""
-        """Source of the actions of the next episodes, where the steps do not name it."""
+        """Source of the actions of the next episodes, if the steps do not name it."""
         self.next_id = ""
         """Id of the next episode; empty for a random one."""
         self._episodes: dict[int, GatheredEpisode | None] = {int(env): None for env in env_idx}
@@ -166,20 +166,20 @@ class EpisodeGatherer:
 
     @property
     def env_idx(self) -> tuple[int, ...]:
-        """The envs that are still gathered."""
+        """The envs whose episodes are still gathered."""
         return tuple(self._episodes)
 
     @property
     def under_way(self) -> tuple[GatheredEpisode, ...]:
-        """Episodes that have begun."""
+        """Episodes that have begun and not ended."""
         return tuple(episode for episode in list(self._episodes.values()) if episode is not None)
 
     def take(self, stepped: Stepped) -> None:
         """Append the next reset or step of the batch.
 
         Raises:
-            ValueError: it does not follow from the one before, or holds values that no file can; what came before can
-                still be finished.
+            ValueError: it does not follow from the previous step, or has values that files cannot represent; the states so
+                far can still be finished.
             RecordingError: it cannot be written.
         """
         step = stepped.step
@@ -190,17 +190,17 @@ class EpisodeGatherer:
                 self._append([e for e in going_on if e.state_names == names], names, stepped)
         for env in [env for env in self._episodes if reset[env]]:
             self.end(env)
-            # Not after a jump into the middle of an episode: no seed starts one there.
+            # Not after a jump into the middle of an episode, which no seed can start.
             if env in self._episodes and step.elapsed_steps[env] == 0:
                 self._begin(env, stepped)
 
     def finish(self) -> None:
-        """End all episodes under way."""
+        """End all running episodes."""
         for env in list(self._episodes):
             self.end(env)
 
     def end(self, env: int) -> None:
-        """End the episode of `env`; without a step it is dropped."""
+        """End the episode of `env`; an episode without a step is dropped."""
         episode = self._episodes.get(env)
         if episode is None:
             return
@@ -263,7 +263,7 @@ class EpisodeGatherer:
 
 def _lost_step(env: int, expected: int, came: int) -> ValueError:
     return ValueError(
-        f"env {env}: step {expected} was expected and step {came} came; a step was lost or the env was reset unseen"
+        f"env {env}: step {expected} was expected, but step {came} arrived; a step was lost or the env was reset unseen"
     )
 
 
@@ -310,7 +310,7 @@ def episode_info(
     reset_options: Mapping[str, Any] | None = None,
     acted_by: str = "",
 ) -> EpisodeInfo:
-    """The description that is needed to repeat an episode of this task."""
+    """The info that is needed to repeat an episode of this task."""
     return EpisodeInfo(
         task=task.env_id,
         env_index=env,
@@ -345,8 +345,8 @@ class Finished:
 class EpisodeFinisher:
     """Writes the files of finished episodes one by one on a thread. Thread-safe.
 
-    A second thread would take turns with it for the interpreter: also at the end, when nothing else wants it, two take a quarter longer
-    (measured). A process does not; then the one that closes makes files too.
+    There is no second thread, since both would compete for the GIL: even at the end, when nothing else needs it, two take a
+    quarter longer (measured). A subprocess does not compete; with one, the closing thread makes files too.
     """
 
     def __init__(
@@ -359,9 +359,9 @@ class EpisodeFinisher:
         """
         Args:
             on_change: called when an episode's files are written, or have failed: on the thread, or by `close`.
-            first: called first on the thread.
-            then: called with the files of each episode, which is not finished before.
-            in_process: make the files in a process, for a caller that needs the interpreter: it takes a second of a core to start.
+            first: called once at the start of the thread.
+            then: called with the files of each episode, which is finished only afterwards.
+            in_process: make the files in a subprocess, for a caller that needs the GIL; its start takes a second of a core.
         """
         self._on_change, self._then = on_change, then
         self._lock = threading.Lock()
@@ -370,7 +370,7 @@ class EpisodeFinisher:
         self._at_work = 0
         self._process: FilesProcess | None = None
         if in_process:
-            with suppress(OSError):  # no memory, or too many processes: the thread makes them
+            with suppress(OSError):  # out of memory, or too many processes: the thread makes the files
                 self._process = FilesProcess()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="episode-files")
         if first is not None:
@@ -388,7 +388,7 @@ class EpisodeFinisher:
             return len(self._waiting) + self._at_work
 
     def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | str]:
-        """Write the files; the future gives the reason as text if writing failed. `finished` also holds the
+        """Write the files; the future's result is the reason as text if writing fails. `finished` also holds the
         reason, until another episode succeeds."""
         made: Future[EpisodeFiles | str] = Future()
         with self._lock:
@@ -397,7 +397,7 @@ class EpisodeFinisher:
         return made
 
     def close(self) -> None:
-        """Wait for the files under way."""
+        """Wait until all files are written."""
         while self._process is not None and self._process.is_ready and self._finish_one(None):
             pass
         self._pool.shutdown(wait=True)
@@ -435,7 +435,7 @@ class EpisodeFinisher:
     def _finish(
         self, episode: GatheredEpisode, process: FilesProcess | None
     ) -> tuple[EpisodeFiles | str, int]:
-        """The files, or the reason why writing failed, and the number of bytes."""
+        """(files, or the reason why writing failed; number of bytes)."""
         try:
             made = episode.writer.finish(process)
             size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))
@@ -444,7 +444,7 @@ class EpisodeFinisher:
         except BaseException as error:
             if isinstance(error, (KeyboardInterrupt, SystemExit)):
                 raise
-            # A panic of rerun's Rust code is no Exception. The journal stays; the next start tries again.
+            # A panic of rerun's Rust code is not an Exception. The journal stays, and the next start tries again.
             if not isinstance(error, (RecordingError, OSError, ValueError)):
                 report_failure(f"An episode of env {episode.env} could not be written", error)
             return f"an episode of env {episode.env} could not be written: {error}", 0

@@ -1,4 +1,4 @@
-"""Records episodes without a page, on a batch of envs in one process or several."""
+"""Records episodes without a page, on batches of envs in one or several processes."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from workbench.record.job_worker import (
 MAX_CHUNK_STARTS = 2
 """Maximum number of times that a chunk of episodes is started when its workers die, before they are tried one by one."""
 _LONG_JOB_BATCHES = 256
-"""Number of batches from which on a chunk holds several: the envs of a batch wait for each other only at the end
-of a chunk."""
+"""Number of batches from which a chunk holds several (`_CHUNK_BATCHES`): the envs of a batch wait for each other only at
+the end of a chunk."""
 _CHUNK_BATCHES = 4
 
 
@@ -41,16 +41,16 @@ class RecordProgress:
     steps: int
     """Control steps so far, over all envs with an episode."""
     over: tuple[int, Written | None] | None = None
-    """Number of the episode that has just ended, and its files (None if they were not kept); None where none has
-    ended."""
+    """Number of the episode that has just ended, and its files (None if they were not kept); None if no episode has
+    just ended."""
     running: Mapping[int, int] = field(default_factory=dict)
     """Control steps so far of the running episodes, by number, in all processes."""
     limit: int = 0
     """Maximum number of control steps of an episode."""
     done: float = 0.0
-    """Episodes kept so far; where every episode is kept, running episodes count in part."""
+    """Episodes kept so far; if every episode is kept, running episodes count as fractions."""
     failures: tuple[Failure, ...] = ()
-    """Episodes so far, by number, that gave no result."""
+    """Episodes so far without a result, by number."""
     was_there: bool = False
     """Whether the episode that has ended comes from an earlier run of the job."""
 
@@ -64,7 +64,7 @@ class Recorded:
     """The result of a recording."""
 
     written: tuple[Written, ...]
-    """By number."""
+    """Episodes by number."""
     tried: int
     """Number of episodes that were run."""
     stopped: bool
@@ -74,11 +74,11 @@ class Recorded:
     failures: tuple[Failure, ...] = ()
     """Episodes, by number, in which the author's code failed or whose workers died."""
     missing: int = 0
-    """Number of requested episodes that did not end."""
+    """Number of requested episodes that were not finished."""
 
 
 def chunk_of(episodes: int, num_envs: int) -> int:
-    """Number of episodes that a worker with `num_envs` envs runs together, for `episodes` episodes in all."""
+    """Number of episodes that a worker with `num_envs` envs runs together, out of `episodes` in all."""
     return num_envs * (_CHUNK_BATCHES if episodes >= _LONG_JOB_BATCHES * num_envs else 1)
 
 
@@ -94,21 +94,21 @@ def record(
 ) -> Recorded:
     """Record into ``what.out``.
 
-    Each episode starts with a reset of its env alone with a seed of its own, and has actions of its own
-    (`RecordActionChooser`): episode k is the one that ``gym.make(...).reset(seed=seed + k)`` starts, for any number of envs and
-    processes.
+    Each episode starts with a reset of its env alone with its own seed, and has its own actions (`RecordActionChooser`):
+    episode k is the episode that ``gym.make(...).reset(seed=seed + k)`` starts, for any number of envs and processes.
 
     Args:
         on_finding: called once for each place where the task breaks a rule without being stopped.
-        stop: called between steps; after True the finished episodes are kept, and the others dropped.
+        stop: called between steps; once it returns True, finished episodes are kept and the others dropped.
         executor: None for this process, or for spawned processes with several workers.
-        run: as of `RecordSetup`, where the job goes on.
-        on_notice: called with what the author should know of the task, each sentence once.
+        run: as in `RecordSetup`, for a job that resumes.
+        on_notice: called once with each notice about the task.
 
     Raises:
-        TaskError: the task cannot be opened, or fails in every chunk of episodes, or in several alike one after another.
+        TaskError: the task cannot be opened, or fails in every chunk of episodes, or in the same way in several consecutive
+            ones.
         RecordingError: a file cannot be written.
-        PoolError: a process that records failed, or processes die again and again.
+        PoolError: a process that records failed, or processes die repeatedly.
         FileNotFoundError, ValueError: the request is invalid.
     """
     what, given = with_given_actions(what)
@@ -124,10 +124,10 @@ def record(
 
 
 def collect(what: RecordOptions, known: Mapping[int, Written | None]) -> Recorded:
-    """Recording from the results of these episodes. Runs nothing.
+    """Combine the results of these episodes to a recording. Runs nothing.
 
     Args:
-        what: as `with_given_actions` completes it.
+        what: options as completed by `with_given_actions`.
     """
     recording = _Recording(
         what,
@@ -149,7 +149,8 @@ def do_record(
     scheduler: Scheduler[Written | None, RecordUpdate],
     run_items: Callable[[RecordSetup, ItemQueue], None] = record_items,
 ) -> None:
-    """Record the items of a scheduler, of one or several recordings. Arguments as of `RecordSetup`; raises as `record`."""
+    """Record the items of a scheduler, for one or several recordings. Arguments as in `RecordSetup`; raises as `record`
+    does."""
     run = run or uuid.uuid4().hex
     needed = [needed_by(what.task, what.actions, what.options.imports) for what in wanted]
     folders = [what.out.absolute() for what in wanted]
@@ -175,7 +176,7 @@ def do_record(
 
 
 class ToldByWorkers:
-    """Collects the workers' messages about episodes, and computes the progress of the job."""
+    """Collects the workers' progress messages, and computes the progress of the job."""
 
     def __init__(
         self,
@@ -208,11 +209,11 @@ class ToldByWorkers:
         return True
 
     def over(self, number: int) -> None:
-        """Handle that an item has ended."""
+        """Handle the end of an item."""
         self._running.pop(number, None)
 
     def failed(self, failure: Failure) -> None:
-        """Handle items that gave no result."""
+        """Handle items without a result."""
         self._failures += (failure,)
         for number in failure.numbers:
             self._running.pop(number, None)
@@ -226,7 +227,7 @@ class ToldByWorkers:
     ) -> RecordProgress:
         """
         Args:
-            counts_parts: whether what is under way counts in part.
+            counts_parts: whether running episodes count as fractions.
         """
         limit = scheduler.limit()
         running = {number: steps for number, steps in self._running.items() if number < limit}
@@ -240,8 +241,8 @@ class ToldByWorkers:
 class _Recording:
     """Collects the results of all processes.
 
-    Of the successes the K with the lowest numbers are kept. With many envs or processes a later episode may succeed before
-    an earlier one has ended; its files are removed when K others come before it.
+    Keeps the K successes with the lowest numbers. With many envs or processes a later episode may succeed before an earlier
+    one has ended; its files are removed once K successes have lower numbers.
     """
 
     def __init__(
@@ -284,7 +285,7 @@ class _Recording:
         self._ended += 1
         self._told.over(number)
         if written is not None:
-            # The path as the person wrote the folder.
+            # Use the folder's path as the person wrote it.
             self._kept[number] = replace(written, path=self._out / written.path.name)
         if self._wanted is not None and len(self._kept) >= self._wanted:
             last = sorted(self._kept)[self._wanted - 1]

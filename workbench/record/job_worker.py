@@ -1,4 +1,4 @@
-"""Runs episodes on a batch of envs and records them: what one worker of `record` does."""
+"""Runs and records episodes on a batch of envs: the work of one worker of `record`."""
 
 from __future__ import annotations
 
@@ -51,20 +51,20 @@ from workbench.task.load import undo_load
 from workbench.task.open import OpenedTask, open_task
 
 _TRIES_PER_SUCCESS = 100
-"""Episodes that are tried for each requested success."""
+"""Number of episodes that are tried for each requested success, by default."""
 _START_TOLERANCE = 1e-4
-"""Metres or radians: a start further from the demonstration's is a different one."""
+"""Maximum distance, in metres or radians, from the demonstration's start state that counts as the same start."""
 
 
 @dataclass(frozen=True)
 class RecordOptions(RecordArguments):
-    """What to record, and the options of its task."""
+    """Options of a recording, and of its task."""
 
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=4))
     plan: PlanOptions = PlanOptions()
     """Options of planned actions."""
     after_success: int = 0
-    """Control steps that an episode continues after its success."""
+    """Number of control steps that an episode continues after its success."""
     workers: int = 1
     """Number of processes that record, if no executor is given; the episodes are the same with any number."""
     source: dict[str, str] = field(default_factory=dict)
@@ -73,7 +73,7 @@ class RecordOptions(RecordArguments):
 
 @dataclass(frozen=True)
 class RecordSetup:
-    """What one worker of a job records."""
+    """Work of one worker of a job that records."""
 
     wanted: tuple[RecordOptions, ...]
     """Options of each recording of the job, as completed by `with_given_actions`."""
@@ -96,7 +96,7 @@ def episode_id(run: str, number: int) -> str:
 
 @dataclass(frozen=True)
 class BatchProgress:
-    """Episodes that one process runs at the moment."""
+    """Progress of the episodes that one process is running."""
 
     steps: tuple[tuple[int, int], ...]
     """Number and control steps so far of each episode."""
@@ -108,10 +108,10 @@ class BatchProgress:
 
 @dataclass(frozen=True)
 class RecordUpdate:
-    """Progress message of a process that records."""
+    """Progress message of a worker."""
 
     activity: str = ""
-    """Work that is done before the first episode."""
+    """Current work before the first episode, for a status line."""
     underway: BatchProgress | None = None
     finding: Finding | None = None
     notice: str = ""
@@ -133,9 +133,9 @@ class Written:
     success: bool | None
     """Success at its last state; None for a task without ``success``."""
     start_corrected: bool = False
-    """Whether its seed gave another start than the demonstration's, and the demonstration's first state was restored."""
+    """Whether its seed gave a different start than the demonstration's, so that the demonstration's first state was restored."""
     planned: PlannedEpisode | None = None
-    """Data about the planning, where the actions were planned."""
+    """Data about the planning, if the actions were planned."""
     address: str = ""
     """Address that its .rrd file was uploaded to; `path` then does not exist."""
     solved_at: int | None = None
@@ -154,7 +154,7 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
     each episode or one for all; empty without a file.
 
     Raises:
-        FileNotFoundError, ValueError: as `find_actions`; or the requested numbers are invalid.
+        FileNotFoundError, ValueError: as `find_actions` does; or the requested numbers are invalid.
     """
     given, env_kwargs = find_actions(what.actions, what.task)
     options = replace(what.options, env_kwargs={**env_kwargs, **what.options.env_kwargs})
@@ -164,7 +164,7 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
     if what.use_env_states and not (given and all(run.env_states for run in given)):
         raise ValueError("--use-env-states needs --actions FILE.h5 with env states in it")
     if what.episodes is not None and what.successes is not None:
-        raise ValueError("--episodes and --successes: name one of them")
+        raise ValueError("give --episodes or --successes, not both")
     for name, number in (
         ("episodes", what.episodes),
         ("successes", what.successes),
@@ -175,7 +175,7 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
         if number is not None and number < 1:
             raise ValueError(f"--{name} must be at least 1, not {number}")
     if what.seconds_per_seed is not None and not 0 < what.seconds_per_seed < math.inf:
-        raise ValueError(f"--seconds-per-seed must be above 0, not {what.seconds_per_seed:g}")
+        raise ValueError(f"--seconds-per-seed must be greater than 0, not {what.seconds_per_seed:g}")
     several = len(given) if len(given) > 1 else 0
     if what.successes is None:
         episodes = what.episodes or len(given) or 4
@@ -187,15 +187,15 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
 
 
 def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedRun] | None = None) -> None:
-    """Record the chunks that one worker gets. Raises as `jobs.record.record`.
+    """Record the chunks of one worker. Raises as `record.job.record` does.
 
     Args:
-        given: as of `with_given_actions`, if it was read already.
+        given: the runs of `with_given_actions`, if they were read already.
     """
     torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # the task may change it
     chunk = None
-    # The first is opened before it is asked for: what opening fails in is no chunk's fault.
+    # A single recording is opened before its first chunk is requested, so that an error of opening is no chunk's failure.
     at = 0 if len(setup.wanted) == 1 else _recording_of(chunk := queue.next(), setup)
     while at is not None:
         what = setup.wanted[at]
@@ -204,7 +204,7 @@ def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedR
             folder = Path(os.fsdecode(setup.folders[at]))
             if setup.mark and not what.upload and not (folder / setup.mark).exists():
                 raise RecordingError(
-                    f"{platform.node()} does not see the folder {folder} of this machine: name one that all machines of "
+                    f"{platform.node()} does not see the folder {folder} of this machine: give one that all machines of "
                     "the cluster share, or an address such as s3://bucket/folder"
                 )
             opened = _opened(what, queue)
@@ -256,7 +256,7 @@ def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> Opened
         for finding in findings_of_shaders(opened.description.cameras):
             queue.send_update(RecordUpdate(finding=finding))
     if isinstance(opened.env.env, BatchedCpuMixin):
-        # Else an episode depends, by its last bits, on those that the same process made before.
+        # Without this an episode depends, in the last bits, on the earlier episodes of the same process.
         opened.env.env.begins_anew = True
     return opened
 
@@ -277,8 +277,8 @@ class _Episodes:
     ) -> None:
         """
         Args:
-            run: as of `RecordSetup`.
-            first: the item that is this recording's episode 0.
+            run: as in `RecordSetup`.
+            first: the item number of this recording's episode 0.
         """
         self._opened, self._what, self._given, self._queue = opened, what, given, queue
         self._run, self._first, self._folder = run, first, folder
@@ -328,10 +328,10 @@ class _Episodes:
         """Run chunks, starting with this one. After a failure the running episodes are dropped.
 
         Args:
-            end: the first item that is not of this recording.
+            end: the first item beyond this recording.
 
         Returns:
-            the first chunk that is not of this recording; None if none is left.
+            the first chunk beyond this recording; None if none is left.
         """
         try:
             while chunk is not None and self._first <= chunk.numbers[0] < end:
@@ -349,7 +349,7 @@ class _Episodes:
         self._chunk = chunk
         self._waiting.extend(n for n in chunk.numbers if self._acts_on_batch or n in chunk.wanted)
         if self._acts_on_batch and (idle := self._envs[len(self._waiting) :]):
-            # What acts sees them too: they are as in every other run.
+            # A source that sees the whole batch sees these envs too: reset them, so that they are the same in every run.
             with blamed("reset", self._opened.loaded, self._opened.env):
                 self._opened.env.reset(self._seed_of(chunk.numbers[0]), idle)
         while self._begin_free():
@@ -371,7 +371,7 @@ class _Episodes:
         return bool(self._running)
 
     def _tell(self, made: int) -> None:
-        """Send the progress of the episodes after `made` further control steps."""
+        """Send the progress of the episodes after `made` more control steps."""
         at = tuple((number, self._steps[env]) for env, number in self._running.items())
         self._queue.send_update(RecordUpdate(underway=BatchProgress(at, self._limit, made)))
 
@@ -453,7 +453,7 @@ class _Episodes:
         return restore_recorded(self._opened, {env: first})
 
     def _step(self) -> None:
-        """Make a control step of all envs, and end the finished episodes."""
+        """Take a control step in all envs, and end the finished episodes."""
         task, loaded = self._opened.env, self._opened.loaded
         action = self._chooser.next_action(task, {env: self._steps[env] for env in self._running})
         with blamed("step", loaded, task):

@@ -1,4 +1,4 @@
-"""Records episodes while the session runs, on a thread of its own."""
+"""Records episodes while the session runs, on its own thread."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from workbench.record.state import (
 class LiveRecorder:
     """Records chosen envs. `close` waits until all files are written.
 
-    The loop only passes the steps on: a row takes a millisecond or less to encode and write to the journal, but a disk may
-    be slow, and the files of an episode take a fraction of a second or more.
+    The loop only passes the steps on to the thread: encoding a row and writing it to the journal takes a millisecond or less,
+    but a disk may be slow, and the files of an episode take a fraction of a second or more.
     """
 
     def __init__(
@@ -39,8 +39,8 @@ class LiveRecorder:
     ) -> None:
         """
         Args:
-            happen: takes what comes of the recording; called on the loop.
-            on_recovered: called with a message about unfinished episodes of an earlier session, from a thread of its own.
+            happen: called on the loop with the events of the recording.
+            on_recovered: called on another thread with a message about unfinished episodes of an earlier session.
         """
         self._folder, self._happen, self._on_recovered = folder, happen, on_recovered
         self._number = 0
@@ -51,7 +51,7 @@ class LiveRecorder:
         self._aside = BlockingPool("recorder")
 
     def perform(self, effect: BeginEpisodes | TakeStep | EndEpisodes) -> None:
-        """Begin it; called on the loop."""
+        """Start the effect; called on the loop."""
         match effect:
             case BeginEpisodes():
                 self._end()
@@ -71,12 +71,12 @@ class LiveRecorder:
             self._aside.begin(gatherer.finish)
 
     def close(self) -> None:
-        """End the running episodes, and write all files. Called on another thread than the loop."""
+        """End the running episodes, and write all files. Must not be called on the loop's thread."""
         do(self._end)
         self._aside.close()
         self.finisher.close()
 
-    # --- beside the loop -------------------------------------------------------------------------------
+    # --- on other threads than the loop's --------------------------------------------------------------
 
     def _post(self, event: RecordEvent) -> None:
         post(partial(self._happen, event))
@@ -86,7 +86,7 @@ class LiveRecorder:
         try:
             gatherer.take(what.stepped)
         except Exception as error:
-            # Expected: a full disk, an entry of evaluate() that is no number, a lost step. All else is our own fault.
+            # Expected errors: a full disk, an entry of evaluate() that is not a number, a lost step. All others are bugs.
             if not isinstance(error, (RecordingError, ValueError)):
                 report_failure("A step could not be recorded", error)
             problem = f"the recording ended: {error}"
@@ -106,7 +106,7 @@ class LiveRecorder:
         self._post(EpisodeWritten(self.finisher.finished))
 
     def _recover(self) -> None:
-        """Recover episodes that an earlier server left unfinished; on the finisher's thread, before all else."""
+        """Recover episodes that an earlier server left unfinished; runs first on the finisher's thread."""
         if not self._folder.is_dir():
             return
         recovered: tuple[str, ...] = ()
@@ -115,7 +115,7 @@ class LiveRecorder:
             recovered = tuple(str(file) for file in recover_confined(self._folder))
             message = recovered_text(recovered)
         except RecordingError as error:
-            message = problem = f"what an earlier recording left could not be recovered: {error}"
+            message = problem = f"an earlier, unfinished recording could not be recovered: {error}"
         self._post(EpisodesRecovered(recovered, problem))
         if message:
             self._on_recovered(message)

@@ -1,4 +1,4 @@
-"""The Episodes tab: record from now on, record the next episode, or keep the past one."""
+"""The Episodes tab: record from now on, record the next episode, or save a past one."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ STOP, STOP_WAITING, STOP_SAVING = "Stop recording", "Stop waiting", "Stop saving
 
 
 class RecordPanel(MomentPart):
-    """Three buttons, each of which also stops what it began, and their state in words.
+    """Three buttons, each of which also stops what it started, and a status text.
 
-    *Record* begins a fresh episode, since one without its reset cannot be replayed; *Record the next episode* waits for a
-    reset; *Save what I just saw* makes a recording of the past.
+    *Record* begins a new episode, since an episode without its reset cannot be replayed; *Record the next episode* waits for
+    a reset; *Save what I just saw* makes a recording of the past.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -62,7 +62,7 @@ class RecordPanel(MomentPart):
         self._record.content = tools_html([Tool(record, ToggleRecording(), hint, off=off, tone="main")])
         self._which.show(recording.chosen, off=not can_record)
         self._which.visible = view.task is None or view.task.num_envs > 1
-        # Off, not left out: the next button would move under the pointer.
+        # Disabled instead of left out: otherwise the next button would move under the pointer.
         following = tool(NEXT, RecordNextEpisode(), off=not can_record or recording.active)
         save = Tool(
             STOP_SAVING if saving else SAVE,
@@ -94,7 +94,7 @@ def has_one_before(view: SessionView) -> bool:
 
 
 def what_saving_means(view: SessionView, all_envs: bool) -> str:
-    """Which episode *Save what I just saw* takes, if it is a running one; else empty."""
+    """Text about the episode that *Save what I just saw* takes, if it is a running one; else empty."""
     steps = runs_since(view)
     if steps is None or view.task is None:
         return ""

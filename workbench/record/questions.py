@@ -1,4 +1,4 @@
-"""The question for what a recording stores of a past moment. Only for a worker that does not play: its envs move."""
+"""Question that captures the recorded data of a past moment. Only for a worker that does not play, because it moves envs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from workbench.machine.processes.wire import Question
 
 @dataclass(frozen=True)
 class Captured:
-    """What a recording stores of a moment."""
+    """Data of a moment for a recording."""
 
     columns: dict[str, NDArray]
     """State columns, as in `Stepped.columns`."""
@@ -21,11 +21,11 @@ class Captured:
 
 @dataclass(frozen=True)
 class CaptureMoment(Question[Captured]):
-    """Put the envs back to a past moment and read what a recording stores of it."""
+    """Restore the envs to a past moment, and capture its data for a recording."""
 
     snapshot: bytes
     """A pickled `envs.snapshots.snapshot.Snapshot` of the whole batch."""
     env_idx: tuple[int, ...]
-    """The envs to draw."""
+    """The envs to render."""
     pictures: bool
-    """Whether to draw pictures."""
+    """Whether to render pictures."""

@@ -37,10 +37,10 @@ from workbench.task.open import describe
 
 logger = logging.getLogger(__name__)
 _MAX_PENDING_STEPS = 2048
-"""Maximum number of steps times envs that wait for the gatherer: 3 MB. Fewer wait after half a second, or when an
-episode begins."""
+"""Maximum number of pending steps (times envs) for the gatherer: 3 MB. The queue is flushed earlier after half a second, or
+when an episode begins."""
 _MAX_PENDING_PICTURE_BYTES = 1 << 25
-"""Maximum size in bytes of the pictures that wait for the gatherer."""
+"""Maximum size of the pictures that wait for the gatherer."""
 
 _SUBPROCESS_ENVS = 4
 """Env count from which a subprocess makes the files; below it, start-up costs more than it saves."""
@@ -61,7 +61,7 @@ class _PendingStep(NamedTuple):
 
 
 class Recorder(gym.Wrapper):
-    """Records the episodes of an env that `workbench.make` gave::
+    """Records the episodes of an env of `workbench.make`::
 
         env = workbench.make("PickCube-v1", num_envs=16)
         env = workbench.Recorder(env, "recordings/")
@@ -73,11 +73,11 @@ class Recorder(gym.Wrapper):
 
     Writes the files of the page and of ``workbench record``, one set per episode: .rrd, .h5 and .json. An episode of an env
     lasts from its reset to its next one, so partial resets, auto-resets and wrappers that continue after success work. The
-    env's own state, observation and reward are recorded, so it goes directly around the env of `make`, inside all wrappers
-    that change actions. From four envs on, a process makes the files.
+    env's own state, observation and reward are recorded, so it must wrap the env of `make` directly, inside all wrappers
+    that change actions. From four envs on, a subprocess makes the files.
 
-    A training loop must not end because a disk is full: an error of the files is one warning, ends the recording, and is
-    kept in `problem`.
+    A full disk must not end a training loop: an error of the files gives one warning, ends the recording, and is kept in
+    `problem`.
     """
 
     def __init__(
@@ -91,21 +91,21 @@ class Recorder(gym.Wrapper):
     ) -> None:
         """
         Args:
-            env: as `workbench.make` gives it.
-            folder: created if it is missing. Half-written files of an earlier recording in it are recovered.
-            env_idx: which envs; None for all.
-            pictures: record every camera at every step, or the cameras of these names; False for none. Sensors that the
-                env observes are rendered already; any other picture takes 25 to 50 ms without a GPU.
-            acted_by: what chooses the actions, such as the name of a policy; for readers of the recordings.
+            env: an env of `workbench.make`.
+            folder: created if it is missing. Unfinished files of an earlier recording in it are recovered.
+            env_idx: the envs to record; None for all.
+            pictures: record every camera at every step, or only the named cameras; False for none. Sensors that the env
+                observes are rendered already; any other picture takes 25 to 50 ms without a GPU.
+            acted_by: source of the actions, such as the name of a policy, for readers of the recordings.
 
         Raises:
-            TypeError: `env` is not a ManiSkill env, or is wrapped as a vector env already.
+            TypeError: `env` is not a ManiSkill env, or is already wrapped as a vector env.
             IndexError: there is no such env.
             RecordingError: `folder` cannot be written to.
         """
         if not isinstance(env, gym.Env) or isinstance(env, gym.vector.VectorEnv):
             raise TypeError(
-                f"Recorder goes around the env that workbench.make gives, inside a vector env: not {type(env).__name__}"
+                f"Recorder wraps the env of workbench.make directly, inside a vector env: not {type(env).__name__}"
             )
         super().__init__(env)
         base: BaseEnv = open_env(env)
@@ -125,10 +125,10 @@ class Recorder(gym.Wrapper):
         """Files of finished episodes that are being written."""
         self._gatherer: EpisodeGatherer | None = None
         self._pending: deque[_PendingStep] = deque()
-        """Steps that the gatherer does not have yet. Gathering them one by one, while the env waits and the caches
-        are full of physics, costs twice as much."""
+        """Steps that wait for the gatherer. Gathering them one by one, while the env waits and the CPU caches are full of
+        physics, costs twice as much."""
         self._waiting_pictures = 0
-        """Approximate bytes of the waiting pictures: another thread may gather at the same time."""
+        """Size of the waiting pictures in bytes; approximate, since another thread may gather at the same time."""
         self._gathering = threading.Lock()
         self._failure: Exception | None = None
         """Exception that gathering raised, perhaps on another thread."""
@@ -157,14 +157,14 @@ class Recorder(gym.Wrapper):
         if self._scene is not self._task.env.scene and not self._finished:
             self._begin()
         if self._gatherer is not None:
-            self._gather()  # with the options of earlier resets
+            self._gather()  # before the options change
             kept = {k: v for k, v in (options or {}).items() if k != "env_idx"}
             self._gatherer.reset_options = kept
         self._add_step(step, mask)
         return obs, info
 
     def _seeds_of_reset(self, seed: Any) -> np.ndarray:
-        """(N,) seeds of the envs of a reset; NO_SEED without one.
+        """(N,) seeds of a reset; NO_SEED for an env without one.
 
         A reset without a seed, such as an auto-reset, continues the random generators, while ManiSkill still reports the seed
         of an earlier episode.
@@ -190,7 +190,7 @@ class Recorder(gym.Wrapper):
         return given  # type: ignore[return-value]
 
     def finish(self) -> None:
-        """End the recording: running episodes end here, and their files are waited for. The env stays usable."""
+        """End the recording and all running episodes, and wait for their files. The env stays usable."""
         if not self._finished:
             self._finished = True
             self._end()
@@ -244,7 +244,7 @@ class Recorder(gym.Wrapper):
             try:
                 while self._pending and self._gatherer is not None:
                     self._gatherer.take(self._pending.popleft().stepped())
-            except Exception as error:  # raised by the next step: this may be another thread
+            except Exception as error:  # kept for the next step, since this may be another thread
                 self._pending.clear()
                 self._failure = error
 

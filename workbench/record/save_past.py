@@ -1,4 +1,4 @@
-"""Records an episode after it happened, from the history."""
+"""Records a past episode from the history."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from workbench.task.description import TaskDescription
 
 
 def moments_of(episodes: Sequence[PastEpisode]) -> list[tuple[Moment, dict[int, list[PastEpisode]]]]:
-    """All their moments once, oldest first, each with the episodes that it belongs to, by env."""
+    """All moments of the episodes once, oldest first, each with the episodes that contain it, by env."""
     found: dict[int, tuple[Moment, dict[int, list[PastEpisode]]]] = {}
     for episode in episodes:
         for moment, env in episode.moments:
@@ -50,9 +50,9 @@ _START_TOLERANCE = 1e-6
 class PastSaver:
     """Records past episodes, one job at a time, in the background process.
 
-    The history has poses, actions, rewards and results of ``evaluate`` as they were, and a snapshot of each moment. The
-    rest (env states, observations, pictures of all cameras) is read from envs that are put back to the snapshots. So the
-    file equals that of a live recording; but after an edit of the task's file that rest is what the new code gives. The
+    The history has the original poses, actions, rewards and results of ``evaluate``, and a snapshot of each moment. The
+    rest (env states, observations, pictures of all cameras) is read from envs that are restored from the snapshots. So the
+    file equals that of a live recording, except that after an edit of the task's file the rest comes from the new code. The
     recorded source is that of the version that played.
     """
 
@@ -66,15 +66,15 @@ class PastSaver:
         """
         Args:
             finisher: makes the files.
-            process: where moments are rendered again.
-            happen: takes what comes of a job; called on the loop.
+            process: the process that renders moments again.
+            happen: called on the loop with the events of a job.
         """
         self._folder, self._finisher, self._process, self._happen = folder, finisher, process, happen
         self._job = 0
         """Number of the running job."""
         self._jobs = Jobs(self._progressed, self._failed)
         self._aside = BlockingPool("keep-past")
-        """Thread that writes, since the disk may be slow."""
+        """Thread that writes, because the disk may be slow."""
 
     def begin(self, effect: BeginSaving, placed: tuple[PlaceCamera, ...]) -> None:
         """Begin a job; called on the loop.
@@ -90,7 +90,7 @@ class PastSaver:
         self._jobs.stop()
 
     def close(self) -> None:
-        """Cancel the running job; returns when no more is written. Called on another thread than the loop."""
+        """Cancel the running job, and wait until nothing more is written. Must not be called on the loop's thread."""
         do(self._jobs.close)
         self._aside.close()
 
@@ -107,7 +107,8 @@ class PastSaver:
         total = len(moments)
 
         async def redraw() -> None:
-            """Continue with the first moment that is not captured yet: a job of higher rank may have interrupted this one."""
+            """Continue with the first moment that is not captured yet, since a job of higher rank may have interrupted this
+            one."""
             await self._process.ensure(job, what.load, placed)
             for episode in what.episodes:
                 if episode.env not in seeds:
@@ -172,7 +173,7 @@ class PastSaver:
     def _begun(
         self, what: SaveRequest, placed: tuple[PlaceCamera, ...], episode: PastEpisode, seed: int
     ) -> GatheredEpisode:
-        """The episode's recording, with what its source does not say of the pictures. Raises RecordingError."""
+        """Begin the episode's recording, including the camera placements that its source lacks. Raises RecordingError."""
         task = _as_played(what.task, episode)
         observed_by = "" if task.source_hash == what.task.source_hash else what.task.source_hash
         writer = GatheredEpisode.of(self._folder, task, episode.env, seed, observed_by=observed_by)
@@ -184,7 +185,7 @@ class PastSaver:
     async def _verified_seed(self, episode: PastEpisode) -> int:
         """Seed of the episode, if a reset of its env alone with this seed gives the first state; else -1.
 
-        What envs that were reset together drew from torch's generator depends on all of them.
+        Random numbers of envs that were reset together depend on all of them, since they share torch's generator.
         """
         if episode.seed < 0:
             return episode.seed
@@ -202,7 +203,7 @@ class PastSaver:
 
 
 def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:
-    """The running version with the source that made the episode's rewards: its scene and cameras are in the pictures."""
+    """The running version, whose scene and cameras are in the pictures, with the source that made the episode's rewards."""
     played = episode.played_by
     if played is None:
         return task
@@ -210,7 +211,7 @@ def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:
 
 
 def _cameras_in_source(task: TaskDescription, episode: PastEpisode) -> dict[CameraKey, CameraSettings]:
-    """Settings in the version that played, for the cameras that the running version has elsewhere."""
+    """Settings in the version that played, for the cameras that the running version places elsewhere."""
     now = {camera.key: camera.settings for camera in task.cameras}
     played = () if episode.played_by is None else episode.played_by.cameras
     return {

@@ -1,4 +1,4 @@
-"""Which past episodes are saved, and what came of it."""
+"""State of saving past episodes, and its changes by events."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from workbench.record.commands import SavePreviousEpisode, SaveSolved, ToggleSav
 from workbench.task.description import TaskDescription
 
 DOES: frozenset[type[Command]] = frozenset({ToggleSavePast, SavePreviousEpisode, SaveSolved})
-"""Commands that `apply` takes."""
+"""Commands that `apply` handles."""
 
 
 @dataclass(frozen=True)
@@ -28,21 +28,22 @@ class SaveStatus:
     failed: bool = False
     """Whether `message` is an error."""
     refused_at: object = None
-    """What was shown when nothing could be recorded of it; the message holds only there. None for any other message."""
+    """The shown version, env and moment of which nothing could be recorded; the message is valid only for it. None for any
+    other message."""
     progress: JobProgress | None = None
     """Progress in moments; None while no job runs."""
 
 
 @dataclass(frozen=True)
 class Saving:
-    """Past episodes are saved by one job at a time."""
+    """State of saving past episodes, one job at a time."""
 
     status: SaveStatus = SaveStatus()
     job: int = 0
     """Number of the last job."""
 
     def status_of(self, run: Run) -> SaveStatus:
-        """The status for what is shown now."""
+        """The status for the shown version, env and moment."""
         if self.status.refused_at in (None, _shown(run)):
             return self.status
         return SaveStatus(progress=self.status.progress)
@@ -52,7 +53,7 @@ class Saving:
 class PastEpisode:
     """The moments of one env's episode, oldest first; the first is its reset.
 
-    It runs through the moments that the env was put back to, until it terminated, was truncated, was reset or was left.
+    It includes the moments that the env was restored to, until it terminated, was truncated, was reset or was abandoned.
     """
 
     env: int
@@ -76,7 +77,7 @@ class PastEpisode:
 
 @dataclass(frozen=True)
 class SaveRequest:
-    """Episodes to record and what a worker needs for it. Independent of the history, which moves on meanwhile."""
+    """Episodes to record, with everything that a worker needs. Independent of the history, which changes meanwhile."""
 
     task: TaskDescription
     load: Load
@@ -89,14 +90,14 @@ class SaveRequest:
 
 @dataclass(frozen=True)
 class SaveWanted:
-    """Save for each of these envs (all if None) the episode that contains the shown moment.
+    """Save, for each of these envs (all if None), the episode that contains the shown moment.
 
-    While live, the running episode is saved; if it has no step yet, the one before.
+    At the newest moment this is the running episode or, if it has no step yet, the previous one.
     """
 
     env_idx: tuple[int, ...] | None = None
     before: bool = False
-    """Save the episode before that one."""
+    """Save the previous episode instead."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class SaveProgressed:
 class EpisodesSaved:
     job: int
     message: str
-    """What was saved, for the page."""
+    """Text about what was saved, for the page."""
 
 
 @dataclass(frozen=True)
@@ -119,12 +120,12 @@ class SaveFailed:
 
 
 SaveEvent = SaveProgressed | EpisodesSaved | SaveFailed
-"""What comes of a job."""
+"""Events of a job."""
 
 
 @dataclass(frozen=True)
 class BeginSaving:
-    """Begin this job; cancel the one before."""
+    """Begin this job; cancel the previous one."""
 
     job: int
     what: SaveRequest
@@ -141,14 +142,14 @@ SaveEffect = BeginSaving | EndSaving
 def apply(
     saving: Saving, event: object, run: Run, chosen: tuple[int, ...] | None, solved: tuple[int, ...]
 ) -> tuple[Saving, list[SaveEffect]]:
-    """The saving after an event, and what has to be done.
+    """The next state after an event, and the effects to carry out.
 
     Args:
         chosen: envs that a person chose for recording; None for all.
         solved: envs whose episode is solved.
 
     Raises:
-        Refused: the command makes no sense now; nothing has changed.
+        Refused: the command is not possible now; nothing has changed.
     """
     runs = saving.status.progress is not None
     match event:
@@ -178,7 +179,7 @@ def apply(
 
 
 def without_message(saving: Saving) -> Saving:
-    """The last result is dropped: something else is recorded, or another version runs."""
+    """Drop the last result, because something else is recorded or another version runs."""
     if not saving.status.message:
         return saving
     return replace(saving, status=SaveStatus(progress=saving.status.progress))
@@ -196,7 +197,7 @@ def _save(
 
 
 def _shown(run: Run) -> object:
-    """The version, env and moment that are shown."""
+    """The shown version, env and moment."""
     past = run.past
     return run.task_serial, run.env, None if past is None else (past.at, past.pinned)
 
@@ -205,11 +206,11 @@ def _shown(run: Run) -> object:
 
 
 def request_of(run: Run, env_idx: tuple[int, ...] | None, before: bool = False) -> SaveRequest | str:
-    """What to record of these envs (all if None): for each the episode that contains the shown moment; or the reason why
-    there is nothing.
+    """The request to record, for each of these envs (all if None), the episode that contains the shown moment; or the reason
+    why there is none.
 
     Args:
-        before: record the episode before that one.
+        before: record the previous episode instead.
     """
     load = run.running_load()
     if run.task is None or run.past is None or load is None:
@@ -233,8 +234,8 @@ def find_episode(history: History, env: int, serial: int | None, before: bool = 
     """The episode of this env that contains a moment, up to its end; or the reason why none can be recorded.
 
     Args:
-        serial: None for the running episode, or the one before if that has no step yet.
-        before: the one before that.
+        serial: serial of the moment; None for the running episode or, if it has no step yet, the previous one.
+        before: return the previous episode instead.
     """
     if not len(history):
         return "there is no step yet"
@@ -252,7 +253,7 @@ def find_episode(history: History, env: int, serial: int | None, before: bool = 
 
 
 def _episode_before(history: History, env: int, episode: PastEpisode) -> PastEpisode | str | None:
-    """The episode before; None if it is no longer in memory."""
+    """The previous episode; None if it is no longer in memory."""
     begin = episode.moments[0][0].serial
     return _episode_at(history, env, begin - 1) if begin > history.first else None
 

@@ -1,4 +1,4 @@
-"""What is recorded while the session runs, and how each event changes it."""
+"""State of the live recording, and its changes by events."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ DOES: frozenset[type[Command]] = of_saving.DOES | {
     RecordNextEpisode,
     ChooseRecordedEnvs,
 }
-"""Commands that `apply` takes."""
+"""Commands that `apply` handles."""
 MAX_PENDING_BYTES = 256 * 1024**2
-"""Maximum bytes of steps that may wait for the disk."""
+"""Maximum size of steps that may wait for the disk."""
 TOO_SLOW = (
     "the recording ended: the disk is slower than the simulation. Record fewer envs, or choose another folder"
 )
@@ -39,7 +39,7 @@ class RecordingStatus:
     active: bool = False
     env_idx: tuple[int, ...] = ()
     since: float = 0.0
-    """Seconds since the epoch at which the recording began; a new version of the task does not change it."""
+    """Start of the recording in seconds since the epoch; a new version of the task does not change it."""
     episodes: int = 0
     """Number of episodes that have ended since the recording began."""
     waiting: int = 0
@@ -56,7 +56,7 @@ class RecordingStatus:
     folder: str = ""
     last_file: str | None = None
     problem: str | None = None
-    """Why the recording ended, or the last file could not be written."""
+    """Reason why the recording ended, or why the last file could not be written."""
     saving: SaveStatus = field(default_factory=SaveStatus)
     chosen: ChosenEnvs = "selected"
     """Envs that a person chose to record and to save."""
@@ -73,7 +73,7 @@ class RunningEpisodes:
 
 @dataclass(frozen=True)
 class LiveRecording:
-    """The recording that runs, and what was recorded before. It takes each env's steps from the next reset on."""
+    """The running recording, which takes each env's steps from its next reset on, and the results so far."""
 
     folder: str
     chosen: ChosenEnvs = "selected"
@@ -98,7 +98,7 @@ class LiveRecording:
     saving: Saving = Saving()
 
     def status(self, run: Run) -> RecordingStatus:
-        """What a page shows of it."""
+        """The status for the page."""
         under_way, written = self.under_way, self.written
         return RecordingStatus(
             active=bool(self.env_idx),
@@ -126,7 +126,7 @@ class Continues:
     env_idx: tuple[int, ...]
     one_each: bool
     put_back: bool
-    """Whether the envs go on with episodes that are under way: a reset would lose the present moment."""
+    """Whether the envs continue their running episodes: a reset would lose the current moment."""
 
 
 # --- events and effects -----------------------------------------------------------------------------
@@ -149,15 +149,15 @@ class StepRecorded:
     """Number of the gatherer."""
     bytes: int
     env_idx: tuple[int, ...]
-    """Envs that go on being recorded."""
+    """Envs that are still recorded."""
     under_way: RunningEpisodes
     problem: str | None = None
-    """Why the step could not be taken."""
+    """Reason why the step could not be recorded."""
 
 
 @dataclass(frozen=True)
 class EpisodeEnded:
-    """An episode has ended; its files are made next."""
+    """An episode has ended; its files are written next."""
 
     live: bool
     """Whether it was recorded while the session ran."""
@@ -165,7 +165,7 @@ class EpisodeEnded:
 
 @dataclass(frozen=True)
 class EpisodeWritten:
-    """The files of an episode are made, or could not be made."""
+    """The files of an episode are written, or could not be written."""
 
     finished: Finished
 
@@ -179,12 +179,12 @@ class EpisodesRecovered:
 
 
 RecordEvent = StepRecorded | EpisodeEnded | EpisodeWritten | EpisodesRecovered
-"""What comes of the recording."""
+"""Events of the recording."""
 
 
 @dataclass(frozen=True)
 class BeginEpisodes:
-    """Record these envs from their next reset on; end the episodes before."""
+    """Record these envs from their next reset on; end the running episodes."""
 
     number: int
     task: TaskDescription
@@ -202,7 +202,7 @@ class TakeStep:
 
 @dataclass(frozen=True)
 class EndEpisodes:
-    """End the running episodes and write what they have."""
+    """End the running episodes and write their files."""
 
 
 RecordEffect = BeginEpisodes | TakeStep | EndEpisodes | SaveEffect | Send | Then
@@ -215,17 +215,16 @@ Change = tuple[LiveRecording, list[RecordEffect]]
 def apply(
     recording: LiveRecording, event: object, run: Run, now: Now, solved: tuple[int, ...] = ()
 ) -> Change:
-    """The recording after an event, and what has to be done.
+    """The next state of the recording after an event, and the effects to carry out.
 
-    A disk that is slower than the simulation for long ends the recording, instead of losing steps silently or filling the
-    memory.
+    If the disk stays slower than the simulation, the recording ends, instead of silently losing steps or filling the memory.
 
     Args:
         run: the run after the event.
         solved: envs whose episode is solved.
 
     Raises:
-        Refused: the command makes no sense now; nothing has changed.
+        Refused: the command is not possible now; nothing has changed.
     """
     chosen = None if recording.chosen == "all" else (run.env,)
     saving, effects = of_saving.apply(recording.saving, event, run, chosen, solved)
@@ -271,7 +270,7 @@ def _apply(
             return _loaded(recording, loaded, run)
         case LoadDone() if (continues := recording.continues) is not None:
             one_each = continues.one_each
-            # The version may have fewer envs.
+            # The new version may have fewer envs.
             env_idx = tuple(env for env in continues.env_idx if env < run.num_envs)
             if not env_idx:
                 return replace(recording, continues=None), []
@@ -336,7 +335,7 @@ def _recorded(recording: LiveRecording, event: StepRecorded) -> Change:
 
 
 def _loaded(recording: LiveRecording, loaded: Loaded, run: Run) -> Change:
-    """An episode must not mix steps of two versions, nor of two processes."""
+    """Handle a load: an episode must not mix steps of two versions or two processes."""
     report = loaded.reload
     if report is not None and report.level == "same":
         return recording, []

@@ -1,1 +1,1 @@
-"""Rescores the history and recordings with today's code."""
+"""Rescores the history and recordings with the current code."""

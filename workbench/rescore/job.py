@@ -1,4 +1,4 @@
-"""Rescores recordings in one process or several: fixed chunks of recordings of one task, and a verdict for each."""
+"""Rescores recordings in one or several processes: fixed chunks of recordings of one task, and a verdict for each."""
 
 from __future__ import annotations
 
@@ -34,27 +34,27 @@ _SUFFIXES = (".rrd", ".h5", ".json")
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording that is to be rescored."""
+    """A recording to rescore."""
 
     place: int
-    """Place in the order of the files."""
+    """Index in the order of the files."""
     path: bytes
-    """Path as bytes, so that it is not relocated where the recording does not travel: then all machines see it
-    there; see `Work.files`."""
+    """Path as bytes, so that it is not relocated: a recording that is not sent to workers has the same path on all machines;
+    see `Work.files`."""
     travels: Path | None
-    """The path, if the recording travels to the workers; else None."""
+    """The path, if the recording is sent to the workers; else None."""
     part: str | None
     id: str
     name: str
     task: str = ""
     note: str = ""
-    """Options that differ from the recorded ones on purpose."""
+    """Note on options that differ from the recorded ones on purpose."""
     why_not: str = ""
-    """Reason why it cannot be rescored, if that is known before the job."""
+    """Reason why it cannot be rescored, if known before the job."""
     refused: bool = False
-    """Whether it is not rescored because its code may not run."""
+    """Whether it is skipped because its code may not run."""
     damaged: bool = False
-    """Whether it is not rescored because it cannot be read."""
+    """Whether it is skipped because it cannot be read."""
 
     def source(self) -> Source:
         """Source of the recording on the submitting side."""
@@ -89,10 +89,10 @@ class RescoreUpdate:
 
 @dataclass(frozen=True)
 class RescoreSetup:
-    """Recordings and codes of a job."""
+    """Recordings of a job, and the codes that rescore them."""
 
     codes: tuple[RescoredBy | None, ...]
-    """Codes that rescore; None for recordings that are not rescored."""
+    """Codes that rescore; None for recordings that are skipped."""
     of_chunk: tuple[int, ...]
     """Index in `codes` for each chunk."""
     items: Mapping[int, Recording]
@@ -129,12 +129,12 @@ def rescore_recordings(
     """Verdicts of the recordings, in the order of the files.
 
     Args:
-        on_progress: gets the rescored episodes, all episodes, and the control steps so far.
+        on_progress: called with the number of rescored episodes, of all episodes, and of control steps so far.
         on_finding: called once for each place where a task breaks a rule without being stopped.
 
     Raises:
-        PoolError: a process that rescores failed, or processes die again and again.
-        TooMuch: the files beside the tasks are more than travel to other machines.
+        PoolError: a process that rescores failed, or processes die repeatedly.
+        TooMuch: the files in the tasks' folders are too large to send to other machines.
     """
     results: dict[int, RescoredRecording] = {}
     found: set[object] = set()
@@ -199,7 +199,7 @@ def _needed(setup: RescoreSetup) -> tuple[list[Path], list[Path]]:
 
 
 def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
-    """The setup for other machines, and the recordings that travel: all, or none if they are too large."""
+    """The setup for other machines, and the recordings that are sent to them: all, or none if they are too large."""
     files = {
         file
         for of in setup.items.values()
@@ -217,11 +217,11 @@ def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
 
 
 class _Stopped(Exception):
-    """Raised when no further result is needed."""
+    """Raised when no more results are needed."""
 
 
 def rescore_items(setup: RescoreSetup, queue: ItemQueue) -> None:
-    """Rescore the chunks that one worker gets. An exception of the author's code is the verdict of its recordings."""
+    """Rescore the chunks of one worker. An exception of the author's code becomes the verdict of its recordings."""
     torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # a task may change it
     chunk = queue.next()
@@ -250,8 +250,8 @@ class _Rescorer:
     queue: ItemQueue
 
     def run(self, code: RescoredBy, chunk: Chunk | None) -> Chunk | None:
-        """Rescore this chunk, and further ones as long as they are of the same code and nothing is raised: then its envs may
-        be in any state. Returns the next chunk."""
+        """Rescore this chunk and the following ones of the same code, until the code raises, which may leave its envs in any
+        state. Returns the next chunk."""
         try:
             with opened_code(
                 code,
@@ -264,15 +264,15 @@ class _Rescorer:
                     chunk = self.queue.next()
                 return chunk
         except (TaskError, CannotEnterRecording) as error:
-            # It cannot be opened for the others either.
+            # The code cannot be opened for the following chunks either.
             while chunk is not None and self.setup.code_of(chunk) == self.at:
                 self._fail(chunk.wanted, error)
                 chunk = self.queue.next()
             return chunk
 
     def _rescore(self, opened: OpenedTask, chunk: Chunk) -> bool:
-        """Rescore the whole chunk, including recordings with a known result: in another batch an episode may
-        differ in the last bits. Returns False if the task raised."""
+        """Rescore the whole chunk, including recordings with a known result, because an episode may differ in the last bits
+        in another batch. Returns False if the task raised."""
         sources = [self._source(number) for number in chunk.numbers]
         missing = set(chunk.wanted)
         try:
@@ -298,8 +298,8 @@ class _Rescorer:
         path = of.travels or of.source().path
         if self.setup.elsewhere and not path.parent.is_dir():
             raise FileNotFoundError(
-                f"{platform.node()} does not see the recordings in {path.parent}, which are too large to travel: put them "
-                "where all machines of the cluster find them"
+                f"{platform.node()} does not see the recordings in {path.parent}, which are too large to send: put them "
+                "into a folder that all machines of the cluster share"
             )
         return Source(path, of.part, str(number), of.name)
 

@@ -17,32 +17,32 @@ from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreEffect,
 from workbench.rescore.verdict import RescoredMoments, RescoreMoments
 
 _CHUNK_SECONDS = 0.1
-"""Desired seconds of one question: it decides how soon progress is shown and a stop takes effect."""
+"""Target duration of one question, after which progress is shown and a stop takes effect."""
 _MAX_MOMENTS = 64
 _SUMMARY_SECONDS = 0.5
-"""Seconds between two summaries."""
+"""Interval between summaries."""
 
 
 class PastRescorer:
-    """Rescores the history in the background process, some moments at a time.
+    """Rescores the history in the background process, a few moments at a time.
 
-    To stop, it sends no more; a process that does not answer (the new code may loop for ever) is ended.
+    To stop, it sends no more questions; a process that does not answer (the new code may hang) is killed.
     """
 
     def __init__(self, process: Background, happen: Callable[[RescoringTold], object]) -> None:
         """
         Args:
-            process: where it runs; other jobs come first.
-            happen: takes what comes of a job; called on the loop.
+            process: the background process; other jobs there have priority.
+            happen: called on the loop with the events of a job.
         """
         self._process, self._happen = process, happen
         self._jobs = Jobs(lambda: None, self._failed)
         self._told = RescoringTold(0, RescoreView())
-        """What the running or the last job has come to."""
+        """State and results of the running or the last job."""
         self._past: RescoredPast | None = None
 
     def perform(self, effect: RescoreEffect) -> None:
-        """Begin it; called on the loop."""
+        """Start the effect; called on the loop."""
         self._jobs.stop()
         if self._past is not None:
             self._past.release()
@@ -54,14 +54,14 @@ class PastRescorer:
                 self._past = None
 
     def close(self) -> None:
-        """Cancel the job, and begin no more."""
+        """Cancel the job, and accept no more."""
         do(self._jobs.close)
 
     def _failed(self, failure: JobFailed) -> None:
         self._tell(state="failed", why=str(failure), problem=failure.problem)
 
     def _tell(self, **values: Any) -> None:
-        """Tell of these fields of the view."""
+        """Update these fields of the view, and send it."""
         self._told = replace(self._told, view=replace(self._told.view, **values))
         self._happen(self._told)
 
@@ -105,8 +105,8 @@ class PastRescorer:
             return
         self._tell(state="loading")
         if self._process.num_envs == past.num_envs:
-            # Loading tries the new code at the env's present moment, where the last job ended. There it may raise or
-            # loop although it runs from the recorded beginnings: so go to one of these first.
+            # Loading tries the new code at the env's current moment, where the last job ended. There the code may raise or
+            # hang although it runs from the recorded start states: so restore one of these first.
             await self._ask(past, past.runs()[0][:1])
         try:
             await self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))

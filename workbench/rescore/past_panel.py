@@ -56,7 +56,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
         self._add_list()
         self._verdicts: Sequence[Verdict[PastRun]] = ()
         self._shown: tuple[int, int | None] = 0, None
-        """Env and moment that the page shows."""
+        """(env, moment) that the page shows."""
         self._first = 0
 
     def key(self, view: SessionView) -> object:
@@ -145,7 +145,7 @@ def _place(verdict: Verdict[PastRun]) -> tuple[int, int]:
 def chart_data(curve: RescoredCurve, shown: int | None) -> tuple[NDArray, ...]:
     """Data for uPlot: x, the recorded curve, the new curve, and a dot at the shown moment, if any.
 
-    Of a long curve the newest part, or the part around the shown moment.
+    A long curve is cut to its newest part, or to the part around the shown moment.
     """
     place = None if shown is None else int(np.searchsorted(curve.serial, shown))
     part = part_round(len(curve.tick), place)
@@ -160,7 +160,7 @@ def in_a_line(rescored: RescoreView) -> str:
     if rescored.state == "loading":
         return "Rescoring the history: loading the new code"
     if rescored.state == "rescoring":
-        # In tenths: each change is sent to the page.
+        # Rounded to 10 %, because each change is sent to the page.
         return f"Rescoring the history: {10 * int(10 * rescored.done / max(1, rescored.total))} %"
     if rescored.state == "done":
         return f"{TITLE}: {verdict_text.headline(rescored.verdicts, others=rescored.differing_names)}"

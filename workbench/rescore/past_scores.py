@@ -1,4 +1,4 @@
-"""Old and new scores of the history, and how they compare."""
+"""Old and new scores of the history, and their comparison."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from workbench.live.history.moments import History, Moment
 from workbench.rescore.verdict import MomentToRescore, Scores, Verdict, compare, scalar_entries
 
 MAX_ENTRIES = 24
-"""Most entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""
+"""Maximum number of entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""
 
 
 @dataclass(frozen=True, eq=False)
 class PastRun:
-    """Successive moments of one env without a jump (a reset, or going back)."""
+    """Successive moments of one env without a jump (a reset, or a restored past moment)."""
 
     env: int
     begin: int
@@ -47,19 +47,19 @@ class RescoredCurve:
     serial: NDArray[np.int64]
     """(T,) serials of the moments."""
     old: NDArray[np.float32]
-    """(T,) recorded numbers; NaN where the old code did not have the number."""
+    """(T,) recorded numbers; NaN if the old code lacks the number."""
     new: NDArray[np.float32]
-    """(T,) rescored numbers; NaN where a moment is not rescored (yet)."""
+    """(T,) rescored numbers; NaN at moments that are not rescored (yet)."""
 
 
 class RescoredPast:
-    """Old and new scores of the history, one row a moment, filled as results come. Used on the loop.
+    """Old and new scores of the history, one row per moment, filled as results arrive. Used on the loop.
 
-    The bodies' drift from the record is kept for each moment and env, since it decides whether a comparison is good. From
-    a kept reset on it is mostly zero to the last bit: there envs have the same physics without a past (measured:
-    PushCube, PickCube and StackCube none, PushT 7e-8 m, PushCube with a going back among its moments 6e-8 m). It may
-    grow where the oldest kept moment is in the middle of an episode, and for tasks whose state does not fit a snapshot
-    (see `envs.snapshots.snapshot`).
+    The bodies' drift from the record is kept for each moment and env, since it decides whether a comparison is reliable.
+    From a kept reset on it is mostly zero to the last bit, because there envs start with fresh physics (measured: PushCube,
+    PickCube and StackCube none, PushT 7e-8 m, PushCube with a restored past moment 6e-8 m). It may grow if the oldest kept
+    moment is in the middle of an episode, and for tasks whose state does not fit a snapshot (see
+    `envs.snapshots.snapshot`).
     """
 
     def __init__(self, history: History, seen: int | None = None, has_reward: bool = True) -> None:
@@ -67,7 +67,7 @@ class RescoredPast:
 
         Args:
             seen: serial of the moment that the page shows; its run is replayed first.
-            has_reward: whether the version before or the new one has a reward.
+            has_reward: whether the old or the new version has a reward.
         """
         self._seen, self._has_reward = seen, has_reward
         self._moments: list[Moment] = []
@@ -92,7 +92,7 @@ class RescoredPast:
         for row, moment in enumerate(self._moments):
             self._write(self._old, row, moment.as_recorded)
         self._drift = np.zeros((count, envs, 2), np.float32)
-        # Runs by number over the batch: which one each env is in at each row.
+        # Number, over the batch, of the run that each env is in at each row.
         within = np.cumsum(self._jumped, axis=0) - 1
         sizes = within[-1] + 1 if count else np.zeros(0, np.int64)
         self._run = within + (np.cumsum(sizes) - sizes)
@@ -110,9 +110,8 @@ class RescoredPast:
         return int((self._is_step & self._rescored).sum())
 
     def runs(self) -> list[range]:
-        """Rows to be replayed in order; each run begins with a jump of all envs. First the run in sight, then the newest.
-
-        A history may hold minutes of simulation.
+        """Rows to replay, as runs that each begin with a jump of all envs. The shown run comes first, then the newest ones,
+        because a history may hold minutes of simulation.
         """
         begins = [int(row) for row in np.flatnonzero(self._jumped.all(axis=1))]
         ends = [*begins[1:], len(self._serial)]
@@ -125,7 +124,7 @@ class RescoredPast:
         return self._jumped.shape[1]
 
     def moment_to_rescore(self, row: int) -> MomentToRescore:
-        """What a worker needs to replay this row."""
+        """The data that a worker needs to replay this row."""
         if self._is_step[row]:
             return MomentToRescore(self._moments[row].step.action)
         envs = tuple(int(env) for env in np.flatnonzero(self._jumped[row]))
@@ -135,11 +134,11 @@ class RescoredPast:
         """Take the new scores of a row.
 
         Raises:
-            ValueError: the env has other bodies than the record, so the two cannot be compared.
+            ValueError: the bodies of the env differ from those of the record, so that the two cannot be compared.
         """
         was = self._moments[row].step.poses
         if step.poses.shape != was.shape:
-            raise ValueError(f"the bodies are others now: poses {step.poses.shape}, were {was.shape}")
+            raise ValueError(f"the bodies have changed: poses {step.poses.shape}, recorded {was.shape}")
         far = pose_distances(step.poses, was)
         self._drift[row] = np.stack([each.max(axis=1, initial=0.0) for each in far], axis=1)
         self._write(self._new, row, step)
@@ -184,12 +183,12 @@ class RescoredPast:
         )
 
     def _compared(self, number: int) -> Verdict[PastRun] | None:
-        """Compare the rescored rows of a run (its jump and its control steps); None below two rows."""
+        """Compare the rescored rows of a run (its jump and its control steps); None for fewer than two rows."""
         env = int(self._run[0].searchsorted(number, side="right")) - 1
         first, end = self._run[:, env].searchsorted([number, number + 1])
         counts = self._rescored[first:end] & self._is_step[first:end]
         counts[0] = self._rescored[first]
-        # A run without jumps of other envs in between is a slice, which is ten times as fast.
+        # Without jumps of other envs in between the run is a slice, which is ten times as fast.
         rows = slice(first, end) if counts.all() else first + counts.nonzero()[0]
         serials = self._serial[rows]
         if len(serials) < 2:

@@ -49,13 +49,13 @@ class RescoreGroup:
     """Info of the first episode of the group."""
     files: tuple[Source, ...]
     note: str = ""
-    """Options that differ from the recorded ones on purpose."""
+    """Note on options that differ from the recorded ones on purpose."""
     recorded_source: bool = False
-    """Open the text that `info` holds instead."""
+    """Open the recorded text in `info` instead."""
 
     @property
     def code(self) -> CodeToRun:
-        """The code that has to be cleared before it runs."""
+        """The code that needs clearance before it runs."""
         return CodeToRun(self.reference, self.info, self.recorded_source)
 
 
@@ -68,12 +68,12 @@ def group_episodes(
     file: Path | None = None,
     recorded_source: bool = False,
 ) -> tuple[list[RescoreGroup], list[Verdict[Source]]]:
-    """Group episodes by env, and return those that cannot be read with the reason.
+    """Group episodes by the env that rescores them; also returns verdicts for those that cannot be read.
 
     Args:
-        num_envs: most envs of a group.
-        task: opened for all of them, in place of the recorded task.
-        file: opened for those whose task is in it.
+        num_envs: maximum number of envs of a group.
+        task: task to open for all of them, instead of the recorded one.
+        file: task file to open for episodes whose task is in it.
         recorded_source: rescore each with the text that it was recorded with.
     """
     groups: dict[str, RescoreGroup] = {}
@@ -105,7 +105,7 @@ def group_episodes(
 
 
 def hidden_modules_text(reference: TaskName) -> list[str]:
-    """A sentence for each module next to the task's file that cannot be imported, since a library has its name."""
+    """A sentence for each module next to the task's file that cannot be imported because a library has the same name."""
     file = named_file(reference)
     return (
         []
@@ -115,26 +115,26 @@ def hidden_modules_text(reference: TaskName) -> list[str]:
 
 
 def rescore_options(options: TaskOptions) -> tuple[TaskOptions, str]:
-    """Options of the same env without pictures, which take most of the time and which no reward reads; and a note on
+    """Options of the same env without pictures, which take most of the time and are not read by rewards; and a note on
     the change."""
     kwargs, note = dict(options.env_kwargs), ""
     mode = kwargs.get("obs_mode")
     if mode is not None and mode not in ("state", "state_dict", "none"):
-        note = f"observations are the state, and not {mode}: no pictures are drawn"
+        note = f"observations are the state, not {mode}: no pictures are rendered"
         kwargs["obs_mode"] = "state"
     kwargs["render_backend"] = "none"
     return replace(options, env_kwargs=kwargs), note
 
 
 def with_renderer(options: TaskOptions) -> TaskOptions:
-    """Options of the same env with a renderer, which some tasks need to be built: PushT-v1 makes render materials for
+    """Options of the same env with a renderer, which some tasks need for building: PushT-v1 makes render materials for
     its shapes."""
     return replace(options, env_kwargs={k: v for k, v in options.env_kwargs.items() if k != "render_backend"})
 
 
 def _info_of(source: Source) -> EpisodeInfo:
     """Info of a recording, from its small .json if there is one, else from `read_recording`, which reads pictures and
-    meshes too. Raises as `read_recording`."""
+    meshes too. Raises as `read_recording` does."""
     try:
         return read_document(source.path.with_suffix(".json")).description().info(source.path.parent)
     except (OSError, WrongDocument):
@@ -142,28 +142,28 @@ def _info_of(source: Source) -> EpisodeInfo:
 
 
 MAX_ENVS = 16
-"""Most envs that rescore at once."""
+"""Maximum number of envs that rescore at once."""
 MAX_VERSIONS = 3
-"""Most versions that a note lists."""
+"""Maximum number of versions that a note lists."""
 
 
 class Rescorer:
-    """Rescores recordings in a process of its own, one task after the other.
+    """Rescores recordings in a separate process, one task after the other.
 
-    The process ends with the job, so that code of recordings does not stay; to stop is to end it early.
+    The process ends with the job, so that code of recordings does not stay loaded; stopping the job kills it.
     """
 
     def __init__(self, clearances: Clearances | None = None, base: TaskOptions | None = None) -> None:
         """
         Args:
-            clearances: decides which code may run; None without a person to ask.
-            base: options of every opened task.
+            clearances: decides which code may run; None if there is no person to ask.
+            base: base options of every opened task.
         """
         self._rescoring = Rescoring()
         self._jobs = Jobs(lambda: None, self._failed)
         self._process = Background()
         self._aside = BlockingPool("rescore")
-        """Thread that reads recordings, and waits for answers of people."""
+        """Thread that reads recordings, and waits for people's answers."""
         self._clearances = clearances or Clearances()
         self._base = base or TaskOptions()
 
@@ -186,7 +186,7 @@ class Rescorer:
         recorded_source: bool = False,
         use_env_states: bool = False,
     ) -> None:
-        """Rescore these; arguments as in `group_episodes`."""
+        """Rescore these files; arguments as in `group_episodes`."""
         if not files:
             return
         self._rescoring = self._rescoring.begun(RescoreView("loading", total=len(files), unit="episodes"))
@@ -197,7 +197,7 @@ class Rescorer:
         self._jobs.start("rescoring", lambda job: self._rescore_all(job, group, use_env_states))
 
     def close(self) -> None:
-        """Stop; returns when the process has ended. Called on another thread than the loop."""
+        """Stop, and wait until the process has ended. Must not be called on the loop's thread."""
         do(self._jobs.close)
         self._aside.end()
         self._process.close()
@@ -210,7 +210,7 @@ class Rescorer:
             self._jobs.stop()
 
     def _tell(self, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
-        """Tell of these fields of the view, and of further verdicts."""
+        """Update these fields of the view, add verdicts, and send the view."""
         known = (*self.view.verdicts, *verdicts)
         view = replace(self.view, verdicts=known, done=len(known), **values)
         self._happen(RescoringTold(self._rescoring.job, view))
@@ -247,11 +247,11 @@ class Rescorer:
         cleared: Sequence[TaskName | NotCleared],
         use_env_states: bool,
     ) -> None:
-        """Rescore each group with the code cleared for it, or its recorded text. A group that fails leaves the others: a
-        folder holds recordings of many tasks, and one of them may be gone.
+        """Rescore each group with the code cleared for it, or its recorded text. A failed group does not stop the others: a
+        folder holds recordings of many tasks, one of which may be missing.
 
         Raises:
-            JobFailed: of the first group, if all fail.
+            JobFailed: the error of the first group, if all fail.
         """
         failures: list[JobFailed] = []
         for group, task in zip(groups, cleared, strict=True):
@@ -299,7 +299,7 @@ class Rescorer:
 
 
 def _write_text(info: EpisodeInfo, stack: ExitStack, job: Job) -> str:
-    """Enter `recorded_source` here, so that the text is removed also if the process is killed. Raises
+    """Enter `recorded_source` in this process, so that the text is removed even if the other process is killed. Raises
     CannotEnterRecording."""
     reference = stack.enter_context(recorded_source(info))
     if job.stopped:
@@ -308,7 +308,7 @@ def _write_text(info: EpisodeInfo, stack: ExitStack, job: Job) -> str:
 
 
 def _code_text(group: RescoreGroup) -> str:
-    """The code that rescores a group, as text."""
+    """Describe the code that rescores a group, for messages."""
     if group.recorded_source:
         return f"{group.info.task} as it was recorded"
     file = named_file(group.reference)

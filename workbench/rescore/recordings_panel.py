@@ -1,4 +1,4 @@
-"""The Rescore tab of the review: runs recorded episodes again with today's or other code, and lists what differs."""
+"""The Rescore tab of the review: reruns recorded episodes with the current or other code, and lists the differences."""
 
 from __future__ import annotations
 
@@ -38,28 +38,28 @@ MAX_NAMES = 3
 
 @dataclass(frozen=True)
 class Code:
-    """Code to run recordings with, as one of the files that the server knows; a page never sends a path."""
+    """Choice of code to run recordings with. It is a file that the server knows: a page never sends a path."""
 
     label: str = field(compare=False)
     told: str = field(compare=False)
-    """Text for the page: which files it runs."""
+    """Text for the page that names the files."""
     file: Path | None = None
-    """File that is used before the files named by the recordings."""
+    """File that takes precedence over the files named by the recordings."""
     recorded: bool = False
 
 
 def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code, ...]:
-    """The choices for these recordings; today's code and the recorded text are always the first two.
+    """The choices for these recordings; the current code and the recorded text are always the first two.
 
     Args:
-        infos: Of the recordings that are open; of others nothing is known before they are rescored.
-        known: Further task files, not named by the recordings.
+        infos: Infos of the open recordings; those of others are unknown before they are rescored.
+        known: Other task files, not named by the recordings.
     """
     named = list({str(reference): reference for reference in map(reference_of, infos)}.values())
     own = {file for file in map(named_file, named) if file is not None}
     codes = [Code(TODAYS, _todays(infos, named)), Code(RECORDED, _recorded(infos), recorded=True)]
     for file in dict.fromkeys(known):
-        # Without open recordings their tasks are not known; recordings of other tasks are skipped later.
+        # Without open recordings the tasks are unknown; recordings of other tasks are skipped later.
         if file not in own and (not infos or any(class_in(file, info.task) for info in infos)):
             taken = {code.label for code in codes}
             label = file.name if file.name not in taken else str(Path(file.parent.name, file.name))
@@ -102,21 +102,21 @@ class RescoreChoices:
 
 
 def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
-    """The sources of these recordings, without those that are gone or cannot be read."""
+    """The sources of these recordings, without those that are deleted or cannot be read."""
     rows = {row.id: row for row in library.view().rows}
     return [row.source for row in (rows[id] for id in dict.fromkeys(ids) if id in rows) if row.paths]
 
 
 class RescorePanel(RescoredPanel[ReviewView, Source]):
-    """The panel in the present container.
+    """The panel in the current container.
 
     Args:
         server: The page.
-        rescorer: What rescores.
-        review: Shows the episode of a row, and says what is open.
-        library: Of the recordings that may be rescored.
-        choices: What was chosen before.
-        known: Further task files that the server knows.
+        rescorer: Rescores the recordings.
+        review: Shows the episode of a row, and knows the open recordings.
+        library: Library of the recordings that may be rescored.
+        choices: Choices that are kept while pages are replaced.
+        known: Returns other task files that the server knows.
     """
 
     does = (*RescoredPanel.does, StopRescoring, RescoreOpen, ChooseRescoreCode, RestoreRecordedStates)
@@ -162,7 +162,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         self._selected: str | None = None
 
     def rescore_and_notify(self, ids: Sequence[str]) -> None:
-        """Start `rescore` and notify every page, for a press from where the tab is not seen."""
+        """Start `rescore` and notify every page, for a click outside of this tab."""
         if not ids:
             tell_all(self._server, "Nothing to rescore", "No recording is selected or open.")
             return
@@ -200,7 +200,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
                 super().do(command, visitor)
 
     def _chosen(self) -> Code:
-        """Chosen code. A code that is no longer among the choices is not used unseen: the first choice replaces it."""
+        """The chosen code; the first choice if the chosen one is no longer available, so that no hidden code is used."""
         return next((code for code in self._codes if code == self._choices.code), self._codes[0])
 
     # --- drawing -----------------------------------------------------------------------------------
@@ -211,7 +211,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         return *at, self._pages.first, self._selected, self._codes_are_of(view), chosen
 
     def _codes_are_of(self, view: ReviewView) -> object:
-        """What the choices of code depend on."""
+        """Key of everything that the choices of code depend on."""
         return tuple(one.id for one in view.opened), tuple(self._known())
 
     def draw(self, view: ReviewView) -> None:
@@ -240,7 +240,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         at = verdict.first_difference
         opened = [one.id for one in self._review.view().opened]
         return {
-            # Its colour, if it is one of several open recordings.
+            # Index of its colour, if it is one of several open recordings.
             "badge": opened.index(verdict.of.id) if len(opened) > 1 and verdict.of.id in opened else None,
             "name": f"seed {verdict.seed}" if verdict.seed >= 0 else _end_of(verdict.of.name),
             "hint": f"{verdict.of.name}. Click to open it"
@@ -274,5 +274,5 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
 
 
 def _end_of(name: str) -> str:
-    """End of the name, which distinguishes recordings of a task."""
+    """End of the name: the part that distinguishes recordings of a task."""
     return name if len(name) <= 24 else f"…{name[-23:]}"

@@ -12,7 +12,7 @@ from workbench.task.problem import TaskError
 
 
 def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMoments:
-    """Replay the moments of `request` in order; the first that raises ends it, with its problem."""
+    """Replay the moments of `request` in order; stops at the first one that raises, and returns its problem."""
     steps: list[StepResult] = []
     missed: dict[str, str] = {}
     for moment in request.moments:
@@ -28,6 +28,6 @@ def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMome
             return RescoredMoments(tuple(steps), missed, error.problem)
         steps.append(step)
         if len(moment.env_idx) == opened.env.num_envs:
-            # A jump of some envs never restores what belongs to the whole batch: it did not then either.
+            # Only for jumps of all envs: a jump of some envs never restores state of the whole batch, in play neither.
             missed |= report.not_carried
     return RescoredMoments(tuple(steps), missed)

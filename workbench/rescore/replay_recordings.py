@@ -32,7 +32,7 @@ from workbench.task.problem import TaskError
 from workbench.task.reference import TaskName
 
 _PROGRESS_SECONDS = 0.2
-"""Seconds between two progress messages."""
+"""Interval between progress messages."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class RescoredBy:
     """Code and options that rescore some recordings."""
 
     task: TaskName
-    """The task. Its code may run: the side that submits the job has asked for consent."""
+    """The task. Its code may run, because the submitting side has obtained consent."""
     options: TaskOptions
     or_else: TaskOptions
-    """Options to use where the task cannot be opened with `options`."""
+    """Options to use if the task cannot be opened with `options`."""
     recorded: EpisodeInfo | None = None
-    """Recording whose text is opened instead of today's code."""
+    """Recording whose text is opened instead of the current code."""
 
 
 @dataclass
@@ -56,11 +56,11 @@ class _Rescoring:
     task: str
     run: RecordedRun
     missed: dict[str, str]
-    """Name and reason of each entry that cannot be read or put into the env."""
+    """Name and reason of each entry that cannot be read or restored into the env."""
     damaged: bool = False
     start_differs: bool = False
     has_reward: bool = True
-    """Whether today's code has a reward."""
+    """Whether the current code has a reward."""
     reward: list[float] = field(default_factory=list)
     """(T,) new rewards."""
     evaluate: dict[str, list[float]] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class _Rescoring:
 
     def verdict(self) -> Verdict[Source]:
         run = self.run
-        # A recording of other software without rewards: nothing to compare with.
+        # A recording of another program may lack rewards: there is nothing to compare with.
         had_reward = not np.isnan(run.reward).all()
         old = run.reward if had_reward else np.zeros(0)
         now = {name: np.array(rows) for name, rows in self.evaluate.items()}
@@ -99,15 +99,15 @@ def rescore(
     use_env_states: bool = False,
     read: Callable[[Source], Episode] = read_recording,
 ) -> Iterator[Rescored]:
-    """Rescore these episodes with the open task's code; gives the verdicts in the order in which the episodes end, and a
+    """Rescore these episodes with the open task's code; yields the verdicts in the order in which the episodes end, and the
     progress a few times a second.
 
-    Each env begins an episode (`replay.begin_run`), makes its actions, and then takes the next one, independent of the
-    other envs. Envs without one do not move.
+    Each env begins an episode (`replay.begin_run`), takes its actions, and then continues with the next one, independent of
+    the other envs. Envs without an episode do not move.
 
     Args:
         use_env_states: restore every recorded state after its step, so that nothing drifts.
-        read: reads a file's episode; raises as `read_recording`.
+        read: reads a file's episode; raises as `read_recording` does.
 
     Raises:
         TaskError: the task's code raised.
@@ -146,7 +146,7 @@ def opened_code(
     on_activity: Callable[[str], None] = lambda activity: None,
     on_finding: Callable[[Finding], None] = lambda finding: None,
 ) -> Iterator[OpenedTask]:
-    """Open the task of a code. Raises TaskError, CannotEnterRecording."""
+    """Context manager that opens the task of a code. Raises TaskError, CannotEnterRecording."""
     text = nullcontext(code.task) if code.recorded is None else recorded_source(code.recorded)
     with text as task:
         try:
@@ -154,7 +154,7 @@ def opened_code(
         except TaskError:
             opened = open_task(task, code.or_else, on_activity=on_activity, on_finding=on_finding)
         if isinstance(opened.env.env, BatchedCpuMixin):
-            # Else an episode depends, by its last bits, on those that the same process rescored before.
+            # Without this an episode depends, in the last bits, on the earlier episodes of the same process.
             opened.env.env.begins_anew = True
         try:
             yield opened
@@ -164,7 +164,7 @@ def opened_code(
 
 
 def answer(request: Rescore, on_progress: Callable[[int, int, Rescored], None]) -> Rescored:
-    """Carry out `request` in a worker: all results go to `on_progress`, and what the code raised is returned."""
+    """Carry out `request` in a worker: all results go to `on_progress`, and an exception of the code is returned."""
     try:
         code = RescoredBy(request.task, request.options, request.or_else)
         with CurrentFolder().again(), opened_code(code) as opened:

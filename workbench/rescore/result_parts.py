@@ -28,18 +28,18 @@ Of = TypeVar("Of")
 
 
 class RescoredPanel(PagePart[View], Generic[View, Of]):
-    """Parts of a rescoring panel, which a subclass puts into the present container in its order; a row of the list goes
-    to its run.
+    """Parts of a rescoring panel, which a subclass adds to the current container in its own order. A click on a row of the list
+    shows its run.
 
     Args:
         server: The page.
-        column: What the list calls a run.
+        column: Heading of the column of runs.
     """
 
     every = 0.25
     does: tuple[type[Command], ...] = (ShowRescored, TurnRescored)
     advice = ""
-    """Sentence that is shown where bodies were far from the record."""
+    """Sentence that is shown if bodies were far from the record."""
 
     def __init__(self, server: viser.ViserServer, column: str) -> None:
         self._server, self._column = server, column
@@ -117,9 +117,9 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
 def status_html(rescored: RescoreView, title: str = "", idle: str = "", advice: str = "") -> str:
     """
     Args:
-        title: Over it.
-        idle: The text before anything was rescored.
-        advice: As `RescoredPanel.advice`.
+        title: Title above the status.
+        idle: Text before anything is rescored.
+        advice: As in `RescoredPanel.advice`.
     """
     return render(
         "rescored", rescored=rescored, title=title, idle=idle, advice=advice, verdict_text=verdict_text

@@ -1,4 +1,4 @@
-"""The rescoring of the history, or of recordings, as one value, and how each event changes it."""
+"""State of rescoring the history or recordings, and its changes by events."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from workbench.rescore.verdict import Verdict
 from workbench.task.problem import Problem
 
 DOES: frozenset[type[Command]] = frozenset({StopRescoring})
-"""Commands that `apply` takes."""
+"""Commands that `apply` handles."""
 
 
 RescoreState = Literal["none", "asking", "loading", "rescoring", "done", "stopped", "failed"]
@@ -37,21 +37,21 @@ class RescoreView:
     done: int = 0
     total: int = 0
     unit: str = "steps"
-    """Unit of `done` and `total`: control ``steps`` of the batch, or ``episodes``."""
+    """Unit of `done` and `total`: ``steps`` (control steps of the batch) or ``episodes``."""
     steps: int = 0
-    """Control steps made so far."""
+    """Number of control steps so far."""
     seconds: float = 0.0
-    """Seconds that these steps took, without loading."""
+    """Duration of these steps in seconds, without loading."""
     task: str = ""
-    """The code that rescores."""
+    """Name of the code that rescores."""
     stopped_by: StoppedBy | None = None
     why: str = ""
-    """Why the job stopped or failed, as text."""
+    """Reason why the job stopped or failed."""
     problem: Problem | None = None
-    """What the code raised."""
+    """Exception of the code."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    """Warnings, a sentence each: state that could not be restored, modules that a library's name hides."""
+    """Warnings as sentences: state that could not be restored, modules that a library of the same name hides."""
     names: tuple[str, ...] = ()
     """Names for `RescoredPast.curve`: ``reward`` first, then the numbers that differ, then the others."""
     differing_names: frozenset[str] = frozenset()
@@ -68,16 +68,16 @@ class Rescoring:
 
     view: RescoreView = RescoreView()
     past: RescoredPast | None = field(default=None, compare=False)
-    """Scores of the history: a store that is written into in place. None for recordings."""
+    """Scores of the history, which are modified in place. None for recordings."""
     job: int = 0
-    """Its number."""
+    """Number of the job."""
 
     @property
     def running(self) -> bool:
         return self.view.state in RUNNING
 
     def begun(self, view: RescoreView, past: RescoredPast | None = None) -> Rescoring:
-        """The next job, which begins with this view."""
+        """State with the next job, which begins with this view."""
         return replace(self, past=past, job=self.job + 1).shows(view)
 
     def shows(self, view: RescoreView) -> Rescoring:
@@ -94,16 +94,16 @@ class Rescoring:
 
 @dataclass(frozen=True)
 class RescoringTold:
-    """What a job has come to."""
+    """New state and results of a job."""
 
     job: int
     view: RescoreView
-    """Its serial counts for nothing."""
+    """The new view; its serial is ignored."""
 
 
 @dataclass(frozen=True)
 class BeginRescoring:
-    """Begin this job with the history; cancel the one before."""
+    """Begin this job with the history; cancel the previous one."""
 
     job: int
     view: RescoreView
@@ -125,10 +125,10 @@ Change = tuple[Rescoring, list[RescoreEffect]]
 
 
 def apply_to_job(rescoring: Rescoring, event: object) -> Change:
-    """The rescoring after what a page asks for, or a job tells, and what has to be done.
+    """The next state after a command or a job's message, and the effects to carry out.
 
     Raises:
-        Refused: the command makes no sense now; nothing has changed.
+        Refused: the command is not possible now; nothing has changed.
     """
     match event:
         case Asked(command=StopRescoring()):
@@ -141,14 +141,14 @@ def apply_to_job(rescoring: Rescoring, event: object) -> Change:
 
 
 def apply(rescoring: Rescoring, event: object, before: Run, run: Run) -> Change:
-    """The rescoring of the history after an event, and what has to be done.
+    """The next state of rescoring the history after an event, and the effects to carry out.
 
     Args:
         before: the run before the event.
-        run: the run after it.
+        run: the run after the event.
 
     Raises:
-        Refused: the command makes no sense now; nothing has changed.
+        Refused: the command is not possible now; nothing has changed.
     """
     match event:
         case FileSaved() if rescoring.running:
@@ -163,10 +163,10 @@ def apply(rescoring: Rescoring, event: object, before: Run, run: Run) -> Change:
 
 
 def rescore_after_load(past: PastAfterLoad, view: RescoreView) -> Literal["rescore", "keep", "forget"]:
-    """Whether to rescore the history with the loaded version, keep the last results, or forget them with the episodes.
+    """Decide whether to rescore the history with the loaded version, keep the last results, or forget them with the episodes.
 
     Args:
-        past: what the load means for the history.
+        past: effect of the load on the history.
     """
     if past == "patched":
         return "rescore"

@@ -1,4 +1,4 @@
-"""Compares a run's recorded reward and evaluate with those of today's code."""
+"""Compares a run's recorded reward and evaluate with those of the current code."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from workbench.task.problem import Problem
 from workbench.task.reference import TaskName
 
 DOUBTFUL_METRES, DOUBTFUL_RADIANS = 1e-3, 1e-2
-"""A body further than this from the recorded state makes a comparison doubtful."""
+"""Distance of a body from the recorded state beyond which a comparison is doubtful."""
 FLAGS = ("success", "fail")
 MAIN = ("reward", *FLAGS)
 Of = TypeVar("Of")
@@ -38,10 +38,10 @@ class Scores:
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Generic[Of]):
-    """The comparison of one run: T control steps and T + 1 states. It ends with the shorter of both scores, also where
-    today's code would have ended the episode earlier.
+    """Comparison of one run: T control steps and T + 1 states. It ends with the shorter of both scores, even if the current
+    code would have ended the episode earlier.
 
-    The run was replayed for it, so the verdict also has the distance from the recorded states.
+    The run is replayed for the comparison, so the verdict also has the distance from the recorded states.
     """
 
     of: Of
@@ -51,10 +51,10 @@ class Verdict(Generic[Of]):
     length: int = 0
     """Control steps."""
     success: tuple[int | None, int | None] = (None, None)
-    """First step of the episode after which success was true, then and now; None if never."""
+    """First step of the episode after which success is true, as (recorded, rescored); None if never."""
     fail: tuple[int | None, int | None] = (None, None)
     has: tuple[str, ...] = ("reward",)
-    """Names among reward, success and fail that the record or today's code has."""
+    """Those of reward, success and fail that the record or the current code has."""
     returns: tuple[float, float] = (0.0, 0.0)
     largest: float = 0.0
     """Largest change of one reward."""
@@ -63,17 +63,17 @@ class Verdict(Generic[Of]):
     look_at: int | None = None
     """Step to show: where success or fail differs, else where the reward differs most."""
     differing: tuple[str, ...] = ()
-    """``reward`` and the entries of ``evaluate`` that differ somewhere."""
+    """Names of the entries of ``evaluate``, and ``reward``, that differ at any step."""
     metres: float | None = None
     """Largest distance in metres of a body from the recorded state; None if there are no states."""
     radians: float = 0.0
     """Largest rotation in radians of a body or joint from the recorded state."""
     drift_at: int | None = None
-    """Step after which the body was furthest from the recorded state."""
+    """Step after which a body was furthest from the recorded state."""
     start_differs: bool = False
-    """Whether the reset with its seed gave another first state, and the recorded one was restored."""
+    """Whether the reset with its seed gave a different first state, and the recorded one was restored."""
     missed: dict[str, str] = field(default_factory=dict)
-    """Name and reason of each part of the state that could not be put into the env."""
+    """Name and reason of each part of the state that could not be restored into the env."""
     why_not: str = ""
     """Reason why the run was not rescored; all other fields are then empty."""
     damaged: bool = False
@@ -97,7 +97,7 @@ class Verdict(Generic[Of]):
 
     @property
     def drifted(self) -> bool:
-        """Whether a difference may come from different states and not from the code."""
+        """Whether a difference may come from different states instead of the code."""
         return self.metres is not None and not (
             self.metres <= DOUBTFUL_METRES and self.radians <= DOUBTFUL_RADIANS
         )
@@ -119,16 +119,16 @@ def compare(
     """Compare recorded scores with new ones.
 
     Args:
-        old: as long as `new`, or longer.
+        old: recorded scores, at least as long as `new`.
         drift: (T + 1, 2) metres and radians of the furthest body from each recorded state; None if unknown.
-        begin: steps of the episode before the run.
+        begin: number of steps of the episode before the run.
     """
     steps = len(new.reward)
     has = {"reward": old.has_reward or new.has_reward}
     has |= {name: name in old.evaluate or name in new.evaluate for name in FLAGS}
     both = [n for n, values in new.evaluate.items() if len(old.evaluate.get(n, ())) >= len(values)]
     names = ("reward", *both)
-    # In one array, since this runs for hundreds of runs several times a second.
+    # In one array for speed: this is called for hundreds of runs several times a second.
     was, now = np.full((2, len(names), steps + 1), np.nan)
     if len(old.reward):
         was[0, 1:], now[0, 1:] = old.reward[:steps], new.reward
@@ -137,7 +137,7 @@ def compare(
         was[row, :length], now[row, :length] = old.evaluate[name][:length], new.evaluate[name]
     apart = gap(was, now)
     differs = too_far(was, apart, axis=1)
-    # Many files have no values for a run's first state.
+    # Many files lack values for the first state of a run.
     differs[:, 0] &= ~np.isnan(was[:, 0])
     others = {name: differs[row].nonzero()[0] for row, name in enumerate(names)}
     turned: dict[str, tuple[int | None, int | None]] = {}
@@ -183,7 +183,7 @@ def compare(
 
 
 def by_change(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
-    """The largest change first: success, fail, then return; unchanged runs and those not rescored last."""
+    """Sort by size of change: success, fail, then return; unchanged and unrescored runs come last."""
 
     def key(verdict: Verdict[Of]) -> tuple[bool, bool, int, float]:
         moved = 2 * (verdict.success[0] != verdict.success[1]) + (verdict.fail[0] != verdict.fail[1])
@@ -194,9 +194,9 @@ def by_change(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
 
 
 def scalar_entries(evaluate: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """The entries of `evaluate`, (n, ...) each, that are one number or flag in each row, as (n,)."""
+    """The entries of `evaluate`, (n, ...) each, that have one number or flag per row, as (n,)."""
     return {
-        # An author's entry may be called "reward" too, and is not the reward.
+        # An author's entry may be called "reward" too, but it is not the reward.
         "evaluate/reward" if name == "reward" else name: values.reshape(len(values))
         for name, values in evaluate.items()
         if values.dtype.kind in "fiub" and values.shape in ((len(values),), (len(values), 1))
@@ -224,27 +224,27 @@ class Rescored:
 
     verdicts: tuple[Verdict[Source], ...]
     steps: int
-    """Control steps since the part before, over all episodes."""
+    """Control steps since the previous part, over all episodes."""
     problem: Problem | None = None
-    """Exception of the task's code; the rescoring ends with it."""
+    """Exception of the task's code, which ended the rescoring."""
 
 
 @dataclass(frozen=True)
 class Rescore(Question[Rescored]):
     """Open a task in a worker without one, and read and rescore these episodes with it. The first part is sent when the task
-    is open; the answer holds only what is not in the parts."""
+    is open; the answer holds only what is not in the parts yet."""
 
     part: ClassVar[Any] = Rescored
     task: TaskName
     options: TaskOptions
     or_else: TaskOptions
-    """Options to use where the task cannot be opened with `options`."""
+    """Options to use if the task cannot be opened with `options`."""
     files: tuple[Source, ...]
     use_env_states: bool
 
 
-# The server keeps the history and hands over snapshots and actions: the batch makes its steps together again, since they may
-# depend on each other by a generator that all envs share. Only for a worker that does not play: its envs move.
+# The server keeps the history and sends snapshots and actions. The envs of the batch step together again, since they may
+# depend on each other through a shared random generator. Only for a worker that does not play, because its envs move.
 
 
 @dataclass(frozen=True)
@@ -256,19 +256,19 @@ class MomentToRescore:
     snapshot: bytes | None = None
     """A pickled `envs.snapshots.snapshot.Snapshot` of the whole batch."""
     env_idx: tuple[int, ...] = ()
-    """The envs that are put back to the snapshot."""
+    """The envs that are restored from the snapshot."""
 
 
 @dataclass(frozen=True)
 class RescoredMoments:
-    """Reward and evaluate of past moments by today's code."""
+    """Reward and evaluate of past moments by the current code."""
 
     steps: tuple[StepResult, ...]
-    """One for each moment; fewer if one raised."""
+    """One result for each moment; fewer if one raised."""
     not_carried: dict[str, str]
-    """What jumps of all envs could not restore, each with the reason."""
+    """State that jumps of all envs could not restore, with the reasons."""
     problem: Problem | None = None
-    """What the moment after `steps` raised."""
+    """Exception of the moment after `steps`."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ _MAX_NAMES = 4
 
 
 def change_text(verdict: Verdict[Any]) -> str:
-    """The change of success and fail, or else of the reward; ``as it was`` if nothing differs."""
+    """Text of the change of success and fail, or else of the reward; ``as it was`` if nothing differs."""
     if verdict.why_not:
         return f"not rescored: {verdict.why_not}"
     flags = (("success", verdict.success), ("fail", verdict.fail))
@@ -39,13 +39,13 @@ def change_text(verdict: Verdict[Any]) -> str:
 
 
 def _flag_text(name: str, was: int | None, now: int | None) -> str:
-    """The steps at which a flag turned true, in the record and now; None for never."""
+    """Text of the steps at which a flag turned true, in the record and now; None for never."""
     before = "never" if was is None else f"at step {was}"
     return f"{name} never now, was {before}" if now is None else f"{name} now at step {now}, was {before}"
 
 
 def _reward_change(verdict: Verdict[Any]) -> str:
-    """Text of how much the rewards changed, or which of the two returns is not finite."""
+    """Text of the change of the rewards, or of the return that is not finite."""
     if math.isfinite(verdict.largest):
         return f"reward by up to {number_text(verdict.largest)}"
     was, now = verdict.returns
@@ -67,7 +67,7 @@ def returns_text(verdict: Verdict[Any]) -> str:
 
 
 def drift_text(verdict: Verdict[Any]) -> str:
-    """How far the bodies drifted from the record."""
+    """Text of the bodies' drift from the record."""
     if verdict.metres is None:
         return "not known"
     return "none" if verdict.metres == 0 else length(verdict.metres)
@@ -77,7 +77,7 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
     """One sentence on what differs.
 
     Args:
-        others: further differing entries, such as those that only one version has.
+        others: other differing entries, such as those that only one version has.
     """
     rescored = [verdict for verdict in verdicts if not verdict.why_not]
     if not rescored:
@@ -96,7 +96,7 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
 
 
 def totals(verdicts: Sequence[Verdict[Any]]) -> list[str]:
-    """Successes and mean return, recorded and now, and the number of episodes without a result; a text each."""
+    """Texts of successes and mean return, recorded and now, and of the number of episodes without a result."""
     rescored = [verdict for verdict in verdicts if not verdict.why_not]
     texts: list[str] = []
     if any(verdict.has_success for verdict in rescored):
@@ -115,10 +115,10 @@ def summary(verdicts: Sequence[Verdict[Any]]) -> str:
 
 
 def drift_summary(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
-    """How far the bodies drifted from the record, and whether that makes the comparison doubtful; empty if unknown.
+    """Text of the bodies' drift from the record, and whether it makes the comparison doubtful; empty if unknown.
 
     Args:
-        advice: a sentence that is added if it does.
+        advice: a sentence that is added if the comparison is doubtful.
     """
     known = [verdict for verdict in verdicts if verdict.metres is not None]
     if not known:
@@ -137,17 +137,17 @@ def drift_summary(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
 
 
 def count_drifted(verdicts: Sequence[Verdict[Any]]) -> int:
-    """Number of episodes whose differences may come from drift and not from the code."""
+    """Number of episodes whose differences may come from drift instead of the code."""
     return sum(verdict.drifted for verdict in verdicts)
 
 
 def not_carried(verdicts: Sequence[Verdict[Any]]) -> tuple[str, ...]:
-    """State that could not be restored, each once with its reason."""
+    """State that could not be restored, with the reasons, each once."""
     return tuple(dict.fromkeys(f"{what}: {why}" for v in verdicts for what, why in v.missed.items()))
 
 
 def as_rows(verdicts: Sequence[Verdict[Source]]) -> list[dict[str, Any]]:
-    """One flat dict an episode, of values that JSON can hold."""
+    """One flat dict per episode, with JSON values."""
     return [
         {
             "episode": verdict.of.name,

@@ -30,16 +30,16 @@ from workbench.task.reference import file_and_class, find_module, named_file, sp
 from workbench.task.settings_in_text import Argument, Constant, SettingError, TaskText
 
 _MIN_CHUNKS = 64
-"""Minimum number of chunks of a whole sweep that has enough episodes; each chunk opens the task once in its worker."""
+"""Minimum number of chunks of a whole sweep, if it has enough episodes; each chunk opens the task once in its worker."""
 _STEPS_AFTER_SUCCESS = 5
-"""Control steps that a planned episode continues after its success, as in `solve.job`."""
+"""Number of control steps that a planned episode continues after its success, as in `solve.job`."""
 _MAX_NAME_CHARACTERS = 80
-"""Maximum length of a folder's name in characters."""
+"""Maximum length of a folder's name."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Name of a constant or argument and its values, each in JSON's types."""
+    """Name of a constant or argument, and its values (JSON types)."""
 
     name: str
     values: tuple[Any, ...]
@@ -47,7 +47,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class SweepOptions:
-    """What to record, and what varies."""
+    """Options of a sweep."""
 
     task: str
     """Reference of the task; see `RecordArguments.task`."""
@@ -70,7 +70,7 @@ class SweepOptions:
 
     @property
     def points(self) -> tuple[Point, ...]:
-        """All combinations of the values; the last setting varies first."""
+        """All combinations of the values; the last setting varies fastest."""
         values = itertools.product(*(one.values for one in self.settings))
         names = [one.name for one in self.settings]
         count = math.prod(len(one.values) for one in self.settings)
@@ -86,7 +86,7 @@ class SweepOptions:
 
     @property
     def stride(self) -> int:
-        """Episode k of point p is item ``p * stride + k`` of the job."""
+        """Number of items per point: episode k of point p is item ``p * stride + k`` of the job."""
         return -(-self.seeds // self.chunk) * self.chunk
 
     @property
@@ -101,7 +101,7 @@ class Point:
     index: int
     values: dict[str, Any]
     folder: str
-    """Path of the folder of the point's recordings, relative to that of the sweep."""
+    """Folder of the point's recordings, relative to the sweep's folder."""
 
     @property
     def json(self) -> dict[str, str]:
@@ -129,12 +129,12 @@ class SweepReport:
 
 
 def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
-    """The recording of each point, with the text of the task's file that it runs. The file is not run.
+    """The recording of each point, with the modified text of the task's file. Does not run the file.
 
     Raises:
-        SettingError: a name is neither a constant of the file nor an argument of the constructor, or a value is of another
+        SettingError: a name is neither a constant of the file nor an argument of the constructor, or a value has another
             type.
-        FileNotFoundError, ValueError: the request is invalid otherwise.
+        FileNotFoundError, ValueError: the request is invalid for another reason.
         OSError: the file cannot be read.
     """
     if what.seeds < 1:
@@ -146,7 +146,7 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
         try:
             text = TaskText(file, read_source(file), _class_name(what.task))
         except SyntaxError as error:
-            raise SettingError(f"{file} is no text: {error}") from error
+            raise SettingError(f"{file} is not text: {error}") from error
     elif (spec := registry.environment(what.task)) is not None:
         arguments = class_arguments(spec.cls)
     found = {one.name: _found(text, arguments, what.task, one.name) for one in what.settings}
@@ -158,7 +158,7 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
     for point in what.points:
         constants = [(one, point.values[name]) for name, one in found.items() if isinstance(one, Constant)]
         given = {one.name: point.values[name] for name, one in found.items() if isinstance(one, Argument)}
-        # The text as it is now, also without a constant: the file may be edited while the sweep runs.
+        # Store the current text even without a constant, since the file may be edited while the sweep runs.
         source = {} if text is None else {str(file): text.replaced(constants)}
         options = replace(what.options, env_kwargs={**what.options.env_kwargs, **given})
         planned = what.actions == SOLVE
@@ -177,7 +177,7 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
         )
         recording, runs = with_given_actions(recording)
         if runs:
-            raise ValueError(f"--actions {what.actions}: a sweep takes no file of actions")
+            raise ValueError(f"--actions {what.actions}: a sweep does not take a file of actions")
         made.append(recording)
     return tuple(made)
 
@@ -203,7 +203,7 @@ def _found(
     if text is not None:
         return text.find(name)
     if arguments is None or name in arguments:
-        # An id that a module of --import registers: only running it would tell.
+        # An id that a module of --import registers: its arguments are known only after running the module.
         return Argument(name)
     close = difflib.get_close_matches(name, arguments, n=3)
     hint = f"did you mean {' or '.join(close)}?" if close else f"it has {', '.join(arguments)}"
@@ -225,12 +225,12 @@ def sweep(
 ) -> SweepReport:
     """Record every point of a sweep. The rows of a point that fails hold the failure.
 
-    Other arguments as of `record`.
+    Other arguments are as in `record`.
 
     Raises:
-        SettingError: as `recordings_of`.
+        SettingError: as `recordings_of` does.
         TaskError: every point fails.
-        RecordingError, PoolError, FileNotFoundError, ValueError: as `record`.
+        RecordingError, PoolError, FileNotFoundError, ValueError: as `record` does.
     """
     recordings = recordings_of(what)
     if executor is None:
@@ -242,7 +242,7 @@ def sweep(
 
 
 def collect_sweep(what: SweepOptions, known: Mapping[int, Written | None]) -> SweepReport:
-    """Report of a sweep from the results of these episodes. Runs nothing."""
+    """Combine the results of these episodes to the report of a sweep. Runs nothing."""
     collected = _Sweep(what, lambda _: None, lambda _: None, lambda: False, lambda _: None, lambda _: None)
     collected.scheduler.go_on(known, lambda number, written: None)
     return collected.report(stopped=False)
@@ -265,7 +265,7 @@ class _Sweep:
         self._told = ToldByWorkers(on_activity, on_finding, on_notice)
         self._rows: dict[int, SweepEpisode] = {}
         self._kept = 0
-        """Number of rows that are not failures."""
+        """Number of rows without a failure."""
         self.scheduler: Scheduler[Written | None, RecordUpdate] = Scheduler(
             what.items,
             self._over,

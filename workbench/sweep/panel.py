@@ -1,4 +1,4 @@
-"""The Sweep tab: the points of a sweep as parallel coordinates and as a table, and the episodes of one to open."""
+"""The Sweep tab: the points of a sweep as parallel coordinates and as a table, and the episodes of a point."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MAX_AXES = 9
 MAX_TICKS = 8
 """Maximum number of labels of an axis."""
 MAX_CLICKABLE_LINES = 64
-"""Maximum number of lines that can be pressed."""
+"""Maximum number of lines that can be clicked."""
 MAX_SHOWN_EPISODES = 5
 """Number of best and of worst episodes of a point that are shown."""
 WIDTH, TOP, BOTTOM, SIDE = 500, 34, 196, 34
@@ -77,14 +77,14 @@ def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Ax
         if k < len(results.names):
             made.append(_of_set(name, x, values, summaries))
         else:
-            # By its place: a term of the reward may be called so too.
+            # Identified by its index, since a term of the reward may have the same name.
             is_rate = k == len(results.names) and name == _RATE
             made.append(_of_numbers(name, x, values, is_rate))
     return made
 
 
 def terms_of(summaries: Sequence[PointSummary]) -> list[str]:
-    """Names of the means: the reward's terms, where the task reports them, else all."""
+    """Names of the means: the reward's terms if the task reports them, else all."""
     names = list(dict.fromkeys(name for one in summaries for name in one.means))
     return [name for name in names if name.startswith(_TERMS)] or names
 
@@ -105,7 +105,7 @@ def _number(text: str) -> float | None:
 
 
 def _of_set(name: str, x: float, texts: Sequence[str], summaries: Sequence[PointSummary]) -> Axis:
-    # One above the other at equal distances: 0.01, 0.1 and 1 are as good a choice as 1, 2 and 3.
+    # Equally spaced, since values like 0.01, 0.1 and 1 are as common as 1, 2 and 3.
     gap = (BOTTOM - TOP) / max(len(texts) - 1, 1)
     heights = {
         text: (BOTTOM - k * gap if len(texts) > 1 else (TOP + BOTTOM) / 2) for k, text in enumerate(texts)
@@ -124,7 +124,7 @@ def _spread(texts: Sequence[str]) -> Sequence[str]:
 def _of_numbers(name: str, x: float, values: Sequence[float | None], is_rate: bool) -> Axis:
     known = [value for value in values if value is not None]
     low, high = (0.0, 1.0) if is_rate else (min(known, default=0.0), max(known, default=0.0))
-    # Halved, or the distance of the largest numbers is infinite.
+    # Halved, because the difference of the largest numbers would overflow.
     span = high / 2 - low / 2
 
     def height(value: float) -> float:
@@ -141,7 +141,7 @@ def _short_number(value: float) -> str:
 
 
 def best_first(rows: Sequence[SweepEpisode]) -> list[SweepEpisode]:
-    """Episodes that succeeded before the others, the earlier and then the higher return first."""
+    """Sort episodes: successes first, then by earlier success, then by higher return."""
 
     def goodness(row: SweepEpisode) -> tuple[bool, float, float]:
         solved = math.inf if row.solved_at is None else row.solved_at
@@ -153,19 +153,18 @@ def best_first(rows: Sequence[SweepEpisode]) -> list[SweepEpisode]:
 
 @dataclass(frozen=True)
 class Shown:
-    """Choices of a person; the same on all open pages."""
+    """A person's choices; shared by all open pages."""
 
     column: str = "success"
     descending: bool = True
     chosen: int | None = None
-    """Index of the chosen point. None until a person chooses: then the point of the open episode is shown, else
-    the best one."""
+    """Index of the chosen point. While it is None, the point of the open episode is shown, else the best one."""
     only: frozenset[tuple[str, str]] = frozenset()
-    """Names of settings and values of the shown points; all values of a setting that is not here."""
+    """Shown values by setting; a setting that is missing here shows all values."""
     pages: Paged = field(default_factory=lambda: Paged(PAGE_ROWS))
 
     def keeps(self, one: PointSummary) -> bool:
-        """Whether it has the values of `only`."""
+        """Whether the point has the values of `only`."""
         return all((name, one.values.get(name)) in self.only for name in {name for name, _ in self.only})
 
 
@@ -190,21 +189,21 @@ def apply(shown: Shown, command: Command, summaries: Sequence[PointSummary]) -> 
 
 @dataclass(frozen=True, eq=False)
 class LoadedSweep:
-    """What was read of the file."""
+    """Content of the results file."""
 
     results: SweepResults | None = None
     problem: str = ""
     summaries: Sequence[PointSummary] = ()
-    """The best first."""
+    """Summaries, best first."""
     point_of: Mapping[str, int] = field(default_factory=dict)
     """Index of the point of each recording, by path of the recording."""
 
 
 class SweepPanel(PagePart[ReviewView]):
-    """The tab's content, in the present container.
+    """The tab's content, in the current container.
 
     Args:
-        on_open: gets the id of a recording in the library.
+        on_open: called with the ids of recordings in the library.
     """
 
     every = 0.25
@@ -223,7 +222,7 @@ class SweepPanel(PagePart[ReviewView]):
         self._episodes = server.gui.add_html("")
         self._disk = BlockingPool("sweep-results")
         self._seen: tuple[int, int] | None = None
-        """Size and time of the file that was read last."""
+        """Size and modification time of the file when it was last read."""
         self._read = LoadedSweep()
         self._shown = Shown()
         library.on_change.add(self._library_changed)
@@ -258,7 +257,7 @@ class SweepPanel(PagePart[ReviewView]):
 
     @on_loop
     def end(self) -> None:
-        """Stop following the file: the page goes."""
+        """Stop following the file when the page closes."""
         self._library.on_change.discard(self._library_changed)
         self._disk.end()
 
@@ -308,7 +307,7 @@ class SweepPanel(PagePart[ReviewView]):
         )
 
     def _episode(self, row: SweepEpisode, ids: dict[str, str], opened: set[str]) -> dict[str, Any]:
-        # Only what the library itself has found can be opened: a path of the table names a row of it, and no file.
+        # Only recordings that the library has found can be opened: a path in the table is looked up in the library.
         id = ids.get(str(self._library.folder / row.recording)) if row.recording else None
         return {
             "press": None if id is None else OpenSweepEpisode(id=id),
@@ -341,8 +340,8 @@ def _note_html(read: LoadedSweep) -> str:
 def _shown_point(
     read: LoadedSweep, shown: Shown, view: ReviewView, library: Sequence[LibraryRow]
 ) -> PointSummary | None:
-    """The point whose episodes are listed: the chosen one, else that of the open episode, else the best one. If it is left
-    out, the best one that is not."""
+    """The point whose episodes are listed: the chosen one, else that of the open episode, else the best one. If that is
+    filtered out, the best remaining one."""
     by_index: dict[int | None, PointSummary] = {one.index: one for one in read.summaries}
     opened = {one.id for one in view.opened}
     paths = (str(path) for row in library if row.id in opened for path in row.paths)
@@ -382,7 +381,7 @@ def _plot_html(
                 "about": _about(one),
             }
         )
-    # The chosen one over the others, and those that are left out below.
+    # The chosen line is drawn above the others, filtered-out lines below.
     lines.sort(key=lambda line: (line["chosen"], line["kept"]))
     return render(
         "sweep_plot",

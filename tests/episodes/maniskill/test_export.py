@@ -87,8 +87,8 @@ def test_nothing_that_is_there_is_written_over(
     assert export(held, "--maniskill", tmp_path / "none.h5", "--only-successes") == 2
     said = capsys.readouterr().err
     for words in (
-        "There is something at",
-        "ends in .h5",
+        "exists already; give a file",
+        "must end in .h5",
         "--lerobot FOLDER or --maniskill FILE.h5",
         "no episode",
     ):

@@ -90,13 +90,13 @@ def words(group: h5py.Group) -> None:
     [
         (external_link, "traj_0/obs in another file (an external link)"),
         (external_storage, "traj_0/obs stored in another file (external storage)"),
-        (virtual, "traj_0/obs put together from other files (a virtual dataset)"),
+        (virtual, "traj_0/obs composed of other files (a virtual dataset)"),
         (soft_link_out, "traj_0/way in another file (an external link)"),
         (two_gigabytes, "claims 2,147,483,648 bytes of numbers for traj_0/rewards"),
         (huge_chunks, "claims chunks of 2,147,483,648 bytes for traj_0/rewards"),
         (circle, f"groups more than {MAX_DEPTH} deep"),
-        (strange_filter, "packed by a filter that h5py does not bring along (32015)"),
-        (words, "no plain number"),
+        (strange_filter, "compressed with a filter that does not come with h5py (32015)"),
+        (words, "not a plain number"),
     ],
 )
 def test_what_leads_out_of_the_file_or_claims_too_much_is_refused(

@@ -54,7 +54,7 @@ def test_what_takes_too_long_is_given_up_and_the_others_are_read(
     assert sorted(key for key, facts in found.items() if facts.problem is None) == ["a", "c", "d"]
     assert (
         found["b"].problem
-        == "b (.json) takes longer to read than 0 s, and is read again when it is opened or changes."
+        == "b (.json) takes longer to read than 0 s; it is read again when it is opened or changes."
     )
     assert not psutil.pid_exists(first)
     (tmp_path / "b.json").unlink()
@@ -95,7 +95,7 @@ def test_a_reader_that_crashes_is_a_row_and_another_one_reads_on(tmp_path: Path)
     thread.join()
     assert sorted(key for key, facts in found.items() if facts.problem is None) == ["a", "c", "d"]
     assert found["b"].problem == (
-        "b (.json) ended the process that reads recordings (it was killed by SIGSEGV), and is read again when it is opened or changes."
+        "b (.json) ended the process that reads recordings (it was killed by SIGSEGV); it is read again when it is opened or changes."
     )
 
 

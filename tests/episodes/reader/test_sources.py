@@ -34,11 +34,11 @@ def test_an_empty_folder_is_passed_over_beside_others_and_a_file_that_is_none_is
     empty.mkdir()
     other.write_text("")
     assert [source.id for source in find_all_sources([empty, folder])] == ["one"]
-    with pytest.raises(UnreadableRecording, match=f"no recording in {other}: looked for are"):
+    with pytest.raises(UnreadableRecording, match=f"no recording in {other}. Recordings are"):
         find_all_sources([folder, other])
-    with pytest.raises(UnreadableRecording, match=f"no recording in {empty}, {empty}: looked for are"):
+    with pytest.raises(UnreadableRecording, match=f"no recording in {empty}, {empty}. Recordings are"):
         find_all_sources([empty, empty])
-    with pytest.raises(FileNotFoundError, match=f"nothing at {tmp_path / 'none'}:"):
+    with pytest.raises(FileNotFoundError, match=f"{tmp_path / 'none'} does not exist:"):
         find_all_sources([folder, tmp_path / "none"])
-    with pytest.raises(UnreadableRecording, match="No recording is named"):
+    with pytest.raises(UnreadableRecording, match="No recording given"):
         find_all_sources([])

@@ -105,7 +105,7 @@ def test_the_native_viewer_shows_the_whole_layout(headless: ViewerClient, file: 
 def test_a_window_without_a_screen_is_refused(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(RuntimeError, match="There is no screen here"):
+    with pytest.raises(RuntimeError, match="There is no display here"):
         open_window([file])
 
 

@@ -113,7 +113,7 @@ def test_rows_that_do_not_fit_are_refused_and_the_episode_goes_on(
         (dataclasses.replace(first, evaluate={"phase": np.array("reach")}), "dtype <U5"),
         (
             dataclasses.replace(first, pictures=(Picture("nose", "sensor", 0, pose, rgb=image),)),
-            "camera nose, which the task has not",
+            "camera nose, which the task does not have",
         ),
         (
             dataclasses.replace(first, pictures=(Picture("eye", "sensor", 0, pose, rgb=image[:2]),)),

@@ -24,7 +24,7 @@ from workbench.episodes.lerobot.format import Choice, Frames, feature_name, fram
 from workbench.episodes.row import UnreadableRecording
 
 ENCODING = Encoding(crf=20, key_every=2, exact_size=True)
-"""A key frame every second frame, as in lerobot's films: training reads frames in random order."""
+"""Has a key frame every second frame, as lerobot's films: training reads frames in random order."""
 ROBOT = "robot_uids"
 
 
@@ -53,7 +53,7 @@ class Exported:
     left_out: int = 0
     """Episodes without success."""
     not_fitting: list[str] = field(default_factory=list)
-    """A sentence for each episode that was left out by `only_fitting`."""
+    """A sentence for each episode that `only_fitting` left out."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -66,7 +66,7 @@ def export_lerobot(
     """Write a dataset of these episodes to a new folder.
 
     Episodes are read and written one by one, so memory use does not grow with their number. A film holds successive
-    episodes. The folder gets its name when it is complete: a full disk leaves nothing behind.
+    episodes. The folder gets its name when it is complete, so that a full disk leaves nothing behind.
 
     Args:
         sources: a name for messages and a function that reads the episode.
@@ -81,9 +81,7 @@ def export_lerobot(
     """
     folder = Path(folder).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FileExistsError(
-            f"There is something at {folder} already; name a folder that does not exist yet."
-        )
+        raise FileExistsError(f"{folder} exists already; give a folder that does not exist yet.")
     made = Exported(folder)
     temporary = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}.part"
     try:
@@ -127,7 +125,7 @@ class _Films:
     def add(self, frames: Frames, camera: str) -> tuple[dict[str, Any], form.Stats]:
         """Append an episode; returns its fields in ``meta/episodes`` and its statistics."""
         sampled, samples = set(form.sampled(len(frames.states)).tolist()), []
-        # ffmpeg makes the file when it has some frames.
+        # ffmpeg creates the file only after some frames.
         if (
             self._film is not None
             and self._path.exists()
@@ -147,7 +145,7 @@ class _Films:
             self._film.add(picture)
             if index in sampled:
                 samples.append(picture)
-        assert self._film is not None, "an episode has a frame"
+        assert self._film is not None, "an episode has at least one frame"
         entry = {
             f"videos/{self._key}/chunk_index": self._chunk,
             f"videos/{self._key}/file_index": self._file,
@@ -179,7 +177,7 @@ class _Writer:
         self._fps, self._robot = 0, None
 
     def fitting(self, name: str, read: Callable[[], Episode]) -> Frames | None:
-        """The frames of an episode for `add`; None if it is left out for lack of success.
+        """The frames of an episode for `add`; None if it is left out because it never succeeds.
 
         Raises:
             DoesNotFit: it cannot be added.
@@ -217,7 +215,7 @@ class _Writer:
             key = form.IMAGES + feature_name(camera)
             if key not in self._films:
                 self._films[key] = films = _Films(self._folder, key, self._fps)
-                # On an error: kill ffmpeg. Otherwise `finish` has closed the films before.
+                # Kills ffmpeg on an error; without one `finish` has already closed the films.
                 self._stack.callback(films.close, abandoned=True)
             camera_entry, stats[key] = self._films[key].add(frames, camera)
             entry |= camera_entry
@@ -294,7 +292,7 @@ class _Writer:
 
     def finish(self) -> None:
         if self._features is None or self._rows is None:
-            why = "none of them reaches success" if self._made.left_out else "none was named"
+            why = "none of them reaches success" if self._made.left_out else "none was given"
             raise ValueError(" ".join(self._made.not_fitting[:5]) or f"There is no episode to export: {why}.")
         self._rows.close()
         for films in self._films.values():

@@ -28,9 +28,9 @@ WORKBENCH_FILE = "meta/workbench.json"
 """Not part of the format: the recordings that the episodes were made from."""
 
 CHUNK_SIZE = 1000
-"""Files per folder."""
+"""Maximum number of files per folder."""
 DATA_MB, VIDEO_MB = 100, 200
-"""A file of this size is followed by a new one."""
+"""Size from which a new file is started."""
 
 IMAGES = "observation.images."
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
@@ -41,7 +41,7 @@ OF_EVERY_FRAME = {
 }
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 MAX_SAMPLED_PICTURES = 100
-"""Pictures of an episode that its statistics use."""
+"""Maximum number of pictures of an episode that its statistics use."""
 
 Stats = dict[str, NDArray[Any]]
 
@@ -52,7 +52,7 @@ def next_file(chunk: int, file: int) -> tuple[int, int]:
 
 
 def stats_of(values: NDArray) -> Stats:
-    """Statistics of `values` (T, D), one feature of an episode; (D,) each, and ``count`` (1,)."""
+    """Statistics of `values` (T, D), one feature of an episode: (D,) arrays, and ``count`` (1,)."""
     numbers = values.astype(np.float64)
     stats = {
         "min": numbers.min(axis=0),
@@ -67,10 +67,10 @@ def stats_of(values: NDArray) -> Stats:
 
 
 def picture_stats(pictures: list[NDArray[np.uint8]]) -> Stats:
-    """Statistics of sampled pictures of one camera in an episode; (3, 1, 1) each in 0..1, and ``count`` (1,)."""
+    """Statistics of sampled pictures of one camera in an episode: (3, 1, 1) arrays in 0..1, and ``count`` (1,)."""
     thinned = []
     for picture in pictures:
-        # As lerobot does: pictures from 300 pixels on are subsampled to about 150.
+        # As in lerobot: pictures of 300 pixels or more are subsampled to about 150.
         longer = max(picture.shape[:2])
         every = longer // 150 if longer >= 300 else 1
         thinned.append(picture[::every, ::every].reshape(-1, 3))
@@ -80,12 +80,12 @@ def picture_stats(pictures: list[NDArray[np.uint8]]) -> Stats:
 
 
 def sampled(count: int) -> NDArray[np.int64]:
-    """Indices of the pictures among `count` that statistics use."""
+    """Indices of the pictures, out of `count`, that the statistics use."""
     return np.unique(np.linspace(0, count - 1, min(count, MAX_SAMPLED_PICTURES)).round().astype(np.int64))
 
 
 def combined_stats(parts: list[Stats]) -> Stats:
-    """Statistics of all episodes from those of each, as lerobot combines them (quantiles are averaged)."""
+    """Statistics of all episodes, combined from those of each as in lerobot (quantiles are averaged)."""
     counts = np.array([float(part["count"][0]) for part in parts])
     weights = (counts / counts.sum()).reshape(-1, *[1] * parts[0]["mean"].ndim)
     means = np.stack([part["mean"] for part in parts])
@@ -102,7 +102,7 @@ def combined_stats(parts: list[Stats]) -> Stats:
 
 
 def tasks_metadata() -> dict[bytes, bytes]:
-    """Metadata by which pandas makes the instructions the table's index, as lerobot's reader expects."""
+    """Metadata that makes pandas use the instructions as the table's index, as lerobot's reader expects."""
 
     def column(name: str | None, field: str, pandas_type: str, numpy_type: str) -> dict[str, Any]:
         types = {"pandas_type": pandas_type, "numpy_type": numpy_type}
@@ -130,12 +130,12 @@ class Choice:
     """The parts of an episode that go into the dataset."""
 
     state: tuple[str, ...] = ()
-    """Keys of the state observations for ``observation.state``; ``agent`` includes all below it. Empty: ``agent``, the
+    """Keys of the state observations for ``observation.state``; ``agent`` includes all keys below it. Empty: ``agent``, the
     robot's own state, or all observations if there is no such key."""
     environment: tuple[str, ...] = ()
     """Keys for ``observation.environment_state``; empty leaves it out."""
     cameras: tuple[str, ...] | None = None
-    """Names; None takes all with colour pictures."""
+    """Names of cameras; None takes all with colour pictures."""
     every: int = 1
     """Keep every n-th step, with its action."""
 
@@ -182,7 +182,7 @@ class Frames:
 
 
 def feature_name(name: str) -> str:
-    """A camera's name as part of a feature's name, which is a folder's name too."""
+    """A camera's name as part of a feature's name, which is also a folder's name."""
     return file_part(name)
 
 
@@ -195,7 +195,7 @@ def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:
     if not episode.length:
         raise ValueError("has no step")
     states = np.arange(0, episode.length, choice.every)
-    # Rewards of left-out steps are added to the frame before, and `done` is kept.
+    # Rewards of skipped steps are added to the previous frame, and `done` is kept.
     rewards = np.add.reduceat(episode.reward.astype(np.float64), states).astype(np.float32)
     done = np.logical_or.reduceat(episode.terminated | episode.truncated, states)
     columns: dict[str, NDArray] = {}

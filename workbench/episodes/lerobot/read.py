@@ -25,12 +25,12 @@ from workbench.machine.files import open_regular_file
 from workbench.pictures.camera_conventions import intrinsic_from_fov
 
 DEFAULT_FOVY_RADIANS = math.radians(60)
-"""Datasets have no camera parameters; nothing is computed from this."""
+"""Placeholder: datasets have no camera parameters, and nothing is computed from this."""
 MAX_EPISODES = 100_000
 MAX_FRAMES = 20_000_000
-"""Frames of a dataset."""
+"""Maximum number of frames of a dataset."""
 MAX_EPISODE_FRAMES = 1_000_000
-"""Frames of an episode."""
+"""Maximum number of frames of an episode."""
 _PLACE = re.compile(r"\{(?P<name>chunk_index|file_index|video_key)(:0?(?P<width>\d)d)?\}")
 _NUMBER = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
@@ -39,7 +39,7 @@ def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
     """The episodes of the dataset in this folder; success means success at some frame.
 
     Raises:
-        UnreadableRecording: it has another version, or is broken.
+        UnreadableRecording: it has an unsupported version, or is broken.
     """
     info = _info(folder)
     try:
@@ -87,7 +87,7 @@ def _of_episodes(
 
 
 def _flat(column: pa.ChunkedArray) -> NDArray[np.float64]:
-    """One number per frame, which some datasets store as lists of one."""
+    """One number per frame; some datasets store them as lists of one."""
     array: Any = column.combine_chunks()
     while pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type):
         array = array.flatten()
@@ -97,11 +97,11 @@ def _flat(column: pa.ChunkedArray) -> NDArray[np.float64]:
 def read_lerobot(folder: Path, index: int) -> Episode:
     """Episode `index` of the dataset in this folder, without a scene.
 
-    A dataset lacks the state after the last action: it is NaN here, without a picture. Films are decoded when a camera is
-    first accessed. A dataset is untrusted: its paths must be in its folder, and claimed sizes are bounded.
+    A dataset lacks the state after the last action, which is NaN here and has no picture. Films are decoded when a camera
+    is first accessed. A dataset is untrusted: its paths must be in its folder, and claimed sizes are bounded.
 
     Raises:
-        UnreadableRecording: it cannot be read; the message says what is wrong.
+        UnreadableRecording: it cannot be read; the message gives the reason.
     """
     folder = Path(folder)
     info = _info(folder)
@@ -252,7 +252,7 @@ def _number_type(name: object) -> str:
 
 
 def _format_path(pattern: str, values: dict[str, Any]) -> str:
-    """``data/chunk-{chunk_index:03d}/...`` with these values; no other feature of ``str.format`` is evaluated."""
+    """``data/chunk-{chunk_index:03d}/...`` with these values. No other feature of ``str.format`` is supported."""
 
     def value(found: re.Match[str]) -> str:
         held = values[found["name"]]

@@ -1,4 +1,4 @@
-"""Writes episodes as one file of demonstrations, as ManiSkill's baselines load it: ``traj_0`` ... and a ``.json`` beside it."""
+"""Writes episodes as one file of demonstrations for ManiSkill's baselines: an ``.h5`` with ``traj_0`` ..., and a ``.json``."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from workbench.machine.text import short_line
 WORKBENCH_ID = "workbench_id"
 """Key of an episode in the ``.json``: the id of its recording."""
 _FLAT = "state"
-"""The observation mode in which ManiSkill gives one vector."""
+"""The observation mode in which ManiSkill returns one vector."""
 
 
 class OtherDemonstration(ValueError):
-    """An episode cannot be in one file with the others; the message is a sentence."""
+    """An episode cannot be in the same file as the others; the message is a sentence."""
 
 
 @dataclass
@@ -39,7 +39,7 @@ class Demonstrations:
     left_out: int = 0
     """Episodes without success."""
     not_fitting: list[str] = field(default_factory=list)
-    """A sentence for each episode that was left out since it does not fit."""
+    """A sentence for each episode that was left out because it does not fit."""
     lossy: bool = False
     """Whether colour pictures come from recordings, which keep them as JPEG."""
     incomplete: list[str] = field(default_factory=list)
@@ -55,31 +55,29 @@ def export_maniskill(
 ) -> Demonstrations:
     """Write these episodes to a new ``.h5`` and its ``.json``.
 
-    One by one, so memory use does not grow with their number. Observations of the mode ``state`` are one vector (T + 1, D), and
-    pictures that were observed are in ``obs/sensor_data``, as ManiSkill records them. The files get their names when they are
-    complete.
+    Episodes are written one by one, so memory use does not grow with their number. Observations of the mode ``state`` are one
+    vector (T + 1, D), and observed pictures are in ``obs/sensor_data``, as ManiSkill records them. The files get their names
+    when they are complete.
 
     Args:
         sources: a name for messages and a function that reads the episode.
         file: ends in ``.h5``; neither it nor its ``.json`` may exist.
-        only_successes: leave out episodes that reach success at no step.
+        only_successes: leave out episodes that never reach success.
         only_fitting: leave out episodes that cannot be read or do not fit the first one.
         on_progress: called with the number of finished episodes, and the name of the current one.
 
     Raises:
         UnreadableRecording: an episode cannot be read, or not all of it.
-        OtherDemonstration: an episode has no step, is of another task, or was made otherwise than the first one.
+        OtherDemonstration: an episode has no step, has another task, or was made with other options than the first one.
         ValueError: there is no episode to write, or `file` has another suffix.
         OSError: it cannot be written.
     """
     file = Path(file).absolute()
     if file.suffix != ".h5":
-        raise ValueError(f"{file.name}: demonstrations are a file that ends in .h5")
+        raise ValueError(f"{file.name}: the file of demonstrations must end in .h5")
     for path in (file, file.with_suffix(".json")):
         if path.exists():
-            raise FileExistsError(
-                f"There is something at {path} already; name a file that does not exist yet."
-            )
+            raise FileExistsError(f"{path} exists already; give a file that does not exist yet.")
     made = Demonstrations(file)
     parts = [file.parent / f".{file.stem}.{uuid.uuid4().hex[:8]}{suffix}" for suffix in (".json", ".h5")]
     document: dict[str, Any] | None = None
@@ -111,13 +109,13 @@ def export_maniskill(
                 trajectory = written.create_group(f"traj_{made.episodes}", track_order=True)
                 put_columns(_flat(episode), trajectory)
                 put_pictures(episode, trajectory)
-                # ManiSkill's own files, which have no scene, keep them to the bit.
+                # ManiSkill's own files, which have no scene, keep pictures to the bit.
                 made.lossy |= episode.geometry is not None and any(
                     "rgb" in m for m in shape["pictures"].values()
                 )
                 if missing := missing_pictures(episode):
                     made.incomplete.append(
-                        f"{name}: its observations had more than its recording keeps: {missing}."
+                        f"{name}: its recording lacks some of its observations: {missing}."
                     )
                 document["episodes"].append(
                     {
@@ -146,7 +144,7 @@ def export_maniskill(
 
 
 def _shape(episode: Episode) -> dict[str, Any]:
-    """What all episodes of a file have in common, by what a person calls it."""
+    """Values that all episodes of a file have in common, by name for messages."""
     info = episode.info
     return {
         "task": info.task,
@@ -159,20 +157,20 @@ def _shape(episode: Episode) -> dict[str, Any]:
 
 
 def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
-    """How an episode differs from the first one, as a sentence; empty if it does not."""
+    """The difference of an episode from the first one, as a sentence; empty if there is none."""
     for what, wanted in first.items():
         if other[what] != wanted:
             found, expected = short_line(repr(other[what]), 300), short_line(repr(wanted), 300)
-            return f"its {what}: {found}, and of the first recording: {expected}"
+            return f"its {what}: {found}, that of the first recording: {expected}"
     return ""
 
 
 def _flat(episode: Episode) -> Episode:
-    """Copy of the episode whose state observations are one vector, where the env gives one."""
+    """Copy of the episode whose state observations are one vector, if the env returns one."""
     mode = episode.info.env_kwargs.get("obs_mode")
     if not episode.obs or not isinstance(mode, str) or _FLAT not in mode.split("+"):
         return episode
     count = episode.length + 1
     rows = [np.asarray(values, np.float32).reshape(count, -1) for values in episode.obs.values()]
-    # Beside pictures it has a name.
+    # With pictures the vector has a name.
     return replace(episode, obs={"" if mode == _FLAT else _FLAT: np.concatenate(rows, axis=1)})

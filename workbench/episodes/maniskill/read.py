@@ -62,7 +62,7 @@ def read_maniskill(path: Path, trajectory: str) -> Episode:
 def leaves(
     node: H5Group | H5Dataset | None, prefix: str = "", skip: Sequence[str] = ()
 ) -> Iterator[tuple[str, NDArray]]:
-    """Every dataset of numbers below `node` by its path, ``a/b``; ``""`` if `node` is one itself."""
+    """Every dataset of numbers below `node` with its path ``a/b``; the path is ``""`` if `node` itself is a dataset."""
     if isinstance(node, H5Dataset):
         if node.is_numbers:
             yield prefix, node.read()
@@ -148,7 +148,7 @@ def _actions(node: H5Group | H5Dataset) -> tuple[NDArray[np.float32], tuple[str,
 
 
 def _picture(path: Path, place: str, modality: Modality, number: int) -> NDArray:
-    """Picture `number` of a dataset (P, H, W, C), as `EncodedPictures` has it."""
+    """Picture `number` of a dataset (P, H, W, C), in the format of `EncodedPictures`."""
     with open_h5(path) as file:
         dataset = file[place]
         if not isinstance(dataset, H5Dataset):
@@ -215,7 +215,7 @@ def _camera_info(
 
 
 def _poses(parameters: H5Group | None, count: int) -> NDArray[np.float32]:
-    """(P, 7) in ManiSkill's camera frame, from OpenGL's (x right, y up, z backward)."""
+    """Poses (P, 7) in ManiSkill's camera frame, from OpenGL's (x right, y up, z backward)."""
     poses = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], dtype=np.float32), (count, 1))
     if parameters is None or "cam2world_gl" not in parameters:
         return poses

@@ -16,22 +16,23 @@ from workbench.machine.files import open_regular_file
 from workbench.machine.processes.child_python import unchanged_environment
 
 with unchanged_environment():
-    # HDF5 reads it when plugins are first asked for: "::" means none. A file names a filter, and a folder of libraries may hold it.
+    # HDF5 reads the variable when plugins are first needed; "::" disables them. A file may name a filter, which HDF5 would
+    # load from a folder of libraries.
     os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")
     h5py.h5pl.size()
 
 MAX_BYTES = 1 << 30
-"""Numbers that are read from one open file."""
+"""Maximum size of the numbers that are read from one open file."""
 MAX_NODES = 200_000
-"""Groups and datasets that are looked up in one open file."""
+"""Maximum number of groups and datasets that are looked up in one open file."""
 MAX_DEPTH = 32
-"""Nesting of groups; hard links can form a cycle."""
+"""Maximum nesting of groups; hard links can form a cycle."""
 ALLOWED_BYTES = 1 << 20
-"""Bytes that every dataset may claim: an unwritten one has no storage and reads as zeros."""
+"""Size that every dataset may claim: an unwritten one has no storage and reads as zeros."""
 MAX_COMPRESSION_RATIO = 1100
-"""Largest compression ratio; deflate's limit is 1032."""
+"""Maximum compression ratio; deflate's limit is 1032."""
 MAX_CHUNK_BYTES = 16 << 20
-"""Bytes that a chunk may have independent of its dataset's storage."""
+"""Size that a chunk may have regardless of its dataset's storage."""
 
 _FILTERS = {
     h5py.h5z.FILTER_DEFLATE,
@@ -49,9 +50,9 @@ _NUMBERS = "biuf"
 class RefusedH5(ValueError):
     """The file is refused; the message follows the file's name.
 
-    HDF5 by itself follows external links, external storage and virtual datasets into other files of the machine, loads
-    filter plugins, and allocates the size that a dataset claims, terabytes in a file of 8 kB. The classes of this module
-    follow hard links, and soft links within the file, read plain numbers only, and compare a dataset's size with its
+    HDF5 by default follows external links, external storage and virtual datasets into other files of the machine, loads
+    filter plugins, and allocates the size that a dataset claims (terabytes in a file of 8 kB). The classes of this module
+    only follow hard links, and soft links within the file, only read plain numbers, and compare a dataset's size with its
     storage before anything is allocated.
     """
 
@@ -61,11 +62,11 @@ def open_h5(path: Path) -> Iterator[H5Group]:
     """The root group of the file at `path`, open during the block.
 
     Raises:
-        OSError: it cannot be opened, or is not a regular file of HDF5.
+        OSError: it cannot be opened, or is not a regular HDF5 file.
     """
     with open_regular_file(path) as file:
         size = os.fstat(file.fileno()).st_size
-    # Without a lock: a recorder may have the file open.
+    # Without a lock, because a recorder may have the file open.
     with h5py.File(path, "r", locking=False) as opened:
         yield H5Group(opened, _Budget(size))
 
@@ -103,18 +104,18 @@ class H5Group:
         return self.get(path) is not None
 
     def __getitem__(self, path: str) -> H5Group | H5Dataset:
-        """Raises KeyError if missing, and RefusedH5."""
+        """The entry. Raises KeyError if it is missing, and RefusedH5."""
         found = self.get(path)
         if found is None:
             raise KeyError(f"{self._where(path)} is missing")
         return found
 
     def get(self, path: str) -> H5Group | H5Dataset | None:
-        """None if missing. Raises RefusedH5."""
+        """The entry; None if it is missing. Raises RefusedH5."""
         return self._follow(path, 0)
 
     def group(self, path: str) -> H5Group | None:
-        """None if missing or not a group. Raises RefusedH5."""
+        """The group; None if it is missing or not a group. Raises RefusedH5."""
         found = self.get(path)
         return found if isinstance(found, H5Group) else None
 
@@ -137,12 +138,10 @@ class H5Group:
         self._budget.take_node()
         link = self._group.get(name, getlink=True)
         if isinstance(link, h5py.ExternalLink):
-            raise RefusedH5(
-                f"has {self._where(name)} in another file (an external link), and other files are not read for it"
-            )
+            raise RefusedH5(f"has {self._where(name)} in another file (an external link), which is not read")
         if isinstance(link, h5py.SoftLink):
             if links >= MAX_DEPTH:
-                raise RefusedH5(f"has links that lead round in a circle (at {self._where(name)})")
+                raise RefusedH5(f"has links that form a cycle (at {self._where(name)})")
             begin = H5Group(self._group.file, self._budget) if link.path.startswith("/") else self
             return begin._follow(link.path, links + 1)
         if link is None:
@@ -165,19 +164,17 @@ class H5Dataset:
         """Raises RefusedH5."""
         self.name = str(dataset.name)
         creation = dataset.id.get_create_plist()
-        # Before reading the shape: HDF5 opens the files of a virtual dataset for it.
+        # Check before reading the shape, for which HDF5 opens the files of a virtual dataset.
         if creation.get_layout() == h5py.h5d.VIRTUAL:
             raise RefusedH5(
-                f"has {self._short} put together from other files (a virtual dataset), which are not read for it"
+                f"has {self._short} composed of other files (a virtual dataset), which are not read"
             )
         if creation.get_external_count():
-            raise RefusedH5(
-                f"has {self._short} stored in another file (external storage), and other files are not read for it"
-            )
+            raise RefusedH5(f"has {self._short} stored in another file (external storage), which is not read")
         for index in range(creation.get_nfilters()):
             if (code := creation.get_filter(index)[0]) not in _FILTERS:
                 raise RefusedH5(
-                    f"has {self._short} packed by a filter that h5py does not bring along ({code})"
+                    f"has {self._short} compressed with a filter that does not come with h5py ({code})"
                 )
         self._dataset, self._budget = dataset, budget
         self.dtype: np.dtype = dataset.dtype
@@ -190,14 +187,14 @@ class H5Dataset:
 
     @property
     def is_numbers(self) -> bool:
-        """Plain booleans, integers or floating point numbers."""
+        """Whether it holds plain booleans, integers or floating point numbers."""
         return self.dtype.kind in _NUMBERS and self._dataset.shape is not None
 
     def __len__(self) -> int:
         return self.shape[0] if self.shape else 0
 
     def read(self) -> NDArray:
-        """All of it. Raises RefusedH5."""
+        """Read the whole dataset. Raises RefusedH5."""
         self._check_numbers()
         self._budget.take_bytes(self._short, self._size(self.shape))
         return _native(self._dataset[()])
@@ -206,27 +203,27 @@ class H5Dataset:
         """Row `number`. Raises RefusedH5, and IndexError if there is none."""
         self._check_numbers()
         if not self.shape:
-            raise RefusedH5(f"has one number where rows are looked for (at {self._short})")
+            raise RefusedH5(f"has a single number instead of rows (at {self._short})")
         index = range(len(self))[number]
         self._budget.take_bytes(self._short, self._size(self.shape[1:]))
         return _native(self._dataset[index])
 
     def _check_numbers(self) -> None:
         if not self.is_numbers:
-            raise RefusedH5(f"has {self._short} of type {self.dtype}, which is no plain number")
+            raise RefusedH5(f"has {self._short} of type {self.dtype}, which is not a plain number")
 
     def _check_size(self) -> None:
-        """Compare the size that its shape claims with its storage."""
+        """Compare the size that the shape claims with the dataset's storage."""
         storage = self._dataset.id.get_storage_size()
         if storage > self._budget.file_size:
             raise RefusedH5(
-                f"claims {storage:,} bytes for {self._short}, and has {self._budget.file_size:,} in all"
+                f"claims {storage:,} bytes for {self._short}, but the file has {self._budget.file_size:,} in all"
             )
         claimed = self._size(self.shape)
         chunk = self._dataset.chunks
         if claimed > ALLOWED_BYTES + storage * (1 if chunk is None else MAX_COMPRESSION_RATIO):
             raise RefusedH5(
-                f"claims {claimed:,} bytes of numbers for {self._short}, and holds {storage:,} bytes of it"
+                f"claims {claimed:,} bytes of numbers for {self._short}, but stores {storage:,} bytes"
             )
         if chunk is not None and self._size(chunk) > MAX_CHUNK_BYTES + storage * MAX_COMPRESSION_RATIO:
             raise RefusedH5(f"claims chunks of {self._size(chunk):,} bytes for {self._short}")

@@ -1,4 +1,4 @@
-"""Writes recorded pictures as the observations that ManiSkill's ``RecordEpisode`` writes: ``sensor_data``, ``sensor_param``."""
+"""Writes recorded pictures as observations in the format of ManiSkill's ``RecordEpisode``: ``sensor_data``, ``sensor_param``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ZLIB_LEVEL = 1
 
 
 def observed_pictures(episode: Episode) -> dict[str, tuple[Modality, ...]]:
-    """Modalities of each sensor that were part of its observations and of which it has a picture of every state."""
+    """Modalities of each sensor that were part of the observations and have a picture for every state."""
     _, wanted = _wanted(episode)
     found: dict[str, tuple[Modality, ...]] = {}
     for track in _sensors(episode):
@@ -34,7 +34,7 @@ def observed_pictures(episode: Episode) -> dict[str, tuple[Modality, ...]]:
 
 
 def missing_pictures(episode: Episode) -> str:
-    """What the observations had that the recording does not keep, as the end of a sentence; empty if nothing."""
+    """Parts of the observations that the recording lacks, as the end of a sentence; empty if there are none."""
     others, wanted = _wanted(episode)
     missing = list(others)
     if wanted:
@@ -54,12 +54,12 @@ def missing_pictures(episode: Episode) -> str:
 def put_pictures(episode: Episode, trajectory: h5py.Group) -> None:
     """Write `observed_pictures` into ``obs`` of the group of an episode, picture by picture.
 
-    Names, types and shapes are those of ``mani_skill.utils.wrappers.record.RecordEpisode`` (3.0.1): of each sensor ``rgb``
+    Names, types and shapes are those of ``mani_skill.utils.wrappers.record.RecordEpisode`` (3.0.1): for each sensor ``rgb``
     (T + 1, H, W, 3) uint8, ``depth`` (T + 1, H, W, 1) int16 millimetres, ``segmentation`` (T + 1, H, W, 1) int16, and
     ``extrinsic_cv`` (T + 1, 3, 4), ``cam2world_gl`` (T + 1, 4, 4), ``intrinsic_cv`` (T + 1, 3, 3) float32.
 
     Raises:
-        OSError: a picture cannot be read, or the file not be written.
+        OSError: a picture cannot be read, or the file cannot be written.
     """
     observed = observed_pictures(episode)
     tracks = {track.info.name: track for track in _sensors(episode) if track.info.name in observed}
@@ -79,7 +79,7 @@ def put_pictures(episode: Episode, trajectory: h5py.Group) -> None:
 
 
 def _wanted(episode: Episode) -> tuple[list[str], tuple[Modality, ...]]:
-    """Pictures that the observations had: those that no recording keeps, and the others."""
+    """Pictures of the observations: (names of those that no recording keeps, modalities of the others)."""
     mode = episode.info.env_kwargs.get("obs_mode")
     if not isinstance(mode, str):
         held = {modality for track in _sensors(episode) for modality in track.pictures}
@@ -112,7 +112,7 @@ def _put(track: CameraTrack, modality: Modality, group: h5py.Group) -> None:
         picture = pictures[number]
         if picture.shape[:2] != size:
             found = f"{picture.shape[1]} x {picture.shape[0]}"
-            raise OSError(f"picture {number} of {track.info.name} is {found} and not {size[1]} x {size[0]}")
+            raise OSError(f"picture {number} of {track.info.name} is {found}, not {size[1]} x {size[0]}")
         if modality == "depth":
             picture = np.rint(picture * MILLIMETRES_PER_METRE)
         if modality != "rgb":
@@ -122,7 +122,7 @@ def _put(track: CameraTrack, modality: Modality, group: h5py.Group) -> None:
 
 
 def _parameters(track: CameraTrack) -> dict[str, NDArray[np.float32]]:
-    """Matrices of each state; a pose that repeats is computed once."""
+    """Camera matrices of each state; repeated poses are computed once."""
     count = len(track.pose)
     world, extrinsic = np.zeros((count, 4, 4)), np.zeros((count, 3, 4))
     world[:, 3, 3] = 1

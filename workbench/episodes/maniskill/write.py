@@ -21,7 +21,7 @@ TRAJECTORY = "traj_0"
 _MIN_COMPRESSED_BYTES = 8 << 10
 _CHUNK_BYTES = 256 << 10
 _ZLIB_LEVEL = 1
-"""Compression level of zlib. On numbers of a simulation level 4 saves 1 % more, in a third more time."""
+"""Compression level of zlib. On numbers of a simulation level 4 saves 1 % more and takes a third longer."""
 _MAKES_UTF8 = h5py.h5p.create(h5py.h5p.LINK_CREATE)
 _MAKES_UTF8.set_char_encoding(h5py.h5t.CSET_UTF8)
 _ORDERED = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
@@ -41,18 +41,18 @@ def write_h5(episode: Episode, path: Path) -> None:
         OSError: it cannot be written.
         ValueError: HDF5 refuses a column.
     """
-    # In memory: on a disk error HDF5 leaves files half open.
+    # Written in memory, because HDF5 leaves files half open on a disk error.
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
         put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
     with path.open("xb") as file:
         file.write(content.getbuffer())
-    h5py.File(path, "r").close()  # fails on a truncated file
+    h5py.File(path, "r").close()  # raises for a truncated file
 
 
 def put_columns(episode: Episode, trajectory: h5py.Group) -> None:
-    """Write the columns of an episode into its group, as `write_h5` says."""
-    # Names in the file: asking h5py is slow.
+    """Write the columns of an episode into its group, in the format of `write_h5`."""
+    # Groups in the file by name: asking h5py is slow.
     groups: dict[tuple[str, ...], h5py.h5g.GroupID] = {(): trajectory.id}
     taken: set[tuple[str, ...]] = set()
 
@@ -86,13 +86,13 @@ def put_columns(episode: Episode, trajectory: h5py.Group) -> None:
 
 
 def _put(parent: h5py.h5g.GroupID, name: str, values: NDArray) -> None:
-    """Write a dataset by HDF5's low-level calls: h5py's high-level ones take longer than writing the numbers."""
+    """Write a dataset with HDF5's low-level calls: h5py's high-level calls take longer than writing the numbers."""
     kind, space = _kind(values.dtype), h5py.h5s.create_simple(values.shape)
     row = math.prod(values.shape[1:]) * values.dtype.itemsize
     packing = _packed(values.shape, row) if row * values.shape[0] >= _MIN_COMPRESSED_BYTES else _PLAIN
     dataset = h5py.h5d.create(parent, name.encode(), kind, space, packing, _MAKES_UTF8)
     if values.size:
-        # With its type: h5py makes it anew otherwise, which takes longer than writing.
+        # Pass the type: otherwise h5py creates it again, which takes longer than writing.
         dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(values), kind)
 
 
@@ -111,10 +111,10 @@ _PLAIN = _plain()
 
 
 def _packed(shape: tuple[int, ...], row: int) -> h5py.h5p.PropDCID:
-    """Storage of a dataset of which a row has so many bytes: compressed, where that saves more than the index of its
-    chunks costs.
+    """Storage layout of a dataset whose rows have `row` bytes: compressed if that saves more than the index of its chunks
+    costs.
 
-    A chunk must fit HDF5's cache of 1 MB: ManiSkill's replay reads row by row.
+    A chunk must fit HDF5's cache of 1 MB, because ManiSkill's replay reads row by row.
     """
     packing = _plain()
     packing.set_chunk((min(max(_CHUNK_BYTES // row, 1), shape[0]), *shape[1:]))
@@ -127,8 +127,8 @@ def write_json(episode: Episode, path: Path, folder: Path, files: Sequence[Path]
     """Write ManiSkill's metadata of the episode, and ours under ``workbench``, to `path`. Raises OSError.
 
     Args:
-        folder: of the recording.
-        files: its other two files.
+        folder: folder of the recording.
+        files: the other two files of the recording.
         sealed: add this installation's seal.
     """
     described = describe_json(episode, folder, files, sealed)

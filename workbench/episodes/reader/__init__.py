@@ -1,1 +1,1 @@
-"""Recordings read in confined processes."""
+"""Reads recordings in confined processes."""

@@ -1,4 +1,4 @@
-"""Packs an episode for the way from reader to server, and validates it there."""
+"""Packs an episode in the reader, and validates and unpacks it in the server."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class InvalidEpisode(Exception):
 
 
 class SentShapes:
-    """Shapes that were sent for one number of `OpenEpisode.sharing`."""
+    """Shapes that were already sent for one number of `OpenEpisode.sharing`."""
 
     _numbers = itertools.count()
 
@@ -38,7 +38,7 @@ class SentShapes:
         self._sent: dict[tuple[int, int], ShapeRead] = {}
 
     def sent(self, mesh: Mesh, material: Material) -> tuple[ShapeRead, bool]:
-        """The shape with its number, and whether it was sent before."""
+        """The shape with its number, and whether it was already sent."""
         # `_sent` keeps the objects alive, so ids are not reused.
         key = (id(mesh), id(material))
         before = key in self._sent
@@ -70,7 +70,7 @@ def _camera(track: CameraTrack) -> CameraRead:
 
 
 class KnownShapes:
-    """Shapes received from readers, while they are shared."""
+    """Shapes that were received from readers and are shared between episodes."""
 
     def __init__(self) -> None:
         self._of: WeakKeyDictionary[
@@ -79,7 +79,7 @@ class KnownShapes:
         self._numbers = itertools.count(1)
 
     def of(self, shapes: SharedShapes) -> tuple[int, dict[tuple[int, int], tuple[Mesh, Material]]]:
-        """The number for `OpenEpisode.sharing`, and the received shapes by process and number."""
+        """The number for `OpenEpisode.sharing`, and the received shapes by (process, number)."""
         if shapes not in self._of:
             self._of[shapes] = (next(self._numbers), {})
         return self._of[shapes]
@@ -91,16 +91,16 @@ def _pictures(modality: Modality, camera: int, count: int, fetch: FetchPicture) 
     def one(number: int) -> bytes:
         blob = fetch(camera, modality, number, True).blob
         if blob is None:
-            raise OSError("the reader gave no picture")
+            raise OSError("the reader returned no picture")
         return blob
 
     def decoded(number: int) -> NDArray:
         picture = fetch(camera, modality, number, False).array
         dtype, ndim = {"rgb": ("u1", 3), "depth": ("f4", 2), "segmentation": ("i4", 2)}[modality]
         if picture is None or picture.dtype != dtype or picture.ndim != ndim or not picture.size:
-            raise OSError("the reader gave no picture")
+            raise OSError("the reader returned no picture")
         if picture.shape[0] * picture.shape[1] > MAX_PIXELS or (ndim == 3 and picture.shape[2] != 3):
-            raise OSError(f"the reader gave a picture of shape {picture.shape}")
+            raise OSError(f"the reader returned a picture of shape {picture.shape}")
         return picture
 
     return EncodedPictures(modality, LazyPictures(count, one), decoded)
@@ -113,13 +113,14 @@ def unpack_episode(
     shapes: SharedShapes,
     known: dict[tuple[int, int], tuple[Mesh, Material]],
 ) -> Episode:
-    """The episode, validated: the file may be broken, and the reader compromised.
+    """Unpack and validate an episode: the file may be broken, and the reader compromised.
 
-    Users of an episode rely on columns with a row per state, faces of existing vertices, actions as long as their names.
+    Users of an episode rely on columns with a row per state, faces of existing vertices, and as many action dimensions as
+    names.
 
     Args:
         process: number of the process that read it.
-        known: shapes received before.
+        known: shapes that were already received.
 
     Raises:
         InvalidEpisode: parts do not fit together.
@@ -148,7 +149,7 @@ def unpack_episode(
         for name, flags in (("terminated", episode.terminated), ("truncated", episode.truncated))
     }
     action = _checked(episode.action, "actions", length, len(episode.action_names))
-    _require(sum(map(len, episode.texts.values())) <= MAX_TEXT_LINES, "too many entries that are no numbers")
+    _require(sum(map(len, episode.texts.values())) <= MAX_TEXT_LINES, "too many entries that are not numbers")
     return replace(
         episode,
         geometry=geometry,
@@ -163,7 +164,7 @@ def unpack_episode(
 
 
 def _checked(array: NDArray, what: str, *shape: int | None, kinds: str = "biuf") -> NDArray:
-    """`array`, if it has this shape (None: any size) and a dtype of these kinds."""
+    """`array`. Raises InvalidEpisode unless it has this shape (None: any size) and a dtype of these kinds."""
     fits = array.ndim == len(shape) and all(want in (None, size) for want, size in zip(shape, array.shape))
     shape_text = " x ".join("any" if size is None else str(size) for size in shape)
     _require(
@@ -176,7 +177,7 @@ def _checked(array: NDArray, what: str, *shape: int | None, kinds: str = "biuf")
 def _rows(
     held: dict[str, NDArray], states: int, broken_files: list[BrokenFile]
 ) -> Iterator[tuple[str, NDArray]]:
-    """Entries with a row per state; others are left out and reported in `broken_files`."""
+    """Entries with a row per state; other entries are left out and reported in `broken_files`."""
     for name, rows in held.items():
         if rows.ndim > 0 and len(rows) == states and rows.dtype.kind in "biuf":
             yield name, rows
@@ -196,13 +197,15 @@ def _geometry(
     for shape in read.shapes:
         known[process, shape.number] = shapes.shared(_mesh(shape.mesh), _material(shape.material))
     bodies = len(bare.body_names)
-    _require(len(bare.body_kinds) == len(bare.body_hidden) == bodies, "kinds of other bodies than there are")
+    _require(
+        len(bare.body_kinds) == len(bare.body_hidden) == bodies, "kinds for a different number of bodies"
+    )
     visuals = []
     for visual in read.visuals:
         _require((process, visual.shape) in known, "a visual without a shape")
         bodies_of = _checked(visual.bodies, "bodies", None, kinds="iu")
         _require(
-            bool(np.all((0 <= bodies_of) & (bodies_of < bodies))), "a visual of bodies that are not there"
+            bool(np.all((0 <= bodies_of) & (bodies_of < bodies))), "a visual of bodies that do not exist"
         )
         none = np.zeros(len(bodies_of), np.int32)
         visuals.append(
@@ -214,7 +217,7 @@ def _geometry(
 def _mesh(mesh: Mesh) -> Mesh:
     vertices = _checked(mesh.vertices, "vertices", None, 3, kinds="f").astype(np.float32, copy=False)
     faces = _checked(mesh.faces, "faces", None, 3, kinds="iu")
-    _require(bool(np.all((0 <= faces) & (faces < len(vertices)))), "faces of vertices that are not there")
+    _require(bool(np.all((0 <= faces) & (faces < len(vertices)))), "faces of vertices that do not exist")
     normals, uvs = (
         None
         if part is None

@@ -1,4 +1,4 @@
-"""The process that forks readers, and the readers' request loop."""
+"""The fork server of the readers, and the readers' request loop."""
 
 from __future__ import annotations
 
@@ -42,21 +42,21 @@ from workbench.machine.processes.family import end_with_parent
 from workbench.machine.processes.wire import MessageSocket, Unpacker, pack, pack_message
 
 MAX_MEMORY_BYTES = 3 << 30
-"""Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
+"""Memory limit of a reader; the numbers of an episode take at most a third of it."""
 MAX_REQUEST_BYTES = 1 << 20
 MAX_RECOVERY_MEMORY_BYTES = 4 << 30
-"""Bytes that a reader may allocate while it recovers recordings."""
+"""Memory limit of a reader that recovers recordings."""
 MAX_SHARED_GROUPS = 4
-"""Groups of episodes (`OpenEpisode.sharing`) whose shapes are kept."""
+"""Maximum number of groups of episodes (`OpenEpisode.sharing`) whose shapes are cached."""
 MAX_MESSAGE_CHARACTERS = 600
 
 
 def main() -> None:
     """Run the fork server: ``python -m workbench.episodes.reader.fork_readers SOCKET``.
 
-    Forking takes milliseconds where starting Python takes half a second. It has imported what readers need and reads no
-    recording itself. It has one thread, since a fork copies no other (numpy's are turned off in its environment), and
-    ends when its socket closes; its readers end with it.
+    Forking takes milliseconds, while starting Python takes half a second. The fork server imports what readers need and
+    reads no recording itself. It has one thread, since a fork copies only one (its environment turns numpy's threads off),
+    and ends when its socket closes; its readers end with it.
     """
     control = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -77,9 +77,9 @@ def main() -> None:
             _run_reader(socket.socket(fileno=fds[0]), request, fork_server)
         os.close(fds[0])
         try:
-            os.setpgid(pid, pid)  # also here: its group may be killed before the reader has made it
+            os.setpgid(pid, pid)  # set here too: the group may be killed before the reader has created it
         except OSError:
-            pass  # the reader made it, or has ended
+            pass  # the reader has created it, or has ended
         control.send(pack(pid))
 
 
@@ -130,16 +130,16 @@ class _Reader:
         except UnreadableRecording as error:
             failed = _failed("unreadable", str(error))
         except MemoryError:
-            failed = _failed("unreadable", "Reading it needs more memory than a recording may use.")
+            failed = _failed("unreadable", "Reading it needs more memory than the limit for recordings.")
         except OSError as error:
             failed = _failed("system", str(error))
         except Exception as error:
-            # Untrusted files can fail in any way, and the reader must serve the next request.
+            # Untrusted files can raise anything, and the reader must serve the next request.
             failed = _failed("unreadable", f"It cannot be read ({type(error).__name__}: {error}).")
         except BaseException as error:
             if type(error).__name__ != "PanicException":  # raised by rerun's Rust code
                 raise
-            failed = _failed("unreadable", f"It cannot be read (rerun's reader gave up: {error}).")
+            failed = _failed("unreadable", f"It cannot be read (rerun's reader panicked: {error}).")
         return pack_message(failed)
 
     def _answer(self, request: Request) -> Answer:

@@ -1,4 +1,4 @@
-"""Reads an episode from the three files of a recording, and finds the recordings in a folder."""
+"""Reads an episode from the three files of a recording."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from workbench.machine.files import NotARegularFile
 
 MAX_STATES = 10_000_000
 MAX_COLUMN_BYTES = 1 << 29
-"""Size of one column as described: the file leaves out repeated rows, so its own size is no bound."""
+"""Maximum described size of one column: the file leaves out repeated rows, so its own size is no bound."""
 
 
 def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
@@ -54,12 +54,12 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
 
     The ``.json`` describes it, the ``.rrd`` holds meshes, poses, pictures and curves, the ``.h5`` env states, observations
     and actions. A file that is broken or missing is listed in `Episode.broken_files`, and its content is empty: without the
-    .rrd no geometry, poses and pictures, without the .h5 no env states. A lone ``.rrd`` misses nothing. The geometry is that
+    .rrd no geometry, poses and pictures, without the .h5 no env states. A lone ``.rrd`` is complete. The geometry is that
     of this env alone, as env 0 of 1. Pictures stay in the file until they are accessed.
 
     Args:
         path: its .rrd, .h5 or .json.
-        shapes: shares equal meshes with other recordings.
+        shapes: shapes to share with other recordings.
 
     Raises:
         UnreadableRecording: it is not a workbench recording, or all files are broken.
@@ -72,15 +72,15 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
 
 
 def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode, str | None]:
-    """`read_episode` without searching the task's file, whose recorded path is returned too.
+    """`read_episode` without searching the task's file; also returns the recorded path of that file.
 
-    Raises as `read_episode`.
+    Raises the errors of `read_episode`.
     """
     path = Path(path)
     files = {suffix: path.with_suffix(suffix) for suffix in (".rrd", ".h5", ".json")}
     there = {suffix: file for suffix, file in files.items() if os.path.lexists(file)}
     if not there:
-        raise UnreadableRecording(f"{path.name} is not there any more.")
+        raise UnreadableRecording(f"{path.name} no longer exists.")
     broken_files: list[BrokenFile] = []
     in_json, not_json = _read_description(there.get(".json"))
     if ".json" not in there and ".h5" in there:
@@ -96,7 +96,7 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
                 what = f"was changed: pictures are missing ({cameras})."
                 broken_files.append(BrokenFile(files[".rrd"].name, what))
         except (OSError, ValueError, RuntimeError) as error:
-            lost = "its 3-D scene, its pictures and what evaluate() said are missing"
+            lost = "its 3-D scene, its pictures and its evaluate() results are missing"
             broken_files.append(_broken_file(files[".rrd"], error, lost))
     if in_json is not None or ".h5" in there:
         try:
@@ -109,7 +109,7 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
         raise UnreadableRecording(f"{told} Copy it again from where it was recorded.")
     if not_json is not None and table is not None:
         broken_files.append(
-            _broken_file(files[".json"], not_json, "its tags, its note and the place of its task are missing")
+            _broken_file(files[".json"], not_json, "its tags, its note and the path of its task are missing")
         )
     description = in_json or _description(there.get(".json"), not_json, table, path)
     try:
@@ -128,7 +128,7 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
 
 def _broken_file(file: Path, error: Exception, lost: str) -> BrokenFile:
     if isinstance(error, FileNotFoundError):
-        return BrokenFile(file.name, f"is not there: {lost}.")
+        return BrokenFile(file.name, f"is missing: {lost}.")
     if isinstance(error, WrongDocument):
         return BrokenFile(file.name, f"{error}: {lost}.")
     if isinstance(error, NotARegularFile):
@@ -141,7 +141,7 @@ def _broken_file(file: Path, error: Exception, lost: str) -> BrokenFile:
 
 
 def _read_description(file: Path | None) -> tuple[Description | None, Exception | None]:
-    """Description in the .json, None if it is not ours; and the error if it is not JSON."""
+    """The description in the .json (None if it is not ours), and the error if it is not JSON."""
     if file is None:
         return None, None
     try:
@@ -165,7 +165,7 @@ def _description(
             raise UnreadableRecording(f"{file.name} {not_json}.") from not_json
         raise UnreadableRecording(f"{file.name} is not from the workbench; read it as ManiSkill's.")
     if table is None:
-        raise UnreadableRecording(f"{path.stem}.json is missing, which says what is in {path.name}.")
+        raise UnreadableRecording(f"{path.stem}.json, which describes {path.name}, is missing.")
     description = table.property("workbench", "description")
     if not isinstance(description, str):
         raise UnreadableRecording(f"{path.stem}.rrd is from another program, or from an older workbench.")
@@ -183,9 +183,9 @@ def _list(value: Any) -> list[Any]:
 def _episode(description: Description, table: RerunTable | None) -> Episode:
     states = description.length + 1
     if not 0 < states <= MAX_STATES:
-        raise ValueError(f"it says that it has {description.length} steps")
+        raise ValueError(f"it claims {description.length} steps")
     if sum(map(len, description.texts.values())) > MAX_TEXT_LINES:
-        raise ValueError(f"it has more than {MAX_TEXT_LINES} lines of entries that are no numbers")
+        raise ValueError(f"it has more than {MAX_TEXT_LINES} lines of entries that are not numbers")
     geometry = poses = None
     cameras: list[CameraTrack] = []
     if table is not None:
@@ -226,7 +226,7 @@ def _columns(
 
 
 def _column(table: RerunTable | None, entity: str, kind: ColumnType, first: int, states: int) -> NDArray:
-    """States `first` to the last of the numbers of `entity`, with dtype and shape of `kind`."""
+    """The numbers of `entity` from state `first` on, with dtype and shape of `kind`."""
     dtype, shape = np.dtype(kind[0]), (states - first, *kind[1])
     _check_room(entity, shape, dtype)
     out = np.full(shape, np.nan if dtype.kind == "f" else 0, dtype=dtype)
@@ -285,7 +285,7 @@ _FLAGS = ("success", "fail")
 
 
 def _read_states(path: Path) -> dict[str, Any]:
-    """Content of the .h5, preferred to the same columns of the .rrd: ManiSkill reads it."""
+    """Content of the .h5, which takes precedence over the same columns of the .rrd because ManiSkill reads it."""
     with open_h5(path) as file:
         group = file.group(TRAJECTORY)
         if group is None:

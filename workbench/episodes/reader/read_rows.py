@@ -41,28 +41,28 @@ from workbench.machine.text import listed
 
 THUMBNAIL_PIXELS = 96
 THUMBNAIL_BYTES = 8192
-"""Recorded thumbnails up to this size are used unchanged."""
+"""Size up to which recorded thumbnails are used unchanged."""
 MAX_EPISODES = 20_000
-"""Episodes of one file that are listed."""
+"""Maximum number of episodes of one file that are listed."""
 
 _MAX_PICTURE_PIXELS = 4096
-"""Pixels of the longer side of a picture that a thumbnail is made of."""
+"""Maximum longer side of a picture that a thumbnail is made from."""
 
 
 def read_found(folder: Path, found: RecordingFiles, only_names: bool = False) -> list[LibraryEntry]:
     """The recordings in these files: none, one, or one per trajectory.
 
-    A broken file becomes a row that states the problem, so that it is found. A ``.json`` that is something else gives
-    none. The ``.json`` has everything but rewards and pictures of ManiSkill's trajectories, which are in the ``.h5``; a
-    lone ``.rrd`` must be read through, which takes a tenth of a second or more.
+    A broken file becomes a row that states the problem, so that it is noticed. A ``.json`` of any other kind gives no row.
+    The ``.json`` has everything but rewards and pictures of ManiSkill's trajectories, which are in the ``.h5``; a lone
+    ``.rrd`` must be read through, which takes a tenth of a second or more.
 
     Args:
-        only_names: leave out what takes long: rewards and pictures of trajectories, and the content of a lone ``.rrd``.
+        only_names: skip what is slow: rewards and pictures of trajectories, and the content of a lone ``.rrd``.
     """
     try:
         entries = _read(folder, found, only_names)
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError) as error:
-        # Untrusted files can fail in any way, and one must not hide the others.
+        # Untrusted files can raise anything, and one must not hide the others.
         entries = [_broken(found, f"cannot be read ({error})")]
     if NOTES in found.sizes:
         notes = read_notes(found.path(folder, NOTES))
@@ -90,7 +90,7 @@ def _read(folder: Path, found: RecordingFiles, only_names: bool) -> list[Library
     elif ".h5" in found.sizes:
         name = Path(found.key).name
         return [
-            broken(found, f"{name}.h5 needs {name}.json beside it, which names the env and the episodes.")
+            broken(found, f"{name}.h5 needs {name}.json next to it, which names the env and the episodes.")
         ]
     if ".rrd" in found.sizes:
         return [(Facts("rrd only"), None) if only_names else _rrd_only(folder, found)]
@@ -115,7 +115,7 @@ def _workbench_entry(found: RecordingFiles, document: Document) -> LibraryEntry:
     except WrongDocument as error:
         written, problem = {}, problem or clean_text(f"{name}.json {error}.", 500)
     for suffix, size in found.sizes.items():
-        # Checksums are compared when it is opened: listing thousands reads no contents.
+        # Compares sizes only: checksums are compared at opening, because listing thousands must not read contents.
         if problem is None and (why := wrong_size(written, suffix, size)) is not None:
             problem = f"{name}{suffix} was cut short or changed: {why}."
     described = document.data["workbench"]
@@ -150,7 +150,7 @@ def _episode(kind: RecordingKind, data: dict[str, Any], if_undated: float) -> Fa
 
 
 def _acted_by(data: object) -> str:
-    """A list in a ``.json``, a text in a ``.rrd``."""
+    """Text of the sources of actions, from a list in a ``.json`` or a text in a ``.rrd``."""
     if not isinstance(data, list):
         return clean_text(data)
     try:
@@ -177,7 +177,7 @@ def _thumbnail(encoded: object) -> bytes | None:
 def _maniskill_entries(
     folder: Path, found: RecordingFiles, document: Document, only_names: bool
 ) -> list[LibraryEntry]:
-    """One row per episode of ManiSkill's ``RecordEpisode``, which made its demonstrations too."""
+    """One row per episode of ManiSkill's ``RecordEpisode``, which also recorded ManiSkill's demonstrations."""
     name = Path(found.key).name
     written = found.newest / 1e9
     count = len(document.data["episodes"])
@@ -222,7 +222,7 @@ def _maniskill_entries(
         )
         entries.append((facts, pictures.get(trajectory)))
     if others and len(names) == count:
-        # Its writer was killed before it wrote the .json.
+        # The writer was killed before it wrote the .json.
         more = clean_text(f"{name}.json does not describe {listed(others)} of {name}.h5.", 500)
         entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
     if count > most:
@@ -242,7 +242,7 @@ def _episode_or_problem(document: Document, number: int) -> EpisodeJson | str:
 
 def _lerobot_entries(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
     """One row per episode of a LeRobot dataset; its key is ``meta/info``."""
-    # Imported late: Arrow starts threads, which must not exist when a reader is forked.
+    # Imported late: Arrow starts threads, which must not exist at a fork.
     from workbench.episodes.lerobot.read import lerobot_rows
 
     written = found.newest / 1e9
@@ -308,8 +308,8 @@ def _rrd_only(folder: Path, found: RecordingFiles) -> LibraryEntry:
     except NotARegularFile as error:
         return _broken(found, str(error.strerror))
     except (OSError, ValueError, RuntimeError):
-        return _broken(found, "is no recording that rerun can read, or was cut short")
+        return _broken(found, "is not a recording that rerun can read, or was cut short")
     episode = data.get("episode", {})
     if not episode:
-        return _broken(found, "is a recording of rerun, but not of an episode")
+        return _broken(found, "is a rerun recording, but not of an episode")
     return _episode("rrd only", episode, found.newest / 1e9), None

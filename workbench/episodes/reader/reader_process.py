@@ -1,4 +1,4 @@
-"""Starts, asks and ends the reader processes."""
+"""Starts reader processes, sends them requests and ends them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from workbench.machine.processes.family import describe_exit
 from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable, pack
 
 START_SECONDS = 60.0
-"""Timeout of the fork server's start, which imports for half a second."""
+"""Timeout of the fork server's start, whose imports take half a second."""
 POLL_SECONDS = 0.2
-"""Seconds between two looks whether an answer is still needed."""
+"""Interval of checking whether an answer is still needed."""
 
 
 FOR_READING = {
-    # A fork copies one thread only.
+    # A fork copies only one thread.
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     # Load no filter plugins of HDF5.
@@ -39,7 +39,7 @@ FOR_READING = {
 
 
 class ReaderEnded(OSError):
-    """A request ended the reader; the message follows the name of what was read."""
+    """A request ended the reader; the message follows the name of the recording."""
 
 
 class ReaderBusy(OSError):
@@ -47,7 +47,7 @@ class ReaderBusy(OSError):
 
 
 class WrongProcess(Exception):
-    """The requested process has ended; another one reads now."""
+    """The requested process has ended and was replaced."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Answered:
 
 
 class _ForkServer:
-    """The fork server of this process, started on first use."""
+    """Client of this process's fork server, which starts on first use."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -66,12 +66,12 @@ class _ForkServer:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Start it without waiting."""
+        """Start the server without waiting."""
         with self._lock:
             self._start()
 
     def new_reader(self, request: NewReader) -> tuple[int, MessageSocket]:
-        """Fork a reader: its process id and socket. Raises OSError."""
+        """Fork a reader; returns its process id and socket. Raises OSError."""
         ours, theirs = socket.socketpair()
         message = pack(request)
         with theirs, self._lock:
@@ -81,7 +81,7 @@ class _ForkServer:
                     socket.send_fds(control, [message], [theirs.fileno()])
                     return self._answer(control), MessageSocket(ours, get_args(Answer))
                 except (OSError, Unreadable):
-                    self._end()  # it was killed: try again with a new one
+                    self._end()  # the server was killed: retry with a new one
         ours.close()
         raise OSError("the process that reads recordings cannot be started")
 
@@ -129,9 +129,9 @@ fork_server = _ForkServer()
 
 
 class Reader:
-    """A process that may read one folder and do little else, started on first use.
+    """A confined process that may read one folder and do little else; starts on first use.
 
-    Thread-safe; requests are answered in their order.
+    Thread-safe; requests are answered in order.
     """
 
     _numbers = itertools.count(1)
@@ -143,15 +143,15 @@ class Reader:
         """
         self._folder, self._writes = Path(folder), writes
         self._allowed: set[Path] = set()
-        """Further files: targets of links in the folder."""
+        """Other files that it may read: targets of links in the folder."""
         self._turns = _FairLock()
         self._pid = 0
         self._line: MessageSocket | None = None
         self._there: tuple[tuple[int, int] | None, ...] = ()
-        """Device and inode of the folder and these files when the present process began."""
+        """Device and inode of the folder and these files when the current process started."""
         self._closed: deque[tuple[int, int]] = deque()
         self.process = 0
-        """Number of the present process; 0 if there is none."""
+        """Number of the current process; 0 if there is none."""
 
     def ask(
         self,
@@ -161,16 +161,18 @@ class Reader:
         process: int | None = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> Answered:
-        """
+        """Send a request and wait for the answer.
+
         Args:
             seconds: timeout of the answer.
-            patience: timeout of waiting for other requests; None waits for ever.
-            process: the process that the request refers to, such as one with an open episode.
-            stopped: asked a few times a second; once it is true, the answer is not needed any more.
+            patience: timeout of waiting for other requests; None waits forever.
+            process: number of the process that the request refers to, such as one with an open episode.
+            stopped: polled a few times a second; once it returns True, the answer is no longer needed.
 
         Raises:
-            ReaderEnded: it ended the reader, or timed out. A new reader serves the next request.
-            ReaderBusy, WrongProcess
+            ReaderEnded: the request ended the reader, or timed out. A new reader serves the next request.
+            ReaderBusy: another request still runs after `patience`.
+            WrongProcess: `process` has ended.
             OSError: no reader can be started.
         """
         (answer,) = self.ask_all([request], seconds, patience, process, stopped)
@@ -186,13 +188,13 @@ class Reader:
         process: int | None = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> list[Answered | ReaderEnded]:
-        """Send several requests at once, each with this timeout; one that ends the reader does not affect the others.
+        """Send several requests at once, each with this timeout; a request that ends the reader does not affect the others.
 
-        A request whose reader dies is sent once more: the cause may have been outside.
+        A request whose reader dies is retried once: the cause may have been external.
         """
         answers: list[Answered | ReaderEnded] = []
         again = -1
-        """Index of the request that was sent once more."""
+        """Index of the request that was retried."""
         with self._turns.hold(patience):
             while len(answers) < len(requests):
                 line = self._started()
@@ -223,19 +225,19 @@ class Reader:
                 self._kill()
 
     def close_episode(self, process: int, opened: int) -> None:
-        """Close an episode with the next request. Does not block: a finalizer may call it on any thread."""
+        """Close an episode with the next request. Does not block, because a finalizer may call it on any thread."""
         self._closed.append((process, opened))
 
     def close(self) -> None:
-        """End it; the next request starts a new one."""
+        """End the process; the next request starts a new one."""
         with self._turns.hold(None):
             self._kill()
 
     def _started(self) -> MessageSocket:
         paths = (self._folder, *sorted(self._allowed))
-        # It may read the folder that existed when it began, not a new one of the same name.
+        # The process may read the folder that existed when it started, not a new one of the same name.
         there = tuple(map(_identity, paths))
-        # Without a request, input means that it was killed from outside.
+        # Input without a request means that the process was killed from outside.
         if self._line is not None and (there != self._there or self._line.waits()):
             self._kill()
         if self._line is None:
@@ -263,19 +265,19 @@ class Reader:
         return ReaderEnded(f"ended the process that reads recordings{with_what}")
 
     def _kill(self) -> int | None:
-        """Kill it; its exit code, if known."""
+        """Kill the process; returns its exit code, if known."""
         if self._line is None:
             return None
         self._line.end.close()
         self._line, self.process = None, 0
-        # With its children. The fork server reaps it in `exit_code`, so the id cannot have been reused.
+        # Kills its children too. The fork server reaps it in `exit_code`, so the id cannot have been reused.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._pid, signal.SIGKILL)
         return fork_server.exit_code(self._pid)
 
 
 def _receive(line: MessageSocket, seconds: float, stopped: Callable[[], bool]) -> Answer:
-    """The next answer. Raises TimeoutError, also when it is `stopped`."""
+    """The next answer. Raises TimeoutError, also once `stopped` returns True."""
     until = time.monotonic() + seconds
     while (left := until - time.monotonic()) > 0 and not stopped():
         if (answer := line.receive(min(left, POLL_SECONDS))) is not None:
@@ -284,7 +286,7 @@ def _receive(line: MessageSocket, seconds: float, stopped: Callable[[], bool]) -
 
 
 class _FairLock:
-    """A fair lock, first come, first served: Python's own may return to the thread that released it."""
+    """A fair (first come, first served) lock: Python's own may go back to the thread that just released it."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -292,7 +294,7 @@ class _FairLock:
 
     @contextlib.contextmanager
     def hold(self, patience: float | None) -> Iterator[None]:
-        """Raises ReaderBusy."""
+        """Hold the lock. Raises ReaderBusy after `patience` seconds."""
         me = object()
         with self._changed:
             self._waiting.append(me)

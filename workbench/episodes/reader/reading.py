@@ -40,15 +40,15 @@ from workbench.episodes.writing.publish import RecordingError
 ROW_SECONDS = 30.0
 OPEN_SECONDS = 60.0
 PICTURE_SECONDS = 70.0
-"""A film is decoded when its first frame is read."""
+"""Timeout of a picture: a film is decoded when its first frame is read."""
 RECOVERY_SECONDS = 1800.0
-"""An hour with four cameras takes some minutes."""
+"""Timeout of a recovery: an hour with four cameras takes some minutes."""
 PICTURE_WAIT_SECONDS = 0.2
-"""Seconds that a picture waits while another recording is being opened."""
+"""Timeout of a picture request that waits while another recording is being opened."""
 MAX_READERS = 4
 MAX_THUMBNAIL_BYTES = 64 << 10
 _BATCH_ROWS = 8
-"""Rows per batch of requests: the reader works on while the last batch goes into the table."""
+"""Number of rows per batch of requests: the reader continues while the last batch goes into the table."""
 _JPEG = b"\xff\xd8\xff"
 T = TypeVar("T")
 
@@ -58,12 +58,12 @@ _shapes = KnownShapes()
 
 
 def start_reading() -> None:
-    """Start the fork server ahead of use. Does not wait; raises OSError."""
+    """Start the fork server in advance, without waiting. Raises OSError."""
     fork_server.start()
 
 
 def stop_reading() -> None:
-    """End all reader processes; they start again on use."""
+    """End all reader processes; they restart on use."""
     with _lock:
         readers = list(_readers.values())
         _readers.clear()
@@ -78,7 +78,7 @@ def read_rows(
     """The recordings in these files of a library's folder, each with its thumbnail; problems become rows.
 
     Args:
-        only_names: as of `read_rows.read_found`.
+        only_names: as in `read_rows.read_found`.
 
     Raises:
         OSError: no reader can be started.
@@ -103,20 +103,20 @@ def read_recording(
     folder: Path | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Episode:
-    """An episode; its pictures are read on access.
+    """Read an episode; its pictures are read on access.
 
-    Recordings may come from anybody, and HDF5, Arrow, rerun, ffmpeg and Pillow parse them in millions of lines of C, C++
-    and Rust. So a confined process with limits on memory and time opens them, never the server; if it ends or hangs,
-    only this recording fails.
+    Recordings are untrusted, and HDF5, Arrow, rerun, ffmpeg and Pillow parse them in millions of lines of C, C++ and Rust.
+    So a confined process with limits on memory and time opens them, never the server; if it ends or hangs, only this
+    recording fails.
 
     Args:
         shapes: shapes to share with other recordings.
-        folder: what the process may read; by default the file's folder.
-        stopped: asked a few times a second; once it is true, reading is given up.
+        folder: folder that the process may read; by default the file's folder.
+        stopped: polled a few times a second; once it returns True, reading is cancelled.
 
     Raises:
-        UnreadableRecording: it cannot be read; the message says what is wrong.
-        OSError: the system refuses its files.
+        UnreadableRecording: it cannot be read; the message gives the reason.
+        OSError: the system refuses access to its files.
     """
     if source.problem is not None:
         raise UnreadableRecording(source.problem)
@@ -142,7 +142,7 @@ def read_recording(
 
 
 def read_store_id(path: Path) -> str:
-    """Rerun's id of the recording in an ``.rrd``. Raises as `read_recording`."""
+    """Rerun's id of the recording in an ``.rrd``. Raises as `read_recording` does."""
     path = Path(path).absolute()
     reader = _reader(path.parent, episodes=True)
     reader.allow(_link_targets([path]))
@@ -152,7 +152,7 @@ def read_store_id(path: Path) -> str:
 
 def read_sweep(path: Path) -> SweepResults:
     """The results of a sweep in a ``results.parquet``. A link that leads out of its folder is not followed. Raises as
-    `read_recording`."""
+    `read_recording` does."""
     path = Path(path).absolute()
     read, _ = _request(_reader(path.parent, episodes=True), ReadSweep(path), SweepRead, path.name)
     try:
@@ -162,15 +162,15 @@ def read_sweep(path: Path) -> SweepResults:
 
 
 def recover_confined(folder: Path) -> tuple[Path, ...]:
-    """Make recordings of the journals that dead writers left in `folder`; returns the .rrd of each.
+    """Recover recordings from the journals that dead writers left in `folder`; returns the .rrd of each.
 
-    A folder from elsewhere may contain journals. So a process that may only write below that folder does it, with limits
-    on memory and time; it starts only if there are journals.
+    Foreign folders may contain journals, so a confined process reads them, which may write only below that folder and has
+    limits on memory and time. It starts only if there are journals.
 
     Raises:
         RecordingError: files cannot be written, the folder cannot be read, or the process failed; the journals stay.
     """
-    from workbench.episodes.writing.journal import FOLDER  # with Arrow, which a server need not wait for
+    from workbench.episodes.writing.journal import FOLDER  # imports Arrow, for which a server should not wait
 
     failed = f"Cannot recover the recordings in {folder}: "
     try:
@@ -188,12 +188,12 @@ def recover_confined(folder: Path) -> tuple[Path, ...]:
     finally:
         reader.close()
     if isinstance(answer, Recovered):
-        # Only names: the process that returned them has read untrusted files.
+        # Uses only the names: the process that returned the paths has read untrusted files.
         return tuple(folder / Path(name).name for name in answer.made)
     why = (
         answer
         if isinstance(answer, ReadFailed)
-        else ReadFailed("unreadable", f"it gave {type(answer).__name__}.")
+        else ReadFailed("unreadable", f"it returned {type(answer).__name__}.")
     )
     raise RecordingError(why.message if why.why == "system" else f"{failed}{why.message}")
 
@@ -205,7 +205,7 @@ def recovered_text(paths: Sequence[str]) -> str:
     one = len(paths) == 1
     named = ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
     return (
-        f"{len(paths)} episode{'' if one else 's'} that an earlier session left half written "
+        f"{len(paths)} episode{'' if one else 's'} that an earlier session left unfinished "
         f"{'was' if one else 'were'} recovered: {named}"
     )
 
@@ -221,12 +221,12 @@ def _reader(folder: Path, episodes: bool) -> Reader:
             _, gone = _readers.popitem(last=False)
         reader = _readers[key]
     if gone is not None:
-        gone.close()  # starts again when a picture of its episodes is read
+        gone.close()  # restarts when a picture of its episodes is read
     return reader
 
 
 def _link_targets(paths: Iterable[Path]) -> list[Path]:
-    """Targets of those paths that are links, which may be outside the folder."""
+    """Targets of the paths that are links; they may be outside the folder."""
     return [Path(os.path.realpath(path)) for path in paths if os.path.islink(path)]
 
 
@@ -234,11 +234,11 @@ def _entries(found: RecordingFiles, answered: Answered | ReaderEnded) -> list[Li
     answer = answered.answer if isinstance(answered, Answered) else answered
     if isinstance(answer, RowsRead):
         return [(clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in answer.entries]
-    why = "gave an invalid row"
+    why = "returned an invalid row"
     if isinstance(answer, ReadFailed):
         why = answer.message
     elif isinstance(answer, ReaderEnded):
-        why = f"{answer}, and is read again when it is opened or changes"
+        why = f"{answer}; it is read again when it is opened or changes"
     # Any of the files may be the cause.
     suffixes = ", ".join(suffix for suffix in found.sizes if suffix != NOTES)
     return [broken(found, f"{Path(found.key).name} ({suffixes}) {why}.")]
@@ -283,19 +283,19 @@ class _OpenEpisode:
         self._set_opened(process, opened)
 
     def picture(self, camera: int, modality: Modality, index: int, encoded: bool) -> PictureRead:
-        """Raises OSError; ReaderBusy while another recording is being opened."""
+        """Read a picture. Raises OSError; ReaderBusy while another recording is being opened."""
         with self._lock:
             if self._failed is not None:
                 raise self._failed
             try:
                 answer = self._ask(camera, modality, index, encoded).answer
             except ReaderEnded as error:
-                # It would end every new reader too, thirty times a second.
+                # No retry: it would end every new reader too, thirty times a second.
                 self._failed = OSError(f"{self._name} {error}")
                 raise self._failed from error
         if isinstance(answer, PictureRead):
             return answer
-        raise OSError(answer.message if isinstance(answer, ReadFailed) else "the reader gave no picture")
+        raise OSError(answer.message if isinstance(answer, ReadFailed) else "the reader returned no picture")
 
     def _ask(self, camera: int, modality: Modality, index: int, encoded: bool) -> Answered:
         for _ in range(2):
@@ -317,7 +317,8 @@ class _OpenEpisode:
 
 
 def find_sources(path: Path) -> list[Source]:
-    """The recordings in a file, or in a folder and the folders below it, by name: those that its library lists, damaged ones too.
+    """The recordings in a file, or in a folder and the folders below it, by name, including damaged ones, as its library
+    lists them.
 
     Raises:
         UnreadableRecording: a folder cannot be listed.
@@ -341,10 +342,10 @@ def find_sources(path: Path) -> list[Source]:
 
 
 def _source(folder: Path, files: RecordingFiles, facts: Facts, number: int) -> Source:
-    """Where to read the recording of a row.
+    """The source of a row's recording.
 
     Args:
-        number: of the row among those of these files.
+        number: index of the row among the rows of these files.
     """
     path = files.paths(folder)[0]
     part, problem = facts.trajectory, facts.problem
@@ -353,10 +354,10 @@ def _source(folder: Path, files: RecordingFiles, facts: Facts, number: int) -> S
     elif part is not None:
         path = path.with_suffix(".h5")
     elif facts.kind == "workbench" or ".rrd" in files.sizes:
-        problem = None  # reading it says what is damaged, and gives the rest
+        problem = None  # reading it reports the damage and returns the rest
     name = path.name if facts.kind == "lerobot" else path.stem
     name = name if part is None else f"{name}#{part}"
-    # A damaged copy must not hide the whole one, nor the other way round.
+    # A damaged copy and a complete one get different ids, so that neither hides the other.
     id = facts.uid if facts.uid and facts.problem is None else f"{os.path.realpath(path)}#{part or number}"
     return Source(path, part, id, name, problem)
 
@@ -366,20 +367,21 @@ def find_all_sources(paths: Sequence[Path]) -> tuple[Source, ...]:
 
     Raises:
         FileNotFoundError: a path does not exist.
-        UnreadableRecording: a file is not a recording, the folders hold none, or one cannot be listed; the message says why.
+        UnreadableRecording: a file is not a recording, the folders hold none, or one cannot be listed; the message gives the
+            reason.
     """
     found: dict[str, Source] = {}
     for path in paths:
         path = Path(path)
         if not path.exists():
-            raise FileNotFoundError(f"There is nothing at {path}: give recordings, or folders of them.")
+            raise FileNotFoundError(f"{path} does not exist: give recordings, or folders of them.")
         some = find_sources(path)
         if not some and not path.is_dir():
             raise _none_in([path])
         for source in some:
             found.setdefault(source.id, source)
     if not paths:
-        raise UnreadableRecording("No recording is named: give recordings, or folders of them.")
+        raise UnreadableRecording("No recording given: give recordings, or folders of them.")
     if not found:
         raise _none_in(paths)
     return tuple(found.values())
@@ -387,6 +389,6 @@ def find_all_sources(paths: Sequence[Path]) -> tuple[Source, ...]:
 
 def _none_in(paths: Sequence[Path]) -> UnreadableRecording:
     return UnreadableRecording(
-        f"There is no recording in {', '.join(map(str, paths))}: looked for are the .rrd, .h5 and .json of the workbench, "
+        f"There is no recording in {', '.join(map(str, paths))}. Recordings are .rrd, .h5 and .json of the workbench, "
         ".h5 with .json of ManiSkill, and LeRobot datasets."
     )

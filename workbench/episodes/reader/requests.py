@@ -1,4 +1,4 @@
-"""Messages to readers and to the fork server, and their answers."""
+"""Requests to readers and to the fork server, and their answers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from workbench.episodes.sweep_results import SweepResults
 
 
 class NewReader(msgspec.Struct, tag=True):
-    """Fork a reader for these paths; sent with its socket. Answered by its process id."""
+    """Fork a reader for these paths; sent with the reader's socket. Answered with its process id."""
 
     paths: list[Path]
     writes: Path | None = None
@@ -25,13 +25,13 @@ class NewReader(msgspec.Struct, tag=True):
 
 
 class GetExitCode(msgspec.Struct, tag=True):
-    """A reader was killed or has ended. Answered by its exit code (`os.waitstatus_to_exitcode`)."""
+    """Reap a reader that was killed or has ended. Answered with its exit code (`os.waitstatus_to_exitcode`)."""
 
     pid: int
 
 
 class ReadRows(msgspec.Struct, frozen=True):
-    """The rows of the files of one name; answered by `RowsRead`."""
+    """Read the rows of the files of one name; answered with `RowsRead`."""
 
     folder: Path
     key: bytes
@@ -39,11 +39,11 @@ class ReadRows(msgspec.Struct, frozen=True):
     sizes: dict[str, int]
     times: dict[str, int]
     only_names: bool = False
-    """Leave out what takes long to read; see `read_rows.read_found`."""
+    """Skip what is slow to read; see `read_rows.read_found`."""
 
 
 class OpenEpisode(msgspec.Struct, frozen=True):
-    """Open an episode; answered by `EpisodeRead`. Its files stay open until `CloseEpisodes`."""
+    """Open an episode; answered with `EpisodeRead`. Its files stay open until `CloseEpisodes`."""
 
     kind: SourceKind
     path: Path
@@ -53,7 +53,7 @@ class OpenEpisode(msgspec.Struct, frozen=True):
 
 
 class ReadPicture(msgspec.Struct, frozen=True):
-    """A picture of an open episode; answered by `PictureRead`."""
+    """Read a picture of an open episode; answered with `PictureRead`."""
 
     opened: int
     camera: int
@@ -70,19 +70,19 @@ class CloseEpisodes(msgspec.Struct, frozen=True):
 
 
 class ReadStoreId(msgspec.Struct, frozen=True):
-    """Rerun's id of the recording in an ``.rrd``; answered by `StoreId`."""
+    """Read rerun's id of the recording in an ``.rrd``; answered with `StoreId`."""
 
     path: Path
 
 
 class ReadSweep(msgspec.Struct, frozen=True):
-    """The results of a sweep; answered by `SweepRead`."""
+    """Read the results of a sweep; answered with `SweepRead`."""
 
     path: Path
 
 
 class Recover(msgspec.Struct, frozen=True):
-    """Run `writing.finish.recover` on a folder; answered by `Recovered`."""
+    """Run `writing.finish.recover` on a folder; answered with `Recovered`."""
 
     folder: Path
 
@@ -121,7 +121,7 @@ class EpisodeRead(msgspec.Struct, frozen=True):
     source_path: str | None
     """Recorded path of the task's file."""
     episode: Episode
-    """Without cameras, and without the visuals of its scene."""
+    """The episode without cameras, and without the visuals of its scene."""
     cameras: list[CameraRead]
     shapes: list[ShapeRead]
     visuals: list[VisualRead]
@@ -142,14 +142,14 @@ class SweepRead(msgspec.Struct, frozen=True):
 
 class Recovered(msgspec.Struct, frozen=True):
     made: list[str]
-    """Names of their ``.rrd``."""
+    """Names of the ``.rrd`` files of the recovered recordings."""
 
 
 class ReadFailed(msgspec.Struct, frozen=True):
     """The request failed."""
 
     why: Literal["unreadable", "system", "gone"]
-    """The content is broken; the system refuses the file; the episode is not open."""
+    """``unreadable``: the content is broken; ``system``: the system refuses the file; ``gone``: the episode is not open."""
     message: str
 
 

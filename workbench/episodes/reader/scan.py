@@ -12,14 +12,15 @@ from workbench.episodes.row import Facts, LibraryEntry, clean_text
 SUFFIXES = (".json", ".h5", ".rrd")
 """Suffixes of a recording, in the order of preference for opening it."""
 NOTES = ".notes"
-"""Suffix of the JSON file with tags and notes of other programs' recordings; a ``.json`` would be taken for a
-recording's."""
+"""Suffix of the JSON file with tags and notes of other programs' recordings; a ``.json`` would be mistaken for a
+recording."""
 DATASET_KEY = ["meta", "info"]
-"""How the key of a LeRobot dataset ends."""
+"""End of the key of a LeRobot dataset."""
 SETTLE_SECONDS = 3.0
-"""Seconds in which a folder may change again within one tick of its time, or a recording get its other files."""
+"""Time in which a folder may change again within one tick of its modification time, or a recording may get its other
+files."""
 MAX_ENTRIES = 500_000
-"""Names that are listed: the folder may be a home folder."""
+"""Maximum number of names that are listed: the folder may be a home folder."""
 
 
 @dataclass(frozen=True)
@@ -27,15 +28,15 @@ class RecordingFiles:
     """The files of one name; unequal after any of them was written, added or removed."""
 
     key: str
-    """Path of the name below the library's folder, with ``/``."""
+    """Path without suffix, relative to the library's folder, with ``/``."""
     sizes: dict[str, int]
-    """Suffix to bytes, in the order of `SUFFIXES`, `NOTES` last."""
+    """Size in bytes by suffix, in the order of `SUFFIXES`, `NOTES` last."""
     times: dict[str, int]
-    """Suffix to nanoseconds."""
+    """Modification time in nanoseconds by suffix."""
 
     @property
     def newest(self) -> int:
-        """Time of the last change, in nanoseconds, notes excluded."""
+        """Time of the last change in nanoseconds, excluding notes."""
         return max(at for suffix, at in self.times.items() if suffix != NOTES)
 
     def path(self, folder: Path, suffix: str) -> Path:
@@ -52,13 +53,13 @@ def broken(found: RecordingFiles, problem: str) -> LibraryEntry:
 
 
 def files_named(path: Path) -> RecordingFiles | None:
-    """The files of the recording that the file `path` belongs to, as those of its folder's library; None if there are none."""
+    """The files of the recording that `path` belongs to, with its folder as the library; None if there are none."""
     stats: dict[str, os.stat_result] = {}
     for suffix in (*SUFFIXES, NOTES):
         try:
             stats[suffix] = path.with_suffix(suffix).stat()
         except OSError:
-            continue  # not there, or a link that leads nowhere
+            continue  # missing, or a dangling link
     return _group(path.stem, stats)
 
 
@@ -71,19 +72,19 @@ def key_of(path: str) -> str:
 class Scan:
     """Result of `scan_folder`.
 
-    A folder's time changes when a name in it is added, removed or replaced, which is how recordings are written. So
-    `is_unchanged` only checks the times of folders. These advance in ticks, and a file within the tick of the last scan
-    would be missed: a folder with a recent time counts as changed (`fresh`).
+    A folder's modification time changes when a name in it is added, removed or replaced, which is how recordings are
+    written. So `is_unchanged` only checks the times of folders. These advance in ticks, and a file within the tick of the
+    last scan would be missed, so a folder with a recent time counts as changed (`fresh`).
     """
 
     found: dict[str, RecordingFiles] = field(default_factory=dict)
     """Files of each recording, by key."""
     folders: dict[str, int] = field(default_factory=dict)
-    """Every scanned folder, and its time in nanoseconds."""
+    """Modification time in nanoseconds of every scanned folder."""
     unsettled: dict[str, RecordingFiles] = field(default_factory=dict)
-    """Files whose ``.json`` may still come, by key."""
+    """Files whose ``.json`` may still follow, by key."""
     fresh: bool = False
-    """Something was written so recently that it must be scanned again."""
+    """Whether something was written so recently that the folder must be scanned again."""
     problem: str | None = None
     """A sentence, if the scan is incomplete."""
 
@@ -108,7 +109,7 @@ def scan_folder(folder: Path) -> Scan:
     while pending:
         path, below = pending.pop()
         try:
-            # Its time first, so that a file added during the listing counts as a change.
+            # Read the time first, so that a file added during the listing counts as a change.
             at = os.stat(path).st_mtime_ns
             with os.scandir(path) as listed:
                 folders[path] = at
@@ -123,12 +124,12 @@ def scan_folder(folder: Path) -> Scan:
         except FileNotFoundError:
             if not below:
                 problem = (
-                    f"{_printable(folder)} is not there. It is made when an episode is recorded into it."
+                    f"{_printable(folder)} does not exist. It is created when an episode is recorded into it."
                 )
         except OSError as error:
-            problem = f"{_printable(path)} cannot be looked into: {error.strerror or error}."
+            problem = f"{_printable(path)} cannot be listed: {error.strerror or error}."
         if entries > MAX_ENTRIES:
-            problem = f"{_printable(folder)} holds more than {MAX_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
+            problem = f"{_printable(folder)} holds more than {MAX_ENTRIES:,} files, and not all of them were searched. Choose a folder with recordings in it."
             break
     found, unsettled = {}, {}
     for key, stats in names.items():

@@ -1,1 +1,1 @@
-"""Rerun's files and viewer."""
+"""Rerun recordings, and rerun's viewer."""

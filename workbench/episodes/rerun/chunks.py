@@ -16,9 +16,9 @@ from rerun.chunk import Chunk
 STEP = "step"
 SIM_TIME = "sim_time"
 LOOK = "look"
-"""Component of a visual, JSON: its name, its colour as red, green, blue and alpha, how metallic and how rough it is."""
+"""Component of a visual, JSON: its name, its colour (RGBA), metallic and roughness."""
 _MAX_CACHED_STEPS = 2000
-"""Most steps whose times are cached: those of hours would be a hundred megabytes, for as long as the process lives."""
+"""Maximum number of steps whose times are cached: hours would take a hundred megabytes for the life of the process."""
 SERIES_COLORS = (
     (86, 180, 233),
     (230, 159, 0),
@@ -36,7 +36,7 @@ invisible in the viewer's dark or light theme."""
 def changed_rows(values: NDArray) -> list[NDArray[np.int64] | None]:
     """Rows of `values` (K, R, D) to write, for each of the K series; None for all rows.
 
-    A row that equals both neighbours is left out: the row before it holds there, and the curve is the same. A row of one
+    A row that equals both neighbours is left out: the previous row is valid there, and the curve is the same. A row of one
     number takes 20 bytes besides the number, and most flags change once per episode. First and last row always stay, so
     that the entity covers the recorded time.
     """
@@ -53,7 +53,7 @@ def changed_rows(values: NDArray) -> list[NDArray[np.int64] | None]:
 
 
 def static_chunk(entity: str, *values: Any) -> Chunk:
-    """`values` of `entity` for all times.
+    """A chunk with static `values` of `entity`.
 
     Raises:
         ValueError: rerun refuses a value.
@@ -83,10 +83,10 @@ def series_chunk(entity: str, names: tuple[str, ...], first_color: int = 0) -> C
 
 @dataclass(frozen=True)
 class _Column:
-    """Replaces rerun's ``ComponentColumn``, for an Arrow array.
+    """Replacement of rerun's ``ComponentColumn`` for an Arrow array.
 
     Rerun's archetypes validate and convert their arguments, which for a few hundred rows takes longer than making the
-    chunk. They are called once, for names and Arrow types of the columns.
+    chunk. So they are called only once, for names and Arrow types of the columns.
     """
 
     descriptor: rr.ComponentDescriptor
@@ -119,7 +119,7 @@ def _text_columns() -> tuple[tuple[rr.ComponentDescriptor, pa.DataType], ...]:
 
 def _lists(numbers: NDArray, kind: pa.DataType, per_row: int) -> pa.Array:
     """`numbers` as rows of type `kind` with `per_row` elements each, which may be fixed-size lists."""
-    # Rows of a journal may be unaligned: Arrow would use them without a copy, and rerun aborts the process (seen).
+    # Rows of a journal may be unaligned. Arrow would use them without a copy, on which rerun aborts the process (observed).
     flat = pa.array(np.require(numbers.reshape(-1), requirements=["C", "A"]))
     if pa.types.is_fixed_size_list(kind.value_type):
         flat = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)
@@ -132,27 +132,27 @@ def _begins(count: int, per_row: int) -> pa.Array:
 
 
 class TimedChunks:
-    """Chunks on both timelines of an episode."""
+    """Makes chunks on both timelines of an episode."""
 
     def __init__(self, control_dt: float) -> None:
         """`control_dt` in seconds."""
         self._control_dt = control_dt
 
     def of(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> Chunk:
-        """`columns` with a row for each of `steps` (R,)."""
+        """A chunk of `columns` with a row for each of `steps` (R,)."""
         return Chunk.from_columns(entity, _times_of(steps, self._control_dt), columns)
 
     def poses(
         self, entities: Sequence[str], steps: NDArray[np.int64], poses: NDArray[np.float32]
     ) -> Iterator[Chunk]:
-        """`poses` (len(steps), len(entities), 7), translation and xyzw; only `changed_rows`."""
+        """Chunks of `poses` (len(steps), len(entities), 7), translation and xyzw; only `changed_rows`."""
         if not entities:
             return
         by_entity = np.ascontiguousarray(poses.transpose(1, 0, 2), dtype=np.float32)
         everything = np.arange(len(steps))
         changed = [everything if rows is None else rows for rows in changed_rows(by_entity)]
         written = np.concatenate([values[rows] for values, rows in zip(by_entity, changed)])
-        # Arrow's arrays are made for all entities at once: each takes longer to make than a hundred poses to copy.
+        # One Arrow array for all entities, because making an array takes longer than copying a hundred poses.
         parts = written[:, :3], written[:, 3:]
         columns = [(about, _lists(part, kind, 1)) for (about, kind), part in zip(_pose_columns(), parts)]
         begin = 0
@@ -162,7 +162,7 @@ class TimedChunks:
             begin += len(rows)
 
     def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> Chunk:
-        """`values` (len(steps), ...), one batch per step with at least one number; only `changed_rows`."""
+        """A chunk of `values` (len(steps), ...), one batch per step with at least one number; only `changed_rows`."""
         flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
         (rows,) = changed_rows(flat[None])
         if rows is not None:
@@ -171,7 +171,7 @@ class TimedChunks:
         return self.of(entity, steps, [_Column(descriptor, _lists(flat, kind, flat.shape[1]))])
 
     def texts(self, entity: str, lines: Sequence[tuple[int, str, str]]) -> Chunk:
-        """A line of a log for each step, level and text."""
+        """A chunk with a log line for each (step, level, text)."""
         steps, levels, texts = zip(*lines)
         columns = [
             _Column(descriptor, pa.array([[text] for text in column], kind))
@@ -188,7 +188,7 @@ def _times_of(steps: NDArray[np.int64], control_dt: float) -> tuple[rr.TimeColum
 
 @lru_cache(maxsize=64)
 def _kept_times(steps: bytes, control_dt: float) -> tuple[rr.TimeColumn, ...]:
-    """Most entities share them, and so does the next episode of the same length."""
+    """Cached times: shared by most entities, and by the next episode of the same length."""
     return _times(np.frombuffer(steps, np.int64), control_dt)
 
 
@@ -199,7 +199,7 @@ def _times(steps: NDArray[np.int64], control_dt: float) -> tuple[rr.TimeColumn, 
 
 
 def static_pose(entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> Chunk:
-    """The pose, (3,) and (4,), of an entity that never moves."""
+    """A chunk with the pose, (3,) and (4,), of an entity that never moves."""
     return _static_pose(entity, tuple(translation.tolist()), tuple(xyzw.tolist()))
 
 

@@ -33,12 +33,13 @@ LOGS = "/logs"
 EVENTS = "/logs/events"
 ENTRY_TEXTS = "/logs/evaluate"
 OBSERVATION = "/observation/state"
-"""All observations but pictures as one batch, as in LeRobot: an entity each would cost 5 kB per file and 40 B per step."""
+"""All observations except pictures as one batch, as in LeRobot: one entity for each would cost 5 kB per file and 40 B per
+step."""
 REWARD_TERMS = "reward_terms/"
 """Prefix of the entries of ``evaluate()`` that are terms of the reward."""
 
 _MAX_PIXELS, _MAX_PICTURES = 1 << 20, 1024
-"""Limits of one chunk, whose pictures are in memory together."""
+"""Maximum pixels and pictures of one chunk, whose pictures are in memory together."""
 _PNG_RGBA = 6
 """Colour type of a PNG, its byte 25 (PNG specification, section 11.2.1)."""
 FRUSTUM_METRES = 0.12
@@ -51,9 +52,9 @@ z up): the rotation matrix [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]."""
 
 
 def chunks(episode: Episode) -> Iterator[Chunk]:
-    """All chunks of an episode with a scene, static ones first; pictures are read as they are needed.
+    """All chunks of an episode with a scene, static ones first; pictures are read when they are needed.
 
-    Programs read these files too, so the layout is a contract:
+    Other programs read these files, so the layout is a contract:
 
     - ``/world`` right-handed, z up; ``/world/<body>`` its pose, ``/world/<body>/<n>`` its static meshes;
     - ``/world/cameras/<name>`` pose and pinhole, with children ``rgb``, ``depth`` and ``segmentation``;
@@ -62,11 +63,11 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
       ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` and ``/logs/evaluate`` as text.
 
     Timelines are ``step``, the state's number, and ``sim_time``. Row k is the state after k control steps, with the
-    action that led there and its reward: the action of row k is ``episode.action[k - 1]``, and row 0 has neither. Rows
-    of numbers or poses between two equal ones are left out (`chunks.changed_rows`): the last row before them holds.
+    action that led to it and its reward: the action of row k is ``episode.action[k - 1]``, and row 0 has neither. Rows
+    of numbers or poses between two equal ones are left out (`chunks.changed_rows`): the previous row is valid there.
 
-    All data are columns, one call per entity: forty times faster than one call per row (measured). Rerun has xyzw
-    quaternions and OpenCV cameras (x right, y down, z forward); ManiSkill has wxyz and x forward, y left, z up.
+    All data are columns, with one call per entity: forty times faster than one call per row (measured). Rerun uses xyzw
+    quaternions and OpenCV cameras (x right, y down, z forward); ManiSkill uses wxyz and x forward, y left, z up.
 
     Raises:
         ValueError: rerun refuses a value.
@@ -111,20 +112,20 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
 
 
 def _bodies(episode: Episode) -> dict[int, str]:
-    """Entities of the bodies that are in the episode's env."""
+    """Entities, by body index, of the bodies in the episode's env."""
     assert episode.geometry is not None and episode.poses is not None
     present = np.asarray(np.isfinite(episode.poses).any(axis=(0, 2)))
     return {body: entity for body, entity in enumerate(body_entities(episode.geometry)) if present[body]}
 
 
 def _never_moves(poses: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(...) of poses (R, ..., 7): whether all R are equal."""
+    """Whether all R of the poses (R, ..., 7) are equal, as (...)."""
     bits = poses.view(np.int32)  # as bits, so that NaN equals NaN
     return np.asarray((bits == bits[0]).all(axis=(0, -1)))
 
 
 def _pieces(cameras: Sequence[CameraTrack]) -> list[tuple[int, slice]]:
-    """Camera and slice of pictures of each chunk, in order of time."""
+    """(camera, slice of its pictures) of each chunk, in order of time."""
     found = []
     for number, camera in enumerate(cameras):
         many = min(max(_MAX_PIXELS // (camera.info.width * camera.info.height), 1), _MAX_PICTURES)
@@ -139,7 +140,7 @@ def _pieces(cameras: Sequence[CameraTrack]) -> list[tuple[int, slice]]:
 def body_entities(geometry: SceneGeometry) -> tuple[str, ...]:
     """(B,) entity path of each body: ``/world/<actor>`` or ``/world/<articulation>/<link>``.
 
-    Rerun composes the transforms of nested entities, so no body may be below another: an actor with the name of an
+    Rerun composes the transforms of nested entities, so no body may be below another one: an actor with the name of an
     articulation, or of the cameras' folder, gets an underscore.
     """
     return _entities_of(geometry.body_names)
@@ -196,17 +197,17 @@ def _world() -> Chunk:
 
 _TEXTURE_QUALITY = 64
 VIEWER_TEXELS = 96
-"""Texels on the longest side of a texture as rerun shows it; the workbench reads the full one, which is stored next to
+"""Longest side, in texels, of a texture for rerun's viewer; the workbench reads the full texture, which is stored next to
 it as WebP."""
 _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
-"""Results of `_mesh_chunk` by the visual's id, while the visual lives: the next episode of the scene reuses them, since
-textures are megabytes to convert."""
+"""Cache of `_mesh_chunk` by the visual's id, for the life of the visual: the next episode of the scene avoids converting
+megabytes of textures."""
 _MAX_ENTITIES = 64
-"""Entities per visual. A scene that names bodies by env has one, and a copy, for each env."""
+"""Maximum number of cached entities per visual. A scene that names bodies by env has one, and a copy, for each env."""
 _encoded: dict[bytes, bytes] = {}
 _MAX_ENCODED_TEXTURES = 256
 _making = threading.Lock()
-"""Several threads may write episodes of one scene."""
+"""Guards the caches: several threads may write episodes of one scene."""
 
 
 def _mesh_chunk(visual: Visual, entity: str) -> Chunk | None:
@@ -229,12 +230,12 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
     mesh = _mesh(visual.mesh, visual.material)
     if mesh is None:
         return None
-    # Values that rerun's mesh lacks, for reading the scene back. In one component, since each takes 350 bytes.
+    # Values that rerun's mesh lacks, for reading the scene back; in one component, since each component takes 350 bytes.
     material = visual.material
     look = [visual.name, *map(float, (*material.base_color, material.metallic, material.roughness))]
     extras: dict[str, Any] = {LOOK: json.dumps(look)}
     if material.texture is not None and visual.mesh.uvs is not None and _is_large(material.texture):
-        # Rerun's own texture is uncompressed: that of ManiSkill's table would be three quarters of most recordings.
+        # Rerun's own texture is uncompressed: the table's of ManiSkill would be three quarters of most recordings.
         extras["texture"] = pa.array(np.frombuffer(_webp(material.texture), np.uint8))
     return static_chunk(entity, mesh, rr.AnyValues(**extras))
 
@@ -244,7 +245,7 @@ def _is_large(texture: NDArray[np.uint8]) -> bool:
 
 
 def _webp(texture: NDArray[np.uint8]) -> bytes:
-    """WebP bytes, cached by content: encoding a texture takes 0.2 s, and every recorder reads the scene again."""
+    """The texture as WebP, cached by content: encoding one takes 0.2 s, and every recorder reads the scene again."""
     pixels = np.ascontiguousarray(texture[..., :3])
     digest = xxhash.xxh3_128_digest(pixels.data)
     if digest not in _encoded:
@@ -257,12 +258,12 @@ def _webp(texture: NDArray[np.uint8]) -> bytes:
 
 
 def _small(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3)"""
+    """The texture (H, W, 3) for rerun's viewer."""
     if not _is_large(texture):
         return np.ascontiguousarray(texture[..., :3])
     image = Image.fromarray(np.ascontiguousarray(texture[..., :3]))
     image.thumbnail((VIEWER_TEXELS, VIEWER_TEXELS), Image.Resampling.BOX)
-    # Nobody sees the last two bits, and without them the file takes a third less.
+    # The last two bits are invisible, and without them the file is a third smaller.
     return np.asarray(image) & np.uint8(0xFC) | np.uint8(2)
 
 
@@ -286,7 +287,7 @@ def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
 
 def _classes(segmentation: Mapping[int, str]) -> Chunk:
     names = {0: "background", **segmentation}
-    # Class ids are 16 bit in rerun; names of larger ones are dropped (ManiSkill's are int16).
+    # Rerun's class ids have 16 bits; names of larger ids are dropped (ManiSkill's are int16).
     classes = [(int(id_), name) for id_, name in sorted(names.items()) if 0 <= id_ <= 0xFFFF]
     return static_chunk(CAMERAS, rr.AnnotationContext([(*c, (0, 0, 0)) if c[0] == 0 else c for c in classes]))
 
@@ -316,7 +317,7 @@ def _pinhole(camera: CameraTrack, entity: str, ids: np.dtype) -> Iterator[Chunk]
 
 
 def _ids(cameras: Sequence[CameraTrack], pieces: Iterable[tuple[int, slice]]) -> list[np.dtype]:
-    """Dtype of each camera's segmentation ids; int32 if one of its pictures has ids beyond 16 bits."""
+    """Dtype of each camera's segmentation ids: int32 if one of its pictures has ids beyond 16 bits."""
     wide = set()
     for number, some in pieces:
         held = cameras[number].segmentation
@@ -330,7 +331,7 @@ def _picture_columns(modality: Modality, blobs: Sequence[bytes], kind: np.dtype)
         return rr.EncodedImage.columns(blob=blobs)
     if modality == "depth":
         return rr.EncodedDepthImage.columns(blob=blobs)
-    # Rerun shows names of ids only for uncompressed pictures; its files compress them.
+    # Rerun shows names of ids only for uncompressed pictures; its files compress them anyway.
     ids = np.stack([decode("segmentation", blob) for blob in blobs]).astype(kind)
     return rr.SegmentationImage.columns(buffer=ids.reshape(len(ids), -1).view(np.uint8))
 
@@ -339,11 +340,11 @@ def _picture_columns(modality: Modality, blobs: Sequence[bytes], kind: np.dtype)
 
 
 def _numbers(episode: Episode) -> list[tuple[str, list[str], NDArray]]:
-    """Entity, names of its curves, and its rows of numbers: one per state, or T without the reset."""
+    """(entity, names of its curves, rows of numbers): one row per state, or T rows without the reset."""
     found = [
         ("/action", list(episode.action_names), episode.action),
         ("/reward", ["reward"], episode.reward),
-        # The blueprint draws nothing below /episode: names and colours would take 2 kB each.
+        # Without names and colours, which would take 2 kB each: the blueprint draws nothing below /episode.
         ("/episode/terminated", [], episode.terminated),
         ("/episode/truncated", [], episode.truncated),
     ]
@@ -374,7 +375,7 @@ def _series_names(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 def _series(numbers: Iterable[tuple[str, list[str], NDArray]]) -> Iterator[Chunk]:
     drawn: Counter[str] = Counter()
     for entity, series, _ in numbers:
-        # One view shows all entities of a folder, and the batch's together with the env's.
+        # One view shows all entities of a folder, and those of the batch together with those of the env.
         folder = entity.split("/")[1].replace("batch", "evaluate")
         if series:
             yield series_chunk(
@@ -396,7 +397,7 @@ def events(episode: Episode) -> list[tuple[int, str, str]]:
 
 
 def rising_edges(values: NDArray[np.bool_]) -> list[int]:
-    """Indices at which `values` becomes true."""
+    """Indices at which `values` turns true."""
     before = np.concatenate([[False], values[:-1]])
     return np.flatnonzero(values & ~before).tolist()
 
@@ -407,7 +408,7 @@ def _texts(episode: Episode) -> list[tuple[int, str, str]]:
         (
             state,
             "INFO",
-            f"{name}: {entry.text}" if entry is not None else f"{name} is not returned any more",
+            f"{name}: {entry.text}" if entry is not None else f"{name} is no longer returned",
         )
         for name, track in episode.texts.items()
         for state, entry in track

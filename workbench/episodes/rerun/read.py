@@ -28,17 +28,17 @@ _PROPERTIES = "/__properties"
 _ALL = ("+ /**", f"+ {_PROPERTIES}/**")
 """``/**`` does not include rerun's own entities."""
 
-# Opening a truncated file raises an error; this warning would repeat it in the terminal.
+# Opening a truncated file raises an error, which this warning would repeat in the terminal.
 warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)
 
 
 class RerunTable:
     """The content of an ``.rrd`` by entity and component.
 
-    Rerun's query engine is an extra of 100 MB, but chunks are Arrow tables, so columns that `layout` wrote come out as
+    Rerun's query engine is an extra of 100 MB, but chunks are Arrow tables, so the columns that `layout` wrote can be read as
     columns. The file is read once, in pieces; pictures are not kept, but read again on access (`pictures`). A mesh is in
-    every recording of its scene, often as the same chunk: one that another recording has loaded is found by the chunk's id,
-    and not decoded again.
+    every recording of its scene, often as the same chunk: a mesh that another recording has loaded is found by the chunk's
+    id, and not decoded again.
 
     The file stays open while its pictures may be read, also after it is deleted.
     """
@@ -48,7 +48,8 @@ class RerunTable:
         Args:
             shapes: shapes to share with other recordings.
 
-        Raises OSError, ValueError or RuntimeError if `path` is not an ``.rrd``.
+        Raises:
+            OSError, ValueError, RuntimeError: `path` is not an ``.rrd``.
         """
         self._shapes = SharedShapes() if shapes is None else shapes
         self._timed: dict[tuple[str, str], list[tuple[NDArray[np.int64], pa.Array]]] = {}
@@ -57,7 +58,7 @@ class RerunTable:
         self._static_chunks: dict[str, list[tuple[str, int]]] = {}
         """Id and size of the static chunks of each entity."""
         self.lost_pictures: tuple[str, ...] = ()
-        """Entities whose pictures cannot be read, because the file is damaged there."""
+        """Entities whose pictures cannot be read because the file is damaged there."""
         self._file = OpenFile(path)
         try:
             for chunk in self._file.chunks(*_ALL):
@@ -66,7 +67,7 @@ class RerunTable:
             self._read_what_is_left()
 
     def _read_what_is_left(self) -> None:
-        """Read a damaged file: pictures are most of it, and one of them should not cost the rest."""
+        """Read the intact chunks of a damaged file: most of it are pictures, and a damaged one must not lose the rest."""
         for held in (self._timed, self._static, self._pictures, self._static_chunks):
             held.clear()
         pictures = self._file.entities_with(PICTURE_COMPONENTS.values())
@@ -95,13 +96,13 @@ class RerunTable:
             return
         for name, column in _data_of(batch):
             if name in PICTURE_COMPONENTS.values():
-                # A copy: Arrow's would keep the pictures of the chunk in memory.
+                # A copy, because Arrow's array would keep the pictures of the chunk in memory.
                 self._pictures.setdefault((entity, name), []).append(_PictureChunk(chunk.id, steps.copy()))
             else:
                 self._timed.setdefault((entity, name), []).append((steps, column))
 
     def property(self, name: str, component: str) -> Any:
-        """A property's value, a list of several, None if missing."""
+        """A property's value; a list for several values, None if it is missing."""
         for (entity, key), values in self._static.items():
             if entity == f"{_PROPERTIES}/{name}" and key.rsplit(":", 1)[-1] == component:
                 found = values.to_pylist()
@@ -177,7 +178,7 @@ class RerunTable:
         )
 
     def _visual_at(self, entity: str, default: str) -> tuple[str, Mesh, Material] | None:
-        """Name (`default` if not recorded), mesh and material of a visual; None if there is none."""
+        """Name (`default` if none is recorded), mesh and material of a visual; None if there is none."""
         chunks = self._static_chunks.get(entity, [])
         # Rerun's ids are unique; the size guards against manipulated files.
         mark = chunks[0] if len(chunks) == 1 else None
@@ -216,7 +217,7 @@ class RerunTable:
             name, *numbers = json.loads(look)
             r, g, b, a, metallic, roughness = map(float, numbers)
             return str(name), Material((r, g, b, a), metallic, roughness, texture)
-        # Files of versions before have the name, and a component for all numbers or one for each.
+        # Files of older versions have the name, and a component for all numbers or one for each.
         name = str(self._one(entity, "visual", default))
         surface = self._static.get((entity, "surface"))
         if surface is not None:
@@ -233,7 +234,7 @@ class RerunTable:
         return name, material
 
     def _texture(self, entity: str) -> NDArray[np.uint8] | None:
-        """(H, W, 4)"""
+        """The texture (H, W, 4)."""
         buffer = self._static.get((entity, "Mesh3D:albedo_texture_buffer"))
         if buffer is None:
             return None
@@ -243,7 +244,7 @@ class RerunTable:
         return np.concatenate([rgb, np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=-1)
 
     def _full_texture(self, entity: str, shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The texture (H, W, 3) of which rerun shows a small one; `shown` itself where there is no other."""
+        """The full texture (H, W, 3) of the small one that rerun shows; `shown` itself if there is no other."""
         encoded = self._static.get((entity, "texture"))
         if encoded is None:
             return shown
@@ -258,7 +259,7 @@ class RerunTable:
 
 
 def rows_at(steps: NDArray[np.int64], first: int, states: int) -> NDArray[np.int64]:
-    """(states - first,) index of the row that holds at each state: its own or the last before it; -1 if there is none.
+    """(states - first,) index of the row that is valid at each state: its own or the last one before; -1 if there is none.
 
     Equal rows are left out of a file (`chunks.changed_rows`).
     """
@@ -275,7 +276,7 @@ def _plain(values: pa.Array) -> NDArray:
 def read_properties(path: Path) -> dict[str, dict[str, Any]]:
     """The properties of the first recording in `path`, by name and component; several values are a list.
 
-    A library needs no more of a lone ``.rrd``. A truncated file is read up to its end.
+    A library needs nothing else of a lone ``.rrd``. A truncated file is read up to its end.
 
     Raises:
         ValueError: `path` holds no recording.
@@ -317,7 +318,7 @@ def _data_of(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.Array]]:
 # --- pictures --------------------------------------------------------------------------------------
 
 CACHE_BYTES = 64 << 20
-"""Decompressed chunks kept in the process; the newest is kept at any size."""
+"""Maximum size of the cache of decompressed chunks; the newest chunk is kept at any size."""
 PICTURE_COMPONENTS: dict[Modality, str] = {
     "rgb": "EncodedImage:blob",
     "depth": "EncodedDepthImage:blob",
@@ -329,7 +330,7 @@ PICTURE_COMPONENTS: dict[Modality, str] = {
 class _PictureChunk:
     id: str
     steps: NDArray[np.int64]
-    """(R,) state of each picture."""
+    """(R,) state index of each picture."""
 
 
 class OpenFile:
@@ -344,7 +345,7 @@ class OpenFile:
 
     @property
     def path(self) -> Path:
-        """A path by which rerun opens it, while this object lives: it takes no name that is not UTF-8."""
+        """A path for rerun, valid while this object lives: rerun does not open names that are not UTF-8."""
         try:
             os.fspath(self._path).encode()
         except UnicodeEncodeError:
@@ -352,14 +353,14 @@ class OpenFile:
         return self._path
 
     def chunks(self, *content: str, is_static: bool | None = None) -> Iterator[Chunk]:
-        """The chunks of these entities, in rerun's filter syntax, read one after the other.
+        """Read the chunks of these entities (in rerun's filter syntax), one after the other.
 
         Raises ValueError or RuntimeError if it is not a complete ``.rrd``.
         """
         yield from self._opened().stream().filter(content=content, is_static=is_static)
 
     def entities_with(self, components: Iterable[str]) -> tuple[str, ...]:
-        """Entities that have one of the components. Raises as `chunks`."""
+        """Entities that have one of the components. Raises as `chunks` does."""
         columns, wanted = self._opened().schema().component_columns(), set(components)
         return tuple({column.entity_path: None for column in columns if column.component in wanted})
 
@@ -373,15 +374,15 @@ class OpenFile:
             os.close(self._descriptor)
 
     def __reduce__(self) -> str:
-        # In another process the descriptor would be another file, which `__del__` would close.
+        # In another process the descriptor would be a different file, which `__del__` would close.
         raise TypeError("An open recording cannot be sent to another process; send its path.")
 
 
 class _ChunkCache:
-    """The last used chunks of pictures, of all recordings of the process.
+    """Cache of the last used chunks of pictures, for all recordings of the process.
 
     An episode of ten thousand steps with four cameras is a few hundred megabytes, and a review may have sixty open. A
-    chunk is a few megabytes, and the next picture is usually in the same one.
+    chunk is a few megabytes, and the next picture is usually in the same chunk.
     """
 
     def __init__(self) -> None:
@@ -412,7 +413,7 @@ _chunk_cache = _ChunkCache()
 
 
 def _read_rows(file: OpenFile, entity: str, chunk: str, component: str) -> pa.Array:
-    # Rerun's reader finds entities, not chunks: 10 ms for the 3,000 pictures of a camera (measured).
+    # Rerun's reader finds entities, not single chunks: 10 ms for the 3,000 pictures of a camera (measured).
     try:
         for read in file.chunks(f"+ {entity}", is_static=False):
             if read.id == chunk:
@@ -430,7 +431,7 @@ def pictures_in(
     height: int,
     width: int,
 ) -> tuple[NDArray[np.int64], EncodedPictures]:
-    """State (P,) of each picture, ascending, and the pictures."""
+    """States (P,) of the pictures, ascending, and the pictures."""
     component = PICTURE_COMPONENTS[modality]
     states = np.concatenate([chunk.steps for chunk in chunks])
     order = np.argsort(states, kind="stable")
@@ -452,6 +453,6 @@ def pictures_in(
 
 
 def _steps(batch: pa.RecordBatch) -> NDArray[np.int64] | None:
-    """(R,) state of each row; None if the chunk has no such timeline."""
+    """(R,) state index of each row; None if the chunk has no such timeline."""
     index = batch.schema.get_field_index(STEP)
     return None if index < 0 else batch.column(index).cast(pa.int64(), safe=False).to_numpy()

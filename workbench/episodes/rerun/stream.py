@@ -19,10 +19,10 @@ from rerun.chunk import Chunk
 from workbench.episodes.rerun.layout import CAMERAS
 
 _COPIED_BYTES = 1 << 16
-"""Bytes that are copied at once: what a pipe holds."""
+"""Number of bytes that are copied at once: the capacity of a pipe."""
 _one_at_a_time = threading.Lock()
-"""Rerun 0.41 waits for ever where one thread makes a stream while another one ends the threads of streams. And two that
-change and restore a variable of the environment may restore the other's change."""
+"""Serializes writers: rerun 0.41 deadlocks if one thread makes a stream while another one ends the threads of streams. And
+two threads that change and restore an environment variable may restore each other's change."""
 
 
 def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> bytes:
@@ -38,20 +38,20 @@ def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> bytes:
 def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: Iterable[Chunk]) -> None:
     """Write `chunks` as one recording to `path`, after `blueprint`, which becomes the active and the default one.
 
-    ``LazyChunkStream.write_rrd`` is faster, but writes one store only, and a blueprint is a second one.
+    ``LazyChunkStream.write_rrd`` is faster, but writes only one store, and a blueprint is a second one.
 
     Raises:
         OSError: it cannot be written.
-        Exception: an error of `chunks`.
+        Exception: raised by `chunks`.
     """
     with _one_at_a_time, path.open("wb", buffering=0) as file, _copied_to(file) as copy:
         with _rerun_enabled():
-            # Rerun's default id is that of the process: two episodes of one process would become one.
+            # A new id, because rerun's default is one per process: two episodes of one process would become one.
             stream = rr.RecordingStream(application_id, recording_id=uuid.uuid4().hex, send_properties=False)
         try:
             stream.save(copy.path)
             stream.log_file_from_contents("blueprint.rbl", blueprint)
-            # Waits for the blueprint. A viewer that reads the file from its beginning uses its own layout until it comes.
+            # Write the blueprint first. A viewer that reads the file from its beginning uses its own layout until then.
             stream.flush()
             for chunk in chunks:
                 copy.check()
@@ -67,7 +67,7 @@ def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: I
 
 @contextmanager
 def _rerun_enabled() -> Iterator[None]:
-    """Override ``RERUN=off`` of the user, which is for logging in their code: with it rerun writes nothing, silently."""
+    """Override the user's ``RERUN=off``, which is for logging in their code: with it rerun silently writes nothing."""
     entries = os.environ.get("RERUN")
     if entries is None:
         yield
@@ -80,8 +80,8 @@ def _rerun_enabled() -> Iterator[None]:
 
 
 def _end_threads(application_id: str) -> None:
-    """End the threads of disconnected streams. Else each leaves two, for as long as the process lives."""
-    # It also turns off the global recording, to which the user's code may log: their data count more than our threads.
+    """End the threads of disconnected streams. Without this each leaves two threads for the life of the process."""
+    # Not with a global recording, which this would turn off: the user's code may log to it.
     if rr.get_global_data_recording() is None and rr.get_thread_local_data_recording() is None:
         rr.init(application_id, init_logging=False)
 
@@ -91,10 +91,10 @@ class _File(Protocol):
 
 
 class _Copy(threading.Thread):
-    """A pipe, and a thread that copies what comes out of it to a file.
+    """Thread that copies the content of a pipe to a file.
 
-    Rerun gets the pipe instead of the file: where a file cannot be written, for example because the disk is full, rerun
-    0.41 prints the error and does not raise it, or waits for ever.
+    Rerun writes to the pipe instead of the file: if a file cannot be written, for example because the disk is full, rerun
+    0.41 prints the error instead of raising it, or hangs.
     """
 
     def __init__(self, file: _File) -> None:
@@ -120,7 +120,7 @@ class _Copy(threading.Thread):
         buffer = memoryview(bytearray(_COPIED_BYTES))
         while True:
             ready = {end for end, _ in poll.poll()}
-            # Not until the end of the file: it does not come while a process that was forked meanwhile has the pipe.
+            # Do not wait for EOF: it does not arrive while a process that was forked meanwhile holds the pipe.
             if self._read_end not in ready:
                 return
             rest = buffer[: os.readv(self._read_end, [buffer])]
@@ -128,10 +128,10 @@ class _Copy(threading.Thread):
                 try:
                     rest = rest[self._file.write(rest) :]
                 except BaseException as error:
-                    self._error = error  # and go on reading: rerun may wait for ever
+                    self._error = error  # keep reading, or rerun may hang
 
     def finish(self) -> None:
-        """Return when everything that rerun has written is copied."""
+        """Wait until everything that rerun has written is copied."""
         os.eventfd_write(self._finished, 1)
         self.join()
         for end in (self._read_end, self._write_end, self._finished):
@@ -140,7 +140,7 @@ class _Copy(threading.Thread):
 
 @contextmanager
 def _copied_to(file: _File) -> Iterator[_Copy]:
-    """Raises OSError if `file` cannot be written."""
+    """Context manager with a `_Copy` to `file`. Raises OSError if `file` cannot be written."""
     copy = _Copy(file)
     copy.start()
     try:

@@ -32,7 +32,7 @@ VIEWER_FILES = {
     "re_viewer.js": "text/javascript; charset=utf-8",
     "re_viewer_bg.wasm": "application/wasm",
 }
-"""Name to content type."""
+"""Content type by name."""
 
 VIEWER_POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'unsafe-inline'; "
@@ -48,7 +48,7 @@ _packing = threading.Lock()
 
 
 def rerun_command() -> list[str]:
-    """The command of the rerun that this interpreter imports.
+    """The command of the rerun version that this interpreter imports.
 
     A ``rerun`` on PATH may have another version, and file and viewer must match. ``python -m rerun_cli`` loses the exit
     status (rerun 0.41), and killing it leaves its program running.
@@ -60,7 +60,7 @@ def rerun_command() -> list[str]:
 
 
 def quiet_environment() -> dict[str, str]:
-    """The environment in which rerun's command sends no usage statistics.
+    """Environment in which rerun's command sends no usage statistics.
 
     Rerun has no variable for that alone; with ``CI`` set it neither sends nor asks, and keeps the user's settings (rerun
     0.41, crate re_analytics).
@@ -71,17 +71,17 @@ def quiet_environment() -> dict[str, str]:
 
 
 def free_port() -> int:
-    """A loopback port that was free just now; rerun cannot choose one and report it."""
+    """A free loopback port; rerun cannot choose one and report it."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return probe.getsockname()[1]
 
 
 def await_port(process: subprocess.Popen[bytes], port: int) -> None:
-    """Return when `process` listens on `port`.
+    """Wait until `process` listens on `port`.
 
     Raises:
-        RuntimeError: it ended, or was killed after `START_SECONDS`.
+        RuntimeError: the process ended, or was killed after `START_SECONDS`.
     """
     deadline = time.monotonic() + START_SECONDS
     while time.monotonic() < deadline:
@@ -116,12 +116,12 @@ class Viewer:
     _says: threading.Thread
 
     def wait(self) -> None:
-        """Return when the window is closed.
+        """Wait until the window is closed.
 
         Raises:
             RuntimeError: the viewer ended with an error.
         """
-        # Polled: a signal that the kernel delivers to another thread does not wake a blocking wait.
+        # Poll, because a signal that the kernel delivers to another thread does not wake a blocking wait.
         while (status := self._process.poll()) is None:
             time.sleep(0.1)
         if status:
@@ -141,13 +141,13 @@ def resolve_recordings(paths: Sequence[Path]) -> list[Path]:
     """
     files = [Path(path).resolve() for path in paths]
     if not files:
-        raise ValueError("No recording was named: give the path of one or more .rrd files.")
+        raise ValueError("No recording given: give the path of one or more .rrd files.")
     for file in files:
         if not file.is_file():
             raise FileNotFoundError(f"{file} is not a file: give the path of an .rrd file.")
         if file.suffix != ".rrd":
             # The web viewer would show nothing, without an error.
-            raise ValueError(f"{file} is no .rrd file.")
+            raise ValueError(f"{file} is not an .rrd file.")
     return files
 
 
@@ -156,13 +156,13 @@ def open_window(paths: Sequence[Path]) -> Viewer:
 
     Raises:
         ValueError, FileNotFoundError: see `resolve_recordings`.
-        RuntimeError: there is no screen, or rerun did not start.
+        RuntimeError: there is no display, or rerun did not start.
     """
     files = resolve_recordings(paths)
     if not has_screen(os.environ):
-        # Rerun would only fail after loading the files.
+        # Checked first, because rerun fails only after loading the files.
         raise RuntimeError(
-            "There is no screen here (DISPLAY and WAYLAND_DISPLAY are empty); open the page instead."
+            "There is no display here (DISPLAY and WAYLAND_DISPLAY are empty); open the page instead."
         )
     port = free_port()
     command = [*rerun_command(), "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
@@ -180,7 +180,7 @@ def open_window(paths: Sequence[Path]) -> Viewer:
 
 
 def _print_all(output: IO[bytes]) -> None:
-    """Print rerun's output without control characters, since it contains names from the file."""
+    """Print rerun's output without control characters, because it contains names from the file."""
     with output:
         for line in output:
             print(only_colours(line.decode(errors="replace")), end="", file=sys.stderr, flush=True)
@@ -195,16 +195,16 @@ def has_screen(environment: Mapping[str, str]) -> bool:
 
 
 def viewer_file(name: str) -> Path:
-    """Path of the gzip of a file of the web viewer, `name` in `VIEWER_FILES`."""
+    """Path of a gzipped file of the web viewer; `name` is a key of `VIEWER_FILES`."""
     return web_viewer_folder() / f"{name}.gz"
 
 
 def web_viewer_folder() -> Path:
-    """Folder of the web viewer's files, ``<name>.gz`` each; the first call makes them, in about ten seconds.
+    """Folder of the web viewer's files ``<name>.gz``; the first call creates them, in about ten seconds.
 
-    The files are inside rerun's command, which only serves them, uncompressed (43 MB). So it is started once per version
-    of rerun, on loopback (by default it binds to every address), and the files are stored as gzip (14 MB) in the user's
-    cache. `share.rerun_panel` serves them.
+    The files are embedded in rerun's command, which only serves them, uncompressed (43 MB). So it is started once per
+    version of rerun, on loopback (by default it binds to every address), and the files are stored as gzip (14 MB) in the
+    user's cache. `share.rerun_panel` serves them.
 
     Raises:
         RuntimeError: rerun did not serve them, or they cannot be stored.
@@ -217,7 +217,7 @@ def web_viewer_folder() -> Path:
                 _write_cache(web_viewer_files(), folder)
             except OSError as error:
                 raise RuntimeError(
-                    f"rerun's web viewer could not be stored in {folder} ({error.strerror or error}); make room there, or name "
+                    f"rerun's web viewer could not be stored in {folder} ({error.strerror or error}); make room there, or set "
                     "another folder in XDG_CACHE_HOME."
                 ) from error
     return folder
@@ -238,11 +238,11 @@ def _write_cache(files: dict[str, bytes], folder: Path) -> None:
     try:
         for name, content in files.items():
             (made / f"{name}.gz").write_bytes(gzip.compress(content, 6))
-        # By one rename: other processes see a complete folder.
+        # Rename at the end, so that other processes see a complete folder.
         made.rename(folder)
     except OSError:
         shutil.rmtree(made, ignore_errors=True)
-        if not folder.is_dir():  # else another process has stored the same files
+        if not folder.is_dir():  # otherwise another process has stored the same files
             raise
 
 
@@ -263,7 +263,7 @@ def web_viewer_files() -> dict[str, bytes]:
     )
     try:
         await_port(process, page_port)
-        # Ignore proxies of the environment: the files are on this machine.
+        # Ignore the environment's proxies: the files are on this machine.
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         files = {}
         for name in VIEWER_FILES:

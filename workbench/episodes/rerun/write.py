@@ -1,4 +1,4 @@
-"""Writes an episode as an ``.rrd`` with a blueprint in the arrangement of the workbench's page."""
+"""Writes an episode as an ``.rrd`` with a blueprint that resembles the workbench's page."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ from workbench.episodes.rerun.layout import (
 from workbench.episodes.rerun.stream import encode_blueprint, write_recording
 
 MAX_SERIES = 32
-"""An ``evaluate()`` entry with more numbers is not drawn: it would hide the others."""
+"""Maximum number of curves of an ``evaluate()`` entry; one with more is not drawn, because it would hide the others."""
 MAX_STACKED = 3
-"""More cameras than this are in tabs: stacked, each would be a narrow strip."""
+"""Maximum number of stacked cameras; more are in tabs, because each would be a narrow strip."""
 EYE_DIRECTION = (0.75, 0.85, 0.6)
-"""Direction from the scene's middle to the eye, like ManiSkill's render cameras."""
+"""Direction from the scene's centre to the eye, like ManiSkill's render cameras."""
 
 
 def write_rrd(episode: Episode, path: Path) -> None:
     """Write `episode`, which has a scene, to `path`, overwriting a file there.
 
-    Chunks are made while rerun writes them, so that pictures are never in memory all at once.
+    Chunks are made while rerun writes them, so that the pictures are never all in memory at once.
 
     Raises:
         OSError: it cannot be written, or a picture cannot be read.
@@ -74,7 +74,7 @@ def _blueprint(application_id: str, arranged: Arrangement) -> bytes:
 
 
 def _application_id(info: EpisodeInfo) -> str:
-    """The viewer keeps one blueprint per application id; rerun renames an id with a slash."""
+    """Application id of a recording. The viewer keeps one blueprint per id, and renames an id with a slash."""
     return f"workbench {info.task}".replace("/", "-")
 
 
@@ -95,7 +95,7 @@ def _title(episode: Episode) -> str:
 def properties(episode: Episode) -> dict[str, dict[str, Any]]:
     """The properties of the recording, by name and component.
 
-    ``success`` and ``fail`` are those of the last state, ``success_once`` and ``fail_once`` of any, as in ManiSkill's
+    ``success`` and ``fail`` are those of the last state, ``success_once`` and ``fail_once`` of any state, as in ManiSkill's
     metrics. ``source`` has the texts of the task's files, so that the episode can be replayed after they change.
     ``workbench`` is the `Description` for programs.
     """
@@ -130,7 +130,7 @@ class Arrangement:
     """The inputs of an episode's blueprint, which most episodes of a scene share."""
 
     cameras: tuple[tuple[str, str, tuple[str, ...]], ...]
-    """Name, entity and modalities of each."""
+    """(name, entity, modalities) of each camera."""
     drawn: tuple[str, ...]
     """Entities of ``evaluate()`` that are drawn as curves."""
     texts: bool
@@ -169,7 +169,7 @@ def arrangement(episode: Episode) -> Arrangement:
 def blueprint_of(arranged: Arrangement) -> rrb.Blueprint:
     """The scene on the left, cameras on the right, curves below.
 
-    All views are given: rerun's automatic layout changes between releases and makes a view for every number.
+    All views are explicit: rerun's automatic layout changes between releases and makes a view for every number.
     """
     scene = rrb.Spatial3DView(
         name="Scene",
@@ -232,7 +232,7 @@ def _curves(arranged: Arrangement) -> rrb.ContainerLike:
 
 
 def _eye(episode: Episode) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Eye and target, which frame the movable bodies. By default rerun frames the whole scene, with 100 m of ground."""
+    """Eye and target that frame the movable bodies. By default rerun frames the whole scene, with 100 m of ground."""
     assert episode.poses is not None and episode.geometry is not None
     low, high = movable_bounds(episode.poses[0], episode.geometry.body_kinds)
     # Rounded, so that episodes of a scene share one cached blueprint.

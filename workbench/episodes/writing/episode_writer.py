@@ -41,17 +41,16 @@ _PIXELS: dict[Modality, tuple[tuple[int, ...], str, str]] = {
     "depth": ((), "fi", "(H, W) of numbers"),
     "segmentation": ((), "iu", "(H, W) of integers"),
 }
-"""Shape of a pixel, dtype kinds, and both for messages."""
+"""(shape of a pixel, dtype kinds, text of both for messages)."""
 
 
 class EpisodeWriter:
-    """`append` rows, the state after the reset first, then `finish` or `discard`.
+    """Writes one episode: `append` rows, the state after the reset first, then call `finish` or `discard`.
 
     The caller must not wait for the disk, memory must stay bounded, and the process may be killed at any moment. So a
-    step only pays for checking and packing a row, which goes into a `Journal`; pictures go to `encode_async`. The files
-    are made once, in `finish`.
+    step only checks and packs a row, which goes into a `Journal`; pictures go to `encode_async`. `finish` makes the files.
 
-    One thread at a time may use it; another one may call `finish`. `len()` is the number of control steps.
+    Only one thread at a time may use it; another thread may call `finish`. `len()` is the number of control steps.
     """
 
     def __init__(
@@ -63,10 +62,10 @@ class EpisodeWriter:
         action_names: Sequence[str],
         cameras: Sequence[CameraInfo],
     ) -> None:
-        """`folder` is made if missing.
+        """Creates `folder` if it is missing.
 
         Raises:
-            RecordingError: nothing can be written there.
+            RecordingError: `folder` cannot be written to.
         """
         self._folder = Path(folder)
         self._header = Header(info, geometry, dict(segmentation), tuple(action_names), tuple(cameras))
@@ -115,16 +114,16 @@ class EpisodeWriter:
         pictures: Sequence[Picture] = (),
         others: Mapping[str, OtherEntry] = NO_OTHERS,
     ) -> None:
-        """Add a state as packed by `BatchPacker`: the one after the reset first, then each with the action that led there.
+        """Add a state as packed by `BatchPacker`: first the state after the reset, then each with the action that led to it.
 
         Args:
-            pictures: of this env alone; each camera keeps the modalities of its first picture. They are encoded in the
-                background: do not write to them afterwards.
+            pictures: pictures of this env alone; each camera keeps the modalities of its first picture. They are encoded in
+                the background: do not modify them afterwards.
             others: entries of ``evaluate()`` that are not rows, each as returned by `OtherEntry.of_env`.
 
         Raises:
-            ValueError: it does not fit the episode, which is unchanged.
-            RecordingError: the journal cannot be written, possibly an earlier row: writing lags behind.
+            ValueError: the row does not fit the episode, which is unchanged.
+            RecordingError: the journal cannot be written, possibly for an earlier row, since writing is delayed.
         """
         number = self._layouts.get(layout)
         items: list[JournalItem] = []
@@ -150,7 +149,7 @@ class EpisodeWriter:
         """Set the source of the actions from the next one on.
 
         Raises:
-            RecordingError: as `append`.
+            RecordingError: as `append` does.
         """
         try:
             self._journal.append(JournalEntry("acted", len(self), what.encode()))
@@ -160,18 +159,18 @@ class EpisodeWriter:
     def placed(
         self, key: CameraKey, used: CameraSettings | None, in_file: CameraSettings | None = None
     ) -> None:
-        """Note where a camera stands from the next state on.
+        """Record the placement of a camera from the next state on.
 
         Args:
-            used: None for where the task's description has it.
-            in_file: what the recorded source says, where that is something else than the description.
+            used: its settings; None for those in the task's description.
+            in_file: its settings in the recorded source, if they differ from the description.
 
         Raises:
-            RecordingError: as `append`.
+            RecordingError: as `append` does.
         """
         info = self._header.cameras[self._cameras[key]]
         if info.settings is None:
-            return  # what the file says of it cannot be expressed, and such a camera cannot be placed
+            return  # the file's settings of this camera cannot be expressed, and such a camera cannot be placed
         moved = MovedCamera(self._states, *key, used or info.settings, in_file or info.settings)
         try:
             self._journal.append(JournalEntry("placed", self._states, msgspec.json.encode(moved)))
@@ -179,11 +178,11 @@ class EpisodeWriter:
             raise self._failed(error) from error
 
     def finish(self, process: FilesProcess | None = None) -> EpisodeFiles:
-        """Make the files of the episode, in `process` if it can. After an error it can be called again, or `close`.
+        """Make the files of the episode, in `process` if possible. After an error call it again, or call `close`.
 
         Raises:
             ValueError: there is no state yet.
-            RecordingError: they cannot be written; only the journal stays, for `recover`.
+            RecordingError: the files cannot be written; only the journal stays, for `recover`.
         """
         if self._finished is not None:
             return self._finished
@@ -193,7 +192,7 @@ class EpisodeWriter:
             raise self._failed(error) from error
         try:
             self._finished = self._make_files(process)
-        except BaseException:  # also a panic of rerun's
+        except BaseException:  # including panics of rerun
             self._journal.sync()
             self.close()
             raise
@@ -207,12 +206,12 @@ class EpisodeWriter:
         )
 
     def close(self) -> None:
-        """Release the journal, which stays for `recover`."""
+        """Close the journal, which stays for `recover`."""
         self._journal.close()
 
     def discard(self) -> None:
-        """Delete everything of the episode but the files that `finish` made."""
-        # What cannot be deleted is left to `recover`: it must not turn a finished recording into an error.
+        """Delete everything of the episode except the files that `finish` made."""
+        # A failed deletion is left to `recover`: it must not turn a finished recording into an error.
         for remove in (self._journal.remove, self._scene.unlink):
             with contextlib.suppress(OSError):
                 remove()
@@ -221,7 +220,7 @@ class EpisodeWriter:
     def _pictures_of(
         self, pictures: Sequence[Picture]
     ) -> tuple[dict[int, tuple[Modality, ...]], list[JournalItem]]:
-        """Modalities by camera, and the journal's entries."""
+        """Modalities by camera, and the entries for the journal."""
         seen: dict[int, tuple[Modality, ...]] = {}
         for picture in pictures:
             seen[self._check(picture, seen)] = tuple(_arrays_of(picture))
@@ -242,7 +241,9 @@ class EpisodeWriter:
     def _check(self, picture: Picture, seen: Mapping[int, object]) -> int:
         index = self._cameras.get(picture.key)
         if index is None:
-            raise ValueError(f"a picture of {picture.kind} camera {picture.camera}, which the task has not.")
+            raise ValueError(
+                f"a picture of {picture.kind} camera {picture.camera}, which the task does not have."
+            )
         if index in seen:
             raise ValueError(f"camera {picture.camera} gave two pictures of one state.")
         info = self._header.cameras[index]
@@ -260,13 +261,13 @@ class EpisodeWriter:
         if given != before or not given:
             raise ValueError(
                 f"camera {info.name} gave {', '.join(before) or 'nothing'} first and now "
-                f"{', '.join(given) or 'nothing'}; a recording keeps the same all through."
+                f"{', '.join(given) or 'nothing'}; within a recording they must stay the same."
             )
         return index
 
     @staticmethod
     def _check_numbers(camera: str, modality: Modality, pixels: NDArray) -> None:
-        """Check dtype and shape now: the encoder would fail later, without the step."""
+        """Check dtype and shape now: the encoder would fail later, when the step is unknown."""
         shape, kinds, what = _PIXELS[modality]
         if pixels.dtype.kind not in kinds or pixels.shape[2:] != shape or (shape and pixels.itemsize != 1):
             raise ValueError(
@@ -292,16 +293,16 @@ def _arrays_of(picture: Picture) -> dict[Modality, NDArray]:
 
 
 MAX_PENDING_BYTES = 8 << 20
-"""Limit of pictures that wait for a thread: a few hundredths of a second of work, which a killed process loses."""
+"""Maximum size of pictures that wait for a thread: a few hundredths of a second of work, which a killed process loses."""
 _BATCH_BYTES = 1 << 20
-"""Pictures that are submitted together. Waking a thread at every step for one small picture costs the step as much as
-encoding it, and with cold caches it takes three times as long (measured)."""
+"""Size from which pictures are submitted together. Waking a thread at every step for one small picture costs the step as
+much as encoding it, and with cold caches it takes three times as long (measured)."""
 
 _Pictures = Sequence[tuple[str, int, Modality, NDArray]]
 
 
 class PendingEntries(Future[list[JournalEntry]]):
-    """Entries that are being encoded; `result` submits them if they still wait."""
+    """Entries that are being encoded; `result` submits them if they are still queued."""
 
     def __init__(self, pool: _EncoderPool, pictures: _Pictures) -> None:
         super().__init__()
@@ -327,10 +328,10 @@ class PendingEntries(Future[list[JournalEntry]]):
 
 
 class _EncoderPool:
-    """Encodes pictures on a few threads: JPEG and zlib release the interpreter's lock.
+    """Encodes pictures on a few threads: JPEG and zlib release the GIL.
 
-    Colour, depth and segmentation of 128 x 128 take 0.5 ms, of 512 x 512 eight: sixteen envs with a camera each would
-    wait for that at every step. Waiting pictures are bounded; beyond that the caller encodes its own.
+    Colour, depth and segmentation of 128 x 128 take 0.5 ms, of 512 x 512 8 ms: sixteen envs with a camera each would
+    wait for that at every step. The queue is bounded; beyond the limit the caller encodes its own pictures.
     """
 
     def __init__(self) -> None:
@@ -358,7 +359,7 @@ class _EncoderPool:
         return pending
 
     def begin(self) -> None:
-        """Submit what has gathered."""
+        """Submit the queued pictures."""
         with self._lock:
             gathered, self._gathered, self._gathered_bytes = self._gathered, [], 0
         if not gathered:
@@ -380,7 +381,8 @@ _making = threading.Lock()
 
 
 def encode_async(pictures: _Pictures) -> PendingEntries:
-    """Journal entries of `pictures`: kind and number of the entry, modality, picture. Do not write to the pictures."""
+    """Encode `pictures` to journal entries: kind and number of the entry, modality, picture. Do not modify the pictures
+    afterwards."""
     global _pool
     with _making:
         if _pool is None:
@@ -395,4 +397,4 @@ def _reset_pool() -> None:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_reset_pool)  # a forked child has none of the threads
+    os.register_at_fork(after_in_child=_reset_pool)  # a forked child lacks the threads

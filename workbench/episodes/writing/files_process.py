@@ -1,4 +1,4 @@
-"""A process that makes the files of episodes while this one goes on."""
+"""A subprocess that makes the files of episodes in the background."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from workbench.machine.processes.child_python import child_environment, start_wi
 from workbench.machine.processes.wire import Unpacker, Unreadable, has_come, pack, pack_message
 
 _MAX_MESSAGE_BYTES = 1 << 16
-"""Limit of a message, in bytes."""
+"""Maximum size of a message."""
 
 
 @dataclass(frozen=True)
@@ -51,14 +51,15 @@ class _NotMade:
 
 
 class FilesProcess:
-    """Makes files from journals, which hold all that they need. One thread may call `make`, any `is_ready`.
+    """Makes files from journals in a subprocess. One thread may call `make`, any thread `is_ready`.
 
-    A thread would take turns for the interpreter with the env, whose calls of PhysX keep the lock. It takes a second of a core to start, and
-    110 MB. The lowest priority was no faster, and would let journals pile up where all cores are busy.
+    A thread would compete for the GIL with the env, whose calls of PhysX hold it. Starting the process takes a second of a
+    core and 110 MB. It does not run at the lowest priority, which was no faster and would let journals pile up while all
+    cores are busy.
     """
 
     def __init__(self) -> None:
-        """Start it, not waiting for it. Raises OSError."""
+        """Start the subprocess without waiting for it. Raises OSError."""
         self._is_ready = False
         self._asking = threading.Lock()
         self._unpacker = Unpacker((_Ready, _Made, _NotMade))
@@ -73,10 +74,10 @@ class FilesProcess:
             return self._is_ready
 
     def make(self, journal: Journal, header: Header, states: int) -> EpisodeFiles | None:
-        """`make_files` there, in the folder of the journal's; None if it could not, and may have begun."""
+        """Run `make_files` in the subprocess, into the folder of the recordings; None if it failed, possibly halfway."""
         path = journal.path.absolute()
         try:
-            # With the descriptor goes the lock: nobody recovers the journal while it is at work, also if we are killed.
+            # The descriptor passes on the lock: no process recovers the journal meanwhile, even if this process is killed.
             asked = _Make(path, states, len(header.geometry.visuals))
             socket.send_fds(self._end, [pack(asked)], [journal.descriptor])
             made = self._receive()
@@ -92,14 +93,14 @@ class FilesProcess:
         return None
 
     def close(self) -> None:
-        """End it, at once."""
+        """Kill the subprocess."""
         self._is_ready = False
         self._end.close()
         self._process.kill()
         self._process.wait()
 
     def _receive(self) -> _Ready | _Made | _NotMade | None:
-        """None if it has ended."""
+        """The next message; None if the subprocess has ended."""
         try:
             said = self._end.recv(_MAX_MESSAGE_BYTES)
             return self._unpacker.message(said) if said else None
@@ -132,7 +133,7 @@ def main() -> None:
 
 def _make(what: _Make, scenes: dict[tuple[int, ...], tuple[Visual, ...]]) -> _Made | _NotMade:
     try:
-        # Episodes of a scene have one file, by hard links, and share what is made of its meshes.
+        # Episodes of a scene share one file by hard links, and the chunks that are made from its meshes.
         path = what.journal.with_suffix(SCENE_SUFFIX)
         file = os.stat(path)
         key = (file.st_dev, file.st_ino, file.st_mtime_ns, file.st_size)

@@ -1,4 +1,4 @@
-"""Turns journals into the files of recordings: at the end of an episode, or after its writer died."""
+"""Converts journals to the files of recordings: at the end of an episode, or after its writer died."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from workbench.episodes.writing.publish import RecordingError, candidates, publi
 
 SUFFIXES = (".rrd", ".h5", ".json")
 DAMAGED_SUFFIX = ".damaged"
-"""Suffix of a damaged journal; nothing reads such a file."""
+"""Suffix of a damaged journal, which is kept but never read."""
 
 
 @dataclass(frozen=True)
 class EpisodeFiles:
-    """The files of one recording; without the .json the other two do not count."""
+    """The files of one recording; a recording without a .json does not exist."""
 
     rrd: Path
     h5: Path
@@ -50,8 +50,8 @@ def make_files(
     """Write the episode in `journal` to `folder`; the journal stays.
 
     Args:
-        states: how many there must be, if given.
-        again: another process was asked for it and ended, at any moment: files that it has published are those.
+        states: expected number of states, if given.
+        again: whether another process has begun this and ended at any moment; files that it has published are used.
 
     Raises:
         RecordingError: the files cannot be written; none of them exists then.
@@ -65,7 +65,7 @@ def make_files(
                 raise ValueError("the episode has no state yet: its first row is the state after the reset.")
             if states is not None and episode.length + 1 != states:
                 there = f"{episode.length + 1} of {states} states"
-                raise OSError(errno.EIO, f"{there} can be read back from {journal.name}")
+                raise OSError(errno.EIO, f"{there} could be read back from {journal.name}")
             if again and (stem := _already_made(header.info, journal, folder)) is not None:
                 rrd, h5, json = (folder / f"{stem}{suffix}" for suffix in SUFFIXES)
                 return EpisodeFiles(rrd, h5, json, episode.solved_at, episode.means)
@@ -85,7 +85,7 @@ def make_files(
         ) from error
     finally:
         for path in temporaries:
-            # `recover` deletes what stays; an error here must not hide the one above.
+            # `recover` deletes the rest; an error here must not hide the one above.
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 
@@ -98,8 +98,8 @@ def temporary_files(journal: Path) -> tuple[Path, ...]:
 def episode_stem(info: EpisodeInfo) -> str:
     """``PushCube-v1_seed0003_env03_2026-11-21T08-15-30``: task, seed, env, local time of the recording.
 
-    An unknown seed (below 0) gives ``noseed``. Only letters, digits and ``_ -``: ManiSkill's replay cuts a name at a dot.
-    Two episodes of one second get the same stem; `publish` makes it unique.
+    An unknown seed (below 0) gives ``noseed``. Contains only letters, digits and ``_ -``: ManiSkill's replay cuts a name at a
+    dot. Two episodes of the same second get the same stem; `publish` makes it unique.
     """
     when = datetime.datetime.fromisoformat(info.written_at).astimezone()
     return f"{stem_begin(info.task, info.seed)}{info.env_index:02d}_{when:%Y-%m-%dT%H-%M-%S}"
@@ -112,7 +112,7 @@ def stem_begin(task: str, seed: int) -> str:
 
 
 def remove_episode(folder: Path, task: str, seed: int, id: str) -> None:
-    """Delete what there is of the episode with this id: its files, and the journal of a writer that died.
+    """Delete all traces of the episode with this id: its files, and the journal of a writer that died.
 
     Raises OSError.
     """
@@ -128,19 +128,19 @@ def remove_episode(folder: Path, task: str, seed: int, id: str) -> None:
 
 
 def recover(folder: Path) -> list[EpisodeFiles]:
-    """Make recordings of all journals in `folder` whose writer is dead, which left its journal unlocked.
+    """Recover recordings from all journals in `folder` whose writer is dead (their lock is free).
 
-    A writer may die while recording, while making files, and between two names of one recording; its journal is there
-    in each case. A journal without a control step is deleted, one that was damaged is kept under another name. When one
+    A writer may die while recording, while making files, and between publishing two files of one recording; its journal
+    exists in each case. A journal without a control step is deleted, a damaged one is kept under another name. If one
     journal fails, the error is raised after the others are done.
 
     Raises:
-        RecordingError: files cannot be written, or the folder or a journal cannot be read or not all of it; the journals stay.
+        RecordingError: files cannot be written, or the folder or a journal cannot be read completely; the journals stay.
         MemoryError: a journal needs too much memory; the others are done.
     """
     folder = Path(folder)
     if (folder / FOLDER).is_symlink():
-        # `_remove_strays` would delete files of another folder.
+        # Refuse the link: `_remove_strays` would delete files of another folder.
         raise RecordingError(
             f"Cannot recover the recordings in {folder}: {FOLDER} is a link to another folder"
         )
@@ -151,7 +151,7 @@ def recover(folder: Path) -> list[EpisodeFiles]:
             try:
                 made += _recover(journal, folder)
             except Exception as error:
-                # Of any type: a broken journal must not keep the others from being recovered.
+                # Catches every error: a broken journal must not prevent the recovery of the others.
                 failed = error
         _remove_strays(folder)
         remove_empty_folder(folder)
@@ -166,7 +166,7 @@ def recover(folder: Path) -> list[EpisodeFiles]:
 
 
 def _recover(journal: Path, folder: Path) -> list[EpisodeFiles]:
-    """Raises as `recover`, after the episode up to the damage was made of a damaged journal."""
+    """Recover one journal, a damaged one up to the damage. Raises as `recover` does."""
     descriptor = claim(journal)
     if descriptor is None:
         return []
@@ -187,7 +187,7 @@ def _recover(journal: Path, folder: Path) -> list[EpisodeFiles]:
         os.rename(journal, aside)
         before = f"The steps before are in {files[0].json.name}. " if files else ""
         raise RecordingError(
-            f"A journal in {folder} is damaged, and {lost} bytes of it cannot be read. {before}All of it is kept in "
+            f"A journal in {folder} is damaged, and {lost} bytes of it cannot be read. {before}The whole journal is kept in "
             f"{FOLDER}/{aside.name}."
         )
     finally:
@@ -195,7 +195,7 @@ def _recover(journal: Path, folder: Path) -> list[EpisodeFiles]:
 
 
 def _already_made(info: EpisodeInfo, journal: Path, folder: Path) -> str | None:
-    """The stem of its files, if the writer had published them; deletes files of an incomplete publication."""
+    """The stem of its files if the writer had published all of them; deletes the files of an incomplete publication."""
     temporaries = dict(zip(SUFFIXES, temporary_files(journal)))
     for stem in _stems(folder, episode_stem(info)):
         if _id_of(folder / f"{stem}.json") == info.id:
@@ -210,7 +210,7 @@ def _already_made(info: EpisodeInfo, journal: Path, folder: Path) -> str | None:
 
 
 def _stems(folder: Path, stem: str) -> Iterator[str]:
-    """Stems in use among the candidates for the recording."""
+    """Candidates for the recording's stem that are in use."""
     for candidate in candidates(stem):
         if not any((folder / f"{candidate}{suffix}").exists() for suffix in SUFFIXES):
             return
@@ -225,7 +225,7 @@ def _id_of(path: Path) -> str | None:
 
 
 def _remove_strays(folder: Path) -> None:
-    """Delete temporary files without a journal: their writer died while it cleaned up."""
+    """Delete temporary files without a journal, left by a writer that died during its cleanup."""
     for path in (folder / FOLDER).glob("*"):
         kept = (path.with_suffix(suffix) for suffix in (".arrow", DAMAGED_SUFFIX))
         if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not any(one.exists() for one in kept):

@@ -23,7 +23,7 @@ from workbench.episodes.writing.journal import JournalEntry, JournalReader
 
 @dataclass(frozen=True)
 class Header:
-    """What is known when an episode begins."""
+    """Metadata that is known when an episode begins."""
 
     info: EpisodeInfo
     geometry: SceneGeometry
@@ -31,7 +31,7 @@ class Header:
     action_names: tuple[str, ...]
     cameras: tuple[CameraInfo, ...]
     made_here: bool = True
-    """Recorded by this installation; False for a journal in a folder from elsewhere."""
+    """Whether this installation recorded it; False for a journal in a foreign folder."""
 
     @property
     def bodies(self) -> int:
@@ -58,9 +58,9 @@ def header_from(text: str, visuals: tuple[Visual, ...]) -> Header:
     """The inverse of `header_text`, with the meshes in `visuals`. Raises ValueError, KeyError or TypeError."""
     data = json.loads(text)
     num_envs, names, kinds, hidden = data["bodies"]
-    # A kind of a damaged journal that no reader of the files would take.
+    # Validates the kinds: a damaged journal may hold kinds that readers of the files would reject.
     scene = msgspec.convert({"body_names": names, "body_kinds": kinds, "body_hidden": hidden}, SceneJson)
-    # Journals of earlier versions hold an object, without a seal.
+    # Journals of older versions hold an object, without a seal.
     info = data["info"] if isinstance(data["info"], str) else json.dumps(data["info"])
     return Header(
         info=_info_from(json.loads(info)),
@@ -85,11 +85,11 @@ def mark_recovered(header: Header) -> Header:
 
 
 def read_header(journal: JournalReader, visuals: tuple[Visual, ...]) -> Header | None:
-    """None if the journal ends before its header.
+    """Read the header; None if the journal ends before it.
 
     Raises:
         OSError: the journal cannot be read.
-        ValueError: its header is invalid: a later version wrote it, or another program.
+        ValueError: the header is invalid: written by a later version or another program.
     """
     for _, entries in journal:
         try:
@@ -121,8 +121,8 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
     """The journal's episode, with the scene of its whole batch; None if it has no state.
 
     The numbers of an hour are a hundred megabytes and are read at once, since both file formats need whole columns:
-    length, types and static bodies are known only at the end. Pictures would not fit into memory, so they are read when
-    they are written to a file: keep the journal open until then. Raises OSError.
+    length, types and static bodies are known only at the end. Pictures would not fit into memory, so they are read only
+    when they are written to a file: keep the journal open until then. Raises OSError.
     """
     layouts: list[np.dtype] = []
     runs: list[tuple[int, list[bytes]]] = []
@@ -152,9 +152,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
             _, index, name = kind.split("/")
             seen[int(index)].places.setdefault(_modality(name), []).append(place)
         elif kind != "header":
-            raise ValueError(
-                f"{journal.path.name} holds an entry that is none of a journal's ({kind[:40]!r})"
-            )
+            raise ValueError(f"{journal.path.name} holds an entry of an unknown kind ({kind[:40]!r})")
     if not runs:
         return None
     columns = assemble([np.frombuffer(b"".join(rows), layouts[layout]) for layout, rows in runs])
@@ -182,7 +180,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
 
 
 def _complete_states(journal: JournalReader) -> Iterator[tuple[tuple[int, int], JournalEntry]]:
-    """Place and entry of all complete states; the row of each comes last."""
+    """(place, entry) of all entries of complete states; the row of each state comes last."""
     held: list[tuple[tuple[int, int], JournalEntry]] = []
     for begin, entries in journal:
         for row, entry in enumerate(entries):

@@ -30,11 +30,11 @@ from workbench.machine.files import open_regular_file
 FOLDER = ".writing"
 SCENE_SUFFIX = ".scene"
 SYNC_SECONDS = 0.4
-"""Interval of writing."""
+"""Interval of writing and syncing."""
 _BATCH_BYTES = 2 << 20
-"""Beyond this `append` writes by itself: memory stays bounded when the disk is slower than the episode."""
+"""Queued bytes from which `append` writes by itself, so that memory stays bounded if the disk is slower than the episode."""
 _MAX_CACHED_BATCHES = 4
-"""Batches cached while reading: pictures of the same states are read camera by camera."""
+"""Maximum number of cached batches while reading: pictures of the same states are read camera by camera."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 _BEGIN = _SCHEMA.serialize().size
 """Offset of the first batch."""
@@ -54,8 +54,8 @@ JournalItem = JournalEntry | Future[list[JournalEntry]]
 class Journal:
     """The journal of a running episode, ``.writing/<id>.arrow`` in the recordings' folder.
 
-    The files of an episode can only be written when it is over (rerun's index comes last, HDF5 cannot be truncated, both
-    need whole columns), and the task's code may hang, use up the memory or crash before that. So every row goes into a
+    The files of an episode can only be written when it has ended (rerun's index comes last, HDF5 cannot be truncated, both
+    need whole columns), and the task's code may hang, exhaust the memory or crash before that. So every row goes into a
     journal, from which the writer or the next process makes the files (`finish.recover`).
 
     It is an Arrow stream of one table, ``kind``, ``number`` and ``value``, that may end anywhere. A state's pictures come
@@ -63,24 +63,24 @@ class Journal:
 
     - ``header``: JSON; the scene's meshes are in a file next to it (`write_scene`);
     - ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: one or several consecutive rows of that layout;
-    - ``acted`` `action`: what chose the actions from this number on, if not what the header names;
+    - ``acted`` `action`: source of the actions from this number on, if it differs from the header's;
     - ``placed`` `state`: JSON of a camera that was placed by hand, from this state on (`MovedCamera`);
     - ``entry`` `state`: JSON of an entry of ``evaluate()`` that is not a number and changes here (`columns.TextWriter`);
     - ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
 
-    One thread writes all journals of the process every `SYNC_SECONDS`, another syncs them. The file is locked (``flock``) while it
-    is written; the system releases the lock of a dead process, which tells dead writers from live ones.
+    One thread writes all journals of the process every `SYNC_SECONDS`, another one syncs them. The file is locked (``flock``)
+    while it is open; the system releases the lock of a dead process, which distinguishes dead writers from live ones.
     """
 
     def __init__(self, path: Path) -> None:
-        """Begin the journal `path`, which must not exist; its folder is made. Raises OSError."""
+        """Create the journal `path`, which must not exist, and its folder. Raises OSError."""
         self.path = path
         self._descriptor = _create(path)
         self._closer = weakref.finalize(self, os.close, self._descriptor)
         self._size = 0
         self._waiting: list[JournalItem] = []
         self._waiting_bytes = 0
-        self._lock = threading.Lock()  # of `_waiting`; not held during disk access
+        self._lock = threading.Lock()  # guards `_waiting`; not held during disk access
         self._writing = threading.Lock()
         self._syncing = threading.Lock()
         self._error: OSError | None = None
@@ -101,7 +101,7 @@ class Journal:
 
     @property
     def size(self) -> int:
-        """Bytes written and waiting."""
+        """Bytes written and queued."""
         return self._size + self._waiting_bytes
 
     def append(self, *items: JournalItem) -> None:
@@ -126,7 +126,7 @@ class Journal:
             self.write()  # an error is raised by the next `append`: this state is queued
 
     def write(self) -> None:
-        """Write what was queued: it survives the death of the process."""
+        """Write what is queued, so that it survives the death of the process."""
         with self._writing:
             if self._error is not None or not self._closer.alive:
                 return
@@ -153,9 +153,9 @@ class Journal:
                 self._waiting_bytes += sum(map(_size, made.result()))
 
     def sync(self) -> None:
-        """Write what was queued and sync it: it survives a power cut. An error is raised by the next `append`.
+        """Write what is queued and sync it, so that it survives a power cut. The next `append` raises an error of this.
 
-        Rows can be written meanwhile: a sync may take long.
+        Rows can be written meanwhile, since a sync may take long.
         """
         self.write()
         with self._syncing:
@@ -170,8 +170,8 @@ class Journal:
     def finish(self) -> None:
         """Write everything and stop the periodic writing; the file stays locked until `close`.
 
-        It is not synced: files replace it at once. Entries that could not be written are tried again; raises OSError if
-        they fail again.
+        Does not sync, because the files replace the journal soon. Retries entries that could not be written; raises OSError
+        if they fail again.
         """
         _journal_threads.remove(self)
         self._error = None
@@ -204,7 +204,7 @@ class Journal:
 
 
 def _resolve(items: Sequence[JournalItem]) -> tuple[list[JournalEntry], int, OSError | None]:
-    """Entries of `items`, and how many items they are; on an error only those of complete states before it."""
+    """(entries, number of resolved items, error): on an error only the entries of complete states before it."""
     entries: list[JournalEntry] = []
     whole, done = 0, 0
     for number, item in enumerate(items, 1):
@@ -222,7 +222,7 @@ def _resolve(items: Sequence[JournalItem]) -> tuple[list[JournalEntry], int, OSE
 
 
 def _rows_joined(entries: Iterable[JournalEntry]) -> Iterator[JournalEntry]:
-    """Consecutive rows of a layout as one entry: a hundred entries take as long as the files that are made of them."""
+    """Join consecutive rows of a layout to one entry: a hundred entries take as long as making the files from them."""
     for (kind, number), run in groupby(entries, key=itemgetter(0, 1)):
         if kind == "row":
             yield JournalEntry(kind, number, b"".join([entry.value for entry in run]))
@@ -231,7 +231,7 @@ def _rows_joined(entries: Iterable[JournalEntry]) -> Iterator[JournalEntry]:
 
 
 def _require_name(descriptor: int) -> None:
-    """Raises OSError if the file has no name any more."""
+    """Raise OSError if the file was removed from its folder."""
     if os.fstat(descriptor).st_nlink == 0:
         gone = "the folder, or the file in it, was removed during the recording"
         raise FileNotFoundError(errno.ENOENT, gone)
@@ -246,15 +246,16 @@ def _create(path: Path) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        except FileNotFoundError:  # another writer removed the empty folder just now
+        except FileNotFoundError:  # another writer has just removed the empty folder
             continue
     raise FileNotFoundError(errno.ENOENT, "another process keeps removing the folder")
 
 
 class _JournalThreads:
-    """Write and sync all journals of this process periodically, while there are any.
+    """Threads that periodically write and sync all journals of this process, while there are any.
 
-    Two, since a sync may take long on a disk that hangs: what is not synced is written, and a killed process does not lose it.
+    There are two, since a sync may hang with the disk: unsynced data are written anyway, and a killed process does not lose
+    them.
     """
 
     def __init__(self) -> None:
@@ -268,7 +269,7 @@ class _JournalThreads:
             self._journals.add(journal)
             for what, work in (("write", self._write), ("sync", self._sync)):
                 thread = self._threads.get(what)
-                if thread is None or not thread.is_alive():  # a forked child has none
+                if thread is None or not thread.is_alive():  # a forked child lacks the threads
                     thread = threading.Thread(target=work, name="episode-journals", daemon=True)
                     self._threads[what] = thread
                     thread.start()
@@ -296,7 +297,7 @@ class _JournalThreads:
                 journal.sync()
 
     def _wait(self, what: str) -> list[Journal]:
-        """The journals after the interval; none, if the thread is to end."""
+        """Wait for the interval; returns the journals, or none if the thread should end."""
         with self._changed:
             wake = time.monotonic() + SYNC_SECONDS
             while self._journals and (left := wake - time.monotonic()) > 0:
@@ -310,15 +311,15 @@ _journal_threads = _JournalThreads()
 
 
 def before_writing(flush: Callable[[], None]) -> None:
-    """Call the bound method `flush` before each write, while its object lives: for a caller that batches rows.
+    """Call the bound method `flush` before each write, while its object lives, for a caller that batches rows.
 
-    It runs on a thread of the journals' and must not raise.
+    It runs on the journals' thread and must not raise.
     """
     _journal_threads.flush_first.append(weakref.WeakMethod(flush))
 
 
 class _BoundedFile:
-    """A file for Arrow, of which no more is read than there is: a damaged length would allocate what it claims."""
+    """A file for Arrow whose reads are limited to its size: a damaged length would allocate the size that it claims."""
 
     mode = "rb"
 
@@ -365,8 +366,8 @@ class JournalReader:
                 raise
 
     def lost_bytes(self) -> int:
-        """Bytes from the batch on at which the last iteration ended, if complete batches follow it: the journal was damaged,
-        and not cut short. 0 if nothing is lost but what was being written. Raises OSError."""
+        """Number of bytes from the batch on at which the last iteration ended, if complete batches follow it: then the journal
+        was damaged, not cut short. 0 if only the batch that was being written is lost. Raises OSError."""
         size, at = self._file.size, self._end
         while (at := self._find_batch(at + 1, size)) < size:
             try:
@@ -377,26 +378,26 @@ class JournalReader:
         return 0
 
     def _find_batch(self, begin: int, size: int) -> int:
-        """Offset of the next bytes with which a batch begins; `size` if there are none."""
+        """Offset of the next marker of a batch; `size` if there is none."""
         held = b""
         while begin < size:
             self._file.seek(begin)
             held = self._file.read(_BATCH_BYTES)
             if (at := held.find(_MARK)) >= 0:
                 return begin + at
-            # The mark may lie across the end of what was read.
+            # The marker may cross the end of the block.
             begin += max(len(held) - len(_MARK) + 1, 1)
         return size
 
     def value(self, place: tuple[int, int]) -> bytes:
-        """Value of an entry: `place` is its batch's offset and its number in the batch."""
+        """Value of an entry; `place` is (offset of its batch, index in the batch)."""
         return self._batch(place[0])[0].column(2)[place[1]].as_py()
 
     def _read(self, begin: int) -> tuple[pa.RecordBatch, int]:
         """The batch at offset `begin`, and its end. Raises OSError, EOFError or ArrowInvalid if it is incomplete."""
         self._file.seek(begin)
         batch = pa.ipc.read_record_batch(pa.ipc.read_message(self._file), _SCHEMA)
-        batch.validate(full=True)  # one with other offsets would crash this process
+        batch.validate(full=True)  # invalid offsets would crash this process
         return batch, self._file.tell()
 
     def close(self) -> None:
@@ -408,24 +409,24 @@ def remove_empty_folder(folder: Path) -> None:
     """Remove the folder of the journals if it is empty."""
     try:
         os.rmdir(folder / FOLDER)
-    except OSError:  # not empty, or not there
+    except OSError:  # not empty, or missing
         pass
 
 
 def claim(path: Path) -> int | None:
-    """Lock the journal of a dead writer; None if another process holds the lock, or the file is gone.
+    """Lock the journal of a dead writer; None if another process holds the lock, or the file is deleted.
 
     The lock lasts until the returned descriptor is closed.
     """
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):
-            return None  # not made by a writer
+            return None  # not written by a writer
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
         return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.fstat(descriptor).st_nlink > 0:  # else its holder has just deleted it
+        if os.fstat(descriptor).st_nlink > 0:  # else the lock's last holder has just deleted it
             return descriptor
     except BlockingIOError:
         pass
@@ -446,19 +447,19 @@ _last: tuple[weakref.ref[SceneGeometry], Path] | None = None
 def write_scene(geometry: SceneGeometry, path: Path) -> None:
     """Write `geometry` to `path`, which must not exist. Raises OSError.
 
-    Meshes must be on the disk from the first row on. They are megabytes (ManiSkill's table alone has a texture of 4 MB),
-    and sixty-four envs begin an episode at once. So episodes of one scene share one file by hard links. The format is
-    numpy's archive of plain arrays and a line of JSON, which is validated on reading and executes no code.
+    Meshes must be on the disk from the first row on. They take megabytes (the texture of ManiSkill's table alone 4 MB), and
+    sixty-four envs may begin an episode at once, so episodes of one scene share one file by hard links. The format is a
+    numpy archive of plain arrays and a line of JSON, which is validated on reading and executes no code.
     """
     global _last
     with _lock:
         if _last is not None and _last[0]() is geometry and _last[1].parent == path.parent:
             try:
                 os.link(_last[1], path)
-                # The newest name is gone last: the next batch begins while the files of this one are made.
+                # Keep the newest name, which is deleted last: the next batch begins while the files of this one are made.
                 _last = (_last[0], path)
                 return
-            except OSError:  # that episode's file is deleted, or the filesystem has no links
+            except OSError:  # that episode's file is deleted, or the filesystem does not support links
                 pass
         _write(geometry, path)
         _last = (weakref.ref(geometry), path)

@@ -1,4 +1,4 @@
-"""Gives the files of a recording their names: all of them complete, or none."""
+"""Publishes the files of a recording under their names: all of them complete, or none."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from workbench.machine.files import give_name
 
 
 class RecordingError(OSError):
-    """An episode could not be written; the message says what to do. No file was left."""
+    """An episode could not be written; the message gives advice. No file is left."""
 
 
 def try_folder(folder: Path) -> None:
-    """Check that recordings can be written to `folder`, which may be missing, before minutes are spent on one.
+    """Check that recordings can be written to `folder`, which may be missing, before minutes are spent on recording.
 
     Raises:
         RecordingError: they cannot be written.
@@ -27,7 +27,7 @@ def try_folder(folder: Path) -> None:
     try:
         os.fspath(folder.absolute()).encode()
     except UnicodeEncodeError as error:
-        why = "its name is not UTF-8, and rerun writes to no such folder. Choose another one"
+        why = "its name is not UTF-8, which rerun does not support. Choose another one"
         raise RecordingError(f"Cannot record to {folder}: {why}.") from error
     there = next(parent for parent in (folder, *folder.absolute().parents) if os.path.lexists(parent))
     try:
@@ -38,7 +38,7 @@ def try_folder(folder: Path) -> None:
 
 
 def sync_files(paths: Sequence[Path]) -> None:
-    """Sync all of `paths` at once, since each waits a few milliseconds. Raises OSError."""
+    """Sync all of `paths` in parallel, since each takes a few milliseconds. Raises OSError."""
     errors: list[OSError] = []
 
     def sync(path: Path) -> None:
@@ -61,10 +61,10 @@ def publish(temporaries: Sequence[Path], folder: Path, stem: str) -> list[Path]:
     """Link finished files (``<id>.rrd``, ``<id>.h5`` ...) to the first stem that is free for all of them, in order.
 
     The .json comes last: **a recording without a .json does not exist.** Racing processes get different names. The
-    temporaries stay if the filesystem has links.
+    temporaries stay if the filesystem supports links.
 
     Raises:
-        OSError: none of them has a name.
+        OSError: publishing failed; no file has a name.
     """
     for candidate in candidates(stem):
         paths = [folder / f"{candidate}{temporary.suffix}" for temporary in temporaries]
@@ -102,7 +102,7 @@ def _remove(paths: Sequence[Path]) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Sync a folder: otherwise a power cut may lose a new name in it, though not the file's content."""
+    """Sync a folder. Without this a power cut may lose a new name in it, though not the file's content."""
     _sync(path)
 
 
@@ -122,7 +122,7 @@ def reason(error: OSError, folder: Path) -> str:
     ):
         return f"the disk that holds {there or folder} is full. Make room there, or choose another folder."
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return f"{folder} may not be written to. Choose another folder, or change its permissions."
+        return f"{folder} is not writable. Choose another folder, or change its permissions."
     if error.errno in (errno.ENOTDIR, errno.EEXIST):
         return f"{folder} is not a folder. Choose another one."
     if error.errno == errno.ENAMETOOLONG:
@@ -130,5 +130,5 @@ def reason(error: OSError, folder: Path) -> str:
     if error.errno == errno.EFBIG:
         return "the file is larger than the system allows. Record shorter episodes, or lift the limit (ulimit -f)."
     if error.errno == errno.ENOENT:
-        return f"{folder} was removed while it was written to. Record again: the folder is created again."
+        return f"{folder} was removed during the recording. Record again: the folder is created again."
     return f"{error.strerror or error}."

@@ -1,4 +1,4 @@
-"""Puts finished recordings where fsspec can write: S3, Google's storage, another machine. The .json comes last."""
+"""Uploads finished recordings with fsspec: to S3, Google Cloud Storage, another machine. The .json comes last."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _INSTALL = {
 
 
 def require_place(address: str) -> None:
-    """Try to write to the address, before minutes are spent.
+    """Try to write to the address, before minutes are spent on recording.
 
     Raises:
-        RecordingError: it cannot be written; the text says why.
+        RecordingError: it cannot be written to; the message gives the reason.
     """
     system, path = _place(address)
     try:
@@ -32,15 +32,15 @@ def require_place(address: str) -> None:
         system.pipe_file(f"{path}/.workbench", b"")
         system.rm_file(f"{path}/.workbench")
     except Exception as error:
-        # Of any type: each storage has errors of its own.
+        # Catches every error: each storage has its own types.
         raise RecordingError(f"Cannot record to {address}: {type(error).__name__}: {error}") from error
 
 
 def upload_episode(files: EpisodeFiles, address: str) -> None:
-    """Upload, and delete the files here.
+    """Upload the files of an episode, and delete them here.
 
     Raises:
-        RecordingError: it failed; without a .json there is no episode in that place.
+        RecordingError: it failed; without a .json the episode does not exist at the address.
     """
     system, path = _place(address)
     try:
@@ -56,7 +56,7 @@ def upload_episode(files: EpisodeFiles, address: str) -> None:
 
 
 def upload_file(file: Path, address: str) -> None:
-    """Upload a file, which stays here. Raises RecordingError."""
+    """Upload a file and keep it here. Raises RecordingError."""
     system, path = _place(address)
     try:
         _make_place(system, path)
@@ -68,7 +68,7 @@ def upload_file(file: Path, address: str) -> None:
 
 
 def remove_uploaded(address: str, stem: str) -> None:
-    """Delete the files of an episode from a place, the .json first. Raises RecordingError."""
+    """Delete the files of an episode from an address, the .json first. Raises RecordingError."""
     system, path = _place(address)
     try:
         for suffix in (".json", ".h5", ".rrd"):
@@ -81,7 +81,7 @@ def remove_uploaded(address: str, stem: str) -> None:
 
 
 def remove_uploaded_id(address: str, task: str, seed: int, id: str) -> None:
-    """Delete the episode with this id, if it is there. Raises RecordingError."""
+    """Delete the episode with this id, if it exists. Raises RecordingError."""
     system, path = _place(address)
     try:
         system.invalidate_cache()
@@ -91,11 +91,11 @@ def remove_uploaded_id(address: str, task: str, seed: int, id: str) -> None:
     except RecordingError:
         raise
     except Exception as error:
-        raise RecordingError(f"Cannot look into {address}: {type(error).__name__}: {error}") from error
+        raise RecordingError(f"Cannot list {address}: {type(error).__name__}: {error}") from error
 
 
 def _make_place(system: Any, path: str) -> None:
-    # A bucket is not made: who may write into one may not always make one.
+    # Does not create a bucket: permission to write into a bucket does not include creating one.
     if "/" in path and not system.exists(path):
         system.makedirs(path, exist_ok=True)
 
