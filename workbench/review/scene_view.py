@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.cameras.frustums import SMALL, CameraFrustums, without_the_viewpoint
+from workbench.cameras.frustums import SMALL_METRES, CameraFrustums, without_the_viewpoint
 from workbench.envs.camera_data import CameraInfo, CameraKey, Picture
 from workbench.envs.scene.shapes import BodyKind, Material, SceneGeometry, Visual, fingerprint
 from workbench.episodes.episode import CameraTrack
@@ -268,7 +268,7 @@ class ReviewIn3D:
             pictures = without_the_viewpoint(
                 pictures, {} if there is None else {("human", there.camera): there}
             )
-        self._frustums.draw(cameras, pictures, scene.layout.offsets[view.selected], SMALL)
+        self._frustums.draw(cameras, pictures, scene.layout.offsets[view.selected], SMALL_METRES)
 
     def _draw_names(self, view: ReviewView, scene: ReviewScene | None) -> None:
         """Label the recordings that are not selected, if few; the selected one's label is on its frame."""
