@@ -83,20 +83,20 @@ class RecentTasks:
                     text = msgspec.json.format(msgspec.json.encode(_Document(encoded)), indent=1)
                     write_private(RECENT_FILE, text, folder)
             except OSError as error:
-                self._warn_once(f"The tasks that you opened cannot be kept for the next run: {error}")
+                self._warn_once(f"The list of recent tasks cannot be saved for the next run: {error}")
 
     def _read(self) -> list[RecentTask]:
         try:
             content = read_private(RECENT_FILE, self._folder())
         except OSError as error:
-            self._warn_once(f"The tasks that you opened before are not known: {error}")
+            self._warn_once(f"The list of recent tasks cannot be read: {error}")
             return []
         if content is None:
             return []
         try:
             rows = msgspec.json.decode(content, type=_Document).tasks
         except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
-            self._warn_once(f"The list of tasks that you opened before is broken and is made anew: {error}")
+            self._warn_once(f"The list of recent tasks is broken and will be recreated: {error}")
             return []
         return [task for row in rows[: 10 * MAX_TASKS] if (task := _decoded(row)) is not None]
 

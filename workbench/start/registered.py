@@ -214,7 +214,7 @@ class RegisteredTasks:
             await self._disk.run(partial(_write, self._folder / LIST_FILE, content))
         except OSError as error:
             log.warning(
-                "The list of ManiSkill's tasks cannot be kept, and is made again in the next run: %s", error
+                "The list of ManiSkill's tasks cannot be cached and is made again in the next run: %s", error
             )
 
     def _find_pictures(self) -> frozenset[str]:

@@ -85,7 +85,7 @@ class TrustStore:
                     kept = [known for known in self._read(repair=True) if known.hash != entry.hash]
                     self._write([*kept, entry][-MAX_ENTRIES:])
             except OSError as error:
-                self._warn_once(f"What you trust cannot be kept, and is asked again in the next run: {error}")
+                self._warn_once(f"Your answer cannot be stored and is asked again in the next run: {error}")
 
     def _all(self) -> Iterator[_Entry]:
         """Entries of this run, then those on disk, which are read only if those of this run do not match."""
@@ -100,7 +100,7 @@ class TrustStore:
         except OSError as error:
             if repair:
                 raise  # writing now would overwrite its entries
-            self._warn_once(f"What you trusted before is not known: {error}")
+            self._warn_once(f"The stored answers about trusted code cannot be read: {error}")
             return []
         if content is None:
             return []
