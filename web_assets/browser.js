@@ -1,4 +1,4 @@
-// What this browser cannot do: draw with WebGL 2 at all, or on a graphics card.
+// Detects browsers without WebGL 2 or without hardware acceleration.
 "use strict";
 {
   const SOFTWARE = /swiftshader|llvmpipe|softpipe|software/i; // as in viser's BrowserWarning.tsx
@@ -19,15 +19,15 @@
     document.body.append(box);
   }
 
-  // viser lowers the resolution of its view when frames come slowly. In software the page answers nothing for 0.2 to 0.8 s
-  // while it makes the new buffers. viser reads a fixed resolution from its address, once, before it makes its canvas; there it
-  // does not stay, for people copy addresses.
+  // viser lowers the resolution of its view when frames are slow. With software rendering the page is blocked for 0.2 to 0.8 s
+  // while it makes the new buffers. viser reads a fixed resolution from the page's address, once, before it makes its canvas;
+  // it is removed from the address afterwards, since users copy addresses.
   function fixResolution() {
     const KEY = "fixedDpr"; // viser 1.1, DevSettingsStore.ts
     const address = new URL(location.href);
     if (address.searchParams.has(KEY)) return;
     const before = address.href;
-    address.searchParams.set(KEY, Math.min(Math.max(devicePixelRatio, 1), 2)); // as react-three-fiber's canvas by itself
+    address.searchParams.set(KEY, Math.min(Math.max(devicePixelRatio, 1), 2)); // like react-three-fiber's default
     history.replaceState(history.state, "", address);
     new MutationObserver((_, observer) => {
       if (!document.querySelector("canvas[data-engine]")) return;
@@ -41,15 +41,15 @@
   if (!gl) addEventListener("DOMContentLoaded", tellNoWebGL);
   else if (named && SOFTWARE.test(gl.getParameter(named.UNMASKED_RENDERER_WEBGL))) {
     fixResolution();
-    // The server is told by the elements that ask for it (data-only). viser's notice is shown once, for a while (page.css).
+    // Elements with data-only report it to the server. viser's notice is shown once, for a while (page.css).
     const { dataset } = document.documentElement;
     dataset.drawnInSoftware = localStorage.getItem(TOLD) ?? "";
     localStorage.setItem(TOLD, "told");
     setTimeout(() => (dataset.drawnInSoftware = "told"), NOTICE);
   }
-  gl?.getExtension("WEBGL_lose_context")?.loseContext(); // a browser keeps some sixteen at most
+  gl?.getExtension("WEBGL_lose_context")?.loseContext(); // browsers allow about sixteen contexts
 
-  // viser's sorter of Gaussian splats, of which the workbench shows none, makes functions from text when the page is loaded. The
-  // page's policy forbids it, and the console would complain.
+  // viser's sorter of Gaussian splats, which the workbench does not use, evaluates strings when the page loads. The page's
+  // policy forbids that, and the console would show an error.
   addEventListener("unhandledrejection", (event) => event.reason instanceof EvalError && event.preventDefault());
 }

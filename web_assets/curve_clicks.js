@@ -1,10 +1,11 @@
-// A click on a curve shows its step: does the command that the panel names (data-curve). A drag is uPlot's zoom.
+// A click on a curve sends the panel's command (data-curve) with the step at the pointer. A drag is uPlot's zoom.
 //
-// The chart cannot be reached from the page's elements, and after a zoom only it knows what part of the steps it shows. Its legend says the
-// step under the pointer, with the digits of the browser's language. To ask viser for: a click on a chart, with its x.
+// The page's elements give no access to the chart object, and after a zoom only the chart knows its range of steps. Its legend
+// shows the step under the pointer, with the digits of the browser's language. Feature to request from viser: a click event of
+// a chart, with its x.
 "use strict";
 {
-  const STILL = 4; // pixels between the two ends of a click
+  const STILL = 4; // maximum pixels between pointer down and up of a click
   const numbers = new Intl.NumberFormat(navigator.language, { useGrouping: false });
   const digits = [...numbers.format(9876543210)].reverse();
   const decimal = numbers.formatToParts(0.5).find(({ type }) => type === "decimal").value;

@@ -1,6 +1,6 @@
-// In rerun's own page, before anything of its own.
+// Runs in rerun's own page, before rerun's scripts.
 "use strict";
-// rerun fetches recordings without cookies (0.41), and the door lets nobody in without.
+// rerun 0.41 fetches recordings without cookies, and the server refuses requests without the token's cookie.
 const fetch_as_told = window.fetch;
 window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-origin" });
 {
@@ -12,7 +12,7 @@ window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-o
   const set_time = (recording, step) => new Uint8Array(field(6, [
     ...field(1, text(recording)), ...field(2, field(1, text("step"))), ...field(3, [8, ...varint(step)]), 40, 1]));
   const go = async (recording, step) => {
-    // It is refused until the recording has been read so far.
+    // rerun rejects the message until it has read the recording up to this step.
     for (let tries = 0; tries < 300; tries++) {
       await new Promise((done) => setTimeout(done, 200));
       try {
@@ -26,7 +26,7 @@ window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-o
     const end = moment.lastIndexOf("@");
     go(moment.slice(0, end), Number(moment.slice(end + 1)));
   }
-  // It takes the keyboard when it starts; in a panel the keys are the page's until somebody presses into it.
+  // rerun takes the keyboard focus when it starts; in a panel the keys belong to the page until the user clicks into rerun.
   const giveBack = ({ target }) => { target.blur(); frameElement.blur(); };
   if (parent !== window) addEventListener("focusin", giveBack);
   addEventListener("pointerdown", () => removeEventListener("focusin", giveBack), true);

@@ -1,32 +1,32 @@
-// What a person does becomes numbered commands on one WebSocket, in the order in which it was done. Each is answered.
+// Sends the user's input as numbered commands over one WebSocket, in order. The server replies to each.
 //
-//   data-page="x7Hq"                         this page's name, told by the server
-//   data-keys='[["s","live","step",true]]'   keys: context, command, whether a held key repeats it; data-contexts are on
-//   data-context="library"                   while this element is in the page, the keys of that context are on
-//   data-do='["select_env", {"env": 3}]'     a press does this
-//     data-held="held"                         its field for the keys that are held: "", "ctrl", "shift", "ctrl+shift"
-//     data-twice='["open_row", {...}]'         a second press soon after does this
-//     data-place                               its fields x and y: the place in the element, 0 to 1 from its upper left corner
-//     data-along='["step", 0, 99]'             its field for the place along the element: a whole number between these
-//   data-copy="text"                         a press copies this
-//   data-tell='["tell_unfolded", {...}]'     done when the element comes into the page (data-only: only where <html> has data-…)
-//   data-into-sight                          then its parent is scrolled into sight; data-follow="7": the library's row with that number
-//   data-title="PushCube"                    the name of the browser's tab; without one the last one stays
-//   data-field='["set_seed", {}, "seed"]'    what is entered goes into the last named field: at Enter or when the focus leaves, when
-//                                            it is chosen, or (data-live) as it is typed; Enter does data-enter
-//     data-number="[0, null, 1, true]"         a number: the least, the greatest, what an arrow key adds, whether it is whole
-//   data-search="text.look..."               a list that the field of this name searches: letters go into the field, arrows from it
-//                                            into the list, beginning at data-best
-//   data-shows='[["text.set_seed.seed", "12", false, {}]]'  what the server has for a field of this name: copied into it while nobody
-//                                            uses it; whether it is off; options ([shown, value]) or bounds that it has from now on
+//   data-page="x7Hq"                         this page's name, assigned by the server
+//   data-keys='[["s","live","step",true]]'   keys: key, context, command, whether a held key repeats it; data-contexts are always on
+//   data-context="library"                   while this element is in the page, the keys of that context work
+//   data-do='["select_env", {"env": 3}]'     command of a press
+//     data-held="held"                         its field for the modifier keys: "", "ctrl", "shift", "ctrl+shift"
+//     data-twice='["open_row", {...}]'         command of a double press
+//     data-place                               its fields x and y: the position in the element, 0 to 1 from the upper left corner
+//     data-along='["step", 0, 99]'             its field for the position along the element: an integer between these
+//   data-copy="text"                         a press copies this text
+//   data-tell='["tell_unfolded", {...}]'     command when the element is added (data-only: only if <html> has data-…)
+//   data-into-sight                          scroll the parent into view when added; data-follow="7": the library's row with that number
+//   data-title="PushCube"                    title of the browser's tab; without one the last title stays
+//   data-field='["set_seed", {}, "seed"]'    the value goes into the last named field: committed on Enter or blur, when an option is
+//                                            chosen, or (data-live) on every input; Enter sends data-enter
+//     data-number="[0, null, 1, true]"         a number: minimum, maximum, step of an arrow key, whether it is an integer
+//   data-search="text.look..."               a list that the field of this name searches: letters go into the field, arrow keys from it
+//                                            into the list, starting at data-best
+//   data-shows='[["text.set_seed.seed", "12", false, {}]]'  the server's value for the field of this name, copied into it while it is
+//                                            not in use; whether it is disabled; new options ([label, value]) or bounds
 "use strict";
 {
-  const STILL = 6; // pixels that a press may move
-  const TWICE = 450; // milliseconds between two presses
+  const STILL = 6; // maximum pixels that a press may move
+  const TWICE = 450; // maximum milliseconds between the presses of a double press
   const NOTICE = 8000; // milliseconds
-  const DRAWN = 1000; // milliseconds after which what was entered is drawn
-  const OPENING = 1000; // milliseconds in which a window opens
-  const AWAY = 1500; // milliseconds without a connection, after which the page says so
+  const DRAWN = 1000; // milliseconds within which the server redraws an entered value
+  const OPENING = 1000; // milliseconds within which a window opens
+  const AWAY = 1500; // milliseconds without a connection before the notice is shown
 
   // --- the channel ------------------------------------------------------------------------------------------------------
 
@@ -34,8 +34,8 @@
   let page = "";
   let sent = 0;
   const unanswered = new Map(); // number -> the data-field or the pressed element's data-do
-  const newest = new Map(); // the same -> a value that waits for the reply to the one before
-  const early = []; // asked before the socket was open
+  const newest = new Map(); // the same key -> the newest value, waiting for the reply to the previous one
+  const early = []; // messages from before the socket was open
 
   let notice = null;
   function tell(text, beside = null) {
@@ -61,13 +61,13 @@
 
   const isUnanswered = (of) => [...unanswered.values()].includes(of);
 
-  // Of a field or a drag only the newest value, while one is unanswered.
+  // For a field or a drag, queue only the newest value while a reply is pending.
   function sendNewest(of, command) {
     if (isUnanswered(of)) newest.set(of, command);
     else send(command, of);
   }
 
-  // What was typed before a command goes before it.
+  // Values entered before a command are sent before it.
   function ask(command) {
     for (const [of, value] of newest) send(value, of);
     newest.clear();
@@ -127,13 +127,13 @@
     document.body.append(gone);
   }
 
-  // After the token was renewed the server refuses the connection; the page that it sends then says what to do.
+  // After the token was renewed the server refuses the connection; its page then explains what to do.
   async function reloadIfShutOut() {
     const reply = await fetch("/workbench/logo.svg", { cache: "no-store" }).catch(() => null);
     if (reply?.status === 403) location.reload();
   }
 
-  // What was not answered may be done or not, and is not asked again: minutes later it would surprise.
+  // Commands without a reply may have been carried out or not. They are not retried: minutes later that would be a surprise.
   function lost() {
     if (unanswered.size) tell("The connection was lost: what was asked for last may not have been done.");
     unanswered.clear();
@@ -148,7 +148,7 @@
   const heldOf = ({ ctrlKey, metaKey, shiftKey }) => [(ctrlKey || metaKey) && "ctrl", shiftKey && "shift"].filter(Boolean).join("+");
   const within = (at, from, size) => Math.min(1, Math.max(0, (at - from) / Math.max(size, 1)));
 
-  // The command of an element, with what the event says of it.
+  // The command of an element, with fields from the event.
   function commandOf(element, event) {
     const [name, fields] = JSON.parse(element.dataset.do);
     const said = { ...fields };
@@ -156,7 +156,7 @@
     return [name, said];
   }
 
-  // The command of each place in an element, which is replaced by the next redraw.
+  // Returns the command for each position in an element; computed once, since the next redraw replaces the element.
   function commandAt(element) {
     const [name, fields] = JSON.parse(element.dataset.do);
     const { left, top, width, height } = element.getBoundingClientRect();
@@ -167,10 +167,10 @@
     };
   }
 
-  // A redraw may replace or move an element between pointer down and up, and then the browser makes no click. So a press means
-  // what was under the pointer as it went down, and counts if the pointer hardly moved or is still on what does the same.
+  // A redraw may replace or move an element between pointer down and up, and then the browser sends no click. So a press applies
+  // to the element at pointer down, and counts if the pointer hardly moved or is still on an element with the same command.
   let pressed = null; // { does, command, twice, held, x, y }
-  let dragged = null; // { of, at } of the element along which the pointer goes
+  let dragged = null; // { of, at } of the dragged element
   let last = { does: "", at: 0 };
 
   addEventListener(
@@ -228,12 +228,12 @@
   const CONTROL = "button, a[href], input, select, summary, [role=slider], [role=tab], [role=menuitem], [role=option], [role=button]";
   const MOVES = /^(Enter| |Arrow.*|Home|End|Page.*)$/;
   const NAMES = { " ": "space" };
-  const OPENS = /^ctrl\+(k|o|shift\+p)$/; // the palette, the list of tasks
-  let opening = 0; // until when a window may open; what is typed meanwhile is meant for it, and triggers nothing here
+  const OPENS = /^ctrl\+(k|o|shift\+p)$/; // keys of the palette and of the list of tasks
+  let opening = 0; // until when a window may open; keys typed meanwhile are meant for it and trigger nothing here
   const PRESSED = "[data-do], [data-copy], [data-fold]";
-  let keys = []; // [key, context, command, repeats]; the last ones are kept while a folded panel takes them out of the page
+  let keys = []; // [key, context, command, repeats]; kept while a folded panel removes them from the page
   let always = [];
-  let keyList = null; // their list for a person
+  let keyList = null; // the list of keys to show
 
   function readKeys() {
     const told = [...document.querySelectorAll("[data-keys]")].at(-1);
@@ -243,7 +243,7 @@
     always = told.dataset.contexts.split(" ");
   }
 
-  // CapsLock changes `key`, and a Cyrillic layout has no "s": the letter is that of the place where "s" is.
+  // CapsLock changes `key`, and a Cyrillic layout has no "s": use the letter of the physical key.
   function nameOf({ key, code, ctrlKey, metaKey, altKey, shiftKey }) {
     const letter = /^\p{L}$/u.test(key);
     const name = NAMES[key] ?? (letter && !/^[a-z]$/i.test(key) ? code.replace("Key", "") : key);
@@ -251,7 +251,7 @@
     return [...held.filter(Boolean), name.toLowerCase()].join("+");
   }
 
-  // Over a dialog that is open only the keys of what is in it count.
+  // While a dialog is open, only the contexts in it count.
   function contexts() {
     const dialog = [...document.querySelectorAll("[aria-modal=true], dialog[open], body > .wb-all-keys:popover-open")].at(-1);
     const there = [...(dialog ?? document).querySelectorAll("[data-context]")].map((one) => one.dataset.context);
@@ -266,7 +266,7 @@
     return found.sort((a, b) => on.indexOf(a[1]) - on.indexOf(b[1]))[0];
   }
 
-  // A copy, which no redraw takes out of the page.
+  // A copy, which a redraw does not remove.
   function toggleKeyList() {
     const shown = document.querySelector("body > .wb-all-keys:popover-open");
     if (shown || !keyList) return shown?.hidePopover();
@@ -276,8 +276,8 @@
     list.showPopover();
   }
 
-  // viser moves its view with these, and offers no way to take them from it: S would be a step and carry the view away. Its
-  // listener comes after this one on the document.
+  // viser moves its view with these keys and cannot be told not to: S would step and also move the view. Its listener on the
+  // document runs after this one.
   const MOVE_VIEW = /^(Key[WASDQE]|Arrow(Up|Down|Left|Right))$/; // viser 1.1, CameraControls.tsx
   document.addEventListener("keydown", (event) => MOVE_VIEW.test(event.code) && event.stopImmediatePropagation());
 
@@ -285,7 +285,7 @@
     "keydown",
     (event) => {
       if (event.isComposing || event.keyCode === 229) return;
-      // A list that was opened by the pointer and closed again would take the letters of keys for its options.
+      // A select that was opened by the pointer and closed again would use letters to choose options.
       if (byPointer && event.target.matches?.(CLOSED)) event.target.blur();
       byPointer = false;
       const at = document.activeElement ?? document.body;
@@ -319,7 +319,7 @@
         return;
       }
       const found = keyed(event);
-      // Who types keeps all keys, but for Escape in a dialog's field; a focused control keeps those that move it.
+      // A text field gets all keys, except Escape in a dialog; a focused control gets the keys that move it.
       const typing = document.activeElement?.closest(TYPED) && !(event.key === "Escape" && at.closest("[aria-modal=true]"));
       if (typing || (MOVES.test(event.key) && !event.altKey && at.closest(CONTROL))) return;
       if (event.key === "?") toggleKeyList();
@@ -332,8 +332,8 @@
     true,
   );
 
-  // In a table or on a strip Tab stops at one part, and the arrows go from there to the others; of cards, up and down to the one
-  // above and below.
+  // In a table or on a strip, Tab stops at one part and the arrow keys move to the others; among cards, up and down move to the
+  // card above and below.
   const STEPS = { ArrowLeft: -1, ArrowUp: -1, ArrowRight: 1, ArrowDown: 1 };
   function walk(list, from, key) {
     const parts = [...list.querySelectorAll("[tabindex][data-do]")];
@@ -346,7 +346,7 @@
     ((/Up|Down/.test(key) && next.find(isThere)) || next[0])?.focus();
   }
 
-  // Whether nothing is left to do for the key. A letter goes on, into the field that has the focus by then.
+  // Returns whether the key is fully handled. A letter is not: it goes into the field, which has the focus by then.
   function searches(event, at) {
     const list = [...document.querySelectorAll("[data-search]")].at(-1);
     const dialog = [...document.querySelectorAll("[aria-modal=true]")].at(-1);
@@ -383,7 +383,7 @@
     return low === null ? `it is at most ${high}` : `it goes from ${low} to ${high}`;
   }
 
-  // What an input holds, as its command takes it; undefined where that is no number.
+  // The value of an input for its command; undefined if it is not a valid number.
   function valueOf(input) {
     if (input.type === "checkbox") return input.checked;
     if (input.tagName === "SELECT") return JSON.parse(input.value);
@@ -395,8 +395,8 @@
     tell(`${input.ariaLabel}: ${why}. It stays ${input.value}.`, input);
   }
 
-  // Between the reply and the next drawing the server's value is the one before: without this an input would jump back to it.
-  const entered = new Map(); // data-field -> [what its input shows, until when that stays]
+  // Between the reply and the next drawing the page has the server's old value: without this an input would jump back to it.
+  const entered = new Map(); // data-field -> [shown value, time until which it stays]
 
   function typed(input) {
     const of = input.dataset.field;
@@ -415,14 +415,14 @@
     setTimeout(showValues, DRAWN + 50);
   }
 
-  // One step further, within its bounds.
+  // Change a number by steps, within its bounds.
   function stepNumber(input, steps) {
     const [low, high, step] = JSON.parse(input.dataset.number);
     const next = Number(((Number(input.value) || 0) + steps * step).toPrecision(12));
     input.value = Math.max(low ?? next, Math.min(high ?? next, next));
     typed(input);
   }
-  const edited = new WeakSet(); // inputs with text that was not sent yet
+  const edited = new WeakSet(); // inputs with unsent text
   addEventListener("input", ({ target }) => {
     if (!target.dataset?.field) return;
     edited.add(target);
@@ -444,12 +444,13 @@
         if ("live" in input.dataset) typed(input);
       }
       if (input.dataset.enter && event.key === "Enter") ask(JSON.parse(input.dataset.enter));
-      // A dialog has its own use for both keys.
+      // A dialog handles both keys itself.
       if (!input.closest("[role=dialog]")) input.blur();
     },
   );
 
-  // Copied while nobody uses it; `refused` is a field whose value was not taken, unless more was typed since.
+  // Copy the server's values into inputs that are not in use; also into the field `refused`, whose value was refused, unless more
+  // was typed since.
   function showValues(refused = "", into = null) {
     for (const shows of document.querySelectorAll("[data-shows]")) {
       for (const [name, value, off, { options, bounds }] of JSON.parse(shows.dataset.shows)) {
@@ -461,7 +462,7 @@
           const used = document.activeElement === input && input !== into && (of !== refused || edited.has(input));
           if (newest.has(of) || isUnanswered(of)) continue;
           const [shown, until] = entered.get(of) ?? ["", 0];
-          if (shown === String(value)) entered.delete(of); // drawn: another command may change it from now on
+          if (shown === String(value)) entered.delete(of); // drawn: other commands may change it from now on
           else if (performance.now() < until) continue;
           if (used) continue;
           if (input.type === "checkbox") input.checked = value;
@@ -487,8 +488,8 @@
 
   // --- focus ------------------------------------------------------------------------------------------------------------
 
-  // What was clicked gives the focus back, so that the page's keys go on: a button would else take Space for itself. Who
-  // walks with Tab keeps it.
+  // A clicked control gives up the focus, so that the page's keys keep working: a focused button would handle Space itself.
+  // With Tab navigation the focus stays.
   let byPointer = false;
   let focused = "";
   addEventListener("pointerdown", () => {
@@ -507,7 +508,7 @@
       kind,
       (event) => {
         giveBack(event);
-        // Again: some controls take the focus in handlers that come after this one.
+        // Repeat: some controls take the focus in later handlers.
         clearTimeout(again);
         again = setTimeout(() => byPointer && giveBack(event), 50);
       },
@@ -515,16 +516,16 @@
     );
   }
 
-  // A redraw takes the focus from an element that it replaces; it goes to the one that does the same.
+  // A redraw that replaces the focused element loses the focus; move it to the new element with the same command.
   addEventListener("focusin", ({ target }) => {
     const { do: does, fold } = (!byPointer && target.closest("[data-do], [data-fold]")?.dataset) || {};
     focused = does ? `[data-do="${CSS.escape(does)}"]` : fold ? `[data-fold="${CSS.escape(fold)}"]` : "";
   }, true);
   addEventListener("focusout", ({ relatedTarget }) => relatedTarget && (focused = ""), true);
 
-  // --- what comes into the page -------------------------------------------------------------------------------------------
+  // --- elements added to the page -----------------------------------------------------------------------------------------
 
-  // For each attribute what is done once with an element that has it.
+  // By data attribute: what to do once with each element that has it.
   const arrivals = {
     tell(element) {
       const { tell, only } = element.dataset;
@@ -534,7 +535,7 @@
       input.focus();
       input.select();
     },
-    // Again, since what stands beside it comes a moment later.
+    // Repeat, since neighbouring elements are added a moment later.
     intoSight(element) {
       const show = () => element.parentElement?.scrollIntoView({ block: "nearest" });
       show();

@@ -1,20 +1,20 @@
-// What viser's tabs, folds and palette lack. To ask viser for: a tab group whose open tab the server can set, and hears of; folds
-// that the server and the keyboard open; an address as what a command of the palette does.
+// Features that viser's tabs, folds and palette lack. To request from viser: a tab group whose open tab the server can set and
+// is notified of; folds that the server and the keyboard can open; palette commands that open an address.
 //
-//   data-which="3f2a"      what the page shows: who comes back to it finds the tab that was open there (data-anew: the first one)
-//     data-says              the server is told which tab is open
-//   data-open-tab="Studio" a tab is opened, and in it data-open-fold
+//   data-which="3f2a"      id of the page's content: when the user returns to it, its last open tab is restored (data-anew: the first)
+//     data-says              report the open tab to the server
+//   data-open-tab="Studio" open this tab, and in it data-open-fold
 "use strict";
 {
   const KEEPS = "workbench tab of ";
-  const COMES = 5000; // milliseconds within which the tabs come
-  const SETTLES = 1000; // from the first of them on; until all are there viser opens the first again
+  const COMES = 5000; // milliseconds within which the tabs appear
+  const SETTLES = 1000; // milliseconds from the first tab on; until all exist viser reopens the first
   const FOLD_COMES = 2000;
 
   // --- tabs -------------------------------------------------------------------------------------------------------------
 
   let which = "";
-  let wanted = null; // { name, until }: the tab that was open here before
+  let wanted = null; // { name, until }: the tab to restore
   let told = { mark: null, name: "" };
 
   const nameOf = (tab) => tab.textContent.trim().replace(/ \d+$/, ""); // without the number of findings
@@ -22,7 +22,7 @@
   const tabsOf = (mark) => [...(mark?.closest(".mantine-Paper-root")?.querySelectorAll("[role=tab]") ?? [])];
   const isOpen = (tab) => tab.getAttribute("aria-selected") === "true";
 
-  // viser's tabs hear this key, and a pointer that goes down and up.
+  // viser's tabs react to this key, and to pointer down and up.
   function press(tab) {
     tab.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", code: "Enter", bubbles: true }));
   }
@@ -31,7 +31,7 @@
     wanted = null;
     if (tabsOf(marker()).includes(tab)) sessionStorage.setItem(KEEPS + which, nameOf(tab));
   }
-  // At pointer down, for viser opens a tab before the click.
+  // At pointer down, since viser opens a tab before the click.
   for (const kind of ["pointerdown", "keydown"]) {
     addEventListener(kind, (event) => {
       const tab = event.isTrusted && (kind === "pointerdown" || event.key === "Enter") && event.target.closest?.("[role=tab]");
@@ -64,7 +64,7 @@
     wb.ask(["tell_open_tab", { tab: told.name }]);
   }
 
-  // --- folds: a sheet within a bordered sheet, with an arrow behind its label; it hears a click alone ----------------------
+  // --- folds: a sheet within a bordered sheet, with an arrow after its label; it reacts only to a click --------------------
 
   const ARROW = "svg:is(.tabler-icon-chevron-down, .tabler-icon-chevron-up)";
   const ICONS = { "list-search": "Commands (Ctrl+K)", adjustments: "Scene tree and settings", "arrow-back": "Back to the panels" };
@@ -86,7 +86,7 @@
     }
   }
 
-  // It may be in another fold, or in a tab that was just opened.
+  // The fold may be in another fold, or in a tab that was just opened.
   function openFold(label, until) {
     const heading = document.querySelector(`[data-fold="${CSS.escape(label)}"]`);
     if (!heading) {
@@ -94,7 +94,7 @@
       return;
     }
     for (const one of headings()) if (one.parentElement.contains(heading) && !isUnfolded(one)) one.click();
-    // It unfolds for 200 ms, and the palette gives the focus back to where it was.
+    // Unfolding takes 200 ms, and the palette restores the previous focus.
     for (const after of [0, 250, 500]) {
       setTimeout(() => {
         heading.parentElement.scrollIntoView({ block: "start" });
@@ -105,7 +105,7 @@
 
   // --- the palette --------------------------------------------------------------------------------------------------------
 
-  // A browser lets a page open a tab only while a press is handled, and the server hears of it later. Enter is a click too.
+  // A browser allows opening a tab only while it handles a press, and the server gets the command later. Enter is a click too.
   addEventListener("click", ({ target }) => {
     const label = target.closest?.(".mantine-Spotlight-action")?.querySelector(".mantine-Spotlight-actionLabel");
     if (label?.textContent === "Help: open the documents") open("/help/", "_blank", "noopener");

@@ -111,7 +111,7 @@ def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
 
     from tests.drive.panels import Panels
     from workbench.library.folder import Library
-    from workbench.library.listing import MOST_ROWS
+    from workbench.library.listing import ROWS_PER_PAGE
     from workbench.library.panel import LibraryPanel
 
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -121,7 +121,7 @@ def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
     panel, panels = LibraryPanel(server, library, lambda ids: None), Panels(server)
     said: dict[str, float] = {}
     draws: list[float] = []
-    wanted = min(MOST_ROWS, count)
+    wanted = min(ROWS_PER_PAGE, count)
     while not {"all", "pictures"} <= said.keys():
         at = time.perf_counter()
         panel.draw()

@@ -28,7 +28,7 @@ from workbench.library.commands import (
     ToggleRow,
     UndoDelete,
 )
-from workbench.library.listing import MOST_ROWS, LibraryList, Listing, apply, make_listing
+from workbench.library.listing import ROWS_PER_PAGE, LibraryList, Listing, apply, make_listing
 from workbench.page.command import Command
 
 Rows = tuple[LibraryRow, ...]
@@ -45,7 +45,7 @@ ROWS: Rows = tuple(
         task="push" if k % 3 else "pick",
         success=k % 2 == 0,
     )
-    for k in range(MOST_ROWS + 3)
+    for k in range(ROWS_PER_PAGE + 3)
 )
 
 
@@ -69,7 +69,7 @@ def test_the_cursor_goes_on_from_the_place_of_a_row_that_is_gone() -> None:
 
 
 def test_an_arrow_without_a_cursor_begins_on_the_page_that_is_shown() -> None:
-    assert after([NextRows(), NextRow()]).selected == (f"r{MOST_ROWS}",)
+    assert after([NextRows(), NextRow()]).selected == (f"r{ROWS_PER_PAGE}",)
     assert after([NextRows(), NextRows(), PreviousRows(), NextRow()]).selected == ("r0",)
 
 

@@ -34,14 +34,14 @@ from workbench.library.commands import (
     UndoDelete,
 )
 from workbench.library.folder import Library
-from workbench.library.listing import MOST_ROWS, Action
+from workbench.library.listing import ROWS_PER_PAGE, Action
 from workbench.library.panel import LibraryPanel
 from workbench.library.rows import OpenVersion
 from workbench.page.command import Command
 from workbench.page.commands import AnswerDialog, CloseDialog
 from workbench.page.widgets.visitors import Visitor
 
-COUNT = MOST_ROWS + 5
+COUNT = ROWS_PER_PAGE + 5
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def table(panels: Panels, library: Library, told: Told, clock: Clock) -> Iterato
 
     panels.visitors.do = do
     table = Table(panel, panels, clock)
-    until(lambda: table.draw() or table.pictures() == MOST_ROWS, "the pictures")
+    until(lambda: table.draw() or table.pictures() == ROWS_PER_PAGE, "the pictures")
     yield table
     panel.end()
 
@@ -145,9 +145,9 @@ def newest(first: int, last: int) -> list[str]:
 
 
 def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
-    assert table.shown() == newest(0, MOST_ROWS)
+    assert table.shown() == newest(0, ROWS_PER_PAGE)
     table.ask(NextRows())
-    assert table.shown() == newest(MOST_ROWS, COUNT)
+    assert table.shown() == newest(ROWS_PER_PAGE, COUNT)
     table.ask(SortRows(column="seed"))
     assert table.shown()[:3] == ["id00", "id01", "id02"]
     table.ask(SortRows(column="seed"))
@@ -171,7 +171,7 @@ def test_rows_of_another_version_than_the_open_one_are_marked_as_soon_as_it_is_a
     open_version = OpenVersion(recorded[0], "edited")
     clock.passes()
     panel.draw()
-    assert panels.html("wb-library").count("another version") == MOST_ROWS
+    assert panels.html("wb-library").count("another version") == ROWS_PER_PAGE
 
 
 def test_another_search_filter_or_order_begins_on_the_first_page(table: Table) -> None:
@@ -183,9 +183,9 @@ def test_another_search_filter_or_order_begins_on_the_first_page(table: Table) -
         lambda: table.ask(SortRows(column="seed")),
     ):
         table.ask(NextRows())
-        assert len(table.shown()) == COUNT - MOST_ROWS
+        assert len(table.shown()) == COUNT - ROWS_PER_PAGE
         arrange()
-        assert len(table.shown()) == MOST_ROWS
+        assert len(table.shown()) == ROWS_PER_PAGE
 
 
 def test_the_recordings_of_one_task_are_listed_until_it_has_none_or_all_are_wanted_again(
@@ -214,7 +214,7 @@ def test_the_recordings_of_one_task_are_listed_until_it_has_none_or_all_are_want
     table.draw()
     assert table.shown() == ["z1"]
     table.key(ClearRowFilter())
-    assert len(table.shown()) == MOST_ROWS and table.panels.field("Task").value == "all tasks"
+    assert len(table.shown()) == ROWS_PER_PAGE and table.panels.field("Task").value == "all tasks"
 
 
 def test_all_selects_what_is_listed_and_leaves_the_filter(table: Table) -> None:
@@ -274,14 +274,14 @@ def test_rows_are_selected_as_in_a_list_of_files(table: Table, told: Told) -> No
 def test_keys_walk_over_the_pages(table: Table) -> None:
     table.key(NextRow())
     assert table.selected() == (newest(0, 1)[0],)
-    for _ in range(MOST_ROWS):
+    for _ in range(ROWS_PER_PAGE):
         table.key(NextRow())
     table.draw()
-    assert table.selected() == tuple(newest(MOST_ROWS, MOST_ROWS + 1))
-    assert table.shown() == newest(MOST_ROWS, COUNT) and "data-follow" in table.panels.html("<style")
+    assert table.selected() == tuple(newest(ROWS_PER_PAGE, ROWS_PER_PAGE + 1))
+    assert table.shown() == newest(ROWS_PER_PAGE, COUNT) and "data-follow" in table.panels.html("<style")
     table.key(AlsoPreviousRow())
     table.key(AlsoPreviousRow())
-    assert table.selected() == tuple(newest(MOST_ROWS - 2, MOST_ROWS + 1))
+    assert table.selected() == tuple(newest(ROWS_PER_PAGE - 2, ROWS_PER_PAGE + 1))
 
 
 def test_what_is_no_longer_listed_is_no_longer_selected(table: Table, library: Library, told: Told) -> None:
@@ -391,7 +391,7 @@ def test_a_disk_that_hangs_holds_neither_the_table_nor_what_is_pressed_in_it(
     until(lambda: begun == ["first"], "the first note")
     goes_on.set()
     until(lambda: [library.row(f"id0{k}").note for k in (0, 1)] == ["first", "second"], "the notes")  # type: ignore[union-attr]
-    until(lambda: table.draw() or table.pictures() == MOST_ROWS, "the pictures")
+    until(lambda: table.draw() or table.pictures() == ROWS_PER_PAGE, "the pictures")
 
 
 def test_only_the_first_answer_counts(table: Table, library: Library) -> None:

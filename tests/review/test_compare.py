@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.drive.episodes import BODY, geometry_of, made, poses_of
-from workbench.review.differences import ARM, Difference, difference, distances, source_changes
+from workbench.review.differences import ARM_METRES, Difference, difference, distances, source_changes
 
 
 def parts_at(found: Difference) -> int | None:
@@ -56,7 +56,7 @@ def test_other_bodies_lengths_and_entries_are_said() -> None:
 
 def test_turning_counts_and_either_sign_of_a_quaternion_is_the_same() -> None:
     still, turned = np.array([0, 0, 0, 1, 0, 0, 0.0]), np.array([0, 0, 0, np.cos(0.1), np.sin(0.1), 0, 0])
-    assert np.isclose(distances(still, turned), 0.2 * ARM)
+    assert np.isclose(distances(still, turned), 0.2 * ARM_METRES)
     assert distances(still, -still) == 0
     lacking = np.full(7, np.nan)
     assert distances(still, lacking) == np.inf and distances(lacking, lacking) == 0

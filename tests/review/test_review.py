@@ -164,7 +164,9 @@ def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
 
 
 def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workbench.review.state.FIRST_SHOWN", 0.0)  # it is seen before the other is read
+    monkeypatch.setattr(
+        "workbench.review.state.FIRST_SHOWN_SECONDS", 0.0
+    )  # it is seen before the other is read
     review, _ = review_of(
         new=made(4, written_at="2026-11-22T10:00:00+00:00"),
         old=made(6, written_at="2026-11-21T10:00:00+00:00"),
@@ -348,7 +350,7 @@ def test_nothing_is_opened_library_stays_after_a_person_has_opened_a_recording(
 
 
 def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workbench.review.state.FIRST_SHOWN", 0.0)
+    monkeypatch.setattr("workbench.review.state.FIRST_SHOWN_SECONDS", 0.0)
     review, shelf = review_of(a=made(10), b=made(20), c=made(10), d=made(30, success_from=9), e=made(10))
     reached, go_on = threading.Event(), threading.Event()
 
@@ -382,7 +384,7 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
 
 
 def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workbench.review.state.FIRST_SHOWN", 0.0)
+    monkeypatch.setattr("workbench.review.state.FIRST_SHOWN_SECONDS", 0.0)
     shelf = Shelf({"a": made(10), "b": made(20), "c": made(30)})
     reached, go_on = threading.Event(), threading.Event()
     readers: list[threading.Thread] = []

@@ -9,7 +9,7 @@ import numpy as np
 from tests.drive.episodes import BODY, geometry_of, made, poses_of
 from workbench.episodes.episode import Episode
 from workbench.page.scene.glb import group_visuals
-from workbench.review.scene_view import SEE_THROUGH, review_scene
+from workbench.review.scene_view import GHOST_ALPHA, review_scene
 from workbench.review.view import Opened, find_events
 
 
@@ -34,7 +34,7 @@ def test_a_ghost_is_tinted_and_drawn_only_where_it_parts() -> None:
     assert scene is not None and not scene.layout.offsets.any()
     ghosts = {int(v.bodies[0]): v.material for v in scene.geometry.visuals if 1 in v.envs}
     assert set(ghosts) == {BODY["cube"]}, "what rests at one place in both is drawn once"
-    assert ghosts[BODY["cube"]].base_color[3] == SEE_THROUGH
+    assert ghosts[BODY["cube"]].base_color[3] == GHOST_ALPHA
     assert np.isnan(scene.poses((4, 4))[1]).all(), "as long as they are together there is no ghost"
     apart = scene.poses((6, 6))[1]
     assert np.isfinite(apart[BODY["cube"]]).all() and np.isnan(apart[BODY["arm/hand"]]).all()

@@ -13,7 +13,7 @@ from workbench.page.door.file_response import Downloads
 from workbench.page.door.gated_server import GatedServer
 from workbench.share.commands import MakeShared
 from workbench.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView
-from workbench.share.panel import ALL_CAMERAS, MOST_NAMED, Chosen, SharePanel, will_make
+from workbench.share.panel import ALL_CAMERAS, MAX_NAMED, Chosen, SharePanel, will_make
 
 
 class Noted(Making):
@@ -72,16 +72,16 @@ def test_recordings_and_files_are_named_before_they_are_made(
     assert "Selected in the library" in panels.html() and "Push_seed1" in panels.html()
     said = panels.html()
     assert "2 files" in said and "Push_seed1.base_camera.mp4" in said and "Push_seed1.hand_camera.mp4" in said
-    many = tuple(Source(Path(f"/recordings/r{k}.json")) for k in range(MOST_NAMED + 2))
+    many = tuple(Source(Path(f"/recordings/r{k}.json")) for k in range(MAX_NAMED + 2))
     will = will_make("sheet", Chosen(many), ALL_CAMERAS, tmp_path)
-    assert (will["what"], will["files"][0]) == (f"{MOST_NAMED + 2} files", ("r0.sheet.png",) * 2)
+    assert (will["what"], will["files"][0]) == (f"{MAX_NAMED + 2} files", ("r0.sheet.png",) * 2)
     assert str(tmp_path / "datasets") in will_make("lerobot", Chosen(many), ALL_CAMERAS, tmp_path)["where"]
     panel.draw(Chosen(many))
     assert "Open in the review" in panels.html() and "and 2 more" in panels.html()
     assert "one video for each camera of these 7 recordings" in panels.html()
     panels.set("Make", "Sheet of pictures (png)")
     panel.draw(Chosen(many))
-    assert panels.html().count("and 2 more") == 2 and panels.html().count(".sheet.png<") == MOST_NAMED
+    assert panels.html().count("and 2 more") == 2 and panels.html().count(".sheet.png<") == MAX_NAMED
 
 
 def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(

@@ -14,7 +14,7 @@ from workbench.live.messages import FollowPlan, PlanDropped, PlanWanted, Setting
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import bodies_of
 from workbench.solve.questions import PlanActions, PlannedEnv
-from workbench.solve.worker import MOST_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
+from workbench.solve.worker import MAX_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
 from workbench.task.description import TaskOptions
 from workbench.task.load import load_task
 from workbench.task.open import OpenedTask, Opening, build_task
@@ -61,7 +61,7 @@ def test_each_env_gets_a_plan_of_its_own_and_what_its_rollouts_earned(
     assert (one.env, other.env) == (0, 1) and one.horizon == 4
     assert one.actions.shape == (1, 7) and not np.array_equal(one.returns, other.returns)
     assert (np.diff(one.returns) <= 0).all() and {one.plan, one.hold} <= set(range(6))
-    assert one.paths.shape == (6, 5, 3) and one.drawn == tuple(range(6)) and len(one.drawn) <= MOST_PATHS
+    assert one.paths.shape == (6, 5, 3) and one.drawn == tuple(range(6)) and len(one.drawn) <= MAX_PATHS
     # They begin where the hand is.
     hand = push.description.geometry.body_names.index("panda/panda_hand_tcp")
     assert np.abs(one.paths[:, 0] - poses[0, hand, :3]).max() < 1e-5

@@ -264,7 +264,7 @@ def test_a_cached_picture_is_shown_and_what_is_none_is_not(
     catalogue = made(["Good-v1", "Bad-v1", "Large-v1"])
     (tmp_path / "cache/Good-v1.jpg").write_bytes(jpeg())
     (tmp_path / "cache/Bad-v1.jpg").write_bytes(b"<svg onload=alert(1)>")
-    (tmp_path / "cache/Large-v1.jpg").write_bytes(jpeg() + b"x" * registered_module.LARGEST_PICTURE)
+    (tmp_path / "cache/Large-v1.jpg").write_bytes(jpeg() + b"x" * registered_module.MAX_PICTURE_BYTES)
     (tmp_path / "cache/Secret-v1.jpg").write_bytes(jpeg())
     listed(catalogue)
     assert catalogue.registered.view.pictures == {"Good-v1"}
@@ -285,7 +285,7 @@ def test_maniskills_tasks_are_listed_and_drawn_once(child_process: None, tmp_pat
     assert "PickCube-v1" in view.ids and not view.problem
     drawn = next(iter(view.pictures))
     picture = Image.open(io.BytesIO(first.picture(drawn) or b""))
-    assert picture.size == (registered_module.WIDTH, registered_module.HEIGHT)
+    assert picture.size == (registered_module.WIDTH_PIXELS, registered_module.HEIGHT_PIXELS)
     assert np.asarray(picture).std() > 5, "something is to be seen on it"
     again = RegisteredTasks(lambda: False, folder=tmp_path)
     again.start()
@@ -336,7 +336,7 @@ def test_a_task_that_cannot_be_drawn_is_not_tried_for_ever(
         until(lambda tasks=tasks: tasks.view.why_not and not tasks.view.doing, "its end")
         tasks.close()
         assert tasks.view.why_not["A-v1"].text == "it crashed"
-    assert process.asked == ["A-v1"] * registered_module.MOST_TRIES
+    assert process.asked == ["A-v1"] * registered_module.MAX_TRIES
 
 
 def test_a_picture_that_takes_too_long_is_left_out_and_its_process_ends(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.start.recents import MOST_KEPT, RECENT_FILE, RecentTasks
+from workbench.start.recents import MAX_TASKS, RECENT_FILE, RecentTasks
 from workbench.task.description import TaskOptions
 from workbench.task.reference import lasting
 
@@ -38,12 +38,12 @@ def test_the_last_one_comes_first_with_its_options_also_in_another_run(folder: P
 
 def test_two_runs_do_not_take_each_others_and_only_the_newest_are_kept(folder: Path) -> None:
     first, second = recents(folder), recents(folder)
-    for number in range(MOST_KEPT):
+    for number in range(MAX_TASKS):
         (first, second)[number % 2].add(f"Task{number}-v1", TaskOptions())
-    assert len(recents(folder).list()) == MOST_KEPT
+    assert len(recents(folder).list()) == MAX_TASKS
     first.add("Last-v1", TaskOptions())
     kept = [task.reference for task in recents(folder).list()]
-    assert kept[0] == "Last-v1" and len(kept) == MOST_KEPT and "Task0-v1" not in kept
+    assert kept[0] == "Last-v1" and len(kept) == MAX_TASKS and "Task0-v1" not in kept
 
 
 def test_a_name_lasts_in_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

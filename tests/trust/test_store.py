@@ -84,4 +84,4 @@ def test_a_store_that_cannot_be_read_just_now_is_not_written_over(
         kept.trust(content("two"))
         assert kept.trusts(content("two"))
     assert store.read_bytes() == before and TrustStore().trusts(content("one"))
-    assert "not known" in caplog.text and "cannot be kept" in caplog.text
+    assert "cannot be read" in caplog.text and "cannot be stored" in caplog.text

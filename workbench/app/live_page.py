@@ -19,7 +19,7 @@ from workbench.app.session import Session
 from workbench.app.status_line import StatusLine
 from workbench.cameras.commands import SelectCamera
 from workbench.cameras.events import CameraChosen
-from workbench.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
+from workbench.cameras.frustums import LARGE_METRES, SMALL_METRES, CameraFrustums, without_the_viewpoint
 from workbench.cameras.panel import CamerasPanel
 from workbench.cameras.studio_panel import StudioPanel
 from workbench.cameras.view import shown_cameras
@@ -421,7 +421,7 @@ class Page:
         offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
         placed = self._studio.draw_in_view(view, offset)
         self._timeline.fold(self._studio.looks_through)
-        self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE, placed)
+        self._frustums.draw(task.cameras, pictures, offset, SMALL_METRES if alone else LARGE_METRES, placed)
         self._forces.draw(self._inspect.forces(view), offset)
         self._solve.draw_in_view(view, offset)
         # A scene of another size is framed again; a reload that keeps the size never moves the view.

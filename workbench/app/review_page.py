@@ -59,7 +59,7 @@ from workbench.review.curves_panel import ReviewCurves, ReviewNumbers
 from workbench.review.panel import ReviewPanel
 from workbench.review.playback import Review
 from workbench.review.scene_view import ReviewIn3D, shown_together
-from workbench.review.state import MOST_OPEN
+from workbench.review.state import MAX_OPEN
 from workbench.review.view import PictureReader, ReviewView, column_at, outcome_text
 from workbench.share.panel import Sharing
 from workbench.start.panel import OpenDialog
@@ -235,7 +235,7 @@ class ReviewPage:
                 OpenSideBySide(),
                 "Show them side by side (Shift+Enter)",
                 self._open_side_by_side,
-                MOST_OPEN,
+                MAX_OPEN,
             )
         )
         self._library.add_action(

@@ -204,7 +204,7 @@ class Session:
         if failure is not None and isinstance(event, Asked):
             raise failure
         if failure is not None:
-            report_failure("What follows from an event could not be done", failure)
+            report_failure("An effect of an event failed", failure)
         return begun
 
     @property

@@ -1,4 +1,4 @@
-"""The camera studio: how each event changes it, and the work that follows."""
+"""How each event changes the camera studio, and the jobs that follow."""
 
 from __future__ import annotations
 
@@ -90,21 +90,21 @@ DOES: frozenset[type[Command]] = frozenset(
         *_OF_REPORTS,
     }
 )
-"""Commands that `apply` takes."""
+"""Commands that `apply` handles."""
 
 
 def apply(studio: Studio, event: object, run: Run, now: Now) -> Change:
-    """The studio after an event, and what has to be done.
+    """The studio after an event, and the effects to perform.
 
     Args:
-        run: after the event.
+        run: the run after the event.
 
     Raises:
         Refused: the command makes no sense now; nothing has changed.
     """
     studio, effects = _apply(studio, event, run, now)
     if studio.is_open and not studio.was_chosen and studio.selected is None and run.task is not None:
-        # The first sensor camera. A person may then choose none.
+        # Choose the first sensor camera. The user may then choose none.
         cameras = sorted(run.task.cameras, key=lambda camera: camera.kind != "sensor")
         if cameras:
             studio, _ = _select(studio, cameras[0].key, run)
@@ -192,7 +192,7 @@ def _place(studio: Studio, placed: CameraPlaced, run: Run, now: Now) -> Change:
 
 
 def _moved(studio: Studio, placements: Placements, key: CameraKey) -> Change:
-    """Send the placement of this camera to the worker if it changed."""
+    """Send the placement of this camera, if it changed."""
     before, studio = studio.placements.placed, replace(studio, placements=placements)
     return (studio, []) if placements.placed.get(key) == before.get(key) else _send(studio, key)
 
@@ -240,10 +240,10 @@ def _draw_preview(studio: Studio, run: Run) -> Change:
 
 
 def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
-    """A version runs: update cameras and placements, and compare it with a written edit.
+    """Handle a loaded version: update cameras and placements, and compare it with a written edit.
 
     Args:
-        scene_changed: reports are of another version.
+        scene_changed: whether reports are of another version.
     """
     if run.task is None:
         return studio, []
@@ -258,7 +258,7 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
             f"{names} {'was' if one else 'were'} changed in the file and now {'follows' if one else 'follow'} "
             "it; Undo restores your placement."
         )
-    # Selected again is the camera that was selected in the earlier session; none if the camera is gone.
+    # Select the camera of the previous session again; none if the camera is gone.
     selected = studio.selected or studio.select_when_loaded
     if selected is not None and info_of(run, selected) is None:
         selected = None
@@ -268,8 +268,8 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
     stop: list[StudioEffect] = []
     if scene_changed:
         studio, stop = outdated(studio), [STOP_REPORTS]
-    # Dropped ones too: their placement may have been on its way during the load. And edited ones: after an edit
-    # was taken out again the version may count as the same, so the worker's camera would stay where it was.
+    # Also dropped ones: their placement may have been in transit during the load. And edited ones: after an edit is
+    # reverted the version may count as the same, so the worker's camera would not move.
     to_send = dict.fromkeys((*placements.placed, *dropped, *sorted(own & in_file.keys())))
     studio, sent = _send(studio, *to_send)
     studio, planned = plan_in_copy(studio, run)
@@ -277,7 +277,7 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
 
 
 def _placed(studio: Studio, event: Placed) -> Change:
-    """The worker's answer to a placement."""
+    """Handle the worker's answer to a placement."""
     if not event.why_not:
         return studio, []
     problem = f"{event.key[1]} could not be placed: {event.why_not}."
@@ -288,7 +288,7 @@ def _placed(studio: Studio, event: Placed) -> Change:
 def _failed(studio: Studio, lane: Lane, why: str) -> Studio:
     match lane:
         case "preview":
-            # The last preview stays; the next change draws again.
+            # The last preview stays; the next change redraws it.
             return replace(studio, preview_problem=f"The preview failed: {why}.", drawing=False)
         case "new camera":
             return replace(studio, problem=f"There is no picture of the new camera: {why}.")
@@ -298,10 +298,10 @@ def _failed(studio: Studio, lane: Lane, why: str) -> Studio:
 
 
 class StudioJobs:
-    """Does the work of the studio. Used on the loop.
+    """Runs the jobs of the studio. Used on the loop.
 
-    A preview is drawn by a temporary camera with the same lens (`pictures.temporary_camera`): 1280 x 720 takes long without a
-    GPU, 64 x 64 shows little, and another size of the env's camera would change the observation.
+    A temporary camera with the same lens (`pictures.temporary_camera`) renders the preview: 1280 x 720 takes long without a
+    GPU, 64 x 64 shows little, and resizing the env's camera would change the observation.
     """
 
     def __init__(
@@ -315,7 +315,7 @@ class StudioJobs:
         Args:
             asker, background: ask the worker that plays, and the background process.
             on_change: called when `progress` has changed.
-            happen: takes what the work comes to.
+            happen: handles the resulting events.
         """
         self._asker, self._happen = asker, happen
         self._file, self._reports = FileEdits(asker, happen), CameraReports(asker, background, happen)
@@ -330,7 +330,7 @@ class StudioJobs:
         return self._lanes["background"].progress or self._lanes["live"].progress
 
     def perform(self, effect: StudioEffect) -> None:
-        """Begin it."""
+        """Start the effect."""
         reports, lanes = self._reports, self._lanes
         match effect:
             case StopJobs(lanes=names):

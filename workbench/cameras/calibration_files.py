@@ -31,11 +31,11 @@ from workbench.pictures.camera_conventions import (
 Floats = NDArray[np.float64]
 
 FORMAT = "workbench-cameras"
-MOST_CHARACTERS = 100_000
-MOST_YAML = 20_000
-"""Characters; a calibration has about two thousand, and Python's YAML parser takes 20 ms for a thousand."""
-# `intrinsic_cv` of ManiSkill counts pixels from the outer edge of the first one (the middle of a picture is W / 2), OpenCV's
-# calibration from its middle. Files name every convention, since ``extrinsic`` alone may be one of four matrices.
+MAX_CHARACTERS = 100_000
+MAX_YAML_CHARACTERS = 20_000
+"""Limit for YAML: a calibration has about two thousand, and Python's YAML parser takes 20 ms for a thousand."""
+# `intrinsic_cv` of ManiSkill counts pixels from the outer edge of the first pixel (the middle of a picture is W / 2),
+# OpenCV's calibration from its centre. Files name every convention, since ``extrinsic`` alone may be one of four matrices.
 PIXELS = "pixels from the outer edge of the top left pixel; OpenCV's own calibration gives half a pixel less"
 CONVENTIONS = {
     "length": "metres",
@@ -49,7 +49,7 @@ CONVENTIONS = {
 
 @dataclass(frozen=True)
 class CameraToExport:
-    """One camera, at one moment of one env."""
+    """A camera to export, at one moment of one env."""
 
     key: CameraKey
     settings: CameraSettings
@@ -63,7 +63,7 @@ class CameraToExport:
         """(7,) pose in the env's frame.
 
         Raises:
-            ValueError: it is mounted, and `mount_pose` is not given.
+            ValueError: the camera is mounted, and `mount_pose` is not given.
         """
         if self.mount is not None and self.mount_pose is None:
             raise ValueError(f"camera {self.key[1]!r} is mounted on {self.mount}: mount_pose is needed")
@@ -74,23 +74,23 @@ class CameraToExport:
 class FoundPose:
     """A matrix in a text that may be a camera's pose.
 
-    A matrix does not say its convention: camera to world and world to camera both look plausible, as do the three
-    conventions of camera axes. So a person is asked, except for our own JSON, which names it.
+    A matrix does not contain its convention: camera to world and world to camera both look plausible, as do the three
+    conventions of camera axes. So the user has to choose, except for our own JSON, which names them.
     """
 
     label: str
-    """Path of the matrix in the text, for a person to choose."""
+    """Path of the matrix in the text, shown to the user."""
     matrix: Floats
     """(4, 4) matrix."""
     stated: tuple[Convention, Direction] | None = None
-    """Convention and direction, if the text names them; None if a person must choose."""
+    """Convention and direction, if the text names them; None if the user must choose."""
 
 
-# --- out ---------------------------------------------------------------------------------------------------------
+# --- export ------------------------------------------------------------------------------------------------------
 
 
 def cameras_as_json(cameras: Sequence[CameraToExport]) -> str:
-    """All cameras with all their numbers and conventions, as JSON."""
+    """All cameras with all numbers and conventions, as JSON."""
     entries = []
     for camera in cameras:
         s, pose = camera.settings, camera.pose_in_env
@@ -123,7 +123,7 @@ def cameras_as_json(cameras: Sequence[CameraToExport]) -> str:
 
 
 def cameras_as_opencv_yaml(cameras: Sequence[CameraToExport]) -> str:
-    """YAML for ``cv2.FileStorage``: a map for each camera, named by kind and name."""
+    """YAML for ``cv2.FileStorage``: one map per camera, keyed by kind and name."""
     lines = ["%YAML:1.0", "---", f"# Metres; {PIXELS}."]
     for camera, key in zip(cameras, _opencv_keys(cameras), strict=True):
         s, pose = camera.settings, camera.pose_in_env
@@ -142,7 +142,7 @@ def cameras_as_opencv_yaml(cameras: Sequence[CameraToExport]) -> str:
 def camera_as_ros_yaml(camera: CameraToExport) -> str:
     """ROS CameraInfo of one camera, for ``camera_calibration_parsers`` and ``camera_info_manager``.
 
-    CameraInfo has no extrinsic: that of the optical frame is in a comment, for ``static_transform_publisher``.
+    CameraInfo has no extrinsic: the pose of the optical frame is in a comment, for ``static_transform_publisher``.
     """
     s, pose = camera.settings, camera.pose_in_env
     k = intrinsic_of(s)
@@ -164,7 +164,7 @@ def camera_as_ros_yaml(camera: CameraToExport) -> str:
 
 
 def _opencv_keys(cameras: Sequence[CameraToExport]) -> list[str]:
-    """OpenCV's keys begin with a letter and hold letters, digits, - and _."""
+    """Valid keys for OpenCV: they begin with a letter and contain letters, digits, - and _."""
     keys: list[str] = []
     for camera in cameras:
         key = re.sub(r"[^A-Za-z0-9_-]", "_", f"{camera.key[0]}_{camera.key[1]}")
@@ -193,7 +193,7 @@ def _ros_matrix(name: str, matrix: Floats) -> list[str]:
 
 
 def _number(value: float) -> str:
-    """A number with a decimal point: YAML 1.1 reads 1e-08 as a word."""
+    """A number with a decimal point, since YAML 1.1 reads 1e-08 as a string."""
     text = repr(float(value) + 0.0)
     return re.sub(r"^(-?\d+)e", r"\1.0e", text)
 
@@ -202,19 +202,19 @@ def _one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-# --- in ----------------------------------------------------------------------------------------------------------
+# --- import ------------------------------------------------------------------------------------------------------
 
 
 def find_poses(text: str) -> tuple[FoundPose, ...]:
     """Candidates for a camera's pose in untrusted text: our JSON, other JSON or YAML, or a pasted matrix.
 
-    Finds 4 x 4 and 3 x 4 matrices and pairs of rotation and translation (``rvec`` and ``tvec``, ``R`` and ``t``) in maps
-    of any depth. `camera_pose` checks that one is a rotation.
+    Finds 4 x 4 and 3 x 4 matrices and pairs of rotation and translation (``rvec`` and ``tvec``, ``R`` and ``t``) in maps of
+    any depth. `camera_pose` checks that a candidate is a rotation.
 
     Raises:
-        ValueError: nothing is found, or the text cannot be read; says what was expected.
+        ValueError: nothing is found, or the text cannot be read; the message includes what was expected.
     """
-    if len(text) > MOST_CHARACTERS:
+    if len(text) > MAX_CHARACTERS:
         raise ValueError(f"the text has {len(text)} characters; a camera's pose takes a few hundred")
     stripped = text.strip().lstrip("\ufeff")
     if not stripped:
@@ -244,12 +244,12 @@ def camera_pose(
     """(7,) pose of the camera in the env's frame (or in its mount's frame, if that is what was calibrated).
 
     Args:
-        convention: camera axes of the calibration. Needed unless the text names it.
-        direction: of the matrix, camera to world or world to camera. Needed likewise.
-        metres_per_unit: of the translation; 0.001 for millimetres. Ignored if the text names its convention.
+        convention: camera axes of the calibration. Required unless the text names them.
+        direction: direction of the matrix, camera to world or world to camera. Required unless the text names it.
+        metres_per_unit: unit of the translation; 0.001 for millimetres. Ignored if the text names its convention.
 
     Raises:
-        ValueError: an argument is needed and missing, or the matrix is no rotation.
+        ValueError: a required argument is missing, or the matrix is not a rotation.
     """
     if found.stated is not None:
         (convention, direction), metres_per_unit = found.stated, 1.0
@@ -265,10 +265,10 @@ def camera_pose(
 
 
 class _CalibrationLoader(yaml.SafeLoader):
-    """Loads YAML's plain data and OpenCV's matrices; constructs no objects."""
+    """Loads plain YAML data and OpenCV's matrices; constructs no objects."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        # Nine lines of nested aliases expand to a billion leaves, and an alias to itself has no end.
+        # Nine lines of nested aliases expand to a billion leaves, and an alias to itself never ends.
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("a YAML alias (*name) is not read here: write the value out")
         return super().compose_node(parent, index)
@@ -296,7 +296,7 @@ def _parsed(text: str) -> Any:
     bare = _WORDS.sub(" ", text)
     if not re.sub(r"[\s,;|()\[\]]", "", _NUMBER.sub("", bare)):
         return _pasted([float(number) for number in _NUMBER.findall(bare)])
-    if len(text) > MOST_YAML:
+    if len(text) > MAX_YAML_CHARACTERS:
         raise ValueError(f"as YAML {len(text)} characters are too many; a calibration has some two thousand")
     # OpenCV's first line has a colon where YAML has a space.
     try:
@@ -331,7 +331,7 @@ def _workbench_poses(tree: Mapping[Any, Any]) -> Iterator[FoundPose]:
 _ROTATIONS = ("rvec", "rotation_vector", "r", "rotation", "rotation_matrix", "rot", "rot_mat", "rmat")
 _TRANSLATIONS = ("tvec", "translation_vector", "t", "translation", "trans", "position", "tvecs")
 _NO_POSE = ("projection_matrix", "p", "p1", "p2", "q")
-"""Names of 3 x 4 and 4 x 4 matrices of calibration files that are not poses (ROS, OpenCV's stereo calibration)."""
+"""Names of 3 x 4 and 4 x 4 matrices in calibration files that are not poses (ROS, OpenCV's stereo calibration)."""
 
 
 def _search(tree: Any, path: str) -> Iterator[FoundPose]:
@@ -384,7 +384,7 @@ def _array(value: Any) -> Floats | None:
         return None
     flat = [number for row in nested for number in row] if nested else value
     try:
-        # YAML 1.1 reads 1e-08 as a word; booleans and None are not numbers.
+        # YAML 1.1 reads 1e-08 as a string; booleans and None are not numbers.
         numbers = [float(n) for n in flat if isinstance(n, (int, float, str)) and not isinstance(n, bool)]
     except (ValueError, OverflowError):
         return None

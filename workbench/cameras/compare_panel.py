@@ -1,4 +1,4 @@
-"""Compares two placements of a camera: two pictures of the same moment, and the differences in numbers."""
+"""Compares two placements of a camera: two pictures of the same moment, and the numeric differences."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ OTHER_HINT = (
     "The placement to compare with the camera's current one. The file before: as it was before the last change of this "
     "camera that was saved."
 )
-LARGEST = 256
-"""Pixels along the longer side of each picture."""
+PICTURE_PIXELS = 256
+"""Longer side of each picture."""
 
 
 class CameraCompare(PagePart[SessionView]):
-    """The folder in the present container: the placement now, next to the file's or one that was kept as A."""
+    """The folder in the present container: the current placement next to the file's, or next to one kept as A."""
 
     does = (ChooseCompared, KeepPlacement, ComparePlacements, ReturnToKept)
 
@@ -45,7 +45,7 @@ class CameraCompare(PagePart[SessionView]):
         self._kept: dict[CameraKey, CameraSettings] = {}
         self._in_file: dict[CameraKey, CameraSettings] = {}
         self._before: dict[CameraKey, CameraSettings] = {}
-        """Placement of a camera in the file before its newest change there, by camera."""
+        """Placement of each camera in the file before the newest change there."""
         self._asked: tuple[CameraKey, CameraSettings, CameraSettings, str] | None = None
         self._other: Other = "file"
         with server.gui.add_folder("Compare", expand_by_default=False) as self.folder:
@@ -123,7 +123,9 @@ class CameraCompare(PagePart[SessionView]):
         asked = self._asked if self._asked is not None and self._asked[0] == camera.key else None
         return render(
             "camera_pair",
-            pictures=[data_address(picture.rgb, LARGEST) for picture in both if picture.rgb is not None],
+            pictures=[
+                data_address(picture.rgb, PICTURE_PIXELS) for picture in both if picture.rgb is not None
+            ],
             captions=(
                 "now" if asked is None or asked[1] == camera.now else "as it was then",
                 "the other" if asked is None else asked[3],

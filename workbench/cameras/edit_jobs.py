@@ -1,4 +1,4 @@
-"""Edits the author's file for the page: shows a camera's change, writes it, and takes it back."""
+"""Edits the author's file for the page: plans a camera's change, writes it, and reverts it."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ from workbench.task.description import TaskDescription
 
 IN_FILE: tuple[EditStage, ...] = ("written", "checked", "mismatch")
 """Stages in which the change is in the file."""
-_LARGEST = 256
-"""Pixels of the shorter side of a new camera's preview."""
+_PREVIEW_PIXELS = 256
+"""Shorter side of a new camera's preview."""
 _STOP_DRAWING = StopJobs(("new camera",))
 
 
-# --- the value -------------------------------------------------------------------------------------
+# --- state -----------------------------------------------------------------------------------------
 
 
 def with_edits(studio: Studio, **values: Any) -> Studio:
@@ -60,7 +60,7 @@ def with_edits(studio: Studio, **values: Any) -> Studio:
 
 
 def do_edit(studio: Studio, command: Command, run: Run) -> Change:
-    """Commands about the file."""
+    """Carry out a command about the file."""
     match command:
         case SaveCameraChange():
             shown = studio.edits.shown
@@ -76,9 +76,9 @@ def do_edit(studio: Studio, command: Command, run: Run) -> Change:
 
 
 def apply_to_edits(studio: Studio, event: object, run: Run) -> Change:
-    """The studio after an event about the file. Edits are made one after the other.
+    """The studio after an event about the file. Edits are made one after another.
 
-    Placements change when the version with the edit is loaded, and none is lost by it.
+    Placements change when the version with the edit is loaded; none is lost.
     """
     match event:
         case EditWanted(request=request):
@@ -98,7 +98,7 @@ def apply_to_edits(studio: Studio, event: object, run: Run) -> Change:
             shown = replace(shown, stage=stage, message=f"Not done: {reason}.")
             return _ended(with_edits(studio, shown=shown, done=done), run)
         case TaskCopied(file=file, state=state):
-            # The request waits until the copy is loaded.
+            # Keep the request until the copy is loaded.
             studio = with_edits(
                 studio,
                 copied=file,
@@ -124,7 +124,7 @@ def _is_stale(studio: Studio, request: EditRequest | None) -> bool:
 
 
 def _ask(studio: Studio, asked: EditAsked, run: Run) -> Change:
-    """Begin an edit after those that were asked for before."""
+    """Queue an edit behind those that were requested earlier."""
     if studio.edits.closed:
         return studio, []
     studio = with_edits(
@@ -137,12 +137,12 @@ def _ask(studio: Studio, asked: EditAsked, run: Run) -> Change:
 
 
 def _ended(studio: Studio, run: Run) -> Change:
-    """The edit under way is over."""
+    """Handle the end of the current edit."""
     return _go_on(with_edits(studio, busy=False), run)
 
 
 def _go_on(studio: Studio, run: Run) -> Change:
-    """Begin the next edit, unless one is under way."""
+    """Start the next edit, unless one is in progress."""
     effects: list[StudioEffect] = []
     while studio.edits.waiting and not studio.edits.busy:
         first, *rest = studio.edits.waiting
@@ -156,7 +156,7 @@ def _begin(studio: Studio, asked: EditAsked, run: Run) -> Change:
     match asked:
         case EditWanted(request=request) if task is not None:
             left = shown.request if shown.stage == "planned" else None
-            # Clear the answer to another request. But a written edit waits for its version, which needs the state.
+            # Clear the answer to another request, but not a written edit, whose version is still loading.
             shown = shown if shown.loading else EditState(request=request)
             find = FindPlan(request, task, info_of(run, request.key), run.running_load())
             return with_edits(studio, shown=shown, left=left, busy=True), [find]
@@ -171,7 +171,7 @@ def _begin(studio: Studio, asked: EditAsked, run: Run) -> Change:
 
 def _change_file(studio: Studio, edit: SourceEdit, stage: EditStage, message: str) -> Change:
     edits = studio.edits
-    # Before the file is written: the version with the edit may be loaded before the disk says that it is done.
+    # Before the file is written: the version with the edit may be loaded before the write is reported as done.
     studio = _with_stage(studio, message.format(file=edit.names), stage, loading=True)
     done = edits.done[:-1] if stage == "undone" else (*edits.done, studio.edits.shown)
     studio = with_edits(studio, done=done, before=(edits.shown, edits.done), busy=True)
@@ -189,18 +189,18 @@ def _plan_found(studio: Studio, found: PlanFound, run: Run) -> Change:
     if not drawing or request.settings is None:
         return studio, effects
     moment, settings = run.shown_moment(), request.settings
-    scale = min(1.0, _LARGEST / min(settings.width, settings.height))
+    scale = min(1.0, _PREVIEW_PIXELS / min(settings.width, settings.height))
     question = DrawCamera(request.key, settings, moment.env, poses=moment.of(moment.env), scale=scale)
     return studio, [DrawNewCamera(request, question), *effects]
 
 
 def _drop(studio: Studio, run: Run) -> Change:
-    """Drop the plan and show the newest written edit again; if that is shown, forget all written edits."""
+    """Drop the plan and show the newest written edit again; if that is shown already, drop all written edits."""
     done = () if studio.edits.shown.stage in IN_FILE else studio.edits.done
     shown = done[-1] if done else EditState()
     studio = with_edits(studio, done=done, shown=shown, copied=None, just_copied="")
     if run.task is not None:
-        studio, _ = edit_loaded(studio, run.task)  # the version with that edit may have been loaded meanwhile
+        studio, _ = edit_loaded(studio, run.task)  # the version with that edit may have loaded meanwhile
     return studio, [_STOP_DRAWING]
 
 
@@ -223,7 +223,7 @@ def edit_loaded(studio: Studio, task: TaskDescription) -> tuple[Studio, frozense
         message = f"Edit reverted in {edit.names}.{back if went_back else ''}"
         if not done:
             return _with_stage(studio, message, "undone"), changed
-        # The edit before it, which can be reverted next.
+        # Show the previous edit, which can be reverted next.
         shown = replace(done[-1], message=f"{message} Before it: {done[-1].message}")
         return with_edits(studio, shown=shown), changed
     if wrong := mismatch(request, infos, edit.settings):
@@ -255,7 +255,7 @@ def plan_in_copy(studio: Studio, run: Run) -> Change:
 def _with_placements(
     studio: Studio, request: EditRequest, in_file: CameraSettings | None
 ) -> tuple[Studio, bool]:
-    """Update the placements after an edit was made or undone; none is lost.
+    """Update the placements after an edit was made or reverted; none is lost.
 
     Args:
         in_file: the camera's settings in the loaded version; None if there is no such camera.
@@ -276,7 +276,7 @@ def _with_placements(
             back = placements.edit_undone(key, request.settings, in_file)
             went_back, placements = back is not None, back or placements
         elif not undone and now is not None and not differences(now, request.settings):
-            placements = placements.without(key)  # up to rounding, the file has it now
+            placements = placements.without(key)  # the file now has it, up to rounding
     elif request.what == "remove":
         if not undone and placed is not None:
             removed[key] = placed
@@ -289,7 +289,7 @@ def _with_placements(
 
 
 def edit_failed_to_load(studio: Studio) -> Studio:
-    """A version failed to load."""
+    """Handle a version that failed to load."""
     edits = studio.edits
     if edits.copied is not None:
         why = f"{edits.copied} was made, but does not load: fix or delete it."
@@ -311,20 +311,20 @@ def _with_stage(studio: Studio, message: str, stage: EditStage, loading: bool = 
     return with_edits(studio, shown=shown)
 
 
-# --- the work --------------------------------------------------------------------------------------
+# --- jobs ------------------------------------------------------------------------------------------
 
 
 class _Stopped(Exception):
-    """The answer is not needed any more."""
+    """The answer is no longer needed."""
 
 
 class FileEdits:
-    """Finds edits, and writes and reverts them, on a thread of its own. Used on the loop.
+    """Plans, writes and reverts edits, on a separate thread. Used on the loop.
 
     Args:
-        asker: asks the worker that plays.
-        happen: takes what comes of it.
-        patience: seconds for the worker to run the hooks: one of them may loop for ever.
+        asker: asks questions of the worker that plays.
+        happen: handles the resulting events.
+        patience: timeout in seconds for the worker to run the hooks, which may loop for ever.
     """
 
     def __init__(
@@ -396,7 +396,7 @@ class FileEdits:
             self._happen(EditFailed(repr(error)))
 
     async def draw(self, job: Job, wanted: DrawNewCamera) -> None:
-        """Draw what a new camera would see; cancelled by the next request."""
+        """Draw the picture of a new camera; cancelled by the next request."""
         picture = None
         try:
             picture = await self._asker.ask(wanted.question)
@@ -404,7 +404,7 @@ class FileEdits:
             self._happen(NewCameraDrawn(wanted.request, picture))
 
     def stop_question(self) -> None:
-        """Cancel the present question: the worker is gone, or another version comes."""
+        """Cancel the present question: the worker has ended, or another version is loading."""
         self._stopped.set()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Writes cameras into the author's file: shows the change as a diff, makes it, checks it, and takes it back."""
+"""Writes cameras into the author's file: shows the change as a diff, makes it, checks it, and reverts it."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ NOTHING = EditState()
 
 
 class CameraChange:
-    """The diff of a change with its buttons, and what came of it, in the present container.
+    """The diff of a change with its buttons and its result, in the present container.
 
-    The tab has one at each of the two places where changes are asked for; the buttons of a new one are scrolled into view.
+    The tab has one at each of the two places where changes are requested; the buttons of a new diff are scrolled into view.
 
     Args:
-        folder: For a copy of the task.
+        folder: Folder for a copy of the task.
     """
 
     def __init__(self, server: viser.ViserServer, folder: Path) -> None:
@@ -64,10 +64,10 @@ class CameraChange:
         self._drawn: tuple[EditState, bool, bool] | None = None
 
     def draw(self, edit_state: EditState, stale: bool) -> None:
-        """Show the stage of a change; a `EditState` without stage and message hides all.
+        """Show the stage of a change; an `EditState` without stage and message hides everything.
 
         Args:
-            stale: the camera was moved since the change was planned.
+            stale: whether the camera was moved since the change was planned.
         """
         stage = edit_state.stage
         self._html.visible = stage != "none" or bool(edit_state.message)
@@ -78,7 +78,7 @@ class CameraChange:
             and drawn.picture is None
             and edit_state.picture is not None
         ):
-            # The picture of a plan comes later, and pushes the buttons out of sight.
+            # The picture of a plan arrives later and pushes the buttons out of view.
             self.arrival.asked(drawn)
         new = self.arrival.just_came(edit_state if stage != "none" else None)
         if self._drawn is None or self._drawn[0] is not edit_state or self._drawn[1:] != (stale, new):
@@ -87,7 +87,7 @@ class CameraChange:
 
 
 def tools_of(edit_state: EditState, stale: bool, folder: Path) -> list[Tool]:
-    """What can be done with a change; `stale` and `folder` as in `CameraChange`."""
+    """Buttons for a change; `stale` and `folder` as in `CameraChange`."""
     stage, tools = edit_state.stage, []
     if stage == "planned" and not stale:
         name = "" if edit_state.edit is None else edit_state.edit.names
@@ -107,7 +107,7 @@ def edit_html(edit_state: EditState, stale: bool, folder: Path, new: bool = Fals
 
     Args:
         folder: For a copy of the task.
-        new: Scroll its buttons into view.
+        new: Whether to scroll its buttons into view.
     """
     edit, planned = edit_state.edit, edit_state.stage == "planned"
     seen = edit_state.picture.rgb if planned and edit_state.picture is not None else None
@@ -119,7 +119,7 @@ def edit_html(edit_state: EditState, stale: bool, folder: Path, new: bool = Fals
         message="The camera has moved since: show the change again." if stale else edit_state.message,
         mood="warn" if stale else MOODS.get(edit_state.stage, "plain"),
         about=edit_state.request.about if planned and edit_state.request is not None else "",
-        picture="" if seen is None else data_address(seen, PREVIEW),
+        picture="" if seen is None else data_address(seen, PREVIEW_PIXELS),
         drawing=settings if planned and edit_state.drawing else None,
         files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
         folded=edit_state.stage in IN_FILE,
@@ -133,7 +133,7 @@ def edit_html(edit_state: EditState, stale: bool, folder: Path, new: bool = Fals
 def diff_lines(diff: str) -> list[tuple[str, str]]:
     """Kind (``add``, ``del``, ``at``, ``same``) and text of each line of a unified diff, without the file names.
 
-    The common indentation is left out: the panel is narrow.
+    The common indentation is removed, since the panel is narrow.
     """
     kinds = {"+": "add", "-": "del", "@": "at"}
     lines = [(kinds.get(line[:1], "same"), line) for line in diff.splitlines()[2:]]
@@ -164,10 +164,10 @@ NEW = CameraSettings(
     far=100.0,
     shader_pack="minimal",
 )
-"""Settings, without the pose, of the first camera of a kind: those of ManiSkill's own tasks."""
+"""Settings, except the pose, of the first camera of a kind: those of ManiSkill's own tasks."""
 NEW_NAMES = {"sensor": "side_camera", "human": "render_camera"}
-PREVIEW = 256
-"""Pixels of the longer side of the new camera's picture."""
+PREVIEW_PIXELS = 256
+"""Longer side of the new camera's picture."""
 
 FromViewer = Callable[[viser.ClientHandle, CameraSettings], CameraSettings]
 
@@ -176,8 +176,8 @@ class WriteToFile(PagePart[SessionView]):
     """The button that writes the chosen camera's placement, and the folder to add, copy, rename and remove cameras.
 
     Args:
-        above: gets the button and its change.
-        from_viewer: these settings at a page's viewpoint, in the env's frame.
+        above: folder for the button and its change.
+        from_viewer: returns settings with the pose of a page's viewpoint, in the env's frame.
     """
 
     does = (
@@ -200,7 +200,7 @@ class WriteToFile(PagePart[SessionView]):
         gui, folder = server.gui, session.view().of(StudioView).copies_to
         self._name = ""
         self._named: EditState | None = None
-        """Last change after which the field for a name was emptied."""
+        """Last change after which the name field was cleared."""
         with above:
             self._plan = gui.add_html("", visible=False)
             self._change = CameraChange(server, folder)
@@ -238,7 +238,7 @@ class WriteToFile(PagePart[SessionView]):
                 self._ask(EditRequest("remove", studio.chosen.key))
 
     def _ask(self, request: EditRequest) -> None:
-        """Ask for a plan. Notes the place first: the answer may come at once."""
+        """Request a plan. Stores the place of the diff first, since the answer may arrive at once."""
         change = self._change if request.what == "edit" else self._member_change
         change.arrival.asked(self._session.view().of(StudioView).edit_state)
         self._session.happen(EditWanted(request))
@@ -257,7 +257,7 @@ class WriteToFile(PagePart[SessionView]):
         """The typed name, or a free one like `like`.
 
         Raises:
-            Refused: neither is possible.
+            Refused: the name is invalid or taken.
         """
         name = self._name.strip()
         if not name and like:
@@ -280,17 +280,17 @@ class WriteToFile(PagePart[SessionView]):
         stale = is_stale(studio)
         can_place = chosen is not None and not chosen.refused
         of_members = edit_state.what != "edit"
-        # Hidden while "Save" is shown: a second press must not write a diff that was not read.
+        # Hidden while "Save" is shown: a second press must not write a diff that the user has not read.
         can_plan = can_place and (edit_state.stage != "planned" or stale or of_members)
         wants_plan = can_plan and chosen is not None and chosen.moved and edit_state.stage != "written"
-        # Greyed, not hidden: coming with the first movement it would push the controls below away.
+        # Disabled, not hidden: appearing with the first movement, it would push the controls below away.
         plan = tool("Show the change", PlanCameraChange(), off=not wants_plan, tone="main")
         self._plan.visible, self._plan.content = can_plan, tools_html([plan])
         for change, here in ((self._change, not of_members), (self._member_change, of_members)):
             change.draw(edit_state if here else NOTHING, stale and here)
         if edit_state.stage == "checked" and of_members and edit_state is not self._named:
             self._named = edit_state
-            self._name = ""  # it is taken now
+            self._name = ""  # the name is taken now
         self._typed.show(self._name)
         self._members.content = tools_html([] if chosen is None else WITH_CHOSEN, ADD)
 
@@ -305,7 +305,7 @@ def is_stale(studio: StudioView) -> bool:
 
 
 def lens_of_siblings(studio: StudioView, kind: CameraKind) -> CameraSettings:
-    """The file's settings of the first camera of this kind without a mount, or else `NEW`."""
+    """The file's settings of the first camera of this kind without a mount; `NEW` if there is none."""
     for camera in studio.cameras:
         if camera.key[0] == kind and camera.info.mount is None and camera.info.settings is not None:
             return camera.info.settings
@@ -321,62 +321,61 @@ def free_name(studio: StudioView, kind: CameraKind, like: str) -> str:
 
 # --- initial pose of a new sensor -------------------------------------------------------------------
 
-# A person who adds a camera looks at a whole table or a grid of sixteen from metres away, where a cube is four pixels of a
+# A user who adds a camera looks at a whole table or a grid of sixteen from metres away, where a cube is four pixels of a
 # picture of 128. So the direction of the page's view is kept, and the eye moves along it to where the objects of all envs
 # fill the picture; if the view is from about there, the eye is the page's viewpoint.
 
-AROUND = 0.1
-"""Margin in metres around the origins of the objects."""
-ROOM = 1.25
+MARGIN_METRES = 0.1
+"""Margin around the origins of the objects."""
+DISTANCE_FACTOR = 1.25
 """Factor on the distance at which the objects just fill the picture."""
-NEAREST = 0.6
-"""Minimum distance in metres: a hand that reaches for one small object has to be in the picture too."""
-NEAR_ENOUGH = 1.5
+MIN_DISTANCE_METRES = 0.6
+"""Minimum distance: a hand that reaches for one small object must be in the picture too."""
+KEEP_VIEW_FACTOR = 1.5
 """Factor on the wanted distance up to which the page's viewpoint is kept."""
-NEAREST_TARGET = 0.1
-"""Metres."""
-MOST_NAMES = 3
+MIN_TARGET_METRES = 0.1
+MAX_NAMES = 3
 
 
 def first_place(
     seen_from: CameraSettings, names: tuple[str, ...], places: NDArray[np.float64]
 ) -> tuple[CameraSettings, str]:
-    """The initial settings of a new sensor, and a sentence about its place.
+    """The initial settings of a new sensor, and a sentence about its position.
 
     Args:
-        seen_from: its lens at the page's viewpoint, in the env's frame.
-        names: of the objects to see.
-        places: (K, 3) of the objects in all envs, each in its env's frame.
+        seen_from: settings with its lens at the page's viewpoint, in the env's frame.
+        names: names of the objects to see.
+        places: (K, 3) positions of the objects in all envs, each in its env's frame.
     """
     stays = "It is placed at your viewpoint."
     if not len(places):
         return seen_from, stays
     pose = pose_of(seen_from)
-    # Median and quantile: one object that fell from the table must not move the camera away from the others.
+    # Median and quantile: an object that fell off the table must not move the camera away from the others.
     middle = np.median(places, axis=0)
-    reach = float(np.quantile(np.linalg.norm(places - middle, axis=1), 0.9)) + AROUND
+    reach = float(np.quantile(np.linalg.norm(places - middle, axis=1), 0.9)) + MARGIN_METRES
     fov = vertical_fov(intrinsic_of(seen_from), seen_from.height)
-    wanted = max(NEAREST, ROOM * reach / math.sin(fov / 2))
+    wanted = max(MIN_DISTANCE_METRES, DISTANCE_FACTOR * reach / math.sin(fov / 2))
     away = float(np.linalg.norm(middle - pose[:3]))
-    if away <= NEAR_ENOUGH * wanted:
+    if away <= KEEP_VIEW_FACTOR * wanted:
         return seen_from, stays
     x, y, z = rounded(middle - wanted * axes_of(pose[3:])[0], 4)
-    told = ", ".join(names[:MOST_NAMES]) + (" and others" if len(names) > MOST_NAMES else "")
+    told = ", ".join(names[:MAX_NAMES]) + (" and others" if len(names) > MAX_NAMES else "")
     words = f"It looks at {told} from where you look, {wanted:.2f} m away; you are {away:.1f} m away."
     return replace(seen_from, position=(x, y, z)), words
 
 
 def distance_to(settings: CameraSettings, places: NDArray[np.float64]) -> float | None:
-    """Metres along the line of sight to the point nearest to the median of places (K, 3); None if it is behind."""
+    """Distance in metres along the line of sight to the point nearest to the median of places (K, 3); None if behind."""
     if not len(places):
         return None
     pose = pose_of(settings)
     distance = float((np.median(places, axis=0) - pose[:3]) @ axes_of(pose[3:])[0])
-    return None if distance < NEAREST_TARGET else distance
+    return None if distance < MIN_TARGET_METRES else distance
 
 
 def objects_in(view: SessionView) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-    """Names of a task's objects that a sensor may see, and their places (K, 3) in all envs at the shown moment."""
+    """Names of a task's objects that a sensor may see, and their positions (K, 3) in all envs at the shown moment."""
     task, step = view.task, view.step
     if task is None or step is None or step.poses.shape[1] != len(task.geometry.body_names):
         return (), np.zeros((0, 3))

@@ -36,7 +36,7 @@ SENTENCES: dict[Change, tuple[str, str, str]] = {
         "{old} was not removed.",
     ),
 }
-"""Sentences by change: what it would do, what it did, and the message when another plan replaces it."""
+"""Sentences by kind of change: for the plan, for the finished change, and for a plan that is replaced by another."""
 PLANNED, DONE, LEFT = range(3)
 """Index into an entry of `SENTENCES`."""
 
@@ -47,14 +47,14 @@ def change_text(request: EditRequest, when: int, file: str = "") -> str:
 
 
 def plan(task: TaskDescription, info: CameraInfo | None, request: EditRequest, run: RunHooks) -> EditState:
-    """The edit of the files on disk for a request, or why there is none.
+    """Plan the edit of the files on disk for a request, or report why there is none.
 
-    The worker runs the edited files too; a plan whose camera does not come out as requested is refused. Not thread-safe,
-    and too slow for the page's thread.
+    The worker also runs the edited files; a plan whose camera differs from the request is refused. Not thread-safe, and too
+    slow for the page's thread.
 
     Args:
-        info: of the live camera; None if one is added.
-        run: asks the worker.
+        info: description of the live camera; None if one is added.
+        run: runs the hooks in the worker.
     """
     placed = None if request.what == "remove" else request.settings
     text = "" if placed is None else snippet(request.result[1], placed)
@@ -89,7 +89,7 @@ def plan(task: TaskDescription, info: CameraInfo | None, request: EditRequest, r
 
 
 def _owner_text(task: TaskDescription, info: CameraInfo) -> str:
-    """Why neither the task's file nor a copy of it holds this camera; empty if one of them may."""
+    """Reason why neither the task's file nor a copy of it contains this camera; empty if one of them may."""
     own = {Path(file).resolve() for file in (task.file, *task.source_files) if file is not None}
     if info.site is None or Path(info.site.file).resolve() in own:
         return ""
@@ -110,7 +110,7 @@ def _override_edit(
     owner_text: str,
     run: RunHooks,
 ) -> SourceEdit:
-    """Edit that adds a hook to the task's own class to replace an inherited camera; refused with the hook as snippet."""
+    """The edit that adds a hook to the task's own class to replace an inherited camera; refused with the hook as snippet."""
     if request.settings is None or request.what == "remove":
         raise RefusedEdit(owner_text)
     (kind, _), (_, uid), site = request.key, request.result, info.site
@@ -134,14 +134,14 @@ def _override_edit(
 
 
 def _can_be_copied(task: TaskDescription) -> bool:
-    """Whether the task consists of one file, and that may not be edited."""
+    """Whether the task consists of one file that must not be edited."""
     if task.file is None or len(task.source_files) > 1:
         return False
     return not task.source_files or why_not_writable(task.file) is not None
 
 
 def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, EditState]:
-    """Copy the task's file into a folder; returns the copy, or None, and the new state."""
+    """Copy the task's file into a folder; returns the copy (None on failure) and the new state."""
     if task.file is None:
         return None, EditState("refused", message="Not copied: the task has no file.")
     try:
@@ -180,7 +180,7 @@ def _own_edit(
 
 
 def _texts(task: TaskDescription) -> dict[str, str]:
-    """The author's files on disk, with their own line ends. Raises RefusedEdit."""
+    """The author's files on disk, with their own line endings. Raises RefusedEdit."""
     texts: dict[str, str] = {}
     for path in task.source_files:
         try:
@@ -194,8 +194,8 @@ def _texts(task: TaskDescription) -> dict[str, str]:
 def mismatch(
     request: EditRequest, infos: Mapping[CameraKey, CameraInfo], written: CameraSettings | None
 ) -> str:
-    """How the cameras of the reloaded env differ from the request; empty if they do not. The reload builds the camera from
-    the file, so only this proves that the edit is right."""
+    """Text: how the cameras of the reloaded env differ from the request; empty if they do not. The reload builds the camera
+    from the file, so only this check proves that the edit is right."""
     kind, name = request.result
     info = infos.get(request.result)
     if request.what == "remove":
@@ -209,7 +209,7 @@ def mismatch(
 
 
 def difference_text(written: CameraSettings, now: CameraSettings) -> str:
-    """The settings that differ, with both values; empty if none does."""
+    """Text: the settings that differ, with both values; empty if none does."""
 
     def value(settings: CameraSettings, what: str) -> str:
         return setting_text(vars(settings)["quaternion" if what == "orientation" else what])

@@ -1,4 +1,4 @@
-"""What can happen to the camera studio, and what is done about it."""
+"""Events of the camera studio, and the effects that follow from them."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from workbench.task.description import TaskDescription
 
 Triple = tuple[float, float, float]
 Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]
-"""What a camera is measured on: the env; the poses (B, 7) of its bodies, None for now; the moment of the history."""
+"""A case on which a camera is measured: the env; the poses (B, 7) of its bodies, None for now; the moment of the history."""
 
 Lane = Literal["live", "background", "preview", "new camera"]
-"""Each has one job at a time; a new one replaces it. ``live`` measures by the worker that plays, ``background`` by the
-background process."""
+"""Each lane has one job at a time; a new one replaces it. ``live`` uses the worker that plays, ``background`` the background
+process."""
 
-# --- what a page asks for, beside commands -------------------------------------------------------
+# --- requests of a page that are not commands ----------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class CameraChosen:
 
 @dataclass(frozen=True)
 class CameraPlaced:
-    """Place a camera, live. If placements come faster than the worker takes them, only the newest is made."""
+    """Place a camera, live. If placements arrive faster than the worker handles them, only the newest is made."""
 
     key: CameraKey
     settings: CameraSettings
     control: object = None
-    """Id of the control; successive placements by the same one are one step of undo (a drag)."""
+    """Id of the control; successive placements by the same control are one undo step (a drag)."""
     pause: float = math.inf
-    """Seconds without a placement after which a new step begins."""
+    """Seconds without a placement after which a new undo step begins."""
 
 
 @dataclass(frozen=True)
@@ -58,17 +58,17 @@ class StudioOpened:
 
 @dataclass(frozen=True)
 class MeasureWanted:
-    """Measure the selected camera, as placed: over all envs at the shown moment; over steps of the selected env's episode,
-    evenly spread; or over freshly reset envs, in the background."""
+    """Measure the selected camera, as placed: over all envs at the shown moment; over evenly spaced steps of the selected
+    env's episode; or over freshly reset envs, in the background."""
 
     over: Measured
     most: int = MAX_MEASURED
-    """Steps or resets at most."""
+    """Maximum number of steps or resets."""
 
 
 @dataclass(frozen=True)
 class SuggestionsWanted:
-    """Search placements of the selected camera that see these objects in fresh episodes."""
+    """Search for placements of the selected camera that see these objects in fresh episodes."""
 
     objects: tuple[str, ...]
     """Names of objects, or of single links of them (``TaskDescription.objects``)."""
@@ -76,7 +76,7 @@ class SuggestionsWanted:
     high: Triple
     """Corners of the box for the eye; metres, in the frame of the camera's mount, or the env's."""
     seeds: int
-    """Number of episodes, at most one an env."""
+    """Number of episodes, at most one per env."""
 
 
 @dataclass(frozen=True)
@@ -93,24 +93,24 @@ class SheetWanted:
 
 @dataclass(frozen=True)
 class EditWanted:
-    """Find the edit of the file for a request."""
+    """Plan the edit of the file for a request."""
 
     request: EditRequest
 
 
-# --- what jobs come to ---------------------------------------------------------------------------
+# --- results of jobs -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class PreviewDrawn:
-    """The preview that was asked for last."""
+    """The last requested preview was drawn."""
 
     picture: Picture
 
 
 @dataclass(frozen=True)
 class ReportMade:
-    """A report over the cases measured so far."""
+    """A report over the cases measured so far was made."""
 
     report: CameraReport
     of: CameraKey
@@ -123,14 +123,14 @@ class ReportMade:
 
 @dataclass(frozen=True)
 class Measuring:
-    """A measurement has begun, or is over, complete or not."""
+    """A measurement has begun or ended, complete or not."""
 
     on: bool
 
 
 @dataclass(frozen=True)
 class SuggestionsFound:
-    """Placements that see these objects, best first."""
+    """Placements that see these objects were found, best first."""
 
     found: tuple[OfferedPlacement, ...]
     objects: tuple[str, ...]
@@ -138,7 +138,7 @@ class SuggestionsFound:
 
 @dataclass(frozen=True)
 class PicturesCompared:
-    """The shown env by a camera as placed, and with other settings."""
+    """The shown env was drawn by a camera as placed and with other settings."""
 
     now: Picture
     other: Picture
@@ -146,14 +146,14 @@ class PicturesCompared:
 
 @dataclass(frozen=True)
 class SheetPictureDrawn:
-    """The next picture of the sheet."""
+    """The next picture of the sheet was drawn."""
 
     picture: Picture
 
 
 @dataclass(frozen=True)
 class PixelPicked:
-    """What a probed pixel shows."""
+    """A pixel was probed."""
 
     picked: PickedPixel
 
@@ -168,7 +168,7 @@ class WorkFailed:
 
 @dataclass(frozen=True)
 class PlanFound:
-    """The edit for a request, or why there is none."""
+    """The edit for a request was planned or refused."""
 
     request: EditRequest
     state: EditState
@@ -176,7 +176,7 @@ class PlanFound:
 
 @dataclass(frozen=True)
 class NewCameraDrawn:
-    """The preview of a camera that is to be added; None if it was not drawn."""
+    """The preview of a new camera; None if it was not drawn."""
 
     request: EditRequest
     picture: Picture | None
@@ -184,12 +184,12 @@ class NewCameraDrawn:
 
 @dataclass(frozen=True)
 class FileChanged:
-    """The edit is in the file, or out of it again."""
+    """The edit was written or reverted."""
 
 
 @dataclass(frozen=True)
 class FileNotChanged:
-    """The file was left as it is."""
+    """The file was not changed."""
 
     reason: str
 
@@ -197,20 +197,20 @@ class FileNotChanged:
 @dataclass(frozen=True)
 class TaskCopied:
     file: Path | None
-    """The copy; None if there is none."""
+    """The copy; None on failure."""
     state: EditState
 
 
 @dataclass(frozen=True)
 class EditFailed:
-    """A fault of the workbench ended an edit."""
+    """A bug of the workbench ended an edit."""
 
     error: str
 
 
 @dataclass(frozen=True)
 class StudioClosed:
-    """No edit is begun from now on."""
+    """The studio is closing: no edit starts any more."""
 
 
 StudioEvent = (
@@ -251,23 +251,23 @@ class StopJobs:
 
 @dataclass(frozen=True)
 class StopQuestion:
-    """Cancel the question that an edit has asked the worker."""
+    """Cancel the question of an edit to the worker."""
 
 
 @dataclass(frozen=True)
 class DrawPreview:
-    """Draw the selected camera in another size."""
+    """Draw the selected camera at another size."""
 
     question: DrawCamera
 
 
 @dataclass(frozen=True)
 class MeasureLive:
-    """Measure a camera on these cases, with a report after each `every`."""
+    """Measure a camera on these cases, with a report after each `every` cases."""
 
     what: str
     question: MeasureCamera
-    """Without env and poses."""
+    """The question without env and poses."""
     settings: CameraSettings | None
     """The camera's present settings."""
     cases: tuple[Case, ...]
@@ -287,7 +287,7 @@ class MeasureSeeds:
 
 @dataclass(frozen=True)
 class Suggest:
-    """Search placements in fresh episodes."""
+    """Search for placements in fresh episodes."""
 
     what: str
     space: SearchSpace
@@ -297,7 +297,7 @@ class Suggest:
 
 @dataclass(frozen=True)
 class Compare:
-    """Draw a camera as placed, and with other settings."""
+    """Draw a camera as placed and with other settings."""
 
     key: CameraKey
     other: CameraSettings
@@ -326,7 +326,7 @@ class Pick:
 
 @dataclass(frozen=True)
 class FindPlan:
-    """Find the edit of the files on disk for a request."""
+    """Plan the edit of the files on disk for a request."""
 
     request: EditRequest
     task: TaskDescription
@@ -337,7 +337,7 @@ class FindPlan:
 
 @dataclass(frozen=True)
 class DrawNewCamera:
-    """Draw what a new camera would see."""
+    """Draw the picture of a new camera."""
 
     request: EditRequest
     question: DrawCamera
@@ -345,7 +345,7 @@ class DrawNewCamera:
 
 @dataclass(frozen=True)
 class ChangeFile:
-    """Write an edit, or revert it."""
+    """Write or revert an edit."""
 
     edit: SourceEdit
     revert: bool

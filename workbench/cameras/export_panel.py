@@ -1,4 +1,4 @@
-"""Matrices of a camera in a chosen convention, files of cameras, and import of a calibration."""
+"""Shows matrices of a camera in a chosen convention, exports cameras to files, and imports a calibration."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CONVENTIONS: dict[str, Convention] = {
     "OpenGL, Blender": "opengl",
     "ManiSkill, ROS body": "maniskill",
 }
-"""In ROS x is forward in the frame of a camera's body, and z is forward in its optical frame (REP 103)."""
+"""Conventions by label. In ROS, x is forward in the frame of a camera's body, and z in its optical frame (REP 103)."""
 AXES = {
     "opencv": "x right, y down, z forward",
     "opengl": "x right, y up, z backward",
@@ -66,8 +66,8 @@ UNITS_HINT = "Units of what is pasted. What is shown or downloaded, and our own 
 class CameraExport(PagePart[SessionView]):
     """The folder in the present container.
 
-    A matrix of sixteen numbers does not tell its direction and the names of the camera's axes: both are chosen here, and
-    hold for what is shown and for what is pasted.
+    A matrix does not contain its direction and the convention of the camera's axes: both are chosen here, for shown and for
+    pasted matrices.
     """
 
     does = (
@@ -194,10 +194,10 @@ class CameraExport(PagePart[SessionView]):
 def calibration_text(cameras: Sequence[StudioCamera], form: Form) -> str:
     """The text of a calibration file: cameras as placed, at the shown moment of the selected env.
 
-    ROS's format has one camera a file; several become YAML documents in one text.
+    ROS's format has one camera per file; several become YAML documents in one text.
 
     Raises:
-        ValueError: a camera cannot be exported; the message is for the reader.
+        ValueError: a camera cannot be exported; the message is for the user.
     """
     to_export = []
     for camera in cameras:
@@ -220,12 +220,12 @@ def calibrated_pose(
     convention: Convention | None,
     metres_per_unit: float = 1.0,
 ) -> frames.Floats:
-    """(7,) pose by a calibration, in the frame of the camera's mount, or the env's if it has none.
+    """(7,) pose from a calibration, in the frame of the camera's mount, or the env's if it has none.
 
-    Our own JSON contains direction and convention; for all else they are arguments.
+    Our own JSON contains direction and convention; for other texts they are arguments.
 
     Raises:
-        ValueError: with a message for the reader.
+        ValueError: the text has no usable pose; the message is for the user.
     """
     info = camera.info
     found = calibration_files.find_poses(text)
@@ -238,17 +238,17 @@ def calibrated_pose(
         return pose
     if camera.mount_pose is None:
         raise ValueError(f"the pose of {info.mount}, on which {info.name} is mounted, is not known yet")
-    return frames.relative_to(camera.mount_pose, pose)  # ours is of the env's frame
+    return frames.relative_to(camera.mount_pose, pose)  # our JSON is in the env's frame
 
 
 def file_name(name: str, form: Form) -> str:
-    """A name for the download, with only letters, digits, - and _ of the camera's name."""
+    """File name for the download; of the camera's name only letters, digits, - and _ are kept."""
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "camera"
     return f"{plain}.json" if form == "json" else f"{plain}_{form}.yaml"
 
 
 def matrices_html(camera: StudioCamera | None, convention: Convention, direction: Direction) -> str:
-    """Intrinsic and extrinsic of the camera at its present place, in the env's frame."""
+    """Intrinsic and extrinsic of the camera at its present pose, in the env's frame."""
     if camera is None or camera.now is None:
         return render("note", text="Choose a camera first.")
     pose = frames.pose_in_env(camera.now, camera.mount_pose)
@@ -265,7 +265,7 @@ def matrices_html(camera: StudioCamera | None, convention: Convention, direction
 
 
 def aligned(matrix: NDArray[np.float64]) -> str:
-    """Rows of a matrix with aligned decimal points, for reading."""
+    """The rows of a matrix with aligned decimal points, for reading."""
     cells = [[f"{number + 0.0:.4f}".replace("-0.0000", "0.0000") for number in row] for row in matrix]
     width = max(len(cell) for row in cells for cell in row)
     return "\n".join("  ".join(cell.rjust(width) for cell in row) for row in cells)

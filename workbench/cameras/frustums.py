@@ -1,4 +1,4 @@
-"""The selected env's cameras in the 3D view, each a frustum with its live picture."""
+"""Draws the selected env's cameras in the 3D view, each as a frustum with its live picture."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
     # Columns: OpenCV's right, down and forward in ManiSkill's camera frame (x forward, y left, z up).
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 )
-LARGEST_IMAGE = 128
-"""Maximum size in pixels of the longer side of the picture on a frustum."""
-SMALL, LARGE = 0.07, 0.14
-"""Depth in metres of a frustum: small for one env, large for a view of the whole grid."""
+MAX_IMAGE_PIXELS = 128
+"""Maximum longer side of the picture on a frustum."""
+SMALL_METRES, LARGE_METRES = 0.07, 0.14
+"""Depth of a frustum: small for one env, large for a view of the whole grid."""
 COLOURS: dict[CameraKind, tuple[int, int, int]] = {"sensor": (245, 159, 0), "human": (132, 94, 247)}
-THIN, THICK = 2.0, 4.0
-"""Width in pixels of a frustum's lines; the chosen frustum's lines are thick."""
+THIN_PIXELS, THICK_PIXELS = 2.0, 4.0
+"""Width of a frustum's lines; the chosen frustum's lines are thick."""
 
 
 @dataclass(frozen=True)
 class PlacedFrustum:
-    """A camera that is being placed: drawn at its present place, which its newest picture may not have yet."""
+    """A camera that is being placed: drawn at its present pose, which its newest picture may not have yet."""
 
     pose: NDArray[np.float64]
     """(7,) pose in the view."""
     settings: CameraSettings
     hidden: bool = False
-    """Whether a page looks through the camera, and would see nothing but the camera's picture."""
+    """Whether a page looks through the camera, and would see only the camera's picture."""
 
 
 class CameraFrustums:
-    """One frustum for each camera with a picture, at the pose that comes with the picture."""
+    """One frustum for each camera with a picture, at the picture's pose."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -52,15 +52,15 @@ class CameraFrustums:
         cameras: tuple[CameraInfo, ...],
         pictures: dict[CameraKey, Picture],
         offset: NDArray[np.float32],
-        size: float = LARGE,
+        size: float = LARGE_METRES,
         placed: Mapping[CameraKey, PlacedFrustum] | None = None,
     ) -> None:
         """Draw the cameras of these pictures and those that are being placed, and remove all others.
 
         Args:
             cameras: The task's cameras.
-            pictures: By camera; empty shows none.
-            offset: (3,) of the selected env in the view.
+            pictures: Pictures by camera; empty shows none.
+            offset: (3,) offset of the selected env in the view.
             size: Depth of a frustum in metres.
             placed: Cameras that are being placed, with or without a picture.
         """
@@ -83,8 +83,8 @@ class CameraFrustums:
     def under_ray(self, origin: NDArray, direction: NDArray) -> CameraKey | None:
         """The camera whose frustum a ray (3,) in the view hits first, or None.
 
-        By a ray, not by viser's clicks on nodes: a clickable node takes every press at its place, also those on the
-        gizmo that is drawn over it.
+        viser's clicks on nodes are not used: a clickable node captures every press in its area, also those on the gizmo
+        drawn over it.
         """
         met = [
             (distance, key)
@@ -114,7 +114,7 @@ class CameraFrustums:
             wxyz, position = frustum_pose(picture.pose, offset)
         else:
             return
-        thickness = THIN if placed is None else THICK
+        thickness = THIN_PIXELS if placed is None else THICK_PIXELS
         frustum = self._drawn.get(camera.key)
         if frustum is None:
             add = partial(
@@ -136,16 +136,16 @@ class CameraFrustums:
             and picture is not self._drawn_pictures.get(camera.key)
             and picture.rgb is not None
         ):
-            # Assigning encodes and sends it, even the same picture.
+            # Assign only a new picture: assigning encodes and sends it, even if it is equal.
             self._drawn_pictures[camera.key] = picture
             frustum.handle.image = small_image(picture)
 
 
 def _distance_to(handle: viser.CameraFrustumHandle, origin: NDArray, direction: NDArray) -> float | None:
-    """Where a ray (3,) enters a frustum, in lengths of `direction`; None where it misses."""
+    """Distance at which a ray (3,) enters a frustum, in lengths of `direction`; None if it misses."""
     turn = viser.transforms.SO3(handle.wxyz).inverse()
     start, along = turn @ (np.asarray(origin, float) - handle.position), turn @ np.asarray(direction, float)
-    # viser keeps the volume of the pyramid (CameraFrustumVariants.tsx), whose tip is at the origin.
+    # viser keeps the volume of the pyramid constant (CameraFrustumVariants.tsx); its tip is at the origin.
     y = np.tan(handle.fov / 2)
     x = y * handle.aspect
     depth = np.mean(handle.scale) / np.cbrt(x * y / 3)
@@ -161,18 +161,18 @@ def _distance_to(handle: viser.CameraFrustumHandle, origin: NDArray, direction: 
 
 
 def small_image(picture: Picture) -> NDArray[np.uint8] | None:
-    """Every n-th pixel of a picture: a frustum is at most some hundred pixels wide.
+    """Every n-th pixel of a picture, since a frustum is at most some hundred pixels wide.
 
     A texture of 512 x 512 that changes fifteen times a second keeps a browser without a graphics card busy.
     """
     if picture.rgb is None:
         return None
-    stride = max(1, max(picture.rgb.shape[:2]) // LARGEST_IMAGE)
+    stride = max(1, max(picture.rgb.shape[:2]) // MAX_IMAGE_PIXELS)
     return np.ascontiguousarray(picture.rgb[::stride, ::stride])
 
 
 def frustum_pose(pose: NDArray, offset: NDArray) -> tuple[NDArray, NDArray]:
-    """wxyz and position in the view of a camera's pose (7,), in OpenCV's frame (z forward, y down)."""
+    """wxyz and position in the view for a camera's pose (7,), in OpenCV's frame (z forward, y down)."""
     turned = viser.transforms.SO3(pose[3:].astype(np.float64)) @ CAMERA_TO_OPENCV
     return turned.wxyz, (pose[:3] + offset).astype(np.float64)
 
@@ -182,12 +182,12 @@ def without_the_viewpoint(
 ) -> dict[CameraKey, Picture]:
     """The pictures to draw while one env is alone in the view.
 
-    The view then starts at the task's human camera (`viewpoint`); that camera's picture, or that of a sensor at the same
+    The view then starts at the task's human camera (`viewpoint`); the picture of that camera, or of a sensor at the same
     place, would fill it.
     """
     eyes = [picture.pose[:3] for (kind, _), picture in seen.items() if kind == "human"]
     return {
         key: picture
         for key, picture in pictures.items()
-        if all(np.linalg.norm(picture.pose[:3] - eye) > 2 * LARGE for eye in eyes)
+        if all(np.linalg.norm(picture.pose[:3] - eye) > 2 * LARGE_METRES for eye in eyes)
     }

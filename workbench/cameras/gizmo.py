@@ -32,9 +32,9 @@ from workbench.page.scene.viewpoint import DEFAULT_ASPECT
 from workbench.page.widgets.notices import refusals_told
 from workbench.pictures.camera_conventions import axes_of, intrinsic_of, target_of, vertical_fov
 
-LEFT_ALONE = 60.0
-"""Seconds without a movement after which a gizmo is free that was never released (its page was closed)."""
-PIXELS = 76.0
+RELEASE_TIMEOUT_SECONDS = 60.0
+"""Time without movement after which a gizmo that was never released (its page was closed) counts as free."""
+GIZMO_PIXELS = 76.0
 TARGET_PIXELS = 44.0
 """Sizes of the gizmos on the screen."""
 SIGHT_COLOUR = (34, 139, 230)
@@ -43,7 +43,7 @@ UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """State of a camera when a gizmo was taken. All movements until the release are one step of undo."""
+    """State of a camera when a drag of a gizmo began. All movements until the release are one undo step."""
 
     key: CameraKey
     settings: CameraSettings
@@ -55,17 +55,17 @@ class _Taken:
 
 
 class CameraGizmo:
-    """One gizmo to move and turn the chosen camera, or two for its eye and its target, in the view of one page.
+    """A gizmo to move and rotate the chosen camera, or two gizmos for its eye and its target, in the view of one page.
 
-    viser's gizmo lies along its own axes and knows no steps. For turning about the world's axes it is laid along them
-    when it is taken, and its rotation since then is applied to the camera. With steps, the camera jumps while the gizmo
-    follows the hand, and the gizmo goes to the camera when it is released. While it is held the server never writes its
-    pose: that would pull it out of the hand.
+    viser's gizmo uses its own axes and has no steps. To rotate about the world's axes, it is aligned with them when a drag
+    begins, and its rotation since then is applied to the camera. With steps, the camera jumps while the gizmo follows the
+    pointer, and the gizmo returns to the camera on release. During a drag the server never writes the gizmo's pose, which
+    would pull it away from the pointer.
 
     Args:
-        snap: the chosen steps.
-        own_axes: whether it lies along the camera's own axes.
-        look_at: whether to show eye and target.
+        snap: returns the chosen steps.
+        own_axes: returns whether it uses the camera's own axes.
+        look_at: returns whether to show eye and target.
     """
 
     def __init__(
@@ -78,10 +78,10 @@ class CameraGizmo:
     ) -> None:
         self._placing = placing
         self._snap, self._own_axes, self._look_at = snap, own_axes, look_at
-        # A fixed size on the screen: in a grid of sixteen envs 10 cm would be a dot.
+        # Fixed size on the screen: in a grid of sixteen envs 10 cm would be a dot.
         add = partial(page.scene.add_transform_controls, fixed=True, depth_test=False, visible=False)
-        self._camera = add("/studio/camera", PIXELS)
-        self._eye = add("/studio/eye", PIXELS, disable_rotations=True)
+        self._camera = add("/studio/camera", GIZMO_PIXELS)
+        self._eye = add("/studio/eye", GIZMO_PIXELS, disable_rotations=True)
         self._target = add("/studio/target", TARGET_PIXELS, disable_rotations=True)
         self._line = line_set(page, "/studio/line of sight", SIGHT_COLOUR, 2.0)
         self._held_at = -1e9
@@ -91,17 +91,17 @@ class CameraGizmo:
         self._target.on_update(self._on_point)
 
     def remove(self) -> None:
-        """Take it out of the view; a drag ends."""
+        """Remove the gizmo; a drag ends."""
         self._line.draw()
         for handle in (self._camera, self._eye, self._target):
             handle.remove()
 
     @property
     def held(self) -> bool:
-        return self._start is not None and time.monotonic() - self._held_at < LEFT_ALONE
+        return self._start is not None and time.monotonic() - self._held_at < RELEASE_TIMEOUT_SECONDS
 
     def draw(self, camera: StudioCamera | None) -> None:
-        """Put the gizmos on this camera; None removes them."""
+        """Draw the gizmos at this camera; None removes them."""
         if self.held:
             if camera is not None:
                 self._draw_line(camera)
@@ -123,7 +123,7 @@ class CameraGizmo:
         _move(self._target, frame.point_to_view(target_of(camera.now)), UNTURNED)
 
     def _draw_line(self, camera: StudioCamera | None) -> None:
-        """Draw a line from the eye to the target, which shows what the target's arrows belong to."""
+        """Draw a line from the eye to the target, to show which camera the target belongs to."""
         if camera is None or camera.now is None or not self._look_at():
             self._line.draw()
             return
@@ -143,7 +143,7 @@ class CameraGizmo:
         return True
 
     def _went_on(self, phase: str) -> _Taken | None:
-        """State of the camera when the gizmo was taken, for an update of a drag; else None."""
+        """State of the camera at the start of the drag, for an update of a drag; else None."""
         taken, self._held_at = self.held, time.monotonic()
         if (phase == "start" or not taken) and not self._take():
             return None
@@ -152,7 +152,7 @@ class CameraGizmo:
             self._start = None
         return start if phase == "update" else None
 
-    # Async: callbacks in viser's pool of threads would come in any order.
+    # Async: callbacks in viser's thread pool would arrive in any order.
     async def _on_camera(self, event: viser.TransformControlsEvent) -> None:
         pose = np.concatenate([event.target.position, event.target.wxyz])
         post(partial(self._drag_camera, event.client, event.phase, pose))
@@ -191,7 +191,7 @@ class CameraGizmo:
         self._placing.place(start.key, moved, start, math.inf)
 
     def _let_go(self) -> None:
-        """Release it: the next drawing puts it back on the camera."""
+        """End the drag: the next drawing puts the gizmo back on the camera."""
         self._start = None
 
 
@@ -202,12 +202,12 @@ def _move(handle: viser.TransformControlsHandle, position: Floats, wxyz: Floats)
         handle.wxyz = wxyz
 
 
-WIDEST = math.radians(150)
-"""Widest field of view that the page can draw."""
-BAR = 48
-"""Pixels at the lower edge of the view that the folded timeline takes: the picture's border is above it."""
-BORDER_AT = 0.15
-"""Metres in front of the eye: as near as the page draws, or bodies would hide it."""
+MAX_FOV_RADIANS = math.radians(150)
+"""Maximum field of view that the page can draw."""
+BAR_PIXELS = 48
+"""Height of the folded timeline at the lower edge of the view: the picture's border is above it."""
+BORDER_METRES = 0.15
+"""Distance of the border from the eye: close to the page's near plane, or bodies would hide it."""
 BORDER_COLOUR = (245, 159, 0)
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 
@@ -220,19 +220,19 @@ class _Looking:
     up: Floats
     fov: float
     shown: tuple[CameraSettings, bytes] | None = None
-    """Settings and pose in the view that the page was last moved to."""
+    """Settings and pose in the view to which the page was last moved."""
 
 
 class LookThrough:
-    """Moves a page's viewpoint to the chosen camera, with its field of view, and back. Kept for each page.
+    """Moves a page's viewpoint to the chosen camera, with its field of view, and back. The state is per page.
 
-    While a page looks through the camera it follows it (typed numbers, undo).
+    While a page looks through the camera, it follows the camera's changes (typed numbers, undo).
     """
 
     def __init__(self, server: viser.ViserServer, placing: Placing) -> None:
         self._server, self._placing = server, placing
         self._asked: deque[int] = deque()
-        """Pages that asked to look through the camera, or to go back, since the last drawing."""
+        """Pages that requested to look through the camera, or to return, since the last drawing."""
         self._looking: dict[int, _Looking] = {}
         self._border = line_set(server, "/studio/border", BORDER_COLOUR, 2.0)
 
@@ -242,12 +242,12 @@ class LookThrough:
         return bool(self._looking)
 
     def toggle(self, client: viser.ClientHandle | None) -> None:
-        """Look through the chosen camera, or go back, with the next drawing."""
+        """Look through the chosen camera, or return, with the next drawing."""
         if client is not None:
             self._asked.append(client.client_id)
 
     def draw(self, camera: StudioCamera | None) -> None:
-        """Follow the camera; go back if it is no longer the chosen one."""
+        """Follow the camera; return if it is no longer the chosen one."""
         clients = self._server.get_clients()
         while self._asked:
             if (client := clients.get(self._asked.popleft())) is not None:
@@ -276,16 +276,16 @@ class LookThrough:
         if camera is None or camera.now is None:
             self._border.draw()
             return
-        corners = picture_corners(camera.now, self._placing.frame(camera).to_view(camera.now), BORDER_AT)
+        corners = picture_corners(camera.now, self._placing.frame(camera).to_view(camera.now), BORDER_METRES)
         self._border.draw(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
 
     def settings_from(
         self, client: viser.ClientHandle, settings: CameraSettings, frame: Frame
     ) -> CameraSettings:
-        """This camera at the page's viewpoint.
+        """`settings` with the pose of the page's viewpoint.
 
         Raises:
-            ValueError: the page's viewpoint is no pose.
+            ValueError: the page's viewpoint is not a valid pose.
         """
         return frame.from_view(settings, viewer_pose(client.camera.position, client.camera.wxyz))
 
@@ -299,7 +299,7 @@ class LookThrough:
             return
         looking.shown = shown
         _, left, up = axes_of(pose[3:])
-        # The page orbits about its up axis: with the camera's own, a drag would tilt a level horizon.
+        # The page orbits about its up axis: with the camera's own up axis, a drag would tilt a level horizon.
         level = abs(left[2]) < 1e-3 and up[2] > 0.05
         eye = client.camera
         aspect = (
@@ -308,9 +308,9 @@ class LookThrough:
         fov = vertical_fov(intrinsic_of(now), now.height)
         target = self._placing.frame(camera).point_to_view(target_of(now))
         fov = fov_that_shows_all(fov, now.width / now.height, aspect)
-        if eye.image_height > 4 * BAR:
-            fov = 2 * math.atan(math.tan(fov / 2) * eye.image_height / (eye.image_height - 2 * BAR))
-        fov = min(fov, WIDEST)
+        if eye.image_height > 4 * BAR_PIXELS:
+            fov = 2 * math.atan(math.tan(fov / 2) * eye.image_height / (eye.image_height - 2 * BAR_PIXELS))
+        fov = min(fov, MAX_FOV_RADIANS)
         _stand(client, pose[:3], target, UPRIGHT if level else up, fov)
 
     def _back(self, client: viser.ClientHandle) -> None:

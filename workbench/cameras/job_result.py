@@ -1,4 +1,4 @@
-"""Progress bar of a background job, and its result scrolled into view."""
+"""Shows the progress bar of a background job, and scrolls its result into view."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from workbench.live.process.background_jobs import JobProgress
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html
 
-JUST = 1.0
-"""Seconds for which a result counts as new."""
+NEW_SECONDS = 1.0
+"""Time for which a result counts as new."""
 
 
 class NewResult:
-    """Notices that a result has just replaced an older one, so that it is scrolled into view once.
+    """Detects that a result has just replaced an older one, so that it is scrolled into view once.
 
-    Only for a moment (``into_sight.html``): a tab that is opened again redraws its HTML, and must not scroll then.
+    It counts as new only for a moment (``into_sight.html``): a tab that is reopened redraws its HTML and must not scroll.
     """
 
     def __init__(self) -> None:
@@ -29,25 +29,25 @@ class NewResult:
         self._came = -1e9
 
     def asked(self, now: object) -> None:
-        """A new result was asked for; `now` is the one that it will replace."""
+        """Store that a new result was requested; `now` is the one that it will replace."""
         self._before, self._waiting = now, True
 
     def just_came(self, now: object) -> bool:
-        """Whether the result came less than `JUST` ago. Call it at every draw, with the present result."""
+        """Whether the result arrived less than `NEW_SECONDS` ago. Call it at every draw, with the present result."""
         if self._waiting and now is not self._before and now:
             self._waiting, self._came = False, time.monotonic()
-        return time.monotonic() - self._came < JUST
+        return time.monotonic() - self._came < NEW_SECONDS
 
 
-SHORT = 0.5
-"""Seconds that a job may take without a bar."""
+BAR_DELAY_SECONDS = 0.5
+"""Time after which a job gets a progress bar."""
 
 
 class JobResult:
-    """A progress bar with a Stop button, and then the result, in the present container.
+    """A progress bar with a Stop button, then the result, in the present container.
 
-    Each folder has one under its own button, and only the one that was asked last shows what runs: one bar above all
-    would push the pressed button away, one at the end is not seen.
+    Each folder has one under its own button, and only the one that was used last shows the running job: a single bar at the
+    top would push the pressed button away, and one at the end would not be visible.
     """
 
     _asked_last: ClassVar[JobResult | None] = None
@@ -62,19 +62,19 @@ class JobResult:
         self._drawn: object = None
 
     def asked(self, now: object) -> None:
-        """A job was asked for here; its result replaces `now`."""
+        """Store that a job was requested here; its result replaces `now`."""
         JobResult._asked_last = self
         self._new.asked(now)
 
     def draw(
         self, running: JobProgress | None, came: object, told: object, html: Callable[[bool], str]
     ) -> None:
-        """Draw the bar and the result, where they changed.
+        """Draw the bar and the result, if they changed.
 
         Args:
             came: the result, if there is one.
-            told: what else its HTML shows; compared.
-            html: renders the result, given whether it came a moment ago.
+            told: key of the other content of its HTML.
+            html: renders the result, given whether it is new.
         """
         self._draw_bar(running)
         new = self._new.just_came(came)
@@ -89,7 +89,7 @@ class JobResult:
             self._began = None
         elif self._began is None:
             self._began = time.monotonic()
-        shown = self._began is not None and time.monotonic() - self._began >= SHORT
+        shown = self._began is not None and time.monotonic() - self._began >= BAR_DELAY_SECONDS
         for handle in (self._bar, self._stop):
             handle.visible = shown
         if shown:

@@ -1,4 +1,4 @@
-"""Number fields for the chosen camera's pose, lens and picture."""
+"""Input fields for the chosen camera's pose, lens and picture."""
 
 from __future__ import annotations
 
@@ -69,13 +69,13 @@ SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
 class CameraNumbers:
     """Two folders in the present container: pose, and lens and picture.
 
-    All forms of the pose show the same camera and each writes it; of the three forms of the orientation one is shown at
-    a time. With one gizmo on the camera a typed eye takes the target along; with an eye and a target each is typed
-    alone. A mounted camera's numbers are in the frame of its link. The lens is a field of view or an intrinsic matrix,
-    which exclude each other in ManiSkill's config; the picture stays the same when the form is changed.
+    All forms of the pose show the same camera and can change it; one of the three forms of the orientation is shown at a
+    time. With the pose handle, a new eye position moves the target along; with the eye and target handles, each changes
+    alone. The numbers of a mounted camera are in the frame of its link. The lens is a field of view or an intrinsic matrix,
+    which exclude each other in ManiSkill's config; changing the form keeps the picture.
 
     Args:
-        look_at: whether eye and target are placed separately, instead of a pose.
+        look_at: returns whether eye and target are placed separately, instead of a pose.
     """
 
     does = (
@@ -111,7 +111,7 @@ class CameraNumbers:
     def _row(
         self, label: str, kind: type[Command], parts: Sequence[str], hint: str, step: float = 0.01
     ) -> Field:
-        """A field of several numbers; `parts` are what the command's `of` can be."""
+        """A field of several numbers; `parts` are the possible values of the command's `of`."""
         given = [{"of": part} for part in parts]
         return Field(self._server, label, kind, "to", [0.0] * len(parts), given=given, hint=hint, step=step)
 
@@ -133,7 +133,7 @@ class CameraNumbers:
             )
             for separately, at, to in ((False, "Position", "Looks at"), (True, "Eye", "Target"))
         }
-        """By whether eye and target are placed separately."""
+        """Fields by whether eye and target are placed separately."""
         self._about = self._server.gui.add_html("")
 
     def _build_orientation(self) -> None:
@@ -239,7 +239,7 @@ class CameraNumbers:
         self._size.show((now.width, now.height))
         self._range.show(rounded((now.near, now.far), UNIT))
         if now.shader_pack not in self._shaders:
-            # A task may have a shader pack of its own.
+            # A task may use its own shader pack.
             self._shaders = (*SHADERS, now.shader_pack)
         self._shader.show(now.shader_pack, options=by_name(self._shaders))
 
@@ -250,7 +250,7 @@ class CameraNumbers:
             self._placing.change(type(command), partial(self._changed, command))
 
     def _changed(self, command: Command, now: CameraSettings, frame: Frame) -> CameraSettings:
-        """The camera as this command has it. Raises ValueError with a sentence."""
+        """The camera's settings after this command. Raises ValueError with a sentence."""
         forward, _, up = axes_of(now.quaternion)
         match command:
             case SetCameraPosition(of=axis, to=metres):
@@ -304,7 +304,7 @@ class CameraNumbers:
 def _with_part(
     numbers: Sequence[float] | Floats, parts: Sequence[str], of: str, to: float
 ) -> tuple[float, ...]:
-    """These numbers with another one for one of their parts; the others stay to the last digit."""
+    """These numbers with the part `of` replaced; the others stay exactly equal."""
     return tuple(to if part == of else float(n) for part, n in zip(parts, numbers, strict=True))
 
 
@@ -331,13 +331,13 @@ def _with_intrinsic(settings: CameraSettings, row: int, column: int, pixels: flo
 def _with_size(settings: CameraSettings, sized: CameraSettings) -> CameraSettings:
     if settings.intrinsic is None:
         return sized
-    # In pixels of the new size, so that the picture stays the same.
+    # Scale to the pixels of the new size, so that the picture stays the same.
     sizes = (settings.width, settings.height), (sized.width, sized.height)
     return replace(sized, intrinsic=matrix3(scaled_intrinsic(settings.intrinsic, *sizes)))
 
 
 def _angles(settings: CameraSettings) -> list[float]:
-    # 180 and -180 degrees are the same; the field would flicker between the two.
+    # 180 and -180 degrees are equal; the field would flicker between the two.
     return [180.0 if round(a, DEGREES) == -180 else a for a in rpy_of(settings.quaternion)]
 
 

@@ -1,4 +1,4 @@
-"""The Cameras tab: pictures of the selected env's cameras, and the Studio's picture of the chosen one with the pick on it."""
+"""The Cameras tab: pictures of the selected env's cameras; and the Studio's picture of the chosen camera, with pixel picks."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ from workbench.page.widgets.parts import Clock, DrawThrottle
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
 
-PICTURE_PERIOD = 1 / 15
-"""Seconds between two pictures of one camera. A picture that is replaced before the browser has loaded it is never seen
-(measured: at 1,000 a second the page shows one in five seconds)."""
-SHOWN_WIDTH = 400
-"""Width in pixels of a shown picture; a panel is some 340 wide."""
-FOLLOWS = 0.4
-"""Seconds within which a picture counts as following another."""
+PICTURE_PERIOD_SECONDS = 1 / 15
+"""Minimum interval between two pictures of one camera. A picture that is replaced before the browser has loaded it is never
+visible (measured: at 1,000 a second the page shows one in five seconds)."""
+SHOWN_WIDTH_PIXELS = 400
+"""Width of a shown picture; a panel is some 340 pixels wide."""
+SETTLE_SECONDS = 0.4
+"""Debounce time: after it without another picture, the last one is sent in full size."""
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "human view"}
 
 
 class CameraImage:
-    """A picture of a camera in a container, made with the first picture.
+    """A picture of a camera in a container, created with the first picture.
 
-    Pictures that follow each other are sent at the size in which the panel shows them, and the last of them then whole:
-    for one that is opened large, and for who looks closely.
+    Pictures in quick succession are sent at the size at which the panel shows them; the last one is then sent in full size,
+    for opening it large.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class CameraImage:
         self._handle: viser.GuiImageHandle | None = None
         self._drawn_at = -math.inf
         self._whole: tuple[str, NDArray[np.uint8]] | None = None
-        """Picture in full size, where it is shown smaller."""
+        """Picture in full size, if it is shown smaller."""
 
     @property
     def visible(self) -> bool:
@@ -74,15 +74,15 @@ class CameraImage:
             self._handle.visible = shown
 
     def draw(self, kind: str, pixels: NDArray[np.uint8]) -> None:
-        follows = self._clock() - self._drawn_at < FOLLOWS
+        follows = self._clock() - self._drawn_at < SETTLE_SECONDS
         self._drawn_at = self._clock()
-        smaller = narrowed(pixels, SHOWN_WIDTH, smooth=kind != "segmentation") if follows else pixels
+        smaller = narrowed(pixels, SHOWN_WIDTH_PIXELS, smooth=kind != "segmentation") if follows else pixels
         self._whole = None if smaller is pixels else (kind, pixels)
         self._send(kind, smaller)
 
     def settle(self) -> None:
-        """Send the last picture whole, when no other has followed it."""
-        if self._whole is not None and self.visible and self._clock() - self._drawn_at >= FOLLOWS:
+        """Send the last picture in full size, if no other has followed."""
+        if self._whole is not None and self.visible and self._clock() - self._drawn_at >= SETTLE_SECONDS:
             self._send(*self._whole)
             self._whole = None
 
@@ -108,20 +108,20 @@ class _Camera:
     stale: bool = False
     """Whether its pictures are marked as pictures of another moment."""
     failed: str = ""
-    """Reason why it cannot be drawn."""
+    """Reason why the camera cannot be drawn."""
     hidden: tuple[str, ...] = ()
     """Names of objects that the task hides from the camera."""
 
 
 class CamerasPanel:
-    """One folder for each camera, with a tick for each modality.
+    """One folder per camera, with a checkbox per modality.
 
-    A picture costs 50 to 100 ms without a GPU, and viser does not tell which tab is open: so only what is ticked is
+    A picture takes 50 to 100 ms without a GPU, and viser does not report which tab is open, so only ticked modalities are
     rendered.
 
     Args:
-        no_camera: The note where there is no camera.
-        studio_shows: The modality that the Studio shows of the camera that is being placed.
+        no_camera: The note for a task without cameras.
+        studio_shows: Returns the modality that the Studio shows of the camera that is being placed.
     """
 
     does = (ShowFrustums, ShowPictures)
@@ -138,9 +138,9 @@ class CamerasPanel:
         self._server, self._clock = server, clock
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._ticked: dict[tuple[CameraKind, str, str], bool] = {}
-        """Whether each modality of each camera is ticked; cameras that are gone are kept, since they may come back."""
+        """Whether each modality of each camera is ticked; removed cameras are kept, since they may come back."""
         self._cameras_serial = -1
-        self._due = DrawThrottle(PICTURE_PERIOD, clock)
+        self._due = DrawThrottle(PICTURE_PERIOD_SECONDS, clock)
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task has loaded."))
         hint = "Draw these cameras, with their pictures, in the 3D view."
         self._frustums = tick(server, "Show in 3D view", ShowFrustums, "on", True, hint=hint)
@@ -177,7 +177,7 @@ class CamerasPanel:
             picture = seen.pictures.get(key)
             if picture is None or picture.env != seen.env:
                 continue
-            # Not again for an equal drawing: the browser would decode the picture again.
+            # Do not redraw an equal picture: the browser would decode it again.
             wanted = self._wanted(camera)
             if camera.drawn is None or camera.drawn[0] is not picture or camera.drawn[1] != wanted:
                 camera.drawn = (picture, wanted)
@@ -194,7 +194,7 @@ class CamerasPanel:
         }
 
     def _build(self, seen: ShownCameras) -> None:
-        """Make one folder for each camera; a camera that is still there keeps its folder and ticks."""
+        """Make one folder per camera; a camera that still exists keeps its folder and ticks."""
         before, self._cameras = self._cameras, {}
         stay = {(c.kind, c.name): modalities_of(c) for c in seen.cameras} if seen.can_render else {}
         for key in [key for key, camera in before.items() if stay.get(key) != tuple(camera.ticks)]:
@@ -238,7 +238,7 @@ class CamerasPanel:
                 given = {"kind": info.kind, "name": info.name, "modality": modality}
                 on = self._ticked.setdefault((*info.key, modality), first and modality == "rgb")
                 ticks[modality] = tick(self._server, modality, ShowPictures, "on", on, given=given)
-                # The picture is made when it comes, and is above its caption.
+                # The picture is created with its first content, and is above its caption.
                 images[modality] = CameraImage(self._server, gui.add_folder(None), self._clock)
                 captions[modality] = gui.add_html("")
         camera = _Camera(info, ticks, captions, folder, about, images)
@@ -246,7 +246,7 @@ class CamerasPanel:
         return camera
 
     def wanted(self, seen: ShownCameras | None) -> tuple[CameraRequest, ...]:
-        """The pictures that it shows, as far as it is drawn."""
+        """The pictures that the panel shows."""
         if seen is None:
             return ()
         return tuple(
@@ -256,7 +256,7 @@ class CamerasPanel:
         )
 
     def _draw_places(self) -> None:
-        """Show the place of each picture that is ticked."""
+        """Show the container of each ticked picture."""
         for camera in self._cameras.values():
             ticked = self._wanted(camera)
             for modality in camera.ticks:
@@ -269,7 +269,7 @@ class CamerasPanel:
         return tuple(modality for modality in camera.ticks if self._ticked[(*camera.info.key, modality)])
 
     def _wanted_of(self, key: CameraKey, camera: _Camera, seen: ShownCameras) -> tuple[str, ...]:
-        """The ticked modalities; for a camera that is being placed also what the Studio shows, in full size."""
+        """The ticked modalities; for a camera that is being placed in full size, also the modality shown in the Studio."""
         wanted = self._wanted(camera)
         if seen.preview or key != seen.placed:
             return wanted
@@ -305,7 +305,7 @@ class CamerasPanel:
 class StudioPicture:
     """The chosen camera's picture in the present container, in any modality; overlays go into `folder`.
 
-    Depth and segmentation too: a far plane that is too near, or a gripper that hides the cube, is seen there first.
+    Depth and segmentation too: they show first that a far plane is too near, or that a gripper hides the cube.
     """
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
@@ -350,19 +350,19 @@ class StudioPicture:
             self._picture.show(False)
             self._caption.content, self._caption.visible = render("note", text=failed), True
             return
-        # The last picture stays until the next comes; another camera's does not.
+        # The last picture stays until the next arrives; that of another camera does not.
         self._picture.show(self._drawn is not None and self._drawn[0] == key)
         self._caption.visible = self.visible and bool(self._caption.content)
         kind = self.shows
         if key is None or picture is None or picture.env != view.selected_env or view.task is None:
             return
         if self._drawn is not None and (self._drawn[0], self._drawn[2]) == (key, kind):
-            if self._drawn[1] is picture or self._clock() - self._drawn_at < PICTURE_PERIOD:
+            if self._drawn[1] is picture or self._clock() - self._drawn_at < PICTURE_PERIOD_SECONDS:
                 return
         self._span = depth_span(self._span if self._drawn and self._drawn[0] == key else None, picture)
         coloured = in_colours(picture, kind, view.task.segmentation, self._span)
         if coloured is None:
-            return  # it is not there yet
+            return  # there is no picture yet
         self._drawn, self._drawn_at = (key, picture, kind), self._clock()
         pixels, self._caption.content = coloured
         self._picture.draw(kind, pixels)
@@ -380,7 +380,7 @@ def modalities_of(info: CameraInfo) -> tuple[str, ...]:
 
 
 def facts(camera: _Camera) -> str:
-    """The line under a camera's name."""
+    """The line below a camera's name."""
     fovy = f"{np.degrees(camera.info.fovy):.0f}°"
     return render(
         "camera_facts",
@@ -392,31 +392,31 @@ def facts(camera: _Camera) -> str:
     )
 
 
-# --- a press on the picture shows the body, the depth and the point there ---------------------------
+# --- picks: a press on the picture shows the body, the depth and the point ---------------------------
 
 
 MARK_COLOUR = (230, 73, 128)
-MARK_SIZE = 0.05
-"""Distance in metres from the point to each end of its cross."""
+MARK_METRES = 0.05
+"""Distance from the point to each end of its cross."""
 
 
 class CameraPick:
-    """An overlay on the picture, the result, and a mark at the point in the 3D view.
+    """Pixel picks: an overlay on the picture, the result, and a mark at the point in the 3D view.
 
-    viser's pictures do not tell where they are pressed, so a pane of our own HTML lies over the picture (``.wb-pane`` in
-    page.css). Make it in the container of the picture, directly after it.
+    viser's pictures do not report the position of a press, so a pane of our own HTML lies over the picture (``.wb-pane`` in
+    page.css). Construct it in the container of the picture, directly after it.
     """
 
     def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
         self._drawn: object = None
-        # After a picture that is added to the container later.
+        # The order puts it after a picture that is added to the container later.
         self._pane = server.gui.add_html("", order=1e5, visible=False)
         self._found = server.gui.add_html("", order=1e5 + 1, visible=False)
         self._cross = line_set(server, "/picked/cross", MARK_COLOUR, 3.0)
         self._label = view_label(server, "/picked/label", "bottom-left")
 
     def draw(self, view: SessionView, shown: bool) -> None:
-        """Draw pane and result, where they changed.
+        """Draw pane and result, if they changed.
 
         Args:
             shown: whether the chosen camera's picture is visible.
@@ -436,7 +436,7 @@ class CameraPick:
             self._found.content = render("camera_found", picked=picked)
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> None:
-        """Mark the picked point by a cross and the body's name.
+        """Mark the picked point with a cross and the body's name.
 
         Args:
             offset: (3,) of the selected env in the view.
@@ -447,7 +447,7 @@ class CameraPick:
             self._label.draw()
             return
         place = np.asarray(picked.point, np.float64) + offset
-        ends = np.eye(3) * MARK_SIZE
+        ends = np.eye(3) * MARK_METRES
         self._cross.draw(np.stack([place - ends, place + ends], axis=1))
         self._label.draw(picked.body or "", place)
 

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from workbench.envs.camera_data import CameraKey, CameraSettings, differences
 from workbench.pictures.camera_conventions import axes_of
 
-_MOST_STEPS = 500
-NEAREST_TARGET, FARTHEST_TARGET, USUAL = 0.1, 3.0, 1.0
-"""Metres in front of the eye: limits and default of the target of a camera without one."""
+_MAX_UNDO_STEPS = 500
+MIN_TARGET_METRES, MAX_TARGET_METRES, DEFAULT_TARGET_METRES = 0.1, 3.0, 1.0
+"""Distance from the eye: limits and default of the target of a camera without one."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class PlacementChange:
 
 @dataclass(frozen=True)
 class Placements:
-    """Placements of cameras, with undo and redo. Methods that change something return another value.
+    """Placements of cameras, with undo and redo. Methods that change something return a new value.
 
-    A step holds a camera's whole settings before and after, so it can be undone even if the file changed since. A gesture
-    (a drag has a hundred positions) is one step. A new version keeps unwritten placements, except of cameras whose
-    settings changed in the file: the author wrote these, so they count, and Undo brings the placement back.
+    A step holds a camera's full settings before and after, so it can be undone even if the file changed since. A gesture
+    (a drag has a hundred positions) is one step. A new version keeps unwritten placements, except for cameras whose
+    settings changed in the file: the author's change wins, and Undo restores the placement.
     """
 
     in_file: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
@@ -74,8 +74,8 @@ class Placements:
         """Place a camera; nothing changes if it is missing.
 
         Args:
-            at: when, in seconds of a monotonic clock.
-            control: id of the control; successive calls with the same one are one step of undo (a drag).
+            at: time in seconds of a monotonic clock.
+            control: id of the control; successive calls with the same one are one undo step (a drag).
             pause: seconds without a call after which a new step begins.
         """
         before = self.now(key)
@@ -83,7 +83,7 @@ class Placements:
             return self
         last = self.done[-1] if self.done and self.done[-1].key == key else None
         if not differences(before, settings):
-            # The distance of the target is no step of its own.
+            # A change of only the target's distance is not a separate step.
             return self._with_distance(key, settings.distance)
         others = self.done
         if last is not None and control is not None and last.control == control and at - last.at <= pause:
@@ -93,7 +93,7 @@ class Placements:
         return replace(self, done=others)._with_step(step)._put(key, settings)
 
     def _with_distance(self, key: CameraKey, distance: float | None) -> Placements:
-        """Another distance of a camera's target, in metres."""
+        """Change the distance of a camera's target, in metres."""
         held = "placed" if key in self.placed else "in_file"
         settings = replace(getattr(self, held)[key], distance=distance)
         done = self.done
@@ -102,7 +102,7 @@ class Placements:
         return replace(self, done=done, **{held: {**getattr(self, held), key: settings}})
 
     def _with_step(self, step: PlacementChange) -> Placements:
-        return replace(self, done=(*self.done[-_MOST_STEPS + 1 :], step), undone=())
+        return replace(self, done=(*self.done[-_MAX_UNDO_STEPS + 1 :], step), undone=())
 
     def undo(self) -> Placements:
         """Undo the last step, if there is one."""
@@ -113,7 +113,7 @@ class Placements:
         return replace(self, done=self.done[:-1], undone=undone)._put(step.key, step.before)
 
     def redo(self) -> Placements:
-        """Redo the step that was undone last, if there is one."""
+        """Redo the last undone step, if there is one."""
         if not self.undone:
             return self
         step = self.undone[-1]
@@ -121,7 +121,7 @@ class Placements:
         return replace(self, done=done, undone=self.undone[:-1])._put(step.key, step.after)
 
     def refused(self, key: CameraKey) -> Placements:
-        """The worker refused the camera's newest placement: restore the one before."""
+        """Restore the previous placement, because the worker refused the newest."""
         if self.done and self.done[-1].key == key:
             return replace(self, done=self.done[:-1])._put(key, self.done[-1].before)
         return self.without(key)
@@ -129,12 +129,12 @@ class Placements:
     def edit_undone(
         self, key: CameraKey, written: CameraSettings, in_file: CameraSettings
     ) -> Placements | None:
-        """A placement was written to the file and taken out again: use the file's settings, and let Undo bring the
-        placement back. None if the camera was placed elsewhere since.
+        """Handle a revert of a written placement: use the file's settings, and let Undo restore the placement. None if the
+        camera was placed elsewhere since.
 
         Args:
-            written: the settings that were taken out of the file.
-            in_file: the file's settings now.
+            written: the settings that were removed from the file.
+            in_file: the file's present settings.
         """
         placed = self.placed.get(key)
         if placed is not None and differences(placed, written):
@@ -161,10 +161,10 @@ class Placements:
 
         Args:
             in_file: their settings.
-            own: cameras that the studio itself changed in the file: their placements stay.
+            own: cameras that the studio itself changed in the file; their placements stay.
 
         Returns:
-            The placements, and the cameras whose placement was dropped, since the file has new settings.
+            The placements, and the cameras whose placement was dropped because the file has new settings.
         """
         before, kept, done = self.in_file, {}, self.done
         dropped: list[CameraKey] = []
@@ -181,11 +181,11 @@ class Placements:
         return Placements(in_file, kept, done, undone), tuple(dropped)
 
     def without(self, key: CameraKey) -> Placements:
-        """The camera is as in the file; no step of undo."""
+        """Drop the camera's placement, without an undo step."""
         return replace(self, placed={one: settings for one, settings in self.placed.items() if one != key})
 
     def with_placed(self, key: CameraKey, settings: CameraSettings) -> Placements:
-        """The camera is placed so; no step of undo."""
+        """Place the camera, without an undo step."""
         return replace(self, placed={**self.placed, key: settings})
 
     def _put(self, key: CameraKey, settings: CameraSettings) -> Placements:
@@ -204,7 +204,7 @@ _STEP_LABELS = (
     ({"width", "height", "intrinsic"}, "changed the size of {}"),
     ({"shader_pack"}, "changed the shader of {}"),
 )
-"""Labels of steps that change no more than these settings; the first match counts."""
+"""Labels of steps that change only these settings; the first match counts."""
 
 
 def _step_label(key: CameraKey, before: CameraSettings, after: CameraSettings) -> str:
@@ -216,5 +216,5 @@ def usual_distance(pose: ArrayLike) -> float:
     """Default distance in metres from a camera's pose (7,) to its target: where its axis meets z = 0, if that is near."""
     p = np.asarray(pose, np.float64)
     forward = axes_of(p[3:])[0]
-    distance = -float(p[2] / forward[2]) if abs(forward[2]) >= 1e-6 else USUAL
-    return distance if NEAREST_TARGET <= distance <= FARTHEST_TARGET else USUAL
+    distance = -float(p[2] / forward[2]) if abs(forward[2]) >= 1e-6 else DEFAULT_TARGET_METRES
+    return distance if MIN_TARGET_METRES <= distance <= MAX_TARGET_METRES else DEFAULT_TARGET_METRES

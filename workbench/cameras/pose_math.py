@@ -36,12 +36,12 @@ from workbench.pictures.camera_conventions import (
 Floats = NDArray[np.float64]
 
 SAME = 1e-7
-"""Tolerance, in metres and for the parts of a unit quaternion: rounding of viser's 32 bit numbers."""
+"""Tolerance in metres and for components of a unit quaternion: rounding of viser's 32-bit numbers."""
 
 
 @dataclass(frozen=True)
 class Snap:
-    """Steps of a gizmo; 0 for continuous."""
+    """Snap steps of a gizmo; 0 for continuous."""
 
     metres: float = 0.0
     degrees: float = 0.0
@@ -49,10 +49,10 @@ class Snap:
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of a camera's numbers (its mount's, or the env's), as seen in the 3D view."""
+    """The frame of a camera's numbers (its mount's or the env's) in the 3D view."""
 
     mount: NDArray[np.float32] | None
-    """(7,) pose of the link of the camera, in the env's frame; None for a camera that is not mounted."""
+    """(7,) pose of the link that carries the camera, in the env's frame; None for a camera without a mount."""
     offset: NDArray[np.float32]
     """(3,) offset of the env in the view."""
 
@@ -65,11 +65,11 @@ class Frame:
     def from_view(
         self, settings: CameraSettings, pose: ArrayLike, distance: float | None = None
     ) -> CameraSettings:
-        """The camera at this pose (7,) of the view, with its distance to the target, or `distance` metres."""
+        """The camera at this pose (7,) in the view, with its present distance to the target, or `distance` metres."""
         there = np.array(pose, np.float64)
         there[:3] -= self.offset
         moved = with_pose(settings, there if self.mount is None else relative_to(self.mount, there))
-        # The way to the view and back rounds: numbers that were not moved keep their exact values.
+        # The conversion to the view and back rounds: unchanged numbers keep their exact values.
         if np.allclose(moved.position, settings.position, rtol=0, atol=SAME):
             moved = replace(moved, position=settings.position)
         if np.allclose(moved.quaternion, settings.quaternion, rtol=0, atol=SAME):
@@ -77,7 +77,7 @@ class Frame:
         return moved if distance is None else replace(moved, distance=max(distance, 1e-3))
 
     def turned_to(self, settings: CameraSettings, target: ArrayLike) -> CameraSettings:
-        """The camera, turned to a target (3,) in the frame of its position.
+        """The camera rotated to look at a target (3,) in the frame of its position.
 
         Raises:
             ValueError: the target is its position.
@@ -86,7 +86,7 @@ class Frame:
         return self.from_view(settings, looking_at(pose, pose[:3], there), math.dist(there, pose[:3]))
 
     def point_to_view(self, point: ArrayLike) -> Floats:
-        """(3,) in the view of a point (3,) in the frame of the camera's position."""
+        """(3,) position in the view of a point (3,) in the frame of the camera's position."""
         there = np.asarray(point, np.float64)
         if self.mount is not None:
             there = compose(self.mount, make_pose(there, (1, 0, 0, 0)))[:3]
@@ -103,20 +103,20 @@ def looking_at(pose: ArrayLike, eye: ArrayLike, target: ArrayLike) -> Floats:
 
 
 def turned_in_world(start: ArrayLike, position: ArrayLike, turn: ArrayLike) -> Floats:
-    """(7,) `start` turned by the quaternion `turn` about the world's axes, at another position."""
+    """(7,) `start` rotated by the quaternion `turn` about the world's axes, at another position."""
     s = np.asarray(start, np.float64)
     turned = rotation_matrix(turn) @ rotation_matrix(s[3:])
     return make_pose(position, quaternion_of(turned))
 
 
 def snapped(start: ArrayLike, pose: ArrayLike, snap: Snap, own_axes: bool, origin: ArrayLike) -> Floats:
-    """(7,) the pose that a gizmo was dragged to, in whole steps.
+    """(7,) the dragged pose of a gizmo, snapped to whole steps.
 
     Along the world's axes the position snaps to a grid, so that round numbers are written; along the camera's own axes it
-    moves in steps from the start of the drag. It turns in steps from the start.
+    moves in steps from the start of the drag. It rotates in steps from the start of the drag.
 
     Args:
-        origin: (3,) of the grid.
+        origin: (3,) origin of the grid.
     """
     s, p = np.asarray(start, np.float64), np.array(pose, np.float64)
     was, is_now = rotation_matrix(s[3:]), rotation_matrix(p[3:])
@@ -124,7 +124,7 @@ def snapped(start: ArrayLike, pose: ArrayLike, snap: Snap, own_axes: bool, origi
     if snap.metres and own_axes:
         p[:3] = s[:3] + was @ (np.round(was.T @ moved / snap.metres) * snap.metres)
     elif snap.metres:
-        # A coordinate that was not dragged stays as it is, also off the grid.
+        # A coordinate that was not dragged stays unchanged, also off the grid.
         grid = np.asarray(origin, np.float64)
         on_grid = np.round((p[:3] - grid) / snap.metres) * snap.metres + grid
         p[:3] = np.where(np.abs(moved) > 1e-6, on_grid, p[:3])
@@ -134,28 +134,28 @@ def snapped(start: ArrayLike, pose: ArrayLike, snap: Snap, own_axes: bool, origi
 
 
 def nudged(pose: ArrayLike, step: Sequence[float]) -> Floats:
-    """(7,) moved by (forward, left, up) metres along the camera's own axes."""
+    """(7,) pose moved by (forward, left, up) metres along the camera's own axes."""
     p = np.array(pose, np.float64)
     p[:3] += rotation_matrix(p[3:]) @ np.asarray(step, np.float64)
     return p
 
 
 def panned(pose: ArrayLike, left: float, up: float) -> Floats:
-    """(7,) turned in place, in degrees: to the left about the vertical, and up."""
+    """(7,) pose rotated in place, in degrees: to the left about the vertical, and up."""
     p = np.asarray(pose, np.float64)
     about_z, about_left = SO3.from_z_radians(math.radians(left)), SO3.from_y_radians(-math.radians(up))
     return make_pose(p[:3], quaternion_of((about_z @ SO3(p[3:]) @ about_left).as_matrix()))
 
 
 def viewer_pose(position: ArrayLike, wxyz: ArrayLike) -> Floats:
-    """(7,) of a page's viewpoint, whose rotation is in OpenCV's frame."""
+    """(7,) pose of a page's viewpoint, whose rotation is in OpenCV's frame."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation_matrix(wxyz), np.asarray(position, np.float64)
     return pose_from_matrix(matrix, "opencv", "camera_to_world")
 
 
 def fov_that_shows_all(fov: float, aspect: float, view_aspect: float) -> float:
-    """Vertical field of view, in a view of another aspect (width over height), that holds the whole picture."""
+    """Vertical field of view that contains the whole picture in a view with another aspect ratio (width over height)."""
     return 2 * math.atan(math.tan(fov / 2) * max(1.0, aspect / view_aspect))
 
 
@@ -182,14 +182,13 @@ def _in_steps(rotation: Floats, step: float) -> Floats:
     return np.asarray(SO3.exp(turn * (whole / angle)).as_matrix(), np.float64) if whole else np.eye(3)
 
 
-PAUSE = 1.2
-"""Seconds. Movements by the same control with shorter pauses are one step of undo."""
+PAUSE_SECONDS = 1.2
+"""Movements by the same control with shorter pauses are one undo step."""
 
 
 class Placing:
-    """Places the chosen camera. Gizmo, keys, number fields and "put it where I look" all end here: it checks that a camera
-    can be placed, knows the frame of its numbers, and makes one movement one step of undo.
-    """
+    """Places the chosen camera for gizmo, keys, number fields and "move to my view": checks that the camera can be placed,
+    knows the frame of its numbers, and makes one movement one undo step."""
 
     def __init__(self, session: LiveSession) -> None:
         self._session = session
@@ -205,7 +204,7 @@ class Placing:
         """The camera to place, its present settings and their frame.
 
         Raises:
-            Refused: there is none.
+            Refused: no camera can be placed.
         """
         camera = self.camera
         if camera is None or camera.now is None:
@@ -215,11 +214,13 @@ class Placing:
     def frame(self, camera: StudioCamera) -> Frame:
         return Frame(camera.mount_pose, self.offset)
 
-    def place(self, key: CameraKey, settings: CameraSettings, control: object, pause: float = PAUSE) -> None:
-        """Place it live; `control` and `pause` as in `CameraPlaced`.
+    def place(
+        self, key: CameraKey, settings: CameraSettings, control: object, pause: float = PAUSE_SECONDS
+    ) -> None:
+        """Place the camera live; `control` and `pause` as in `CameraPlaced`.
 
         Raises:
-            Refused: it is too far away for any task.
+            Refused: it is too far from the origin.
         """
         if not all(abs(x) <= MAX_COORDINATE_METRES for x in settings.position):
             raise Refused(f"A camera must be within {MAX_COORDINATE_METRES:g} m of the origin.")
@@ -229,10 +230,10 @@ class Placing:
         """Apply `change` to the chosen camera; `control` as in `place`.
 
         Args:
-            change: raises ValueError with a sentence where the camera cannot be so.
+            change: returns the new settings; raises ValueError with a sentence if they are impossible.
 
         Raises:
-            Refused: no camera is chosen, or it cannot be placed so.
+            Refused: no camera is chosen, or it cannot have these settings.
         """
         camera, now, frame = self.require()
         try:

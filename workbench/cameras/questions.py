@@ -1,4 +1,4 @@
-"""Questions to a worker about cameras."""
+"""Questions about cameras for a worker."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from workbench.machine.processes.wire import Question
 from workbench.pictures.camera_report import CameraReport, OfferedPlacement, SearchSpace
 from workbench.task.reference import TaskName
 
-# Each question is small, so that the worker that plays answers it between two steps: sixteen envs are sixteen questions.
-# Only a search takes long: it goes to the worker in the background, and any later request ends it.
+# Each question is small, so that the worker that plays answers it between two steps: sixteen envs take sixteen questions.
+# Only a search takes long: it goes to the background process, and any later request ends it.
 
 
 @dataclass(frozen=True)
@@ -24,16 +24,16 @@ class DrawCamera(Question[Picture]):
 
     key: CameraKey
     settings: CameraSettings | None
-    """Settings for this picture only; None for the current ones. Required for a camera that the env does not have: it
-    stands still and is drawn as with a `scale`."""
+    """Settings only for this picture; None for the current ones. Required for a camera that the env does not have, which is
+    fixed and drawn like one with a `scale`."""
     env: int
     modalities: tuple[str, ...] = ("rgb",)
-    """Requested modalities; those that the camera's shader does not give are left out."""
+    """Requested modalities; those that the camera's shader does not provide are left out."""
     poses: NDArray[np.float32] | None = None
     """(B, 7) poses of the env's bodies at a past moment; None for now."""
     scale: float = 1.0
-    """Factor on the picture's size. Other than 1 it needs `settings`, and a temporary camera with the minimal shader draws:
-    colours, depth and segmentation."""
+    """Factor on the picture's size. A factor other than 1 requires `settings`, and a temporary camera with the minimal shader
+    renders colours, depth and segmentation."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class MeasureCamera(Question[CameraReport]):
 
 @dataclass(frozen=True)
 class SuggestCameras(Question[tuple[OfferedPlacement, ...]]):
-    """Search placements of one camera from which it sees the given objects."""
+    """Search for placements of one camera from which it sees the given objects."""
 
     space: SearchSpace
     envs: tuple[int, ...]
@@ -61,9 +61,9 @@ class RunCameras(Question[HookCameras]):
     """Run the camera hooks with other texts of the author's files."""
 
     task: TaskName
-    """The task, by the reference with which it was opened."""
+    """Reference with which the task was opened."""
     texts: Mapping[str, str]
-    """Text of each file, by path."""
+    """Text of each file by path."""
 
 
 CameraQuestion = DrawCamera | MeasureCamera | SuggestCameras | RunCameras

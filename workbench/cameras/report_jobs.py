@@ -44,31 +44,31 @@ from workbench.pictures.camera_conventions import compose
 from workbench.pictures.camera_report import CameraReport, OfferedPlacement, SearchSpace, join_reports
 
 FIRST_SEED = 10_000
-"""First seed of every report, so that two reports can be compared; far from the seeds that people start with."""
-MOST_ENVS = 16
-"""Most envs of a job in the background process; for more seeds these envs are reset again."""
-_REPORT_EVERY = 8
-"""Steps between two partial reports."""
+"""First seed of every report, so that two reports can be compared; far from the seeds that users usually start with."""
+MAX_ENVS = 16
+"""Maximum number of envs of a job in the background process; for more seeds these envs are reset again."""
+_REPORT_STEPS = 8
+"""Number of steps between two partial reports."""
 STOP_REPORTS = StopJobs(("live", "background"))
 
 
-# --- the value -------------------------------------------------------------------------------------
+# --- state -----------------------------------------------------------------------------------------
 
 
 def with_results(studio: Studio, **values: object) -> Studio:
-    """Change results; the last failure is forgotten."""
+    """Change results, and clear the last failure."""
     return replace(studio, results=replace(studio.results, **{"problem": "", **values}))  # type: ignore[arg-type]
 
 
 def outdated(studio: Studio) -> Studio:
-    """Mark the results as those of an earlier version."""
+    """Mark the results as outdated: they are of an earlier version."""
     results = replace(studio.results, outdated=True, compared=None, picked=None, sheet=())
     return replace(studio, results=results)
 
 
 def apply_to_reports(studio: Studio, event: object, run: Run) -> Change:
-    """The studio after an event about reports. The shown moment is asked of the worker that plays, one env at a time, so that it
-    continues playing; fresh episodes of the background process."""
+    """The studio after an event about reports. The worker that plays measures the shown moment, one env at a time, so that
+    it continues playing; the background process measures fresh episodes."""
     match event:
         case MeasureWanted():
             return _measure(replace(studio, problem=""), event, run)
@@ -104,7 +104,7 @@ def apply_to_reports(studio: Studio, event: object, run: Run) -> Change:
 
 
 def do_report(studio: Studio, command: Command, run: Run) -> Change:
-    """Commands about reports."""
+    """Carry out a command about reports."""
     match command:
         case StopMeasuring():
             return studio, [STOP_REPORTS]
@@ -141,7 +141,7 @@ def _measure(studio: Studio, wanted: MeasureWanted, run: Run) -> Change:
     if not cases:
         return studio, []
     what = f"{what} over {len(cases)} steps"
-    return studio, [MeasureLive(what, question, camera.now, cases, _REPORT_EVERY)]
+    return studio, [MeasureLive(what, question, camera.now, cases, _REPORT_STEPS)]
 
 
 def _suggest(studio: Studio, wanted: SuggestionsWanted, run: Run) -> Change:
@@ -177,11 +177,11 @@ def _draw_sheet(studio: Studio, run: Run) -> Change:
     return with_results(studio, sheet=()), [DrawEnvs(camera.key, order, moment)]
 
 
-# --- the work --------------------------------------------------------------------------------------
+# --- jobs ------------------------------------------------------------------------------------------
 
 
 class CameraReports:
-    """Asks the questions of which reports consist. Used on the loop."""
+    """Asks the questions for reports. Used on the loop."""
 
     def __init__(
         self, asker: QuestionClient, background: Background, happen: Callable[[StudioEvent], object]
@@ -189,7 +189,7 @@ class CameraReports:
         """
         Args:
             asker, background: ask the worker that plays, and the background process.
-            happen: takes what comes of it.
+            happen: handles the resulting events.
         """
         self._live, self._background, self._happen = asker, background, happen
 
@@ -215,7 +215,7 @@ class CameraReports:
 
     @contextmanager
     def _measuring(self) -> Iterator[None]:
-        """The report is an old one until a new one comes or the work ends."""
+        """Mark the report as old until a new one arrives or the job ends."""
         self._happen(Measuring(True))
         try:
             yield
@@ -234,8 +234,8 @@ class CameraReports:
     ) -> None:
         """
         Args:
-            reports: of earlier cases; those of `cases` are appended.
-            every: cases between two partial reports.
+            reports: reports of earlier cases; those of `cases` are appended.
+            every: number of cases between two partial reports.
         """
         moments: list[MeasuredMoment] = []
         for env, poses, moment in cases:
@@ -288,13 +288,13 @@ def _for_measuring(load: Load) -> Load:
     options = load.options
     kwargs = dict(options.env_kwargs)
     if kwargs.get("obs_mode", "state") not in ("state", "state_dict", "none"):
-        kwargs["obs_mode"] = "state"  # else every reset renders all cameras of all envs
-    envs = min(options.num_envs, MOST_ENVS)
+        kwargs["obs_mode"] = "state"  # with pictures every reset would render all cameras of all envs
+    envs = min(options.num_envs, MAX_ENVS)
     return replace(load, options=replace(options, num_envs=envs, env_kwargs=kwargs))
 
 
 def pick_pixel(info: CameraInfo, picture: Picture, u: float, v: float, names: dict[int, str]) -> PickedPixel:
-    """What a pixel shows; `u` and `v` are from 0 to 1, from the picture's upper left corner."""
+    """Probe a pixel; `u` and `v` are from 0 to 1, from the picture's upper left corner."""
     shape = next(a.shape for a in (picture.depth, picture.segmentation, picture.rgb) if a is not None)
     height, width = shape[:2]
     column = int(np.clip(np.floor(u * width), 0, width - 1))

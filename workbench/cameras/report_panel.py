@@ -1,4 +1,4 @@
-"""The Studio's report on a camera: what it sees over envs, steps or fresh resets, and a sheet of all envs' pictures."""
+"""The Studio's report on a camera: what it sees over envs, steps or fresh resets; and a sheet with pictures of all envs."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ OVER_HINT = (
     "another process."
 )
 STEPS_HINT = "The most steps of the episode to measure, evenly spaced: each takes a few pictures."
-MOST_PICTURES = 64
+MAX_PICTURES = 64
 """Maximum number of pictures on the sheet, worst first."""
-THUMBNAIL = 128
-"""Pixels along the longer side of a picture on the sheet."""
+THUMBNAIL_PIXELS = 128
+"""Longer side of a picture on the sheet."""
 
 
 class CameraReportPanel(PagePart[SessionView]):
@@ -159,7 +159,7 @@ class CameraReportPanel(PagePart[SessionView]):
         self._report.draw(studio.progress, report, told, html)
 
     def _report_html(self, studio: StudioView, camera: StudioCamera, report: CameraReport, new: bool) -> str:
-        """The table of objects, the depth histogram and fitting planes; `new`: scroll it into view."""
+        """The table of objects, the depth histogram and suggested planes; `new`: scroll it into view."""
         results, depth, lens = studio.results, report.depth, camera.now or camera.info
         moments = [
             {
@@ -235,33 +235,33 @@ class CameraReportPanel(PagePart[SessionView]):
                 "words": ""
                 if report is None or picture.env not in places
                 else env_words(report, places[picture.env]),
-                "picture": data_address(picture.rgb, THUMBNAIL),
+                "picture": data_address(picture.rgb, THUMBNAIL_PIXELS),
                 "selected": picture.env == selected,
                 "press": SelectEnv(env=picture.env),
             }
-            for picture in sheet[:MOST_PICTURES]
+            for picture in sheet[:MAX_PICTURES]
             if picture.rgb is not None
         ]
         note = ("worst first, " if report is not None else "") + "click one to select its env"
-        if len(sheet) > MOST_PICTURES:
-            note = f"{MOST_PICTURES} of {len(sheet)}; {note}"
+        if len(sheet) > MAX_PICTURES:
+            note = f"{MAX_PICTURES} of {len(sheet)}; {note}"
         return render("camera_sheet", cells=cells, note=note, new=new)
 
 
 # --- a report as text, rows and bars: pure functions -------------------------------------------------
 
-# Worst first: an object that some env's picture lacks comes before one that is only cut, and an env is described by its
-# worst object.
+# Worst first: an object that is missing in some env's picture comes before one that is only cut, and an env is described by
+# its worst object.
 
-MOSTLY_HIDDEN = 0.1
+MIN_HIDDEN_SHARE = 0.1
 """Minimum hidden share of an object that is reported."""
-SMALL = 30.0
-"""Pixels below which an object counts as small."""
+SMALL_PIXELS = 30.0
+"""Number of pixels below which an object counts as small."""
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """Bars of equal width over logarithmic depth; metres at both ends."""
+    """Bars of equal width over logarithmic depth, with the depth in metres at both ends."""
 
     bars: tuple[tuple[float, bool], ...]
     """Height of each bar as a share of the highest, and whether the bar lies behind every object."""
@@ -273,7 +273,7 @@ class Histogram:
 
 
 def percent(share: float) -> str:
-    """A share in whole percent; only exactly none is 0 % and only exactly all is 100 %."""
+    """A share in whole percent; only exactly 0 is shown as 0 % and only exactly 1 as 100 %."""
     if math.isnan(share):
         return "–"
     whole = round(100 * share)
@@ -285,18 +285,18 @@ def percent(share: float) -> str:
 
 
 def metres(value: float) -> str:
-    """Text of a length in metres, to three digits."""
+    """Text of a length in metres with three digits."""
     return f"{value:.3g} m"
 
 
 def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]]:
-    """The objects to see, least seen first; then those that the task hides. Without scenery.
+    """Rows for the objects to see, least visible first, then for those that the task hides. Scenery is left out.
 
-    ``bad``: which of ``seen cut hidden`` an author should look at. ``moods``: how it is seen in each picture, ``good``,
-    ``warn`` (cut, or much hidden), ``bad`` (not seen), ``none`` (absent).
+    ``bad``: which of ``seen cut hidden`` the author should check. ``moods``: visibility in each picture: ``good``, ``warn``
+    (cut, or much hidden), ``bad`` (not visible), ``none`` (absent).
 
     Args:
-        unit: what the report is over: envs, steps.
+        unit: unit of the report: envs, steps.
     """
     rows: list[dict[str, Any]] = []
     wanted = report.wanted_objects()
@@ -310,12 +310,12 @@ def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]
             bad.append("seen")
         if found.cut > 0:
             bad.append("cut")
-        if found.wholly_hidden > 0 or found.hidden > MOSTLY_HIDDEN:
+        if found.wholly_hidden > 0 or found.hidden > MIN_HIDDEN_SHARE:
             bad.append("hidden")
         notes = []
         if found.present < len(report.envs):
             notes.append(f"in {found.present} of {len(report.envs)} {unit}")
-        if found.covered > MOSTLY_HIDDEN:
+        if found.covered > MIN_HIDDEN_SHARE:
             notes.append(f"{percent(found.covered)} behind other objects")
         rows.append(
             {
@@ -351,10 +351,10 @@ def headline(report: CameraReport, unit: str = "envs") -> str:
 
 
 def env_words(report: CameraReport, position: int) -> str:
-    """The worst finding in one env, in a few words; empty where there is no object to see.
+    """The worst finding in one env, in a few words; empty if there is no object to see.
 
     Args:
-        position: in `CameraReport.envs`.
+        position: index in `CameraReport.envs`.
     """
     found = [thing for thing in report.wanted_objects() if thing.present[position]]
     if not found:
@@ -363,19 +363,19 @@ def env_words(report: CameraReport, position: int) -> str:
     hidden = float(thing.hidden_share[position])
     if thing.pixels[position] == 0:
         return f"{thing.name} hidden" if thing.alone[position] > 0 else f"no {thing.name}"
-    if hidden > MOSTLY_HIDDEN:
+    if hidden > MIN_HIDDEN_SHARE:
         return f"{thing.name} {percent(hidden)} hidden"
     covered = float(thing.covered_share[position])
-    if covered > MOSTLY_HIDDEN:
+    if covered > MIN_HIDDEN_SHARE:
         return f"{thing.name} {percent(covered)} behind objects"
     if thing.cut[position]:
         return f"{thing.name} cut"
     pixels = f"{thing.name} {thing.pixels[position]:.0f} px"
-    return f"{pixels}, small" if thing.pixels[position] < SMALL else pixels
+    return f"{pixels}, small" if thing.pixels[position] < SMALL_PIXELS else pixels
 
 
 def histogram(depth: DepthReport, near: float, far: float) -> Histogram | None:
-    """The depths of all envs' pictures; None where all is background.
+    """The depths of all envs' pictures; None if everything is background.
 
     Args:
         near, far: the camera's planes, metres.

@@ -1,4 +1,4 @@
-"""The camera studio as one value: placements, the selected camera, reports and the edit of the file."""
+"""The state of the camera studio as one value: placements, the selected camera, reports and the edit of the file."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ EditAsked = EditWanted | SaveCameraChange | RevertCameraChange | CopyTask
 
 @dataclass(frozen=True)
 class Edits:
-    """Edits of the author's file, made one after the other."""
+    """Edits of the author's file, made one after another."""
 
     shown: EditState = EditState()
     done: tuple[EditState, ...] = ()
-    """Edits that are in the file and can be taken back, the newest last."""
+    """Edits in the file that can be reverted, the newest last."""
     removed: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
     """Placements of cameras that were removed from the file."""
     folder: Path = Path()
@@ -49,33 +49,33 @@ class Edits:
     just_copied: str = ""
     """First sentence of the message about the plan in the copy."""
     waiting: tuple[EditAsked, ...] = ()
-    """What was asked for behind the edit under way, the next first."""
+    """Requests queued behind the current edit, the next first."""
     busy: bool = False
-    """An edit is under way."""
+    """Whether an edit is in progress."""
     left: EditRequest | None = None
-    """Request of the plan that was shown before the one under way."""
+    """Request of the plan that was shown before the current one."""
     before: tuple[EditState, tuple[EditState, ...]] = EditState(), ()
-    """`shown` and `done` before the change of the file under way."""
+    """`shown` and `done` before the current change of the file."""
     closed: bool = False
 
 
 @dataclass(frozen=True)
 class Studio:
-    """One value for all that is known of the studio. The cameras themselves are those of the run.
+    """State of the studio. The cameras themselves are in the run.
 
-    A placement is here (with undo), in the worker's live cameras, and at last in the author's file. This one is
+    A placement is here (with undo), in the worker's live cameras, and finally in the author's file. This state is
     authoritative: after each load it is sent to the worker again, so that neither a reload nor a crash moves a camera. If
-    the author changed the camera in the file, the file counts.
+    the author changed the camera in the file, the file wins.
     """
 
     placements: Placements = Placements()
     selected: CameraKey | None = None
     was_chosen: bool = False
-    """Whether somebody has chosen a camera, or none."""
+    """Whether the user has made a choice: a camera, or none."""
     is_open: bool = False
-    """Whether a page has opened the studio: a camera is then chosen."""
+    """Whether a page has opened the studio; a camera is chosen then."""
     select_when_loaded: CameraKey | None = None
-    """The camera that was selected in an earlier session."""
+    """The camera that was selected in the previous session."""
     problem: str = ""
     """Message about the last failure."""
     preview_scale: float = 1.0
@@ -85,18 +85,18 @@ class Studio:
     previewed: Previewed | None = None
     """The last preview."""
     drawing: bool = False
-    """A preview is being drawn."""
+    """Whether a preview is being drawn."""
     results: StudioResults = StudioResults()
     edits: Edits = Edits()
 
 
 Change = tuple[Studio, list[StudioEffect]]
-"""The studio after an event, and what has to be done."""
+"""The studio after an event, and the effects to perform."""
 
 
 @dataclass(frozen=True)
 class KeptPlacements:
-    """Placements with their steps of undo, and the selected camera, for a later session of the same task."""
+    """Placements with their undo steps, and the selected camera, for a later session of the same task."""
 
     placements: Placements
     selected: CameraKey | None
@@ -106,7 +106,7 @@ def first_studio(kept: KeptPlacements | None = None) -> Studio:
     """The studio before a version is loaded. A task is copied to the folder in which the program was started.
 
     Args:
-        kept: of an earlier session of the task.
+        kept: state kept from the previous session of the task.
     """
     edits = Edits(folder=Path.cwd())
     if kept is None:
@@ -119,7 +119,7 @@ def kept_placements(studio: Studio) -> KeptPlacements:
 
 
 def placed_cameras(studio: Studio) -> tuple[PlaceCamera, ...]:
-    """All placements, as requests to another worker."""
+    """All placements, as requests for another worker."""
     return tuple(PlaceCamera(key, settings) for key, settings in studio.placements.placed.items())
 
 
@@ -131,7 +131,7 @@ def info_of(run: Run, key: CameraKey) -> CameraInfo | None:
 
 
 def refusal(run: Run, key: CameraKey) -> str | None:
-    """Why a camera cannot be placed; None if it can."""
+    """Reason why a camera cannot be placed; None if it can."""
     info = info_of(run, key)
     if info is None:
         return f"there is no {key[0]} camera {key[1]}"
@@ -176,11 +176,11 @@ def selected_camera(studio: Studio, run: Run) -> StudioCamera | None:
 
 
 def settings_in_file(placements: Placements, run: Run) -> dict[CameraKey, CameraSettings]:
-    """Settings of the cameras of the running version. A camera without a target in the file keeps the distance that it has, or
+    """Settings of the cameras of the running version. A camera without a target in the file keeps its present distance, or
     gets the default.
 
     Args:
-        placements: before the version was loaded.
+        placements: placements before the version was loaded.
     """
 
     def distance(info: CameraInfo, settings: CameraSettings) -> float | None:
@@ -198,19 +198,19 @@ def settings_in_file(placements: Placements, run: Run) -> dict[CameraKey, Camera
     }
 
 
-# --- what a page shows -----------------------------------------------------------------------------
+# --- view ------------------------------------------------------------------------------------------
 
 
 def view_of(studio: Studio, run: Run, progress: JobProgress | None) -> StudioView:
     """The studio's part of `SessionView`, at the shown moment.
 
     Args:
-        progress: of the running job.
+        progress: progress of the running job.
     """
     results, preview = studio.results, studio.preview
     measured = None if results.report_of is None else studio.placements.now(results.report_of)
     was = results.report_settings
-    # Rounding when it was written does not count.
+    # Ignore rounding of written numbers.
     moved = measured is None or was is None or bool(differences(measured, was, close=3e-4))
     is_shown = preview is not None and (preview.key, preview.env) == (studio.selected, run.env)
     return StudioView(

@@ -1,4 +1,4 @@
-"""The Studio tab: choose one camera, place it, and write it into the file."""
+"""The Studio tab: choose a camera, place it, and write it into the file."""
 
 from __future__ import annotations
 
@@ -65,26 +65,26 @@ NO_CAMERA = "none"
 SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
 SCALES = {"full": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
 TAB = "Studio"
-STEP = 0.01
-"""Distance in metres that a key moves the camera."""
-TURN = 1.0
-"""Angle in degrees that a key turns the camera."""
+STEP_METRES = 0.01
+"""Distance by which a key moves the camera."""
+TURN_DEGREES = 1.0
+"""Angle by which a key rotates the camera."""
 MOVES: dict[type[Command], tuple[float, float, float]] = {
-    MoveCameraLeft: (0, STEP, 0),
-    MoveCameraRight: (0, -STEP, 0),
-    MoveCameraUp: (0, 0, STEP),
-    MoveCameraDown: (0, 0, -STEP),
-    MoveCameraForward: (STEP, 0, 0),
-    MoveCameraBack: (-STEP, 0, 0),
+    MoveCameraLeft: (0, STEP_METRES, 0),
+    MoveCameraRight: (0, -STEP_METRES, 0),
+    MoveCameraUp: (0, 0, STEP_METRES),
+    MoveCameraDown: (0, 0, -STEP_METRES),
+    MoveCameraForward: (STEP_METRES, 0, 0),
+    MoveCameraBack: (-STEP_METRES, 0, 0),
 }
 """Direction (forward, left, up) of each command, in the camera's own frame."""
 TURNS: dict[type[Command], tuple[float, float]] = {
-    TurnCameraLeft: (TURN, 0),
-    TurnCameraRight: (-TURN, 0),
-    TurnCameraUp: (0, TURN),
-    TurnCameraDown: (0, -TURN),
+    TurnCameraLeft: (TURN_DEGREES, 0),
+    TurnCameraRight: (-TURN_DEGREES, 0),
+    TurnCameraUp: (0, TURN_DEGREES),
+    TurnCameraDown: (0, -TURN_DEGREES),
 }
-"""Turn (left, up) of each command."""
+"""Rotation (left, up) of each command."""
 VIEW = "Envs in the 3D view (O). With one alone the handles are large."
 HANDLES = (
     "pose: move or rotate the camera; its target moves with it.\n"
@@ -100,10 +100,10 @@ IN_ITS_EYE = "You are at its position. Move the view to see its handles."
 
 
 class StudioPanel(PagePart[SessionView]):
-    """The tab. Only the chosen camera has gizmos and numbers; it is chosen here or by a press on its frustum.
+    """The tab. Only the chosen camera has gizmos and numbers; it is chosen here or by clicking its frustum.
 
-    From the top: the button that shows the change of the file; the picture, by which every movement is checked; what is
-    used all the time (look through it, undo); the pose; the lens, folded.
+    From the top: the button that shows the change of the file; the picture, in which every movement is checked; the
+    frequently used tools (look through, undo); the pose; the lens, folded.
     """
 
     does = (
@@ -130,7 +130,7 @@ class StudioPanel(PagePart[SessionView]):
     ) -> None:
         """
         Args:
-            pages: the pages that have this tab open, by client id.
+            pages: returns the client ids of the pages that have this tab open.
         """
         self._pages = pages
         self._server, self._session, self._view_panel = server, session, view_panel
@@ -159,11 +159,11 @@ class StudioPanel(PagePart[SessionView]):
         with self._picture.folder:
             self._pick = CameraPick(server, session)
         self._gizmos: dict[int, CameraGizmo] = {}
-        """The handles in the view of each page that has this tab open, by client id. On another tab a drag that is meant for
-        the view would move the camera."""
+        """The handles in the view of each page that has this tab open, by client id. With another tab open, a drag to move the
+        view would move the camera."""
 
     def unfold(self) -> None:
-        """The tab was opened, perhaps before the task was loaded."""
+        """Handle that the tab was opened, perhaps before the task was loaded."""
         self._session.happen(StudioOpened())
 
     @property
@@ -179,9 +179,9 @@ class StudioPanel(PagePart[SessionView]):
     # --- in the view -------------------------------------------------------------------------------------
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> dict[CameraKey, PlacedFrustum]:
-        """Put the gizmos on the chosen camera; return the place of its frustum.
+        """Draw the gizmos at the chosen camera; returns the pose of its frustum.
 
-        That is its present place, not that of its newest picture, which would lag behind the hand.
+        This is its present pose, not that of its newest picture, which would lag behind the pointer.
 
         Args:
             offset: (3,) of the selected env in the view.
@@ -218,7 +218,7 @@ class StudioPanel(PagePart[SessionView]):
             self._gizmos[page].draw(camera)
 
     def _is_in_eye(self, pose: Floats) -> bool:
-        """Whether a page's viewpoint is at the camera: its frustum, with its picture, would fill that view."""
+        """Whether a page's viewpoint is at the camera, whose frustum, with its picture, would fill that view."""
         near = (
             float(np.linalg.norm(c.camera.position - pose[:3])) for c in self._server.get_clients().values()
         )
@@ -241,7 +241,7 @@ class StudioPanel(PagePart[SessionView]):
         self._picture.draw(view)
         self._pick.draw(view, shown=self._picture.visible)
         for part in self._folders:
-            # Without a camera their controls would do nothing.
+            # Hidden: without a camera their controls would do nothing.
             part.folder.visible = chosen is not None
             part.draw(view)
         if chosen is not None:
@@ -307,7 +307,7 @@ class StudioPanel(PagePart[SessionView]):
         """Buttons for the gizmos (pose or eye and target, axes, steps) and for the picture (modality, size).
 
         Args:
-            several: there is more than one env. Among many the handles are a small knot.
+            several: whether there is more than one env. In a view of many envs the handles are small.
         """
         one = self._view_panel.only_selected
         rows = [
@@ -348,7 +348,7 @@ class StudioPanel(PagePart[SessionView]):
         ]
         return tools_html(*(rows if several else rows[1:]))
 
-    # --- what a person does ------------------------------------------------------------------------------
+    # --- commands ----------------------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
@@ -387,8 +387,8 @@ class StudioPanel(PagePart[SessionView]):
         return self._look.settings_from(client, settings, Frame(None, self._placing.offset))
 
     def _by_key(self, command: Command) -> None:
-        """Move the camera by a key. The arrow keys alone belong to the timeline."""
-        # Not from another tab: nothing there shows that a camera moves.
+        """Move the camera by a key. The arrow keys without modifiers belong to the timeline."""
+        # Only with this tab open: nothing on other tabs shows that a camera moves.
         if self._placing.camera is None or not self._pages():
             raise Refused("Choose a camera in the Studio first.")
         if (step := MOVES.get(type(command))) is not None:
@@ -417,7 +417,7 @@ def _choice(
     """A label and buttons of which one is on.
 
     Args:
-        now: the command of the one that is on.
+        now: the command of the button that is on.
     """
     tools = [Tool(name, one, " ", on=one == now, off=off, style="pill") for name, one in commands.items()]
     return [Label(label, hint), *tools]
@@ -429,8 +429,7 @@ def _placed(camera: StudioCamera) -> CameraSettings:
 
 
 def _took(camera: StudioCamera, view: SessionView) -> str:
-    """How the camera's picture is drawn, and how long that took; empty where the preview has another size than the
-    camera."""
+    """How the camera's picture was drawn and how long that took; empty if the preview has another size than the camera."""
     picture = view.pictures.get(camera.key)
     if picture is None or picture.degree is None or view.of(StudioView).preview_scale != 1.0:
         return ""

@@ -36,15 +36,14 @@ from workbench.pictures.camera_conventions import rotation_matrix, triple
 from workbench.pictures.camera_report import OfferedPlacement
 from workbench.task.description import TaskDescription
 
-ROOM, ROOM_ON_MOUNT = 0.3, 0.1
-"""Distance in metres from the eye to each side of the first box; smaller for a camera on a body, which has to
-carry it."""
-MOST_LINKS = 12
-"""Maximum number of links of an articulation for which each link is offered alone."""
-OF_THE_ROBOT = 4
+BOX_METRES, MOUNTED_BOX_METRES = 0.3, 0.1
+"""Distance from the eye to each side of the initial box; smaller for a mounted camera, which its body has to carry."""
+MAX_LINKS = 12
+"""Maximum number of links of an articulation for which each link is offered separately."""
+FIRST_ROBOT_LINKS = 4
 """Number of a robot's links that are offered at first, those of its hand; the others are offered on demand."""
-LARGEST = 160
-ALIKE = 0.995
+PICTURE_PIXELS = 160
+MIN_PERFECT_SCORE = 0.995
 """Scores of at least this are shown as 1.00."""
 BOX_COLOUR = (230, 73, 128)
 
@@ -57,21 +56,21 @@ Box = tuple[Corner, Corner]
 
 @dataclass(frozen=True)
 class VisibleObject:
-    """An object or link that a suggestion can be asked to see."""
+    """An object or link that suggested placements can be required to see."""
 
     name: str
     label: str
     first: bool
     """Whether it is chosen by default."""
     robot: str = ""
-    """The robot that it is a link of; empty for the task's objects."""
+    """The robot to which the link belongs; empty for the task's objects."""
 
 
 class CameraSuggest(PagePart[SessionView]):
     """The folder in the present container, and the box of the bounds in the 3D view.
 
-    The bounds are two corners of a box in the env's frame, or in that of the body that carries the camera. They are a
-    box around the eye that follows the camera until a person writes into them.
+    The bounds are two corners of a box in the env's frame, or in that of the body that carries the camera. The box is
+    around the eye and follows the camera until the user edits it.
     """
 
     does = (
@@ -86,9 +85,9 @@ class CameraSuggest(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
         self._session = session
         self._wanted: dict[CameraKey, frozenset[str]] = {}
-        """Names of the objects that each camera must see, for cameras for which a person chose them."""
+        """Names of the objects that each camera must see, for cameras for which the user chose them."""
         self._boxes: dict[CameraKey, Box] = {}
-        """Bounds of each camera, for cameras for which a person wrote them."""
+        """Bounds of each camera, for cameras for which the user edited them."""
         self._all_links, self._draws_box, self._resets = False, False, 8
         self._drawn_names: object = None
         gui = server.gui
@@ -160,8 +159,8 @@ class CameraSuggest(PagePart[SessionView]):
         return by_default if key is None else self._wanted.get(key, by_default)
 
     def _box_of(self, camera: StudioCamera, now: CameraSettings) -> Box:
-        """Bounds that a person wrote for this camera, or else a box around its eye."""
-        room = ROOM if camera.info.mount is None else ROOM_ON_MOUNT
+        """The bounds that the user entered for this camera, or a box around its eye."""
+        room = BOX_METRES if camera.info.mount is None else MOUNTED_BOX_METRES
         low, high = (np.round(np.add(now.position, by), 2) for by in (-room, room))
         return self._boxes.get(camera.key, (triple(low), triple(high)))
 
@@ -198,13 +197,13 @@ class CameraSuggest(PagePart[SessionView]):
             return
         self._drawn_names = drawn
         links = [choice for choice in choices if choice.robot]
-        few = [c for i, c in enumerate(links) if i < OF_THE_ROBOT or self._all_links or c.name in chosen]
+        few = [c for i, c in enumerate(links) if i < FIRST_ROBOT_LINKS or self._all_links or c.name in chosen]
         self._objects.content = render(
             "camera_objects",
             objects=[self._pill(choice, chosen) for choice in choices if not choice.robot],
             links=[self._pill(choice, chosen) for choice in few],
             rest=len(links) - len(few),
-            fewer=self._all_links and len(links) > OF_THE_ROBOT,
+            fewer=self._all_links and len(links) > FIRST_ROBOT_LINKS,
             more=ToggleAllLinks(),
         )
 
@@ -219,10 +218,12 @@ class CameraSuggest(PagePart[SessionView]):
         return render(
             "camera_offers",
             new=new,
-            alike=len(offered) > 1 and min(offer.score for offer in offered) >= ALIKE,
+            alike=len(offered) > 1 and min(offer.score for offer in offered) >= MIN_PERFECT_SCORE,
             offers=[
                 {
-                    "picture": "" if offer.picture.rgb is None else data_address(offer.picture.rgb, LARGEST),
+                    "picture": ""
+                    if offer.picture.rgb is None
+                    else data_address(offer.picture.rgb, PICTURE_PIXELS),
                     "of": offer,
                     "taken": now is not None
                     and (offer.settings.position, offer.settings.quaternion)
@@ -257,7 +258,7 @@ def ordered(box: Box) -> Box:
 
 
 def choices_in(view: SessionView) -> tuple[VisibleObject, ...]:
-    """Objects that the chosen camera can be asked to see."""
+    """Objects that the chosen camera can be required to see."""
     key = view.of(StudioView).selected
     return () if view.task is None or key is None else choices_of(view.task, key[0])
 
@@ -265,7 +266,7 @@ def choices_in(view: SessionView) -> tuple[VisibleObject, ...]:
 def choices_of(task: TaskDescription, kind: CameraKind) -> tuple[VisibleObject, ...]:
     """The task's objects, their links, and links of the robots, for a camera of this kind.
 
-    Links of several robots alternate, so that no hand comes last.
+    Links of several robots alternate, so that no robot's hand comes last.
     """
     found: list[VisibleObject] = []
     robots = [thing for thing in task.objects if thing.robot]
@@ -273,7 +274,7 @@ def choices_of(task: TaskDescription, kind: CameraKind) -> tuple[VisibleObject, 
         if thing.robot or (thing.hidden and kind == "sensor"):
             continue
         found.append(VisibleObject(thing.name, thing.name, True))
-        if len(thing.links) <= MOST_LINKS:
+        if len(thing.links) <= MAX_LINKS:
             found += [VisibleObject(name, name, False) for name in thing.links]
     for place in range(max((len(robot.links) for robot in robots), default=0)):
         for robot in robots:
@@ -286,6 +287,6 @@ def choices_of(task: TaskDescription, kind: CameraKind) -> tuple[VisibleObject, 
 
 def box_edges(low: Corner, high: Corner) -> NDArray[np.float32]:
     """(12, 2, 3) the edges of a box."""
-    # A corner's index has a bit for each axis; along an edge one of them changes.
+    # A corner's index has a bit for each axis; along an edge one bit changes.
     pairs = [(i, i ^ bit) for bit in (1, 2, 4) for i in range(8) if i & bit]
     return box_corners(low, high)[np.array(pairs)].astype(np.float32)

@@ -1,4 +1,4 @@
-"""Snapshot of the camera studio, a part of `SessionView`."""
+"""The snapshot of the camera studio, a part of `SessionView`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from workbench.live.process.background_jobs import JobProgress
 
 EditStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
 """``planned``: shown, not written. ``written``: in the file, before its reload. ``checked``: the new env's camera equals the
-edit. ``mismatch``: it does not. ``undone``: taken out of the file."""
+edit. ``mismatch``: it does not. ``undone``: reverted in the file."""
 
 
 Change = Literal["edit", "add", "duplicate", "rename", "remove"]
@@ -33,9 +33,9 @@ class EditRequest:
 
     what: Change
     key: CameraKey
-    """The camera that is changed, copied, renamed or removed, or the one that is added."""
+    """The camera that is changed, copied, renamed, removed or added."""
     settings: CameraSettings | None = None
-    """New settings (its present ones if it is removed); None for its placement at the time of the request."""
+    """New settings (the present ones if it is removed); None for its placement at the time of the request."""
     name: str = ""
     """The new name."""
     about: str = ""
@@ -43,13 +43,13 @@ class EditRequest:
 
     @property
     def result(self) -> CameraKey:
-        """The camera that the file has afterwards."""
+        """Key of the camera in the file after the change."""
         return (self.key[0], self.name) if self.name else self.key
 
 
 @dataclass(frozen=True)
 class StudioCamera:
-    """One camera, as the file has it and as it is placed."""
+    """A camera with its settings in the file and as placed."""
 
     key: CameraKey
     info: CameraInfo
@@ -61,12 +61,12 @@ class StudioCamera:
     mount_pose: NDArray[np.float32] | None
     """(7,) p and wxyz of its mount in the selected env's frame, at the shown moment. None for a camera without a mount."""
     refused: str = ""
-    """Why it cannot be placed, as a sentence; empty if it can."""
+    """Reason why it cannot be placed, as a sentence; empty if it can."""
 
 
 @dataclass(frozen=True)
 class EditState:
-    """State of the edit of the file; there is one at a time."""
+    """State of the edit of the file; there is one edit at a time."""
 
     stage: EditStage = "none"
     request: EditRequest | None = None
@@ -74,15 +74,15 @@ class EditState:
     snippet: str = ""
     """Code for a refused edit, which the author can copy into the file."""
     message: str = ""
-    """One sentence or two: what happened, and what to do next."""
+    """One or two sentences: what happened, and what to do next."""
     can_copy: bool = False
-    """Refused because the file must not be edited, while a copy could be: see `CopyTask`."""
+    """Whether it was refused because the file must not be edited, while a copy could be: see `CopyTask`."""
     picture: Picture | None = None
-    """Preview of a camera that is to be added, once it is drawn."""
+    """Preview of a new camera, once it is drawn."""
     drawing: bool = False
-    """The preview is being drawn."""
+    """Whether the preview is being drawn."""
     loading: bool = False
-    """The file has changed, and that version is not loaded yet."""
+    """Whether the file has changed and that version is not loaded yet."""
 
     @property
     def what(self) -> Change:
@@ -91,12 +91,12 @@ class EditState:
 
 @dataclass(frozen=True)
 class PickedPixel:
-    """What a probed pixel shows."""
+    """Result of probing a pixel."""
 
     key: CameraKey
     env: int
     u: float
-    """0 at the left border, 1 at the right."""
+    """0 at the left edge, 1 at the right."""
     v: float
     """0 at the top."""
     pixel: tuple[int, int]
@@ -124,7 +124,7 @@ class StudioResults:
     """Results of reports so far."""
 
     report: CameraReport | None = None
-    """The newest one."""
+    """The newest report."""
     report_of: CameraKey | None = None
     report_settings: CameraSettings | None = None
     """The camera's settings when it was measured."""
@@ -133,11 +133,11 @@ class StudioResults:
     report_moments: tuple[MeasuredMoment, ...] = ()
     """Moment of each of ``report.envs`` in a report over steps; else empty."""
     outdated: bool = False
-    """The report is of an earlier version."""
+    """Whether the report is of an earlier version."""
     measuring: bool = False
-    """A new report is being made and has no numbers yet."""
+    """Whether a new report is being made and has no numbers yet."""
     suggestions: tuple[OfferedPlacement, ...] = ()
-    """Best first."""
+    """Suggested placements, best first."""
     suggestions_of: CameraKey | None = None
     compared: tuple[Picture, Picture] | None = None
     """The camera as placed, and with the settings of `ComparisonWanted`."""
@@ -156,14 +156,14 @@ class StudioResults:
 
 @dataclass(frozen=True)
 class StudioView:
-    """Immutable; plain data and numpy."""
+    """Immutable snapshot of the studio: plain data and NumPy arrays."""
 
     cameras: tuple[StudioCamera, ...] = ()
     selected: CameraKey | None = None
     was_chosen: bool = False
-    """Whether somebody has chosen a camera, or none."""
+    """Whether the user has made a choice: a camera, or none."""
     undo: str | None = None
-    """What `UndoCamera` would undo, as text (``moved base_camera``); None if there is nothing."""
+    """Text: the change that `UndoCamera` would undo (``moved base_camera``); None if there is nothing."""
     redo: str | None = None
     edit_state: EditState = EditState()
     copies_to: Path = Path()
@@ -210,14 +210,14 @@ class ShownCameras:
     """Names of the ids in a segmentation."""
     env: int = 0
     milliseconds: float | None = None
-    """Render time of the newest picture; None for a recorded one, and for one that was drawn while steps were made."""
+    """Render time of the newest picture; None for a recorded picture, and for one drawn while steps were made."""
     can_render: bool = True
     placed: CameraKey | None = None
     """The camera that is placed by hand."""
     preview: bool = False
-    """Whether the placed camera is shown in another size than its own."""
+    """Whether the placed camera is shown at another size than its own."""
     failed: Mapping[CameraKey, str] = field(default_factory=dict)
-    """Why cameras cannot be drawn, as sentences."""
+    """Cameras that cannot be drawn, with the reason as a sentence."""
     hidden: tuple[str, ...] = ()
     """Bodies that the task hides from its sensors."""
 

@@ -62,13 +62,13 @@ from workbench.task.open import OpenedTask
 from workbench.task.problem import problem_from_exception
 from workbench.task.reference import reference_to_class
 
-_PERIOD = 1 / 15
+_PERIOD_SECONDS = 1 / 15
 _PAUSE_SHARE = 0.3
 """Length of the pause after a round, as a share of the round's time."""
 SIMPLIFYING = "simplified meshes"
 """Name of the thread that makes simplified meshes."""
-_STILL = 0.3
-"""Seconds after the last fast picture until an exact one is drawn, if nothing moves."""
+_EXACT_DELAY_SECONDS = 0.3
+"""Time after the last fast picture until an exact one is drawn, if nothing moves."""
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ class _Begun:
 class WorkerCameras:
     """The cameras of the open task: pictures for the page, placements, and questions.
 
-    All pictures share one scene and one renderer, which works on threads of its own. So before anything else draws or
-    changes the scene, `settle` finishes the picture under way and places the cameras that wait.
+    All pictures share one scene and one renderer, which has its own threads. So before anything else draws or changes the
+    scene, `settle` finishes the current picture and places the waiting cameras.
 
-    A picture takes 25 to 90 ms on a software renderer; drawn in one go between two steps it would halve the step rate. So
-    a picture is begun, steps continue, and it is fetched when it should be ready by the time that the last ones took (see
+    A picture takes 25 to 90 ms on a software renderer; drawn synchronously between two steps it would halve the step rate.
+    So a picture is started, steps continue, and it is fetched when it should be ready, judging by the last ones (see
     `begin_pictures`). Sensors come before human cameras, since the two see different objects and cannot be drawn at once,
-    and each kind is sent as soon as it is ready. At most 15 rounds a second, each with a proportional pause, leave the
-    browser on the same machine its share. A camera that is being dragged is drawn next, alone and without a pause.
+    and each kind is sent as soon as it is ready. At most 15 rounds a second, each with a proportional pause, leave CPU time
+    for a browser on the same machine. A camera that is being dragged is drawn next, alone and without a pause.
     """
 
     def __init__(self, task: GuardedTask, on_first: Callable[[bool], None]) -> None:
@@ -111,7 +111,7 @@ class WorkerCameras:
         """Whether the pictures of the watched cameras are out of date."""
         self._hurried: set[CameraKey] = set()
         self._left: list[tuple[CameraRequest, ...]] = []
-        """Groups of this round that are not begun, one for each kind."""
+        """Groups of this round that are not started yet, one per kind."""
         self._begun: _Begun | None = None
         self._expected: dict[tuple[CameraRequest, ...], float] = {}
         """Expected render time of pictures, in seconds."""
@@ -121,9 +121,9 @@ class WorkerCameras:
         """Whether the loop may block until a picture is ready, because no step is due."""
         self._degree: ShownPictures = "exact"
         self._exact_at: float | None = None
-        """Time at which the shown pictures, which are fast, are drawn exactly; None if the shown pictures are exact."""
+        """Time at which the shown fast pictures are redrawn exactly; None if the shown pictures are exact."""
         self._fast_scene: Any = None
-        """Scene for which `_simplifying` makes, or made, the missing simplified meshes; exact pictures are drawn
+        """Scene for which `_simplifying` makes, or has made, the missing simplified meshes; exact pictures are drawn
         meanwhile."""
         self._may_be_fast = False
         self._simplifying = threading.Thread()
@@ -134,16 +134,16 @@ class WorkerCameras:
     # --- requests ------------------------------------------------------------------------------------
 
     def watch(self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "exact") -> None:
-        # Every `Settings` has it, changed or not.
+        # Every `Settings` contains the cameras, changed or not.
         before, of_degree = self._watched, self._degree
         self._watched, self._degree = (env, cameras), degree
-        # From exact to auto, pictures made or under way stay valid: redrawn, they would be fast for a moment.
+        # From exact to auto, finished and pending pictures stay valid: redrawn, they would be fast for a moment.
         stay = degree == of_degree or (of_degree == "exact" and degree == "auto")
         if before != (env, cameras) or not stay:
             self.update_watched()
 
     def place(self, request: PlaceCamera) -> None:
-        # Not at once: the picture under way is finished first, or a drag faster than the renderer would show none.
+        # Not at once: the current picture is finished first, or a drag faster than the renderer would never show one.
         self._to_place.pop(request.key, None)
         self._to_place[request.key] = request
 
@@ -179,15 +179,15 @@ class WorkerCameras:
         self._task.line.send(PastPictures(request.origin, pictures))
 
     def capture(self, opened: OpenedTask, request: CaptureMoment) -> Captured:
-        """Put the envs back to a past moment and read what the history lacks: env states, observations and pictures.
+        """Restore the envs to a past moment and read data that the history lacks: env states, observations and pictures.
 
         Raises:
-            TaskError: a hook of the author's raised.
+            TaskError: one of the author's hooks raised.
         """
         self.settle()  # the same scene is about to be drawn
         with blamed("restore", opened.loaded, opened.env):
-            # All envs: what the task keeps for the batch, and the process's generators, are restored only with all. No
-            # step follows, so the physics needs no fresh scene.
+            # All envs: the task's state for the whole batch and the process's random generators are restored only with all.
+            # No step follows, so the physics needs no fresh scene.
             opened.env.restore(pickle.loads(request.snapshot), fresh_physics=False)
             columns = read_state_columns(opened.env)
         wanted = recorded_pictures(opened.description.cameras) if request.pictures else ()
@@ -201,10 +201,10 @@ class WorkerCameras:
                 raise CannotAnswer(str(error)) from error
         return Captured(columns, tuple(drawn))
 
-    # --- what the worker does to the scene -----------------------------------------------------------
+    # --- changes of the scene ------------------------------------------------------------------------
 
     def update_watched(self) -> None:
-        """Watch the requested cameras that the version has; call when either may have changed."""
+        """Watch the requested cameras that the version has; call it when either may have changed."""
         self.settle()
         opened = self._task.opened
         if opened is None:
@@ -217,19 +217,19 @@ class WorkerCameras:
         self._exact_at = None
         self._hurried.clear()
         self._expected.clear()
-        self._next_round = 0.0  # a person waits for these
+        self._next_round = 0.0  # the user waits for these
 
     def scene_changed(self) -> None:
         """Mark the pictures as out of date."""
         self._wanted = bool(self._there)
 
     def settle(self) -> None:
-        """Finish the picture under way and place the waiting cameras; call before anything else draws the scene."""
+        """Finish the current picture and place the waiting cameras; call it before anything else draws the scene."""
         self.finish_picture()
         self.place_waiting()
 
     def finish_picture(self) -> None:
-        """Finish the picture under way; call before the envs move."""
+        """Finish the current picture; call it before the envs move."""
         begun, self._begun = self._begun, None
         if begun is not None:
             self._left, self._wanted = [], bool(self._there)
@@ -239,7 +239,7 @@ class WorkerCameras:
                 self.failed(error)
 
     def failed(self, error: CannotDraw) -> None:
-        """Leave out a camera that cannot be drawn, and report it."""
+        """Stop watching a camera that cannot be drawn, and report it."""
         self._begun, self._left = None, []
         self._there = tuple(camera for camera in self._there if camera.key != error.key)
         self._hurried.discard(error.key)
@@ -247,17 +247,17 @@ class WorkerCameras:
         self._task.line.send(CameraFailed(error.key, str(error)))
 
     def put_back(self) -> None:
-        """Place the placed cameras again; call when the scene's cameras may be new ones."""
+        """Place the placed cameras again; call it when the scene's cameras may have been rebuilt."""
         if self._task.opened is not None:
             self._placed.put_back(self._task.opened.env.env)
 
     @property
     def placed(self) -> dict[CameraKey, CameraSettings]:
-        """The cameras that are placed by hand, as they are drawn now."""
+        """The cameras placed by hand, with the settings with which they are drawn."""
         return self._placed.all
 
     def forget_placed(self) -> None:
-        """Forget all placements: the cameras belong to another version."""
+        """Drop all placements, because the cameras belong to another version."""
         self._placed.forget()
 
     # --- called by the loop --------------------------------------------------------------------------
@@ -279,20 +279,20 @@ class WorkerCameras:
         return bool(self._to_place) and self._begun is None
 
     def place_waiting(self) -> None:
-        """Place the cameras that wait. No picture may be under way."""
+        """Place the waiting cameras. No picture may be in progress."""
         wanted, self._to_place = self._to_place, {}
         for request in wanted.values():
             if self._task.opened is not None:
                 self._task.line.send(self._place(self._task.opened, request))
 
     def make(self, may_block: bool) -> None:
-        """Fetch a picture that is ready and begin the next."""
+        """Fetch a picture that is ready and start the next."""
         self._may_block = may_block
         opened, wait = self._task.opened, self.wait(time.monotonic())
         if opened is None or wait is None or wait > 0:
             return
         if not self._renderer_ready and self._begun is None:
-            # The first picture of a process takes longer than those after it: its shaders are compiled.
+            # The first picture of a process takes longer, since its shaders are compiled.
             self._on_first(False)
         self._task.heartbeat.begin("drawing")
         try:
@@ -332,10 +332,10 @@ class WorkerCameras:
         return "fast" if self._has_fast(env.env.scene) else "exact"
 
     def _has_fast(self, scene: Any) -> bool:
-        """Whether fast pictures can be drawn now; begins to make what is missing."""
+        """Whether fast pictures can be drawn now; starts to make missing meshes."""
         if scene is not self._fast_scene:
             self._fast_scene, meshes = scene, list[Mesh]()
-            # A GPU draws the exact ones as fast.
+            # A GPU draws exact pictures as fast.
             self._may_be_fast = (
                 isinstance(scene, BatchedCpuScene) and not scene.sub_scenes[0].render_system.device.is_cuda()
             )
@@ -351,21 +351,21 @@ class WorkerCameras:
         self._begun, asked_at = None, time.monotonic()
         made = begun.pictures.finish()
         done = time.monotonic()
-        # A wait measures how long it took; without one it was ready earlier, so the estimate shrinks.
+        # If we waited, the render time is known; if not, the picture was ready earlier, so the estimate shrinks.
         took, waited = done - begun.at, done - asked_at > 0.004
         self._expected[begun.requested] = (
             min(took, 1.0) if waited else 0.9 * self._expected.get(begun.requested, 0.0)
         )
         if not self._left:
             if self._round_degree == "fast" and self._degree == "auto":
-                self._exact_at = done + _STILL
+                self._exact_at = done + _EXACT_DELAY_SECONDS
             pause = _PAUSE_SHARE * (done - self._round_began)
-            self._next_round = max(self._round_began + _PERIOD, done + pause)
+            self._next_round = max(self._round_began + _PERIOD_SECONDS, done + pause)
         stood_still = begun.number == self._task.steps.number
         return Pictures(made, 1000 * took if stood_still else None, begun.number)
 
     def _begin(self, env: TaskEnv) -> None:
-        """Begin the next group of the round, if there is one."""
+        """Start the next group of the round, if there is one."""
         if self._left:
             requested = self._left.pop(0)
             selected = min(self._watched[0], env.num_envs - 1)
@@ -390,8 +390,8 @@ class WorkerCameras:
         self._task.opened = replace(opened, description=replace(opened.description, cameras=infos))
         self.scene_changed()
         if reshaped and isinstance(env.scene, BatchedCpuScene):
-            env.scene.forget_fast_shapes()  # they were chosen for pictures of another size
-        # A person moves this camera: if it is watched, its picture comes first.
+            env.scene.forget_fast_shapes()  # the simplified shapes are for pictures of another size
+        # The user moves this camera: if it is watched, its picture comes first.
         self._hurried |= {key} & {camera.key for camera in self._there}
         if reshaped and key[0] == "sensor" and opened.env.observes_pictures:
             self._task.guarded(_observe_again)
@@ -407,7 +407,7 @@ def _simplify(meshes: Sequence[Mesh]) -> None:
 
 
 def _observe_again(opened: OpenedTask) -> None:
-    """Renew the observation; without this, a policy would get pictures of the old size."""
+    """Recompute the observation; without this, a policy would get pictures of the old size."""
     with blamed("step", opened.loaded, opened.env):
         opened.env.rescore()
     keep_observation_space(opened.env.env, opened.env.obs)
@@ -416,10 +416,10 @@ def _observe_again(opened: OpenedTask) -> None:
 # --- answers to questions; they leave the env unchanged ---------------------------------------------
 
 
-REPORT_SIDE = 128
-"""Most pixels on the shorter side of a measured picture: an object too small for these is hardly visible."""
-LARGEST_SCALE = 4.0
-_PROGRESS_PERIOD = 0.2
+REPORT_PIXELS = 128
+"""Maximum shorter side of a measured picture: an object too small for it is hardly visible."""
+MAX_SCALE = 4.0
+_PROGRESS_PERIOD_SECONDS = 0.2
 
 
 def answer_question(
@@ -429,11 +429,11 @@ def answer_question(
     on_progress: Callable[[int, int], None],
     cancelled: Callable[[], bool],
 ) -> object:
-    """Answer one question. No picture may be under way.
+    """Answer one question. No picture may be in progress.
 
     Args:
         on_progress: called with done and total during a long search.
-        cancelled: whether to end a search early.
+        cancelled: returns whether to end a search early.
 
     Raises:
         ValueError, IndexError, RuntimeError, TaskError: there is no answer.
@@ -444,17 +444,17 @@ def answer_question(
         return _measure(opened, question)
     if isinstance(question, RunCameras):
         return run_cameras(opened, question)
-    progress = throttled(on_progress, _PROGRESS_PERIOD)
+    progress = throttled(on_progress, _PROGRESS_PERIOD_SECONDS)
     return suggest_cameras(
         opened.env.env, question.space, question.envs, progress=progress, cancelled=cancelled
     )
 
 
 def _draw_temporary(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Picture:
-    """A picture in another size than the camera's, or by a camera that the env does not have."""
+    """A picture at another size than the camera's, or of a camera that the env does not have."""
     settings, scale = question.settings, question.scale
-    if settings is None or not 0 < scale <= LARGEST_SCALE:
-        raise ValueError(f"a picture can have up to {LARGEST_SCALE} times its camera's size, not {scale}")
+    if settings is None or not 0 < scale <= MAX_SCALE:
+        raise ValueError(f"a picture can have up to {MAX_SCALE} times its camera's size, not {scale}")
     size = (max(1, round(settings.width * scale)), max(1, round(settings.height * scale)))
     info = opened.description.camera(question.key)
     placement = Placement(settings, question.key[0], None if info is None else info.mount)
@@ -464,7 +464,7 @@ def _draw_temporary(opened: OpenedTask, placed: PlacedCameras, question: DrawCam
         and settings == info.settings
         and not info.varies
     ):
-        # Where it is, to the last bit: its own quaternion may not be of unit length.
+        # Exactly its present pose: its own quaternion may not be of unit length.
         placement = placement_of(opened.env.env, info.key, question.env)
     picture = picture_of(opened.env.env, question.env, placement, question.poses, size)
     wanted = question.modalities
@@ -496,15 +496,15 @@ def _draw(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Pi
 def _measure(opened: OpenedTask, question: MeasureCamera) -> CameraReport:
     env = opened.env.env
     placement = placement_of(env, question.key, question.env, question.settings)
-    size = small_size(placement.settings.width, placement.settings.height, REPORT_SIDE)
+    size = small_size(placement.settings.width, placement.settings.height, REPORT_PIXELS)
     return measure_placement(env, question.env, placement, question.poses, size)
 
 
-# --- the hooks of another text ---------------------------------------------------------------------
+# --- hooks with another text -----------------------------------------------------------------------
 
 
 def run_cameras(opened: OpenedTask, question: RunCameras) -> HookCameras:
-    """Call the camera hooks on the live env, which has the new text's classes meanwhile.
+    """Call the camera hooks on the live env, which temporarily gets the new text's classes.
 
     Raises:
         TaskError: the text does not load, or a hook fails.
@@ -528,7 +528,7 @@ def run_cameras(opened: OpenedTask, question: RunCameras) -> HookCameras:
 def _with_classes_of(
     env: Any, before: LoadedTask, after: LoadedTask, texts: Mapping[str, str]
 ) -> Iterator[None]:
-    """Give the env and its robots the new text's classes, and the attributes that its constructors set, within this."""
+    """Within this context, give the env and its robots the new text's classes and the attributes that its constructors set."""
     agents = [] if env.agent is None else getattr(env.agent, "agents", [env.agent])
     classes = [(agent, type(agent)) for agent in agents]
     task, kept = maniskill_private.task_class(env), [(owner, dict(vars(owner))) for owner in (env, *agents)]
@@ -552,9 +552,9 @@ def _with_classes_of(
 
 
 def _changed_attributes(before: Mapping[str, str], after: Mapping[str, str], owner: Any) -> dict[str, Any]:
-    """The attributes of an object that the new text sets to another value, with that value.
+    """The attributes of an object for which the new text sets another value, with that value.
 
-    A live env has its attributes from the text that built it, and a camera's pose may depend on one.
+    The attributes of a live env come from the text that built it, and a camera's pose may depend on one.
     """
     old, new = Project(before), Project(after)
     edited = [path for path, text in after.items() if before.get(path) != plain_line_ends(text)]

@@ -1,1 +1,1 @@
-"""The library: all recordings below a folder, as a table."""
+"""The library: a table of all recordings below a folder."""

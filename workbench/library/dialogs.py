@@ -19,28 +19,28 @@ from workbench.page.widgets.notices import tell_all
 from workbench.page.widgets.templates import counted, render, size
 from workbench.page.widgets.tools import Tool, tools_html
 
-MOST_NAMES = 6
+MAX_NAMES = 6
 
 
-MOST_KNOWN = 12
-"""Maximum number of tags in use that are listed."""
+MAX_LISTED_TAGS = 12
+"""Maximum number of listed tags that are in use."""
 
 
 @dataclass(frozen=True)
 class _Question:
-    """A question in a dialog, and what was typed so far."""
+    """A question in a dialog, with the text typed so far."""
 
     dialog: Dialog
     answered: Callable[[str], object]
-    """Does what is asked, given the typed text; blocks. Raises LibraryError."""
+    """Performs the operation with the typed text; blocks. Raises LibraryError."""
     typed: str
 
 
 class LibraryEdits:
-    """Asks for tags, a note or a deletion and does it; one dialog at a time. Used on the loop.
+    """Dialogs for tags, notes and deletion, and their operations; one dialog at a time. Used on the loop.
 
-    A dialog over the page, since a form in the scrolled table would be out of sight. It acts on the recordings that it
-    was opened for, not on those selected by the time of the answer.
+    It is a dialog over the page, since a form in the scrolled table would be out of view. It acts on the recordings for
+    which it was opened, not on those selected when the answer arrives.
     """
 
     def __init__(self, server: viser.ViserServer, library: Library) -> None:
@@ -49,11 +49,11 @@ class LibraryEdits:
         self._disk = BlockingPool("library-edits")
 
     def close(self) -> bool:
-        """Close the dialog; False if there is none."""
+        """Close the dialog; returns False if there is none."""
         return self._question is not None and self._question.dialog.close()
 
     def end(self) -> None:
-        """Close the dialog, and end the thread when the edits that were asked for are done."""
+        """Close the dialog, and end the thread when the requested edits are done."""
         self.close()
         self._disk.end()
 
@@ -73,7 +73,7 @@ class LibraryEdits:
         if len(rows) > 1:
             explained += " Shown are the tags that all of them have; their other tags stay."
         if known:
-            explained += f" In use: {', '.join(known[:MOST_KNOWN])}."
+            explained += f" In use: {', '.join(known[:MAX_LISTED_TAGS])}."
         self._ask("Tags", "", rows, explained, "Save", answered, ", ".join(shared))
 
     def ask_note(self, ids: tuple[str, ...]) -> None:
@@ -134,11 +134,11 @@ class LibraryEdits:
 
         Args:
             do: label of the button that accepts.
-            answered: as in `_Question`; the text is as the page sent it.
-            value: text of the input line, in which Enter accepts too. None: no input, and the accept button is red.
+            answered: see `_Question`; the text is unchecked.
+            value: initial text of the input, in which Enter accepts too. None: no input, and the accept button is red.
         """
         gui, names = self._server.gui, [row.name for row in rows]
-        shown = names if len(names) <= MOST_NAMES else names[: MOST_NAMES - 1]
+        shown = names if len(names) <= MAX_NAMES else names[: MAX_NAMES - 1]
         self.close()
         dialog = Dialog(self._server, title)
         self._question = _Question(dialog, answered, value or "")
@@ -160,12 +160,12 @@ class LibraryEdits:
             gui.add_html(tools_html([Tool(do, AnswerDialog(), tone=tone), Tool("Cancel", CloseDialog())]))
 
     def type(self, text: str) -> None:
-        """Store the text that is typed into the question so far."""
+        """Store the text typed so far."""
         if self._question is not None:
             self._question = replace(self._question, typed=text)
 
     def answer(self) -> None:
-        """Do what the question asks; only the first answer counts."""
+        """Perform the operation; only the first answer counts."""
         question = self._question
         if question is not None and self.close():
             begin(self._do(lambda: question.answered(question.typed)))
@@ -175,7 +175,7 @@ class LibraryEdits:
         return [row for row in rows if row is not None]
 
     async def _do(self, work: Callable[[], object]) -> None:
-        """Do the work after the one before. A LibraryError is shown on every page."""
+        """Do the work after all earlier work. A LibraryError is shown on every page."""
         try:
             await self._disk.run(work)
         except LibraryError as error:

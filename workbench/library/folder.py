@@ -1,4 +1,4 @@
-"""The library: every recording below one folder, as a table that follows the folder."""
+"""The library: a table of every recording below one folder, kept up to date with the folder."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from workbench.machine.processes.watched_thread import watched_thread
 
 log = logging.getLogger(__name__)
 
-_MOST_PLACES = 64
-"""Most subfolders that are searched for jobs."""
+_MAX_FOLDERS = 64
+"""Maximum number of subfolders that are searched for jobs."""
 
 SCAN_SECONDS = 1.0
-"""Seconds between two checks of the folders' times."""
-LONGEST_PAUSE = 5.0
+"""Interval of checks of the folders' times."""
+MAX_PAUSE_SECONDS = 5.0
 FULL_SCAN_SECONDS = 30.0
-"""Seconds between two checks of every file: writing a file in place does not change its folder's time."""
+"""Interval of checks of every file: writing a file in place does not change its folder's time."""
 PUBLISH_SECONDS = 0.3
-"""Seconds between two updates of the table while files are being read."""
+"""Interval of updates of the table while files are being read."""
 
 
 class LibraryError(OSError):
-    """An operation on recordings failed; the message says what to do."""
+    """An operation on recordings failed; the message includes the remedy."""
 
 
 @dataclass(frozen=True)
@@ -53,41 +53,41 @@ class LibraryView:
     serial: int = 0
     """Increases with each change."""
     rows: tuple[LibraryRow, ...] = ()
-    """By name."""
+    """Rows, sorted by name."""
     reading: tuple[int, int] | None = None
-    """Files read and files to read, while reading; (0, 0) before they are counted."""
+    """Numbers of files read and to read, while reading; (0, 0) before they are counted."""
     problem: str | None = None
-    """A sentence, if the folder cannot be listed."""
+    """Why the folder cannot be listed, as a sentence; None if it can."""
     trash: Trash = Trash()
     jobs: tuple[JobStatus, ...] = ()
-    """Jobs that record into the folder, or have until a while ago."""
+    """Jobs that record into the folder, or did so recently."""
     sweep: tuple[int, int] | None = None
-    """Bytes and mtime in ns of the file with the results of a sweep; None if the folder has none."""
+    """Bytes and mtime in ns of the file with a sweep's results; None if the folder has none."""
 
 
 class Library:
     """The recordings in a folder and the folders below it.
 
-    The files are the only truth: people and other processes move, copy and delete them. Rows come from an index at
-    once; then names, sizes and times are compared, and files that differ are read on a thread (`watch`), the newest
-    first. Tags, notes and deletion change the files.
+    The files are the source of truth: users and other processes move, copy and delete them. Rows are first loaded from an
+    index; then names, sizes and times are compared, and files that differ are read on a thread (`watch`), newest first.
+    Tags, notes and deletion change the files.
 
-    A page sends only ids. They are looked up here, and paths come from the row.
+    A page sends only ids, which are looked up here; paths come from the rows.
 
     Args:
-        folder: may not exist yet. Only tags, notes and the trash are written into it.
+        folder: need not exist yet. Only tags, notes and the trash are written into it.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder).absolute()
         self._looking = threading.Lock()
-        """Held while the folder is scanned."""
+        """Lock held while the folder is scanned."""
         self._changing = threading.RLock()
-        """Held while `_kept` is changed, but not while files are read."""
+        """Lock held while `_kept` is changed, but not while files are read."""
         self._changed = threading.Lock()
         self._view = LibraryView(reading=(0, 0), sweep=self._sweep())
         self.on_change: set[Callable[[], None]] = set()
-        """Called when the view has changed, on the thread that changed it."""
+        """Callbacks for a change of the view, called on the thread that changed it."""
         self._by_id: dict[str, LibraryRow] = {}
         self._scan = Scan(fresh=True)
         self._full_scan_at = -1e9
@@ -103,11 +103,11 @@ class Library:
         return self._view
 
     def row(self, id: str) -> LibraryRow | None:
-        """None if the id is not in the table."""
+        """The row with this id; None if there is none."""
         return self._by_id.get(id)
 
     def thumbnails(self, ids: Sequence[str]) -> dict[str, bytes]:
-        """JPEGs by id; recordings without one are left out. An export without pictures has that of its recording."""
+        """JPEGs by id; recordings without one are left out. An export without pictures uses that of its recording."""
         by_id, index = self._by_id, self._index
         wanted = {id: [by_id[id], by_id.get(by_id[id].copy_of)] for id in ids if id in by_id}
         places = [row.place for rows in wanted.values() for row in rows if row is not None]
@@ -118,7 +118,7 @@ class Library:
         }
         return {id: jpeg for id, jpeg in found.items() if jpeg is not None}
 
-    # --- keeping up with the folder ------------------------------------------------------------------
+    # --- following the folder ------------------------------------------------------------------------
 
     def watch(self) -> None:
         """Keep the table up to date on a thread, until `close`."""
@@ -128,7 +128,7 @@ class Library:
         self._thread.start()
 
     def request_scan(self) -> None:
-        """Have the watching thread check every file now."""
+        """Make the watching thread check every file now."""
         self._scan_requested.set()
 
     def close(self) -> None:
@@ -143,9 +143,9 @@ class Library:
                 self._index = None
 
     def _places(self) -> list[Path]:
-        """Folders below this one with recordings, those that were written to last."""
+        """The most recently written folders with recordings below this one."""
         newest = sorted(self.view().rows, key=lambda row: -(row.written or 0.0))
-        return list(dict.fromkeys(row.paths[0].parent for row in newest if row.paths))[:_MOST_PLACES]
+        return list(dict.fromkeys(row.paths[0].parent for row in newest if row.paths))[:_MAX_FOLDERS]
 
     def _watch(self) -> None:
         while not self._stopping.is_set():
@@ -154,12 +154,14 @@ class Library:
                 self.refresh(thorough=self._scan_requested.is_set())
                 self._publish(jobs=read_jobs(self.folder, time.time(), self._places()))
             except Exception:
-                # If the thread ended, the table would never change again.
+                # The thread must not end, or the table would never change again.
                 log.exception("The library in %s could not be read; trying again.", self.folder)
                 self._publish(problem="The library could not be read. The reason is in the terminal.")
             self._scan_requested.clear()
-            # Scan at most a tenth of the time: a huge folder that is written to would keep the thread busy.
-            self._scan_requested.wait(min(max(SCAN_SECONDS, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
+            # Spend at most a tenth of the time on scans: a huge folder that is written to would keep the thread busy.
+            self._scan_requested.wait(
+                min(max(SCAN_SECONDS, 9 * (time.monotonic() - began)), MAX_PAUSE_SECONDS)
+            )
 
     def refresh(self, thorough: bool = True) -> None:
         """Read the files that changed since the last call.
@@ -175,15 +177,15 @@ class Library:
                 if self._index is None and self.folder.is_dir() and not self._stopping.is_set():
                     self._index = LibraryIndex(self.folder)
                 if self._view.serial == 0 and self._kept:
-                    # Rows of the index, shown until the files are checked.
+                    # Show the rows of the index until the files are checked.
                     self._show(reading=(0, 0))
             self._full_scan_at = time.monotonic()
             scan = scan_folder(self.folder)
-            self._scan = replace(scan, found={})  # `_kept` has the files that were read
+            self._scan = replace(scan, found={})  # `_kept` has the read files
             self._read_changed(scan)
 
     def _read_changed(self, scan: Scan, only: Collection[str] | None = None) -> None:
-        """Read changed files; with `only`, of these keys alone, to show the result of an operation at once."""
+        """Read changed files; with `only`, just those of these keys, to show the result of an operation at once."""
         with self._changing:
             before = self._view.reading
             changed = [
@@ -194,7 +196,7 @@ class Library:
             gone = {key for key in self._kept if key not in scan.found and (only is None or key in only)}
             for key in gone:
                 del self._kept[key]
-            # After an incomplete scan a missing file may exist: the index keeps it.
+            # After an incomplete scan a missing file may still exist: the index keeps it.
             forgotten = [] if scan.problem else sorted(gone)
         changed.sort(key=lambda found: found.newest, reverse=True)
         unsaved: list[tuple[RecordingFiles, list[LibraryEntry]]] = []
@@ -204,7 +206,7 @@ class Library:
                 break
             with self._changing:
                 if not os.path.lexists(found.paths(self.folder)[0]):
-                    continue  # deleted meanwhile
+                    continue  # the file was deleted meanwhile
                 self._kept[found.key] = IndexedFiles(found, tuple(facts for facts, _ in entries))
                 unsaved.append((found, entries))
                 if time.monotonic() - published > PUBLISH_SECONDS:
@@ -231,12 +233,12 @@ class Library:
     def _row(self, found: RecordingFiles, number: int, facts: Facts, taken: Collection[str]) -> LibraryRow:
         id = facts.uid if facts.uid.isalnum() and facts.uid.isascii() else ""
         if not id or id in taken:
-            # No id of its own, or a copy of another row's recording.
+            # The recording has no id, or is a copy of another row's recording.
             where = f"{found.key}#{facts.trajectory or ''}"
             id = f"at-{hashlib.blake2b(where.encode(errors='surrogateescape'), digest_size=10).hexdigest()}"
         name = found.key.removesuffix("/meta/info") if facts.kind == "lerobot" else found.key
         name += "" if facts.trajectory is None else f"#{facts.trajectory}"
-        # A file's name may hold invalid UTF-8, which cannot be sent to a page.
+        # A file name may contain invalid UTF-8, which cannot be sent to a page.
         name, place = clean_text(name, 400), (found.key, number)
         paths, size = found.paths(self.folder), sum(found.sizes.values())
         return LibraryRow(**vars(facts), id=id, name=name, place=place, paths=paths, size=size)
@@ -266,7 +268,7 @@ class Library:
         """Add tags to recordings and remove tags.
 
         Raises:
-            LibraryError: a file cannot be written; the recordings before it have been changed.
+            LibraryError: a file cannot be written; earlier recordings have been changed.
         """
         add, without = clean_tags(tuple(add)), set(clean_tags(tuple(remove)))
         self._annotate(
@@ -274,7 +276,7 @@ class Library:
         )
 
     def set_note(self, ids: Iterable[str], note: str) -> None:
-        """Set the note of recordings; an empty one removes it. Raises as `set_tags`."""
+        """Set the note of recordings; an empty one removes it. Raises like `set_tags`."""
         note = clean_note(note)
         self._annotate(ids, lambda facts: (facts.tags, note))
 
@@ -303,11 +305,11 @@ class Library:
                 self._read_changed(scan_folder(self.folder), touched)
 
     def delete(self, ids: Iterable[str]) -> str:
-        """Move all files of these recordings to the trash; returns the name of the deletion, for `undo_delete`.
+        """Move all files of these recordings to the trash; returns the name of the deletion for `undo_delete`.
 
         Raises:
-            LibraryError: a file holds other recordings too, and nothing was moved; or a file could not be moved, and the
-                recordings before it were.
+            LibraryError: a file contains other recordings too, and nothing was moved; or a file could not be moved, after
+                earlier recordings were.
         """
         with self._changing:
             keys = self._keys_to_delete(ids)
@@ -323,7 +325,7 @@ class Library:
             return batch
 
     def check_delete(self, ids: Iterable[str]) -> None:
-        """Raises LibraryError if `delete` would refuse these recordings. Waits for nothing."""
+        """Raise LibraryError if `delete` would refuse these recordings. Does not block."""
         self._keys_to_delete(ids)
 
     def _keys_to_delete(self, ids: Iterable[str]) -> set[str]:
@@ -347,7 +349,7 @@ class Library:
         """Restore the files of the last deletion.
 
         Raises:
-            LibraryError: there is none, or a file could not be restored.
+            LibraryError: there is no deletion, or a file could not be restored.
         """
         with self._changing:
             batches = read_trash(self.folder).batches

@@ -1,4 +1,4 @@
-"""A cache of a library's rows and thumbnails, in SQLite."""
+"""SQLite cache of a library's rows and thumbnails."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from workbench.machine.folders import cache_folder
 log = logging.getLogger(__name__)
 
 VERSION = 6
-"""Increase it when the content or the format of rows changes; each version has its own file."""
+"""Increase this when the content or the format of rows changes; each version has its own file."""
 LOCKED_SECONDS = 3.0
-MOST_INDICES = 200
-"""Indices that are kept."""
+MAX_INDICES = 200
+"""Maximum number of indices that are kept."""
 _ROWS = msgspec.msgpack.Decoder(tuple[dict[str, int], dict[str, int], list[Facts]])
 """Sizes and times of the files, and their rows."""
 _JPEGS = msgspec.msgpack.Decoder(list[bytes | None])
@@ -35,21 +35,21 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class IndexedFiles:
-    """The rows of the files of one name, and the sizes and times at which they were read."""
+    """The rows of the files of one recording name, with the files' sizes and times when they were read."""
 
     found: RecordingFiles
     rows: tuple[Facts, ...]
 
 
 class LibraryIndex:
-    """The index of one folder; thread-safe. Its methods do not fail.
+    """The index of one folder. Thread-safe; its methods do not fail.
 
-    Everything in it can be read again from the files, so a broken index is deleted, and a process that finds it locked
-    for `LOCKED_SECONDS` continues without it. SQLite survives two processes at once and being killed.
+    All its content can be read again from the files, so a broken index is deleted, and a process that finds it locked for
+    `LOCKED_SECONDS` continues without it. SQLite survives concurrent processes and kills.
 
-    It is in the user's cache folder, or in memory if that is not writable. Not in the library's folder: a folder from
-    elsewhere could bring an index along that is a link to another program's database, or that has a journal naming
-    files to delete.
+    It is in the user's cache folder, or in memory if that is not writable. It is not in the library's folder: a foreign
+    folder could contain an index that is a link to another program's database, or that has a journal naming files to
+    delete.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -59,7 +59,7 @@ class LibraryIndex:
         _remove_oldest(self._path)
 
     def load(self) -> dict[str, IndexedFiles]:
-        """Everything in it, by key."""
+        """All its content by key."""
 
         def read(database: sqlite3.Connection) -> dict[str, IndexedFiles]:
             kept = {}
@@ -74,7 +74,7 @@ class LibraryIndex:
     def store(
         self, read: Collection[tuple[RecordingFiles, Sequence[LibraryEntry]]], gone: Collection[str] = ()
     ) -> None:
-        """Store what was read, and delete the keys that are `gone`."""
+        """Store read files and delete the keys in `gone`."""
 
         def write(database: sqlite3.Connection) -> None:
             for found, entries in read:
@@ -90,7 +90,7 @@ class LibraryIndex:
         self._do(write, None)
 
     def thumbnails(self, places: Collection[tuple[str, int]]) -> dict[tuple[str, int], bytes]:
-        """JPEGs of these rows, each a key and the number of the row in its files; rows without one are left out."""
+        """JPEGs of these rows, each given as key and row number in its files; rows without one are left out."""
 
         def read(database: sqlite3.Connection) -> dict[tuple[str, int], bytes]:
             found = {}
@@ -109,8 +109,8 @@ class LibraryIndex:
                 self._database = None
 
     def _do(self, work: Callable[[sqlite3.Connection], T], default: T) -> T:
-        """Run `work`; `default` when another process holds the file or the file is broken. A broken one is replaced, which
-        does not harm another process that has it open."""
+        """Run `work`; returns `default` if another process has locked the file or the file is broken. A broken file is
+        replaced, which does not harm another process that has it open."""
         with self._lock:
             if self._database is None:
                 return default
@@ -118,7 +118,7 @@ class LibraryIndex:
                 with self._database:
                     return work(self._database)
             except (sqlite3.Error, msgspec.MsgspecError, ValueError, TypeError) as error:
-                # Python's own errors have no code. The low byte is the error, the rest its variant.
+                # Python's own errors have no code. The low byte is the primary error code, the rest its variant.
                 code = getattr(error, "sqlite_errorcode", None) or 0
                 if code & 0xFF not in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
                     log.info("The index of the library is rebuilt: %s", error)
@@ -154,7 +154,7 @@ def _connect(name: str) -> sqlite3.Connection:
         with database:
             for table in _TABLES:
                 database.execute(f"CREATE TABLE IF NOT EXISTS {table}")
-            # A read-only folder fails only here.
+            # A read-only folder is detected only here.
             database.execute("DELETE FROM read WHERE key = ''")
     except sqlite3.Error:
         database.close()
@@ -163,13 +163,13 @@ def _connect(name: str) -> sqlite3.Connection:
 
 
 def _remove_oldest(path: Path) -> None:
-    """Delete the least recently used indices beyond `MOST_INDICES`."""
+    """Delete the least recently used indices beyond `MAX_INDICES`."""
     try:
         os.utime(path)
         indices = sorted(path.parent.glob("*.sqlite"), key=lambda index: index.stat().st_mtime)
     except OSError:
         return  # missing, or another process is deleting
-    for index in indices[:-MOST_INDICES]:
+    for index in indices[:-MAX_INDICES]:
         _remove(index)
 
 

@@ -1,4 +1,4 @@
-"""Progress of a job that records into a folder: the command writes it there, and a library of the folder shows it."""
+"""Status files of jobs that record into a folder: the command writes them there, and the folder's library shows them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from workbench.episodes.row import clean_text
 from workbench.machine.files import read_regular_file, replace_file
 
 _PREFIX, _SUFFIX = ".job-", ".status"
-_MOST_BYTES = 1 << 18
-_MOST = 64
-"""Most status files that are read: a job in 64 parts has as many."""
+_MAX_BYTES = 1 << 18
+_MAX_FILES = 64
+"""Maximum number of status files that are read: a job in 64 parts has as many."""
 _WRITE_SECONDS = 1.0
 SILENT_SECONDS = 20.0
-"""A job whose status is older than this counts as dead."""
+"""Age of the last status after which a job counts as dead."""
 _KEPT_SECONDS = 3600.0
-"""How long the last status of a job is shown."""
-_MOST_FAILURES = 5
+"""Time for which the last status of a job is shown."""
+_MAX_FAILURES = 5
 
 JobState = Literal["running", "done", "stopped", "failed"]
 
@@ -49,17 +49,17 @@ class JobStatus:
     task: str
     done: int
     total: int
-    """Requested episodes; `done` of them are over."""
+    """Number of requested episodes; `done` of them have ended."""
     rate: float = 0.0
-    """Episodes a second since it began; 0 if unknown."""
+    """Episodes per second since the job began; 0 if unknown."""
     failures: tuple[JobFailure, ...] = ()
     state: JobState = "running"
     part: str = ""
-    """Which part of a divided job it is, for example ``3/64``; empty if the job is not divided."""
+    """Part of a divided job, for example ``3/64``; empty if the job is not divided."""
     written_at: float = 0.0
-    """Seconds since 1970."""
+    """Unix time in seconds."""
     place: str = ""
-    """Where it records, below the folder of the library; the reader fills it in."""
+    """Folder into which it records, below the folder of the library; set by the reader."""
 
     @property
     def failed(self) -> int:
@@ -71,12 +71,12 @@ class JobStatus:
         return left / self.rate if self.state == "running" and self.rate > 0 else None
 
     def is_silent(self, now: float) -> bool:
-        """Whether the job stopped reporting progress."""
+        """Whether the job ended without a last status."""
         return self.state == "running" and now - self.written_at > SILENT_SECONDS
 
 
 class StatusFile:
-    """Writes how far a job is, at most once a second. What cannot be written is left out: it must not end the job."""
+    """Writes a job's status, at most once a second. Errors of writing are ignored: they must not end the job."""
 
     def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
         self._folder, self._clock = folder.absolute(), clock
@@ -84,7 +84,7 @@ class StatusFile:
         self._written_at = 0.0
 
     def is_due(self) -> bool:
-        """Whether the last word of a running job is old enough for another one."""
+        """Whether the last status of a running job is old enough to be replaced."""
         return self._clock() - self._written_at >= _WRITE_SECONDS
 
     def write(self, status: JobStatus) -> None:
@@ -98,33 +98,33 @@ class StatusFile:
             replace_file(self._path, msgspec.json.encode(replace(status, written_at=now)))
 
     def remove_old(self, status: JobStatus) -> None:
-        """Remove what jobs of an earlier hour left, and the last word of earlier runs of this one."""
+        """Remove status files of jobs older than an hour, and the last status of earlier runs of this job."""
         now = self._clock()
         mine = (status.command, status.task, status.part)
-        for path in sorted(self._folder.glob(f"{_PREFIX}*{_SUFFIX}"))[: 10 * _MOST]:
+        for path in sorted(self._folder.glob(f"{_PREFIX}*{_SUFFIX}"))[: 10 * _MAX_FILES]:
             with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeError):
                 if now - path.stat().st_mtime > _KEPT_SECONDS:
                     path.unlink()
                     continue
-                there = msgspec.json.decode(read_regular_file(path, _MOST_BYTES), type=JobStatus)
+                there = msgspec.json.decode(read_regular_file(path, _MAX_BYTES), type=JobStatus)
                 over = there.state != "running" or there.is_silent(now)
                 if over and (there.command, there.task, there.part) == mine:
                     path.unlink()
 
 
 def read_jobs(folder: Path, now: float, below: Iterable[Path] = ()) -> tuple[JobStatus, ...]:
-    """The jobs of a folder that are running, or ended within the last hour; the last word first. The files may be anybody's:
-    what is no status is passed over, and texts are cleaned.
+    """The jobs of a folder that run or ended within the last hour, newest status first. The files are untrusted: invalid ones
+    are skipped, and texts are cleaned.
 
     Args:
-        below: further folders, in it.
+        below: further folders inside it.
     """
     found: list[JobStatus] = []
     for place in dict.fromkeys((folder, *below)):
         with contextlib.suppress(OSError):
-            for path in sorted(place.glob(f"{_PREFIX}*{_SUFFIX}"))[:_MOST]:
+            for path in sorted(place.glob(f"{_PREFIX}*{_SUFFIX}"))[:_MAX_FILES]:
                 with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeError):
-                    status = msgspec.json.decode(read_regular_file(path, _MOST_BYTES), type=JobStatus)
+                    status = msgspec.json.decode(read_regular_file(path, _MAX_BYTES), type=JobStatus)
                     if 0 <= now - status.written_at < _KEPT_SECONDS:
                         where = "" if place == folder else str(place.relative_to(folder))
                         found.append(_cleaned(replace(status, place=where)))
@@ -143,12 +143,12 @@ def _cleaned(status: JobStatus) -> JobStatus:
                 clean_text(one.items, 200),
                 max(one.count, 0),
                 clean_text(one.message, 500),
-                # Not the spaces before a line, which say what belongs to what.
+                # Keep the indentation of lines, which shows their structure.
                 "\n".join(
                     line[: len(line) - len(line.lstrip(" "))][:40] + clean_text(line, 300)
                     for line in one.traceback.splitlines()[:200]
                 ),
             )
-            for one in status.failures[:_MOST_FAILURES]
+            for one in status.failures[:_MAX_FAILURES]
         ),
     )

@@ -11,10 +11,9 @@ from workbench.library.rows import Column, Outcome, begins_descending, chosen, o
 from workbench.page.command import Command
 from workbench.page.widgets.paged import Paged
 
-MOST_ROWS = 50
-"""Rows of one page of the table."""
-LONGEST_WORDS = 200
-_FIRST_PAGE = Paged(MOST_ROWS)
+ROWS_PER_PAGE = 50
+MAX_SEARCH_CHARACTERS = 200
+_FIRST_PAGE = Paged(ROWS_PER_PAGE)
 DOES: tuple[type[Command], ...] = (
     commands.PressRow,
     commands.OpenRow,
@@ -33,12 +32,12 @@ DOES: tuple[type[Command], ...] = (
     commands.LookForRows,
     commands.ClearRowFilter,
 )
-"""Commands that `apply` takes; any other only drops what is not there."""
+"""Commands that `apply` handles; any other one only drops rows that no longer exist."""
 
 
 @dataclass(frozen=True)
 class RowArrangement:
-    """Which rows are listed, and in what order."""
+    """Filter and order of the listed rows."""
 
     column: Column = "date"
     descending: bool = True
@@ -47,16 +46,16 @@ class RowArrangement:
     task: str | None = None
 
     def of(self, rows: tuple[LibraryRow, ...]) -> tuple[LibraryRow, ...]:
-        """The listed ones of these rows, in order."""
+        """The rows that pass the filter, in order."""
         return tuple(ordered(chosen(rows, self.words, self.outcome, self.task), self.column, self.descending))
 
 
 @dataclass(frozen=True)
 class LibraryList:
-    """What a person chose in the list.
+    """The user's choices in the list.
 
-    Selection works as in a file manager: a press selects one row, control toggles it, shift selects all from the last
-    one on. Rows that are not listed are not selected, or a deletion would take what a filter hides.
+    Selection works like in a file manager: a press selects one row, ctrl toggles it, shift selects a range from the last
+    one. Rows that are not listed are not selected, or a deletion would include rows that a filter hides.
     """
 
     arrangement: RowArrangement = RowArrangement()
@@ -64,24 +63,24 @@ class LibraryList:
     selected: frozenset[str] = frozenset()
     """Ids of the selected rows."""
     cursor: str | None = None
-    """Id of the row that was pressed or moved to last."""
+    """Id of the row that was last pressed or reached by keys."""
     follow: bool = False
-    """Whether browsers scroll to the cursor: after keys, which may leave the visible rows."""
+    """Whether browsers scroll to the cursor: after a key, which may leave the visible rows."""
     anchor: str | None = None
     """Id of the row from which shift selects."""
     place: int = 0
-    """Row number of the cursor when it was set; the cursor goes there when its row is deleted."""
+    """Row number of the cursor when it was set; the cursor stays there if its row is deleted."""
 
 
 @dataclass(frozen=True, eq=False)
 class Listing:
-    """A list over the rows that the library has at one moment: what is drawn, and what a command applies to."""
+    """The list for the library's rows at one moment; it is drawn, and commands apply to it."""
 
     library: tuple[LibraryRow, ...]
     """All rows of the library."""
     wanted: LibraryList
     list: LibraryList
-    """As `wanted`, without what is not there: rows that are not listed, and a task without recordings."""
+    """The choices without rows that are not listed and without a task that has no recordings."""
     rows: tuple[LibraryRow, ...]
     """The listed rows, in order."""
 
@@ -105,7 +104,7 @@ def make_listing(
 
     Args:
         library: all rows of the library.
-        before: an earlier listing; what has not changed since is not computed again.
+        before: an earlier listing; unchanged parts are reused.
     """
     if before is not None and before.library is not library:
         before = None
@@ -157,8 +156,8 @@ def apply(listing: Listing, command: Command) -> LibraryList:
             return _arrange(listed, replace(arranged, column=column, descending=down))
         case commands.FilterRows(outcome=outcome):
             return _arrange(listed, replace(arranged, outcome=outcome))
-        case commands.LookForRows(words=words) if words[:LONGEST_WORDS] != arranged.words:
-            return _arrange(listed, replace(arranged, words=words[:LONGEST_WORDS]))
+        case commands.LookForRows(words=words) if words[:MAX_SEARCH_CHARACTERS] != arranged.words:
+            return _arrange(listed, replace(arranged, words=words[:MAX_SEARCH_CHARACTERS]))
         case commands.FilterTask(task=task) if task != arranged.task:
             return _arrange(listed, replace(arranged, task=task))
         case commands.ClearRowFilter():
@@ -172,7 +171,7 @@ def _arrange(listed: LibraryList, arrangement: RowArrangement) -> LibraryList:
 
 
 def _press(listing: Listing, id: str, toggle: bool = False, to_anchor: bool = False) -> LibraryList:
-    """Press this row; nothing if it is not listed."""
+    """Press this row; no effect if it is not listed."""
     ids = [row.id for row in listing.rows]
     if id not in ids:
         return listing.list
@@ -180,7 +179,7 @@ def _press(listing: Listing, id: str, toggle: bool = False, to_anchor: bool = Fa
 
 
 def _move(listing: Listing, by: int, to_anchor: bool = False) -> LibraryList:
-    """Move the cursor as an arrow key does, from its row or from where it last was."""
+    """Move the cursor by an arrow key, from its row or its last position."""
     listed, ids = listing.list, [row.id for row in listing.rows]
     if not ids:
         return listed
@@ -196,8 +195,8 @@ def _take(listed: LibraryList, ids: list[str], place: int, toggle: bool, to_anch
     """Put the cursor on a row and select it.
 
     Args:
-        ids: of the listed rows.
-        toggle: also keep what is selected; the row itself is deselected if it was selected.
+        ids: ids of the listed rows.
+        toggle: keep the selection; the row itself is deselected if it was selected.
         to_anchor: select all rows from the anchor to this one.
     """
     id = ids[place]
@@ -220,6 +219,6 @@ class Action:
     most: int | None = None
     """Maximum number of recordings at once; None for any number."""
     reads: bool = True
-    """Whether it reads the recordings; False for what also applies to files that cannot be read."""
+    """Whether it reads the recordings; False if it also applies to files that cannot be read."""
     salvages: bool = False
     """Whether it uses the readable part of a damaged recording."""

@@ -58,26 +58,26 @@ from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
 
-MOST_JOBS = 6
+MAX_JOBS = 6
 """Maximum number of jobs that are shown at once."""
-MOST_OPEN = 4
+MAX_SIDE_BY_SIDE = 4
 """Maximum number of recordings that a review shows at once."""
 ALL_TASKS = "all tasks"
 LIST = (*DOES, UndoDelete, EmptyTrash, TypeAnswer, AnswerDialog)
-"""Commands that the list itself carries out."""
+"""Commands of the list itself."""
 
 
 class LibraryPanel(PagePart[object]):
     """The table in the present container, the same for all open pages.
 
-    A page of rows with pictures is 150 KB, and the selection changes with every press: so the selection is a style
-    sheet of its own that marks rows by their numbers, and only that is sent. A row keeps its number for as long as the
-    page lives: a press selects the pressed row even if the table has moved meanwhile.
+    A page of rows with pictures has 150 KB, and the selection changes with every press, so the selection is a separate style
+    sheet that marks rows by their numbers, and only that is sent. A row keeps its number as long as the page exists, so a
+    press selects the pressed row even if the table has moved meanwhile.
 
-    Thumbnails are read on a thread of their own when the rows of the shown page change; rows are shown before theirs come.
+    Thumbnails are read on a separate thread when the rows of the shown page change; rows are shown before their thumbnails.
 
     Args:
-        on_open: gets the ids of one to `MOST_OPEN` recordings, in the order of the table.
+        on_open: gets the ids of one to `MAX_SIDE_BY_SIDE` recordings, in the order of the table.
             Called on the loop, and must not block.
     """
 
@@ -92,7 +92,7 @@ class LibraryPanel(PagePart[object]):
         self._folder = os.fsencode(library.folder).decode(errors="replace")
         self._list = LibraryList()
         self._listed: Listing | None = None
-        """The latest listing; only saves computing it again."""
+        """Cache: the last listing."""
         self._edits = LibraryEdits(server, library)
         self._actions: tuple[Action, ...] = (
             Action(
@@ -100,7 +100,7 @@ class LibraryPanel(PagePart[object]):
                 OpenSelected(),
                 "Open it in the review (Enter, or double-click)",
                 on_open,
-                MOST_OPEN,
+                MAX_SIDE_BY_SIDE,
                 salvages=True,
             ),
             Action("Tag", TagSelected(), "Add or remove tags (T)", self._edits.ask_tags, reads=False),
@@ -134,21 +134,21 @@ class LibraryPanel(PagePart[object]):
         self._disk = BlockingPool("thumbnails")
         self._reading: asyncio.Task[None] | None = None
         self._pictured: tuple[LibraryRow, ...] = ()
-        """Rows whose thumbnails are read, or were read last."""
+        """Rows whose thumbnails are being read or were read last."""
         self._thumbnails: Mapping[str, bytes | None] = {}
-        """JPEGs by ids of rows; None for a recording without one. A row that is not here has not been read yet."""
+        """JPEGs by row id; None for a recording without one. A missing row has not been read yet."""
         library.on_change.add(self._library_changed)
         self._library_changed()
 
         self._number_of: dict[str, int] = {}
-        """Number of each recording's row, from 1 on, in the order of arrival."""
+        """Number of each recording's row, from 1, in order of arrival."""
         self._drawn: object = None
         self._jobs_drawn: object = None
         self._filters_drawn: object = None
-        """Key of the data that the filters were counted for: with thousands of rows, counting takes long."""
+        """Key of the data for which the filters were counted: with thousands of rows, counting takes long."""
         self._table_drawn: object = None
 
-    # --- for the page that has it ----------------------------------------------------------------------
+    # --- interface for the page ------------------------------------------------------------------------
 
     def selected(self) -> tuple[str, ...]:
         """Ids of the selected recordings, in the order of the table."""
@@ -156,7 +156,7 @@ class LibraryPanel(PagePart[object]):
 
     @on_loop
     def select(self, ids: Iterable[str]) -> None:
-        """Select those of these recordings that are listed."""
+        """Select these recordings, if they are listed."""
         self._list = replace(self._list, selected=frozenset(ids))
 
     def add_action(self, action: Action) -> None:
@@ -175,7 +175,7 @@ class LibraryPanel(PagePart[object]):
 
     @on_loop
     def end(self) -> None:
-        """Close the dialog and stop following the library: the page goes."""
+        """Close the dialog and stop following the library, because the page is removed."""
         self._library.on_change.discard(self._library_changed)
         if self._reading is not None:
             self._reading.cancel()
@@ -203,7 +203,7 @@ class LibraryPanel(PagePart[object]):
                     if type(action.command) is type(command):
                         self._run(action)
 
-    # --- what is listed --------------------------------------------------------------------------------
+    # --- listing ---------------------------------------------------------------------------------------
 
     def _listing(self, view: LibraryView) -> Listing:
         listing = make_listing(self._list, view.rows, self._listed)
@@ -214,7 +214,7 @@ class LibraryPanel(PagePart[object]):
         post(self._read_thumbnails)
 
     def _read_thumbnails(self) -> None:
-        """Read the thumbnails of the shown rows if they are others than before; on the loop."""
+        """Read the thumbnails of the shown rows if the rows changed; on the loop."""
         rows = self._listing(self._library.view()).page
         if rows == self._pictured:
             return
@@ -230,7 +230,7 @@ class LibraryPanel(PagePart[object]):
     # --- drawing ---------------------------------------------------------------------------------------
 
     def draw(self, view: object = None) -> None:
-        """Draw what has changed; the page's own `view` is not used."""
+        """Draw changed parts; the page's own `view` is not used."""
         view, thumbnails, running = self._library.view(), self._thumbnails, self._running()
         listing = self._listing(view)
         self._find.show(listing.list.arrangement.words)
@@ -246,7 +246,7 @@ class LibraryPanel(PagePart[object]):
         self._trash.content = render("library_trash", trash=view.trash, empty=EmptyTrash())
 
     def _draw_jobs(self, view: LibraryView) -> None:
-        """Draw the progress of the jobs that record into the folder, each with its failures."""
+        """Draw the progress and the failures of the jobs that record into the folder."""
         now = time.time()
         wanted = (view.jobs, [job.is_silent(now) for job in view.jobs])
         if wanted == self._jobs_drawn:
@@ -254,7 +254,7 @@ class LibraryPanel(PagePart[object]):
         self._jobs_drawn = wanted
         shown = [
             {"of": job, "how": job_text(job, now), "runs": job.state == "running" and not job.is_silent(now)}
-            for job in view.jobs[:MOST_JOBS]
+            for job in view.jobs[:MAX_JOBS]
         ]
         self._jobs.content = render("library_jobs", jobs=shown)
         self._jobs.visible = bool(shown)
@@ -304,7 +304,7 @@ class LibraryPanel(PagePart[object]):
         now = datetime.datetime.now().astimezone()
         page, arranged = listing.page, listing.list.arrangement
         none_so = self._none_so(view, arranged)
-        jpegs = [thumbnails.get(row.id, b"") for row in page]  # empty until it is read
+        jpegs = [thumbnails.get(row.id, b"") for row in page]  # empty until the thumbnail is read
         wanted = (
             page,
             jpegs,
@@ -408,7 +408,7 @@ class LibraryPanel(PagePart[object]):
         """Reason why none of these can be read; empty if one can.
 
         Args:
-            salvages: what is left of a damaged recording of the workbench is enough.
+            salvages: whether the readable part of a damaged recording of the workbench is enough.
         """
         rows = [row for row in self._library.view().rows if row.id in ids]
         broken = [row for row in rows if row.problem and not (salvages and row.kind == "workbench")]

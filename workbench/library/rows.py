@@ -46,13 +46,13 @@ MEANS: dict[Outcome, str] = {
     "no success": "No success at the last step, also where it was stopped before its end",
     "broken": "Something is wrong with the files",
 }
-HASH = 7
-"""Number of characters of a source hash that are shown."""
+HASH_CHARACTERS = 7
+"""Number of shown characters of a source hash."""
 _DESCENDING_FIRST: tuple[Column, ...] = ("date", "steps", "return", "success")
 
 
 def count_recordings(rows: Iterable[LibraryRow]) -> int:
-    """Number of recordings in these rows: an export or a copy counts with the recording that it was made from."""
+    """Number of recordings in these rows; an export or a copy does not count in addition to its original."""
     return len({row.copy_of or row.uid or row.id for row in rows})
 
 
@@ -67,8 +67,8 @@ def has_outcome(row: LibraryRow, outcome: Outcome) -> bool:
 
 
 def has_words(row: LibraryRow, words: Sequence[str]) -> bool:
-    """Whether each of these lower-case words occurs in the task, tags, note, name, source hash or action source of
-    the row; ``seed:3`` means that seed."""
+    """Whether each of these lower-case words occurs in the row's task, tags, note, name, source hash or action source;
+    ``seed:3`` means that seed."""
     said = "\n".join(
         (row.task, *row.tags, row.note, row.name, row.source_hash, row.acted_by, row.problem or "")
     ).lower()
@@ -84,8 +84,8 @@ def chosen(
     """The rows that pass a filter.
 
     Args:
-        words: separated by spaces; each must be found.
-        task: None for all.
+        words: words separated by spaces; each must occur.
+        task: task of the recordings; None for all.
     """
     wanted = words.lower().split()
     return [
@@ -96,7 +96,7 @@ def chosen(
 
 
 def none_like_that(words: str, outcome: Outcome, task: str | None) -> str:
-    """The message of a filter that nothing passes."""
+    """The message for a filter that no row passes."""
     wanted = f" of {task}" if task is not None else ""
     kinds: dict[Outcome, str] = {
         "all": "recording",
@@ -110,7 +110,7 @@ def none_like_that(words: str, outcome: Outcome, task: str | None) -> str:
 
 
 def begins_descending(column: Column) -> bool:
-    """Whether the first press on a column puts the largest first."""
+    """Whether the first press on a column sorts in descending order."""
     return column in _DESCENDING_FIRST
 
 
@@ -146,7 +146,7 @@ def cells(row: LibraryRow, running: OpenVersion | None, now: datetime.datetime) 
 
     Args:
         running: None if no task is open.
-        now: in the time zone of the shown dates.
+        now: present time, in the time zone of the shown dates.
     """
     when = None if row.date is None else row.date.astimezone(now.tzinfo)
     env = "" if row.env_index is None else f"env {row.env_index}"
@@ -158,7 +158,7 @@ def cells(row: LibraryRow, running: OpenVersion | None, now: datetime.datetime) 
         "when": "" if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
         "total": "" if row.total_reward is None else number_text(row.total_reward),
         "outcome": _outcome(row),
-        "version": row.source_hash[:HASH],
+        "version": row.source_hash[:HASH_CHARACTERS],
         "other_version": running is not None
         and bool(row.source_hash)
         and row.task == running.task

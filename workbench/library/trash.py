@@ -1,4 +1,4 @@
-"""Moves deleted recordings into ``.trash`` in the library's folder, and back."""
+"""Moves deleted recordings into ``.trash`` in the library's folder and back."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ TRASH = ".trash"
 class Trash:
     """Content of the trash.
 
-    Each deletion is a folder named by its time, with the files under their old paths below the library's folder, so
-    undoing it needs no list. Of a recording's files the one that makes it listed moves first and comes back last.
+    Each deletion is a folder named by its time, with the files under their old paths below the library's folder, so undoing
+    it needs no list. The file that makes a recording appear in the library moves first and is restored last.
     """
 
     batches: tuple[str, ...] = ()
-    """Names of the deletions that hold files, the newest last."""
+    """Names of the deletions that contain files, the newest last."""
     files: int = 0
     size: int = 0
     """Bytes."""
 
 
 class TrashError(OSError):
-    """Files could not be moved; the message says which and why. The recording's other files are where they were, or the
-    message says where."""
+    """Files could not be moved; the message contains the file and the reason. The recording's other files were not moved, or
+    the message contains their place."""
 
 
 def move_to_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | None:
-    """Move the files of these recordings, in order; returns the name of the deletion, or None if no file exists any more.
+    """Move the files of these recordings, in order; returns the name of the deletion, or None if no file exists.
 
     Raises:
-        TrashError: some could not be moved; those before it were.
+        TrashError: a file could not be moved; earlier recordings were moved.
     """
     if (folder / TRASH).is_symlink():
         raise TrashError(f"{folder / TRASH} is a link, so nothing was moved there. Remove it.")
@@ -51,7 +51,7 @@ def move_to_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | N
 
 
 def restore_from_trash(folder: Path, batch: str) -> tuple[str, ...]:
-    """Move the files of a deletion back; returns their paths below `folder`, with ``/``. Existing files stay.
+    """Restore the files of a deletion; returns their paths below `folder`, with ``/``. Existing files are not replaced.
 
     Raises:
         TrashError: a file could not be moved and is still in the trash.
@@ -59,7 +59,7 @@ def restore_from_trash(folder: Path, batch: str) -> tuple[str, ...]:
     root = folder / TRASH / batch
     if batch not in read_trash(folder).batches:
         raise TrashError("That deletion is no longer in the trash.")
-    # The .json, which sorts after .h5, must come last.
+    # The .json must be restored last.
     order = {".h5": 0, ".rrd": 1, ".json": 2}
     files = sorted(
         (path for path in root.rglob("*") if path.is_symlink() or path.is_file()),
@@ -73,7 +73,7 @@ def restore_from_trash(folder: Path, batch: str) -> tuple[str, ...]:
 def read_trash(folder: Path) -> Trash:
     size = 0
     if (folder / TRASH).is_symlink():
-        return Trash()  # leads to a foreign folder
+        return Trash()  # it is a link to a foreign folder
     try:
         with os.scandir(folder / TRASH) as listed:
             batches = sorted(entry.name for entry in listed if entry.is_dir(follow_symlinks=False))
@@ -87,16 +87,16 @@ def read_trash(folder: Path) -> Trash:
                     size += os.lstat(os.path.join(below, name)).st_size
                     held[batch] = held.get(batch, 0) + 1
                 except OSError:
-                    continue  # restored meanwhile
-    # A failed deletion leaves empty folders; undo must skip it.
+                    continue  # the file was restored meanwhile
+    # A failed deletion leaves empty folders, which undo must skip.
     return Trash(tuple(held), sum(held.values()), size)
 
 
 def empty_trash(folder: Path) -> None:
-    """Delete its content permanently.
+    """Delete the content of the trash permanently.
 
     Raises:
-        TrashError: something could not be deleted.
+        TrashError: a file could not be deleted.
     """
     try:
         shutil.rmtree(folder / TRASH)
@@ -107,7 +107,7 @@ def empty_trash(folder: Path) -> None:
 
 
 def _move_together(pairs: Sequence[tuple[Path, Path]]) -> bool:
-    """Move all or none; returns whether there was anything to move."""
+    """Move all files or none; returns whether there was anything to move."""
     done: list[tuple[Path, Path]] = []
     try:
         for source, target in pairs:

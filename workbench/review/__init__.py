@@ -1,1 +1,1 @@
-"""Open recordings, played along one time axis."""
+"""Plays open recordings along one time axis."""

@@ -1,4 +1,4 @@
-"""The Compare tab: where two recordings differ first, entry by entry."""
+"""The Compare tab: the first difference between two recordings, entry by entry."""
 
 from __future__ import annotations
 
@@ -15,23 +15,29 @@ from workbench.page.widgets.templates import letter, render
 from workbench.page.widgets.tools import Tool, tools_html
 from workbench.page.widgets.visitors import Visitor
 from workbench.review.commands import ChooseTolerance, CompareWith, SwapWithFirst
-from workbench.review.differences import TOLERANCES, USUAL_TOLERANCE, Difference, FirstDifference, difference
+from workbench.review.differences import (
+    DEFAULT_TOLERANCE_METRES,
+    TOLERANCES_METRES,
+    Difference,
+    FirstDifference,
+    difference,
+)
 from workbench.review.playback import Review
 from workbench.review.view import Opened, ReviewView
 
-TOLERANCE_NAMES = {length(way): way for way in TOLERANCES}
-MOST_ROWS = 30
+TOLERANCE_NAMES = {length(way): way for way in TOLERANCES_METRES}
+MAX_ROWS = 30
 
 
 class ReviewComparePanel(PagePart[ReviewView]):
-    """Compares the first recording with another; a row goes to the first state at which its entry differs."""
+    """Compares the first recording with another; a press on a row goes to the first state at which its entry differs."""
 
     does = (CompareWith, SwapWithFirst, ChooseTolerance)
 
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
-        self._wish, self._metres = 1, USUAL_TOLERANCE
-        """Recording that was chosen last, kept while fewer are open, and the tolerance."""
+        self._wish, self._metres = 1, DEFAULT_TOLERANCE_METRES
+        """Last chosen recording, kept while fewer are open, and the tolerance."""
         self._other = choice(server, "A against", CompareWith, "index", {"B": 1}, 1)
         self._swap = server.gui.add_html("")
         self._tolerance = choice(
@@ -40,7 +46,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
             ChooseTolerance,
             "metres",
             TOLERANCE_NAMES,
-            USUAL_TOLERANCE,
+            DEFAULT_TOLERANCE_METRES,
             hint="How far apart a body must be to count as different.",
         )
         self._html = server.gui.add_html("")
@@ -69,7 +75,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
     def _content(self, a: Opened, b: Opened, other: int, found: Difference, view: ReviewView) -> str:
         differences = [*([found.bodies] if found.bodies else []), *found.numbers]
         self._differing = [p for p in differences if p.position is not None]
-        presses = [Seek(step=p.position) for p in self._differing[:MOST_ROWS] if p.position is not None]
+        presses = [Seek(step=p.position) for p in self._differing[:MAX_ROWS] if p.position is not None]
         one_sided = [f"{p.name} ({p.values})" for p in differences if p.position is None and p.values]
         return render(
             "review_compare",

@@ -1,4 +1,4 @@
-"""The Curves tab of a review: numbers of the recordings at the position, and curves over their steps."""
+"""The Curves tab of a review: numbers of the recordings at the position, and curves over all steps."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ class ReviewNumbers(PagePart[ReviewView]):
 
 
 class ReviewCurves(PagePart[ReviewView]):
-    """Charts of one entry each, with a line for each recording, aligned: the reward, and one that is chosen.
+    """Charts of one entry each, with one line per aligned recording: the reward and a chosen entry.
 
-    An action and the reward terms have many lines, so they are drawn for the selected recording only. The position is a
-    dot on one line: a line at the position would have to be sent with every frame.
+    The action and the reward terms have many lines, so they are drawn only for the selected recording. The position is a
+    dot on one line: a vertical line at the position would have to be sent with every frame.
     """
 
     every = 0.15
@@ -82,16 +82,16 @@ class ReviewCurves(PagePart[ReviewView]):
         self._lines_drawn: object = None
         self._found: dict[str, dict[str, Lines]] = {}
         self._offered: dict[str, tuple[str, str]] = {}
-        """Entry and line of each choice; the line is empty where the entry has a single line."""
+        """Entry and line of each choice; the line is empty if the entry has a single line."""
         self._wish = ""
-        """Entry that was chosen last, kept while recordings without it are open."""
+        """Last chosen entry, kept while recordings without it are open."""
 
     def key(self, view: ReviewView) -> object:
         which = view.opened_serial, len(view.opened), view.selected
         return *which, view.position, view.anchors, self._wish
 
     def draw(self, view: ReviewView) -> None:
-        # By id: a recording that gets its scene later stays the same recording.
+        # By id: a recording that gets its scene later is still the same recording.
         self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
         shown = shown_together(view)
         self._hint.visible = bool(shown)
@@ -101,7 +101,7 @@ class ReviewCurves(PagePart[ReviewView]):
         self._draw_entry("also", also, view, shown)
         lines = (view.opened_serial, view.selected, view.anchors, len(view.opened))
         if lines != self._lines_drawn:
-            # They do not follow the position, and a chart that is sent again is drawn again.
+            # These charts do not depend on the position, and a chart that is sent again is redrawn.
             self._lines_drawn = lines
             self._draw_lines("terms", TERMS, view)
             self._draw_lines("action", ACTION, view)
@@ -135,7 +135,7 @@ class ReviewCurves(PagePart[ReviewView]):
         return chosen
 
     def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
-        """Draw one entry of all compared recordings."""
+        """Draw one entry for all compared recordings."""
         group, line = self._offered.get(entry, (entry, ""))
         drawn: list[ChartLine] = []
         cursor = 0
@@ -153,7 +153,7 @@ class ReviewCurves(PagePart[ReviewView]):
         self._put(chart, entry, view, drawn, drawn[cursor] if drawn else None)
 
     def _draw_lines(self, chart: str, entry: str, view: ReviewView) -> None:
-        """Draw an entry with several lines, of the selected recording."""
+        """Draw an entry with several lines for the selected recording."""
         chosen, axis = view.chosen, axis_of(view)
         lines = {} if chosen is None else self._found[chosen.id].get(entry, {})
         drawn = [
@@ -171,8 +171,8 @@ class ReviewCurves(PagePart[ReviewView]):
         drawn: list[ChartLine],
         dotted: ChartLine | None = None,
     ) -> None:
-        """Draw the lines, with their peaks where there are many positions, and the dot of one at the present position."""
-        # First, since the steps are those of the first line's peaks.
+        """Draw the lines, reduced to their peaks if there are many positions, and one line's dot at the present position."""
+        # The dotted line first, since the steps are those of the first line's peaks.
         ordered = sorted(drawn, key=lambda line: line is not dotted)
         if not ordered:
             self._charts[chart].hide()
@@ -188,7 +188,7 @@ class ReviewCurves(PagePart[ReviewView]):
 
 
 def _mode_of(episode: Episode) -> str:
-    """The mode of the reward for `number_rows`: only whether there is one is shown."""
+    """The reward mode for `number_rows`, which shows only whether there is a reward."""
     return "" if episode.info.has_reward else "none"
 
 
@@ -208,17 +208,17 @@ def step_of(episode: Episode, state: int) -> StepResult:
 
 
 def known(number: str, state: int) -> str:
-    """The text of a number: NaN at state 0 is a dash, since no step came before it; later the task returned it."""
+    """The text of a number: NaN at state 0 is a dash, since no step led to it; later NaN comes from the task."""
     return "—" if number == "NaN" and state == 0 else number
 
 
 def compared(
     rows: Sequence[NumberRow], beside: Sequence[tuple[Sequence[NumberRow], int]]
 ) -> list[dict[str, Any]]:
-    """Rows of the table: those of the selected recording, then what only others have.
+    """Rows of the table: those of the selected recording, then entries that only others have.
 
     Args:
-        beside: of each recording with a column, its rows and their state.
+        beside: rows and their state for each recording with a column.
     """
     moods = {row.name: row.mood for row in rows}
     for others, _ in beside:

@@ -15,14 +15,14 @@ from workbench.episodes.episode import Episode
 from workbench.episodes.equal_numbers import gap, numbers_differ
 from workbench.machine.text import length, number_text
 
-ARM = 0.1
-"""Metres: a rotation counts as the distance that a point this far from the body's origin moves."""
-TOLERANCES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
-"""Metres. A replay on other threads or another machine differs by 1e-6 to 1e-5."""
-USUAL_TOLERANCE = 1e-4
-_LEAST = 1e-5
+ARM_METRES = 0.1
+"""Lever arm of rotations: a rotation counts as the distance by which a point this far from the body's origin moves."""
+TOLERANCES_METRES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+"""Selectable tolerances. A replay on other threads or another machine differs by 1e-6 to 1e-5."""
+DEFAULT_TOLERANCE_METRES = 1e-4
+_MIN_DIFFERENCE = 1e-5
 """Smaller differences of numbers count as equal: a replay on another machine differs by less."""
-_MOST_LINES = 600
+_MAX_LINES = 600
 
 
 @dataclass(frozen=True)
@@ -37,15 +37,15 @@ class FirstDifference:
     largest: str
     """The largest difference."""
     totals: str = ""
-    """Both sums over the episode, where a sum makes sense."""
+    """Both sums over the episode, if a sum makes sense."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How a recording differs from another.
+    """The differences between two recordings.
 
     Two episodes of one seed under two versions of a task are the same simulation up to some step; after it everything
-    differs a little. So that step and the body that moved first are found, for each quantity on its own.
+    differs slightly. So that step and the first body that differs are determined, for each quantity separately.
     """
 
     bodies: FirstDifference | None
@@ -53,7 +53,7 @@ class Difference:
     body: str
     """The body that differs first."""
     apart: NDArray[np.float64]
-    """(K,) metres between the two poses of the body that is farthest off, from `begin` on."""
+    """(K,) distance in metres between the two poses of the body that differs most, from `begin` on."""
     begin: int
     """Position of the first compared state."""
     compared: int
@@ -61,22 +61,22 @@ class Difference:
     not_in_both: tuple[str, ...]
     """Bodies that only one of the recordings has."""
     numbers: tuple[FirstDifference, ...]
-    """Action, reward, and the entries of ``evaluate``; those that differ come first, by position."""
+    """Action, reward, and the entries of ``evaluate``; differing ones come first, by position."""
     same_seed: bool
     same_source: bool | None
-    """Whether both have the same source; None if one of them has none."""
+    """Whether both have the same source; None if one has none."""
     source: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
     """File, and its changed lines as (``add``, ``del``, ``at`` or ``same``, text)."""
 
 
 def difference(
-    a: Episode, b: Episode, anchors: tuple[int, int], tolerance: float = USUAL_TOLERANCE
+    a: Episode, b: Episode, anchors: tuple[int, int], tolerance: float = DEFAULT_TOLERANCE_METRES
 ) -> Difference:
-    """How `b` differs from `a`.
+    """The differences of `b` from `a`.
 
     Args:
-        anchors: The state of each that is at position 0.
-        tolerance: Metres above which a body's pose differs.
+        anchors: The state of each recording at position 0.
+        tolerance: Distance in metres above which a body's pose differs.
     """
     begin = max(-anchors[0], -anchors[1])
     end = min(len(a.reward) - anchors[0], len(b.reward) - anchors[1])
@@ -120,14 +120,14 @@ def source_changes(
     """Each file that differs: its name, and the changed lines with two lines of context."""
     found = []
     if not set(before) & set(after):
-        # Recorded from two folders: files are matched by name.
+        # Recorded from two folders: match files by name.
         before, after = (
             {PurePath(name).name: text for name, text in texts.items()} for texts in (before, after)
         )
     pairs = {name: (before.get(name, ""), after.get(name, "")) for name in dict.fromkeys([*before, *after])}
     gone, new_ones = next(iter(before), None), next(iter(after), None)
     if gone is not None and new_ones is not None and gone not in after and new_ones not in before:
-        # The task's own file comes first in both. It has another name: without this all its lines are changed.
+        # The task's own file comes first in both. If it has another name, without this all its lines would count as changed.
         del pairs[gone], pairs[new_ones]
         pairs = {f"{gone} → {new_ones}": (before[gone], after[new_ones]), **pairs}
     for name, (old, new) in pairs.items():
@@ -137,8 +137,8 @@ def source_changes(
         for line in list(difflib.unified_diff(old.splitlines(), new.splitlines(), lineterm="", n=2))[2:]:
             kind = {"+": "add", "-": "del", "@": "at"}.get(line[:1], "same")
             lines.append((kind, line))
-        if len(lines) > _MOST_LINES:
-            lines = [*lines[:_MOST_LINES], ("at", f"… and {len(lines) - _MOST_LINES} more lines")]
+        if len(lines) > _MAX_LINES:
+            lines = [*lines[:_MAX_LINES], ("at", f"… and {len(lines) - _MAX_LINES} more lines")]
         found.append((name, tuple(lines)))
     return tuple(found)
 
@@ -172,13 +172,14 @@ def _bodies_difference(
 
 
 def distances(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-    """(...,) metres between poses (..., 7), plus `ARM` times the angle; 0 if both lack the body, inf if one does."""
+    """(...,) distance in metres between poses (..., 7), plus `ARM_METRES` times the angle; 0 if both lack the body, inf if
+    one does."""
     metres, radians = pose_distances(a, b)
-    return metres + ARM * radians
+    return metres + ARM_METRES * radians
 
 
 def _steps(a: NDArray, b: NDArray, rows: tuple[slice, slice]) -> tuple[NDArray, NDArray]:
-    """Values of steps at the states of `rows`: NaN at the first state, which no step led to."""
+    """Values of steps at the states of `rows`: NaN at the first state, to which no step led."""
     padded = [np.concatenate([np.full((1, *x.shape[1:]), np.nan), np.asarray(x, np.float64)]) for x in (a, b)]
     return padded[0][rows[0]], padded[1][rows[1]]
 
@@ -195,7 +196,7 @@ def _first_difference(
         return FirstDifference(name, begin, f"shape {a.shape[1:]} → {b.shape[1:]}", "", totals)
     yes = a.dtype.kind == "b" and b.dtype.kind == "b"
     one, two = (np.asarray(x, np.float64).reshape(len(x), -1) for x in (a, b))
-    differs = numbers_differ(one, two, _LEAST)
+    differs = numbers_differ(one, two, _MIN_DIFFERENCE)
     rows = np.flatnonzero(differs.any(axis=1))
     if not len(rows):
         return FirstDifference(name, None, "", "", totals)

@@ -33,11 +33,11 @@ from workbench.review.commands import (
     ToggleOverlaid,
 )
 from workbench.review.playback import SPEEDS, Review
-from workbench.review.state import MOST_COMPARED
+from workbench.review.state import MAX_OVERLAID
 from workbench.review.view import Opened, ReviewView, outcome_text
 
-MOST_OF_CODE = 200_000
-"""Maximum number of characters of one file's text."""
+MAX_CODE_CHARACTERS = 200_000
+"""Maximum length of one file's text."""
 SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 GHOSTS, GRID = "overlaid", "side by side"
 TRY_AGAIN = "Try again"
@@ -46,14 +46,14 @@ GO_LIVE_HINT = "Restores the shown state in the live env, with the current code"
 
 
 class ReviewPanel(PagePart[ReviewView]):
-    """The controls in the present container; those for comparing only while several recordings are open.
+    """The controls in the present container; those for comparisons are shown only while several recordings are open.
 
     Args:
         server: The page.
-        review: Of the page.
-        on_go_live: Called with the id of the selected recording and the state that is shown, when a person wants to
-            continue from there live, and again to stay in the review instead.
-        going: What is waited for on the way to the live env.
+        review: The review of the page.
+        on_go_live: Called with the id of the selected recording and the shown state, when the user continues live from
+            there, and again to cancel that.
+        going: Returns a text on what the transition to the live env waits for.
     """
 
     does = (
@@ -100,8 +100,8 @@ class ReviewPanel(PagePart[ReviewView]):
 
     @property
     def ghosts(self) -> bool:
-        """Whether the recordings are drawn over each other: a person chose so, and they are few enough."""
-        return self._arranged == GHOSTS and len(self._review.view().opened) <= MOST_COMPARED
+        """Whether the recordings are drawn overlaid: the user chose it, and they are few enough."""
+        return self._arranged == GHOSTS and len(self._review.view().opened) <= MAX_OVERLAID
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
@@ -137,10 +137,10 @@ class ReviewPanel(PagePart[ReviewView]):
         self._again.content = tools_html([tool(TRY_AGAIN, OpenAgain())] if again else [])
         listed = (view.opened, view.selected, bool(view.loading))
         if self._listed != listed:
-            # Not at every position: with many recordings it would be most of a frame's cost.
+            # Not at every position: with many recordings it would take most of a frame's time.
             self._listed = listed
             self._list.content = self._list_html(view)
-        self._arrange.visible = 1 < len(view.opened) <= MOST_COMPARED
+        self._arrange.visible = 1 < len(view.opened) <= MAX_OVERLAID
         self._arrange.show(self._arranged)
         self._align.visible = len(view.opened) > 1 and len(view.alignments) > 1
         self._align.show(view.align, options=by_name(view.alignments))
@@ -181,7 +181,7 @@ def facts_html(chosen: Opened, changed: str) -> str:
         info=info,
         version=recorded_version(info) or info.source_hash,
         changed=changed,
-        most=MOST_OF_CODE,
+        most=MAX_CODE_CHARACTERS,
         acted_by=acted_by_text(info.acted_by),
         observed_by=info.observed_by,
         moved=moved_cameras_text(info.moved_cameras),

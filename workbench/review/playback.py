@@ -50,10 +50,10 @@ from workbench.review.view import Opened, ReviewView, find_events
 log = logging.getLogger(__name__)
 
 MEMORY_SHARE = 0.25
-"""Share of the machine's memory for open recordings: without a limit the system may kill the server."""
+"""Share of the machine's memory for open recordings: without a limit the OOM killer may end the server."""
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 CHECK_SECONDS = 2.0
-"""Seconds between two checks whether files changed since they were read."""
+"""Interval of checks whether files changed since they were read."""
 
 
 class _Stopped(Exception):
@@ -61,10 +61,10 @@ class _Stopped(Exception):
 
 
 class Review:
-    """Opened recordings and one position. All methods may be called on any thread, and return at once.
+    """Opened recordings with one position. All methods are thread-safe and return at once.
 
-    Recordings are in memory (pictures encoded), so seeking changes a number. While playing, the position follows from
-    the clock when it is asked for; nothing ticks. A later opening, or `close`, makes an earlier one stop.
+    Recordings are in memory (pictures encoded), so seeking only changes a number. While playing, the position is computed
+    from the clock on request; there is no timer. A later opening, or `close`, cancels an earlier one.
     """
 
     def __init__(
@@ -81,10 +81,10 @@ class Review:
             library: finds recordings by their ids.
             read: reads the recording of a row, sharing shapes with others, until it is stopped; raises OSError or
                 UnreadableRecording with a sentence. None for `read_recording`.
-            make_scene: for recordings without a scene; None leaves them without.
-            clock: seconds.
-            most_bytes: of memory for the recordings of one opening; None for `MEMORY_SHARE`.
-            memory: bytes that the process has allocated.
+            make_scene: makes scenes of recordings without one; None leaves them without.
+            clock: returns seconds.
+            most_bytes: memory limit for the recordings of one opening; None for `MEMORY_SHARE`.
+            memory: returns the bytes that the process has allocated.
         """
         self._most_bytes = int(MEMORY_SHARE * total_memory()) if most_bytes is None else most_bytes
         self._library, self._make_scene, self._clock = library, make_scene, clock
@@ -125,30 +125,30 @@ class Review:
 
     @on_loop
     def open(self, ids: Sequence[str], state: int | None = None, library_stays: bool = False) -> None:
-        """Show these recordings instead of the open ones, the oldest first.
+        """Open these recordings in place of the open ones, the oldest first.
 
         Args:
-            ids: rows of the library; those beyond `MOST_OPEN` are left out, with a message.
-            state: of the first recording, to begin at.
-            library_stays: as in `ReviewView`.
+            ids: rows of the library; those beyond `MAX_OPEN` are left out, with a message.
+            state: initial state of the first recording.
+            library_stays: see `ReviewView.library_stays`.
         """
         self._wanted(Open(tuple(ids), state, library_stays))
 
     def open_first(self, what: First) -> None:
-        """Open this by itself as soon as the library lists it, unless another recording is opened before."""
+        """Open this recording automatically as soon as the library lists it, unless another one is opened first."""
         post(lambda: self._wanted(OpenFirst(what)))
 
     def library_changed(self) -> None:
-        """The library has another view."""
+        """Handle a change of the library's view."""
         post(self._list)
 
     def add_problem(self, sentence: str) -> None:
-        """Show this among the problems, until something is opened."""
+        """Show this among the problems until something is opened."""
         post(lambda: self._happened(ProblemFound(sentence)))
 
     @on_loop
     def close(self) -> None:
-        """Stop opening, and checking files."""
+        """Stop opening recordings and checking files."""
         self._reading.close()
         self._checks.close()
         self._file_checks.end()
@@ -171,7 +171,7 @@ class Review:
             self._changes.notify()
 
     def _wanted(self, event: Asked | Open | OpenFirst) -> None:
-        self._list()  # the page may draw a row before the loop is told of it
+        self._list()  # the page may draw a row before the loop has its event
         self._happened(event)
 
     def _list(self) -> None:
@@ -189,7 +189,7 @@ class Review:
             await asyncio.sleep(CHECK_SECONDS)
 
     async def _open(self, number: int, rows: tuple[LibraryRow, ...], job: Job) -> None:
-        # Each opening has one of its own: a disk that hangs must not keep the next.
+        # A separate pool for each opening: a disk that hangs must not block the next opening.
         aside = BlockingPool("review-open")
         try:
             shapes = SharedShapes()
@@ -217,7 +217,7 @@ class Review:
             except (OSError, UnreadableRecording) as error:
                 self._happened(RecordingNotRead(number, row.id, f"{row.name} was not opened. {error}"))
             except Exception as error:
-                # The file may hold anything. Without this the page would stay on "opening" without a reason.
+                # The file may contain anything. Without this the page would stay on "opening" without a reason.
                 log.exception("%s could not be opened.", row.name)
                 why = f"{row.name} could not be opened ({type(error).__name__}: {error})."
                 self._happened(RecordingNotRead(number, row.id, why))
@@ -227,7 +227,7 @@ class Review:
         self._happened(ReadingEnded(number, problem))
         return opened
 
-    # --- beside the loop -----------------------------------------------------------------------------
+    # --- off the loop --------------------------------------------------------------------------------
 
     def _read_row(
         self, row: LibraryRow, shapes: SharedShapes, job: Job
@@ -270,7 +270,7 @@ class Review:
         except _Stopped:
             return
         except Exception as error:
-            # That process may send anything. Without this the page would stay on "making" without a reason.
+            # The process may send anything. Without this the page would stay on "making" without a reason.
             report_failure("Scenes of recordings could not be made", error)
             for one in wanted:
                 tell(one, f"Its scene could not be made ({type(error).__name__}: {error}).")

@@ -1,4 +1,4 @@
-"""Makes the 3-D scene of recordings without one (ManiSkill's own), from the env that they name."""
+"""Makes the 3-D scene of recordings without one (ManiSkill's own) from the env that they name."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ _NOT_PASSED_ON = RUN_KEYWORDS | {
 
 
 class SceneError(RuntimeError):
-    """Why a recording's scene cannot be made, as a sentence."""
+    """A recording's scene cannot be made; the text is the reason, as a sentence."""
 
 
 class SceneProcess:
-    """Makes scenes in a process of its own, which ends with the call.
+    """Makes scenes in a separate process, which ends with the call.
 
-    ManiSkill's own recordings hold the states of actors and joints, but neither meshes nor poses of links. So the env is
-    made, reset with the recorded seed, and set to each recorded state. Its code may be missing or broken, and the server
-    imports no simulator: hence the process. Several episodes of one file share its env.
+    ManiSkill's own recordings contain the states of actors and joints, but neither meshes nor poses of links. So the env is
+    built, reset with the recorded seed, and set to each recorded state. A separate process is needed because its code may
+    be missing or broken, and because the server imports no simulator. Several episodes of one file share an env.
     """
 
     def __init__(self, files: Sequence[Path] = (), imports: tuple[str, ...] = ()) -> None:
         """
         Args:
             files: Task files in which the envs of recordings may be found.
-            imports: As `TaskOptions.imports`.
+            imports: See `TaskOptions.imports`.
         """
         self._imports = imports
         self._files = tuple(str(Path(file).absolute()) for file in files)
@@ -45,11 +45,11 @@ class SceneProcess:
     def __call__(
         self, episodes: Sequence[Episode], check: Callable[[], None], on_progress: Callable[[int, str], None]
     ) -> Iterator[tuple[Episode, tuple[str, ...]] | SceneError]:
-        """Yield each episode with its scene and what could not be restored, or why it gets none.
+        """Yield each episode with its scene and a list of what could not be restored, or the reason why it gets none.
 
         Args:
             check: called a few times a second; an exception in it ends the work.
-            on_progress: called with an index into `episodes` and what is being done for that one.
+            on_progress: called with an index into `episodes` and the current work for that episode.
         """
         process = Background(niceness=0)
         try:
@@ -74,7 +74,7 @@ class SceneProcess:
     ) -> SceneMade:
         info = episode.info
         if named := paths_in_arguments(info):
-            # Opening a row must not let an env read files that a recording names: native code may parse them.
+            # Opening a row must not make an env read files that a recording names: native code may parse them.
             raise SceneError(
                 f"It names files for {info.task} to read ({', '.join(named[:3])}), which is not done for looking at it, so "
                 "there are numbers and curves only."

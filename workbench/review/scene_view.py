@@ -1,4 +1,4 @@
-"""Open recordings as one scene in the 3-D view, over each other or side by side."""
+"""Draws open recordings as one scene in the 3-D view, overlaid or side by side."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.cameras.frustums import SMALL, CameraFrustums, without_the_viewpoint
+from workbench.cameras.frustums import SMALL_METRES, CameraFrustums, without_the_viewpoint
 from workbench.envs.camera_data import CameraInfo, CameraKey, Picture
 from workbench.envs.scene.shapes import BodyKind, Material, SceneGeometry, Visual, fingerprint
 from workbench.episodes.episode import CameraTrack
@@ -31,49 +31,49 @@ from workbench.page.widgets.templates import colour, letter
 from workbench.review.commands import SelectRecording
 from workbench.review.differences import distances
 from workbench.review.playback import Review
-from workbench.review.state import MOST_COMPARED
+from workbench.review.state import MAX_OVERLAID
 from workbench.review.view import Opened, ReviewView
 
-SEE_THROUGH = 0.45
+GHOST_ALPHA = 0.45
 """Alpha of a ghost. A lower one vanishes over a white table, a higher one hides the bodies behind."""
-MOST_NAMED = 16
-"""Most recordings side by side with a label each. A browser lays out labels at every frame: with sixty its frame rate
-halves (measured)."""
-APART = 5e-4
-"""Minimum distance in metres between a ghost and its body for the ghost to be drawn."""
-_SAME_PLACE = 1e-5
+MAX_NAMED = 16
+"""Maximum number of recordings side by side with labels. A browser lays out labels in every frame: with sixty its frame
+rate halves (measured)."""
+MIN_GHOST_METRES = 5e-4
+"""Minimum distance between a ghost and its body for the ghost to be drawn."""
+_SAME_PLACE_METRES = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class ReviewScene:
-    """The scene of some open recordings.
+    """The scene of several open recordings.
 
-    Each recording is an env of one scene, and equal shapes are shared. Over each other, later recordings are ghosts:
-    tinted and half transparent, drawn only where they are apart from the first. Bodies that rest at the same place in
-    both for the whole time are drawn once.
+    Each recording is an env of one scene, and equal shapes are shared. When overlaid, all but the first are ghosts: tinted
+    and half transparent, drawn only where they differ from the first. Bodies that rest at the same place in both for the
+    whole time are drawn once.
     """
 
     geometry: SceneGeometry
     layout: EnvLayout
     ghosts: bool
     _poses: tuple[NDArray[np.float32], ...]
-    """(T + 1, its bodies, 7) of each recording."""
+    """(T + 1, number of its bodies, 7) poses of each recording."""
     _bodies: tuple[NDArray[np.int64], ...]
-    """Rows of each recording's bodies among all bodies."""
+    """Indices of each recording's bodies among all bodies."""
 
     def poses(self, states: Sequence[int]) -> NDArray[np.float32]:
-        """(N, B, 7) at this state of each recording; NaN for bodies that a recording lacks."""
+        """(N, B, 7) poses at this state of each recording; NaN for bodies that a recording lacks."""
         found = _side_by_side(self._poses, self._bodies, len(self.geometry.body_names), states)
         if self.ghosts:
             for ghost in found[1:]:
-                # Two surfaces at one place flicker.
-                ghost[distances(found[0], ghost) < APART] = np.nan
+                # Two surfaces at the same place flicker.
+                ghost[distances(found[0], ghost) < MIN_GHOST_METRES] = np.nan
         return found
 
 
 def shown_together(view: ReviewView) -> tuple[int, ...]:
-    """Indices of the recordings drawn together: all, or only the selected one where they are too many."""
-    return tuple(range(len(view.opened))) if len(view.opened) <= MOST_COMPARED else (view.selected,)
+    """Indices of the recordings drawn together: all, or only the selected one if they are too many."""
+    return tuple(range(len(view.opened))) if len(view.opened) <= MAX_OVERLAID else (view.selected,)
 
 
 def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
@@ -110,13 +110,13 @@ def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
                 if name in left_out:
                     continue
                 shape = replace(visual, material=tinted(visual.material, colour(index))) if ghost else visual
-                # Recordings share their shapes (`SharedShapes`): one fingerprint for each.
+                # Recordings share their shapes (`SharedShapes`), so the id identifies a shape.
                 object_ = (id(visual.mesh), id(visual.material), index if ghost else -1)
                 if object_ not in known:
                     known[object_] = fingerprint((shape,))
                 looks = known[object_]
                 number = 0
-                # The same shape twice on one body stays two visuals, as in the recording.
+                # A shape that occurs twice on one body stays two visuals, as in the recording.
                 while (looks, rows[name], number) in shapes and index in shapes[looks, rows[name], number][1]:
                     number += 1
                 shapes.setdefault((looks, rows[name], number), (shape, []))[1].append(index)
@@ -149,17 +149,19 @@ def bodies_at_rest(first: Opened, other: Opened) -> frozenset[str]:
     for row, name in enumerate(b.geometry.body_names):
         if name in places:
             here, there = places[name], b.poses[:, row]
-            if np.all(np.abs(here - here[0]) < _SAME_PLACE) and np.all(np.abs(there - here[0]) < _SAME_PLACE):
+            if np.all(np.abs(here - here[0]) < _SAME_PLACE_METRES) and np.all(
+                np.abs(there - here[0]) < _SAME_PLACE_METRES
+            ):
                 found.append(name)
     return frozenset(found)
 
 
 def tinted(material: Material, tone: str) -> Material:
-    """The material mostly in that colour, half transparent, without texture."""
+    """The material tinted with that colour, half transparent, without texture."""
     tint = np.array([int(tone[i : i + 2], 16) / 255 for i in (1, 3, 5)]) ** 2.2
     own = np.array(material.base_color[:3])
     red, green, blue = (float(c) for c in 0.75 * tint + 0.25 * own)
-    return Material((red, green, blue, SEE_THROUGH * material.base_color[3]), 0.0, 1.0)
+    return Material((red, green, blue, GHOST_ALPHA * material.base_color[3]), 0.0, 1.0)
 
 
 def _side_by_side(
@@ -180,7 +182,7 @@ class ReviewIn3D:
 
     Args:
         server: The page.
-        review: Of the page; a click in the view selects a recording of it.
+        review: The review of the page; a click in the view selects one of its recordings.
         stage: The 3-D view.
     """
 
@@ -188,14 +190,14 @@ class ReviewIn3D:
         self._review = review
         self.bodies, self._framing, self._in_software = stage.scene, stage.framing, stage.in_software
         self._mark = SelectionMark(server)
-        self._names = [view_label(server, f"/names {index}", "top-center") for index in range(MOST_NAMED)]
+        self._names = [view_label(server, f"/names {index}", "top-center") for index in range(MAX_NAMED)]
         self._frustums = CameraFrustums(server)
         self._scene: ReviewScene | None = None
         self._view = ReviewView()
-        """View that the scene was drawn for: another recording may have been opened since."""
+        """View for which the scene was drawn: another recording may have been opened since."""
         self._scene_of: object = None
         self._looks: DrawStyle | None = None
-        """Looks that the bodies were built with."""
+        """Style with which the bodies were built."""
         # viser awaits coroutines, although its types do not say so.
         server.scene.on_click()(self._on_click)  # type: ignore[arg-type]
 
@@ -210,10 +212,10 @@ class ReviewIn3D:
         """Draw the present states.
 
         Args:
-            ghosts: Over each other, if there are several.
-            looks: How bodies are drawn.
-            cameras: Of the selected recording.
-            pictures: Shown in their frustums.
+            ghosts: Whether to overlay the recordings, if there are several.
+            looks: Style of the bodies.
+            cameras: Cameras of the selected recording.
+            pictures: Pictures in their frustums.
         """
         wanted = (view.opened_serial, ghosts, len(view.opened))
         if wanted != self._scene_of:
@@ -237,7 +239,7 @@ class ReviewIn3D:
         self._framing.frame_untouched(self._viewpoint)
 
     def frame(self) -> None:
-        """Point every open page, and those to come, at the scene."""
+        """Frame the scene in every open page and in pages opened later."""
         if self._scene is not None:
             self._framing.frame(self._viewpoint)
 
@@ -250,7 +252,7 @@ class ReviewIn3D:
 
     def _frame_what_is_new(self, view: ReviewView, scene: ReviewScene, in_grid: bool) -> None:
         size = np.round(np.concatenate([scene.layout.low, scene.layout.high]), 0).tobytes()
-        # The live page uses the same key: switching between the two for one task keeps the view.
+        # The live page uses the same key, so switching between the two for one task keeps the view.
         task = view.opened[0].episode.info.task
         if self._framing.is_new((task, len(view.opened) if in_grid else 1, size)):
             self._framing.frame_new(self._viewpoint)
@@ -268,11 +270,11 @@ class ReviewIn3D:
             pictures = without_the_viewpoint(
                 pictures, {} if there is None else {("human", there.camera): there}
             )
-        self._frustums.draw(cameras, pictures, scene.layout.offsets[view.selected], SMALL)
+        self._frustums.draw(cameras, pictures, scene.layout.offsets[view.selected], SMALL_METRES)
 
     def _draw_names(self, view: ReviewView, scene: ReviewScene | None) -> None:
-        """Label the recordings that are not selected, if few; the selected one's label is on its frame."""
-        few = scene is not None and len(view.opened) <= MOST_NAMED
+        """Label the recordings that are not selected, if they are few; the selected one's label is on its frame."""
+        few = scene is not None and len(view.opened) <= MAX_NAMED
         for index, label in enumerate(self._names):
             if scene is None or not few or index >= len(view.opened) or index == view.selected:
                 label.draw()
@@ -304,12 +306,12 @@ class ReviewIn3D:
             return
         index = env_under_ray(scene.layout, np.array(event.ray_origin), np.array(event.ray_direction))
         if index is not None:
-            with suppress(Refused):  # it was closed since it was drawn
+            with suppress(Refused):  # the recording was closed since the drawing
                 self._review.do(SelectRecording(id=view.opened[index].id))
 
 
 def human_camera(view: ReviewView) -> CameraTrack | None:
-    """The human camera of the selected recording, or else of another."""
+    """The human camera of the selected recording; if it has none, of another one."""
     chosen = view.chosen
     several = () if chosen is None else (chosen, *view.opened)
     tracks = (track for one in several for track in one.episode.cameras)
@@ -317,7 +319,7 @@ def human_camera(view: ReviewView) -> CameraTrack | None:
 
 
 def as_picture(track: CameraTrack) -> Picture:
-    """A picture without pixels that has the camera's pose at the start."""
+    """A picture without pixels, with the camera's initial pose."""
     return Picture(track.info.name, "human", 0, track.pose[0])
 
 

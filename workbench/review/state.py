@@ -1,4 +1,4 @@
-"""The review as one value: `apply` says how each event changes it, and what is to be done then."""
+"""The state of the review as one value; `apply` returns the state after each event, and the effects to perform."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from workbench.page.command import Command, Refused
 from workbench.review import commands as review
 from workbench.review.view import START, Opened, Playback, ReviewView
 
-MOST_COMPARED = 4
-"""Most recordings that are drawn over each other; more cannot be told apart."""
-MOST_OPEN = 64
-FIRST_SHOWN = 0.4
-"""Seconds after which the recordings read so far are shown, while others are read; doubled each time, since each time
-a scene is built."""
+MAX_OVERLAID = 4
+"""Maximum number of overlaid recordings; more cannot be distinguished."""
+MAX_OPEN = 64
+FIRST_SHOWN_SECONDS = 0.4
+"""Time after which the recordings read so far are shown, while others are read; doubled each time, since each time a
+scene is built."""
 _NEVER = datetime.datetime.min.replace(tzinfo=datetime.timezone.utc)
 First = Path | Literal["newest"]
-"""A file of a recording, or the newest recording."""
+"""The recording with this file, or the newest recording."""
 
 
 @dataclass(frozen=True)
 class FileStamp:
-    """Name, size and time of a file when it was read."""
+    """State of a recording's file when it was read."""
 
     recording: str
     """Name of the recording."""
@@ -41,26 +41,26 @@ class FileStamp:
 
 @dataclass(frozen=True)
 class OpeningState:
-    """The recordings that are being opened, or were opened last."""
+    """Progress of the present or last opening of recordings."""
 
     number: int = 0
-    """Grows with each opening; what an older one comes to is dropped."""
+    """Increases with each opening; results of an older one are dropped."""
     rows: tuple[LibraryRow, ...] = ()
     state: int | None = None
-    """State of the first recording, to begin at."""
+    """Initial state of the first recording."""
     done: int = 0
-    """Number of rows that were read, or could not be read."""
+    """Number of rows that were read or could not be read."""
     read: tuple[Opened, ...] = ()
     """Recordings read so far; empty again when all are shown."""
     files: Mapping[Path, FileStamp] = field(default_factory=dict)
     show_at: float = 0.0
     """Clock time in seconds at which the recordings read so far are shown."""
-    pause: float = FIRST_SHOWN
-    """Seconds between the last two times at which they are shown."""
+    pause: float = FIRST_SHOWN_SECONDS
+    """Seconds between the last two such times."""
     shown: bool = False
-    """Whether some of it are on the page."""
+    """Whether some of them are on the page."""
     closed: frozenset[str] = frozenset()
-    """Ids closed by a person while others are read."""
+    """Ids that the user closed while others are read."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ class ReviewState:
     view: ReviewView = ReviewView()
     library: LibraryView = LibraryView()
     first: First | None = None
-    """What to open by itself once the library lists it."""
+    """Recording to open automatically once the library lists it."""
     opening: OpeningState = OpeningState()
     files: Mapping[Path, FileStamp] = field(default_factory=dict)
     """Files of the open recordings."""
     problems: tuple[str, ...] = ()
-    """Problems of the last opening, without those of files that changed since."""
+    """Problems of the last opening, except those about files that changed since."""
 
 
 # --- events ------------------------------------------------------------------------------------------
@@ -81,25 +81,25 @@ class ReviewState:
 
 @dataclass(frozen=True)
 class Open:
-    """These recordings are wanted in place of the open ones."""
+    """Open these recordings in place of the open ones."""
 
     ids: tuple[str, ...]
     state: int | None = None
-    """State of the first recording, to begin at."""
+    """Initial state of the first recording."""
     library_stays: bool = False
-    """As in `ReviewView`."""
+    """See `ReviewView.library_stays`."""
 
 
 @dataclass(frozen=True)
 class OpenFirst:
-    """This is to be opened by itself once the library lists it, unless another recording is opened before."""
+    """Open this recording automatically once the library lists it, unless another one is opened first."""
 
     what: First
 
 
 @dataclass(frozen=True)
 class Listed:
-    """The library has another view."""
+    """The library's view changed."""
 
     library: LibraryView
 
@@ -124,16 +124,16 @@ class RecordingNotRead:
 
 @dataclass(frozen=True)
 class ReadingEnded:
-    """No more recordings of an opening come."""
+    """All recordings of an opening were read or left out."""
 
     opening: int
     problem: str = ""
-    """Why some were left out."""
+    """Why some recordings were left out."""
 
 
 @dataclass(frozen=True)
 class SceneTold:
-    """What the making of a scene came to, or how far it is."""
+    """Result or progress of making a scene."""
 
     opening: int
     id: str
@@ -158,7 +158,7 @@ class FilesChecked:
 
 @dataclass(frozen=True)
 class ProblemFound:
-    """This is shown among the problems, until something is opened."""
+    """A problem to show until something is opened."""
 
     sentence: str
 
@@ -182,7 +182,7 @@ ReviewEvent = (
 
 @dataclass(frozen=True)
 class BeginReading:
-    """Read these, in place of what is being read."""
+    """Read these recordings in place of those that are being read."""
 
     opening: int
     rows: tuple[LibraryRow, ...]
@@ -190,7 +190,7 @@ class BeginReading:
 
 @dataclass(frozen=True)
 class CheckFiles:
-    """Check the files of the open recordings, and the selected one's task, now and from time to time."""
+    """Check the files of the open recordings and the selected one's task, now and periodically."""
 
 
 ReviewEffect = BeginReading | CheckFiles
@@ -201,9 +201,9 @@ Change = tuple[ReviewState, list[ReviewEffect]]
 
 
 def apply(state: ReviewState, event: ReviewEvent, now: float) -> Change:
-    """The state after an event at clock time `now` in seconds, and what has to be done.
+    """The state after an event at clock time `now` in seconds, and the effects to perform.
 
-    Raises `Refused` if a command is not possible; the state is then as it was.
+    Raises `Refused` if a command is not possible; the state is unchanged then.
     """
     before = state.view.chosen
     state, effects = _applied(advanced(state, now), event, now)
@@ -265,7 +265,7 @@ def _applied(state: ReviewState, event: ReviewEvent, now: float) -> Change:
 
 
 def advanced(state: ReviewState, now: float) -> ReviewState:
-    """The state with the position to which playing has come."""
+    """The state with the present position of playback."""
     view = state.view
     if view.playback is None:
         return state
@@ -273,13 +273,13 @@ def advanced(state: ReviewState, now: float) -> ReviewState:
     if position <= view.last:
         return state if position == view.position else _with(state, position=position)
     if view.loop:
-        # The last state is shown for as long as any other.
+        # The last state is shown as long as any other.
         return _with(state, position=view.first, playback=Playback(view.first, now))
     return _with(state, position=view.last, playback=None)
 
 
 def next_position_in(state: ReviewState, now: float) -> float:
-    """Seconds until playing comes to another position."""
+    """Seconds until playback reaches another position."""
     playback = state.view.playback
     if playback is None:
         return 3600.0
@@ -301,7 +301,7 @@ def _told(state: ReviewState, *sentences: str) -> ReviewState:
     return _with(state, problems=(*state.view.problems, *sentences))
 
 
-# --- what a page asks for ----------------------------------------------------------------------------
+# --- commands ----------------------------------------------------------------------------------------
 
 
 def _asked(state: ReviewState, command: Command, now: float) -> ReviewState:
@@ -367,7 +367,7 @@ def _paused(state: ReviewState) -> ReviewState:
 
 
 def _moved(state: ReviewState, position: int, now: float) -> ReviewState:
-    """Go to a position, or the nearest in range; what plays goes on from there."""
+    """Go to a position, or the nearest in range; playback continues from there."""
     view = state.view
     position = min(max(position, view.first), view.last)
     return _with(state, position=position, playback=view.playback and Playback(position, now))
@@ -378,7 +378,7 @@ def _to_event(state: ReviewState, direction: int, now: float) -> ReviewState:
     view = state.view
     if not view.opened:
         return state
-    several = range(len(view.opened)) if len(view.opened) <= MOST_COMPARED else (view.selected,)
+    several = range(len(view.opened)) if len(view.opened) <= MAX_OVERLAID else (view.selected,)
     places = {event.state - view.anchors[index] for index in several for event in view.opened[index].events}
     ahead = [place for place in places | {view.last} if (place - view.position) * direction > 0]
     if not ahead:
@@ -401,7 +401,7 @@ def _close(state: ReviewState, index: int, now: float) -> ReviewState:
 
 
 def _swap_with_first(state: ReviewState, index: int, now: float) -> ReviewState:
-    """Swap two recordings in the order; the position stays."""
+    """Swap two recordings; the position stays."""
     view = state.view
     if index >= len(view.opened):
         raise Refused("It is not open any more.")
@@ -413,7 +413,7 @@ def _swap_with_first(state: ReviewState, index: int, now: float) -> ReviewState:
     return _moved(_set_opened(state, opened, order.index(view.selected), view.align, now), view.position, now)
 
 
-# --- what is open ------------------------------------------------------------------------------------
+# --- open recordings ---------------------------------------------------------------------------------
 
 
 def _open_ids(state: ReviewState, asked: Open, now: float) -> Change:
@@ -426,11 +426,11 @@ def _open_ids(state: ReviewState, asked: Open, now: float) -> Change:
             if missing == 1
             else f"{missing} requested recordings are no longer in the folder."
         )
-    if len(wanted) > MOST_OPEN:
+    if len(wanted) > MAX_OPEN:
         problems.append(
-            f"At most {MOST_OPEN} recordings can be open at once; the first {MOST_OPEN} were opened."
+            f"At most {MAX_OPEN} recordings can be open at once; the first {MAX_OPEN} were opened."
         )
-    return _open(state, wanted[:MOST_OPEN], problems, asked.state, now, asked.library_stays)
+    return _open(state, wanted[:MAX_OPEN], problems, asked.state, now, asked.library_stays)
 
 
 def _open_first(state: ReviewState, now: float) -> Change:
@@ -441,7 +441,7 @@ def _open_first(state: ReviewState, now: float) -> Change:
     if isinstance(first, Path):
         row = next((row for row in whole if first.name in [path.name for path in row.paths]), None)
     elif library.rows and library.reading is None:
-        state = replace(state, first=None)  # also if none of them can be read
+        state = replace(state, first=None)  # also if it cannot be read
         row = max(whole, key=lambda row: row.written or 0.0, default=None)
     else:
         return state, []
@@ -456,10 +456,12 @@ def _open(
     now: float,
     library_stays: bool,
 ) -> Change:
-    # The library lists the newest first, but a comparison asks what became of the oldest. It is also read first: the
+    # The library lists the newest first, but a comparison starts from the oldest. The oldest is also read first: the
     # recording that is shown first stays selected when others arrive.
     rows = tuple(sorted(rows, key=lambda row: (row.date is None, row.date or _NEVER)))
-    opening = OpeningState(state.opening.number + 1, rows, at, show_at=now + FIRST_SHOWN, pause=FIRST_SHOWN)
+    opening = OpeningState(
+        state.opening.number + 1, rows, at, show_at=now + FIRST_SHOWN_SECONDS, pause=FIRST_SHOWN_SECONDS
+    )
     state = replace(state, first=None, opening=opening, problems=tuple(problems))
     state = _with(
         state, loading=_loading(opening), problems=state.problems, not_opened=(), library_stays=library_stays
@@ -468,7 +470,7 @@ def _open(
 
 
 def _loading(opening: OpeningState) -> str:
-    """What is being opened, with a count if there are several."""
+    """Text: the recording that is being opened, with a count if there are several."""
     rows, done = opening.rows, opening.done
     if done >= len(rows):
         return ""
@@ -477,7 +479,7 @@ def _loading(opening: OpeningState) -> str:
 
 
 def _row_done(state: ReviewState, now: float) -> ReviewState:
-    """Show those read so far, if a person has waited long enough for the others."""
+    """Show the recordings read so far if the user has waited long enough for the others."""
     opening = replace(state.opening, done=state.opening.done + 1)
     state = replace(state, opening=opening)
     if opening.done < len(opening.rows) and opening.read and now >= opening.show_at:
@@ -488,9 +490,9 @@ def _row_done(state: ReviewState, now: float) -> ReviewState:
 
 
 def _show(state: ReviewState, read: Sequence[Opened], now: float) -> ReviewState:
-    """Show recordings that were read, without those closed again.
+    """Show recordings that were read, except those closed meanwhile.
 
-    Selection and position stay once something of this opening was shown.
+    Selection and position are kept once something of this opening was shown.
     """
     opening, view = state.opening, state.view
     kept = [one for one in read if one.id not in opening.closed]
@@ -505,7 +507,7 @@ def _show(state: ReviewState, read: Sequence[Opened], now: float) -> ReviewState
 def _set_opened(
     state: ReviewState, opened: Sequence[Opened], selected: int, align: str, now: float, stay: bool = False
 ) -> ReviewState:
-    """Show these at the first position, or at the present one if `stay`."""
+    """Show these recordings at the first position, or at the present one if `stay`."""
     view = state.view
     stay = stay and bool(view.opened and opened)
     names = dict.fromkeys(event.name for one in opened for event in one.events if event.style != "reset")
@@ -523,7 +525,7 @@ def _set_opened(
 
 
 def _align(state: ReviewState, how: str, kept: int | None, now: float) -> ReviewState:
-    """Align, and stay at the state `kept` of the selected recording; None goes to the first position."""
+    """Align the recordings and stay at state `kept` of the selected one; None goes to the first position."""
     opened, name = state.view.opened, how.removeprefix("first ")
     anchors = tuple(0 if how == START else (one.first(name) or 0) for one in opened)
     first = -max(anchors, default=0)

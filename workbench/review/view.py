@@ -1,4 +1,4 @@
-"""Snapshots of the open recordings for the review page: position, events, curves and pictures."""
+"""The snapshot of the open recordings for the review page: position, events, curves and pictures."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from workbench.live.history.curves import PREFIX
 from workbench.live.messages import CameraRequest
 
 START = "start"
-"""The alignment that every recording has."""
+"""The alignment that is available for every recording."""
 Style = Literal["reset", "success", "fail", "limit", "odd", "other"]
 """Colour of an event on the strip under the slider."""
 REWARD = "reward"
 TERMS = "terms of the reward"
 ACTION = "action"
-MOST_LINES = 12
-"""Most columns of one entry; more cannot be told apart."""
-_MOST_RUNS = 40
-"""Most events of one entry; an entry that flickers at every step is no event."""
+MAX_LINES = 12
+"""Maximum number of columns of one entry; more cannot be distinguished."""
+_MAX_RUNS = 40
+"""Maximum number of events of one entry; an entry that changes at every step is not an event."""
 
 
 @dataclass(frozen=True)
 class EpisodeEvent:
-    """The first state of a run in which something is true."""
+    """An event: the first state of a run of states in which something is true."""
 
     state: int
     name: str
@@ -40,22 +40,22 @@ class EpisodeEvent:
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """One open recording. Two are equal only if they are the same one, opened once."""
+    """One open recording. Objects are equal only if they are identical."""
 
     id: str
     """Id of the library's row."""
     name: str
-    """Name of the file, as shown."""
+    """Shown name of the file."""
     episode: Episode
     events: tuple[EpisodeEvent, ...]
     scene: str = ""
-    """Message about a missing 3-D scene: it is being made, or why it cannot be."""
+    """Message about a missing 3-D scene: it is being made, or why it cannot be made."""
     making: bool = False
     """Whether the scene is being made in the background."""
 
     @property
     def length(self) -> int:
-        """Number of control steps; there is one state more."""
+        """Number of control steps; there is one more state."""
         return len(self.episode.reward)
 
     @property
@@ -63,13 +63,13 @@ class Opened:
         return self.episode.geometry is not None and self.episode.poses is not None
 
     def first(self, name: str) -> int | None:
-        """The first state with an event of this name; None without one."""
+        """The first state with an event of this name; None if there is none."""
         return next((event.state for event in self.events if event.name == name), None)
 
 
 @dataclass(frozen=True)
 class Playback:
-    """Position and time at which playing began."""
+    """Position and time at which playback began."""
 
     position: int
     at: float
@@ -80,39 +80,39 @@ class Playback:
 class ReviewView:
     """Immutable snapshot of the open recordings and of the position.
 
-    Recordings differ in length and in when things happen. So all share one *position*, counted from the moment at which
-    they are aligned (their starts, the first success of each, ...): position 0 is that moment in each. Before its start
-    an episode shows its first state, after its end its last.
+    Recordings differ in length and in the times of their events. So all share one *position*, counted from the state at
+    which they are aligned (their starts, the first success of each, ...): position 0 is that state in each. Before its
+    start an episode shows its first state, after its end its last.
     """
 
     opened: tuple[Opened, ...] = ()
     opened_serial: int = 0
-    """Grows when other recordings are open, or one of them has got its scene."""
+    """Increases when other recordings are open, or one of them has got its scene."""
     selected: int = 0
     """Index into `opened` of the recording whose cameras and numbers are shown."""
     align: str = START
     alignments: tuple[str, ...] = (START,)
-    """What the open recordings can be aligned at."""
+    """Possible alignments of the open recordings."""
     anchors: tuple[int, ...] = ()
-    """State of each recording that is at position 0."""
+    """State of each recording at position 0."""
     position: int = 0
     first: int = 0
     last: int = 0
-    """First and last position, both included."""
+    """First and last position, inclusive."""
     playback: Playback | None = None
-    """None while nothing plays."""
+    """Playback; None while paused."""
     speed: float = 1.0
     loop: bool = False
     loading: str = ""
-    """What is being opened."""
+    """Text: the recording that is being opened."""
     problems: tuple[str, ...] = ()
-    """Recordings that could not be opened, and files that changed since; a sentence each."""
+    """A sentence for each recording that could not be opened, and for each file that changed since."""
     changed_symbols: str = ""
     """Symbols of the selected recording's task that changed since the recording."""
     not_opened: tuple[str, ...] = ()
     """Ids of the recordings that the last opening could not read."""
     library_stays: bool = False
-    """Whether the library stays unfolded next to what is open, or is being opened."""
+    """Whether the library stays unfolded next to the open recordings."""
 
     @property
     def playing(self) -> bool:
@@ -120,7 +120,7 @@ class ReviewView:
 
     @property
     def states(self) -> tuple[int, ...]:
-        """State of each recording that is shown at the position."""
+        """State of each recording at the position."""
         return tuple(
             state_at(self.position, a, o.length) for o, a in zip(self.opened, self.anchors, strict=True)
         )
@@ -131,7 +131,7 @@ class ReviewView:
 
 
 def state_at(position: int, anchor: int, length: int) -> int:
-    """State at a position of an episode with `length` steps; its first or last state beyond its ends."""
+    """State of an episode with `length` steps at a position; beyond its ends its first or last state."""
     return min(max(position + anchor, 0), length)
 
 
@@ -151,8 +151,8 @@ def column_at(
 
 
 def find_events(episode: Episode) -> tuple[EpisodeEvent, ...]:
-    """Events in order of time, the start first: success, fail and every other bool of ``evaluate`` that turns true,
-    time limits, and rewards that are not finite."""
+    """Events in order of time, the start first: success, fail and every other bool of ``evaluate`` that becomes true, time
+    limits, and rewards that are not finite."""
     found = [EpisodeEvent(0, "reset", "reset")]
     for name, values in episode.evaluate.items():
         yes = None if name.startswith(PREFIX) else _flag(values)
@@ -171,9 +171,9 @@ def find_events(episode: Episode) -> tuple[EpisodeEvent, ...]:
 
 
 def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """All numbers over time: by entry, then by line, the states (K,) and the numbers (K,) at them.
+    """All numbers over time: states (K,) and numbers (K,), by entry, then by line.
 
-    Entries with several numbers a state (an action, the terms of a reward) have a line each.
+    Entries with several numbers per state (an action, the terms of a reward) have one line per number.
     """
     states = np.arange(len(episode.reward) + 1)
     after = states[1:]
@@ -185,7 +185,7 @@ def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDA
         if values.dtype.kind not in "fiub":
             continue
         if name.startswith(PREFIX):
-            if values.ndim == 1 and len(terms) < MOST_LINES:
+            if values.ndim == 1 and len(terms) < MAX_LINES:
                 terms[name.removeprefix(PREFIX)] = (after, _numbers(values)[1:])
             continue
         label = f"{name} (evaluate)" if name in (REWARD, TERMS, ACTION) else name
@@ -196,15 +196,15 @@ def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDA
     if terms:
         found[TERMS] = terms
     if episode.action.shape[1:] and episode.action.shape[1]:
-        action = np.asarray(episode.action, np.float64)[:, :MOST_LINES]
+        action = np.asarray(episode.action, np.float64)[:, :MAX_LINES]
         found[ACTION] = {
-            name: (after, action[:, index]) for index, name in enumerate(episode.action_names[:MOST_LINES])
+            name: (after, action[:, index]) for index, name in enumerate(episode.action_names[:MAX_LINES])
         }
     return found
 
 
 def outcome_text(episode: Episode) -> tuple[str, str]:
-    """How the episode ended, and the colour for it: ``good``, ``bad``, ``warn`` or none."""
+    """Text: how the episode ended; and its colour: ``good``, ``bad``, ``warn`` or none."""
     success, fail = (_flag(episode.evaluate.get(name)) for name in ("success", "fail"))
     if fail is not None and len(fail) and fail[-1]:
         return "failed", "bad"
@@ -221,7 +221,7 @@ def outcome_text(episode: Episode) -> tuple[str, str]:
 
 def _lines(name: str, values: NDArray, states: NDArray) -> Iterator[tuple[str, tuple[NDArray, NDArray]]]:
     flat = _numbers(values.reshape(len(values), -1))
-    for column in range(min(flat.shape[1], MOST_LINES)):
+    for column in range(min(flat.shape[1], MAX_LINES)):
         label = name if values.ndim == 1 else f"{name}[{column}]"
         yield label, (states, flat[:, column])
 
@@ -239,7 +239,7 @@ def _flag(values: NDArray | None) -> NDArray[np.bool_] | None:
         return flat
     if flat.dtype.kind != "f":
         return None
-    # An entry that only some states had is stored as 0.0 and 1.0, with NaN for the others.
+    # An entry that only some states have is stored as 0.0 and 1.0, with NaN for the others.
     known = flat[np.isfinite(flat)]
     return np.nan_to_num(flat) != 0 if len(known) and np.isin(known, (0.0, 1.0)).all() else None
 
@@ -247,17 +247,17 @@ def _flag(values: NDArray | None) -> NDArray[np.bool_] | None:
 def _turns_true(yes: NDArray[np.bool_]) -> list[int]:
     before = np.concatenate([[False], yes[:-1]])
     starts = np.flatnonzero(yes & ~before)
-    return starts[:1].tolist() if len(starts) > _MOST_RUNS else starts.tolist()
+    return starts[:1].tolist() if len(starts) > _MAX_RUNS else starts.tolist()
 
 
 # --- pictures ------------------------------------------------------------------------------------------
 
 
 class PictureReader:
-    """Decodes the pictures of one recording at a time. Not thread-safe: the page's loop owns it.
+    """Decodes the pictures of one recording at a time. Not thread-safe: used on the page's loop.
 
-    A picture takes some milliseconds to decode and an episode of four cameras has thousands. So only the shown one of
-    each camera is decoded and kept: the page asks for the same one thirty times a second.
+    A picture takes some milliseconds to decode and an episode with four cameras has thousands. So only the shown picture of
+    each camera is decoded and cached: the page requests the same one thirty times a second.
     """
 
     def __init__(self) -> None:
@@ -267,7 +267,7 @@ class PictureReader:
         """Why a picture cannot be shown, as a sentence; else empty."""
 
     def cameras(self, episode: Episode) -> tuple[CameraInfo, ...]:
-        """Cameras of the episode, each with the modalities that were recorded."""
+        """Cameras of the episode, each with its recorded modalities."""
         return tuple(
             replace(track.info, modalities=tuple(track.pictures))
             for track in episode.cameras
@@ -277,9 +277,9 @@ class PictureReader:
     def pictures(
         self, episode: Episode, state: int, requests: Iterable[CameraRequest], env: int
     ) -> dict[CameraKey, Picture]:
-        """The newest picture of each camera at or before `state`, labelled as a picture of `env`.
+        """The newest picture of each camera at or before `state`, labelled with `env`.
 
-        A camera whose picture cannot be decoded has none; `problem` says why.
+        A camera whose picture cannot be decoded is left out; `problem` contains the reason.
         """
         if episode is not self._episode:
             self._episode, self._cache, self.problem = episode, {}, ""
@@ -299,7 +299,7 @@ class PictureReader:
                     degree = "fast" if episode.info.pictures == "fast" else None
                     picture = decode_picture(track, index, modalities, env, degree)
                 except ReaderBusy:
-                    # Another recording is being opened by the reader: the last picture stays until it is done.
+                    # The reader is opening another recording: the last picture stays until that is done.
                     if kept is not None:
                         found[track.info.key] = kept[2]
                     continue

@@ -1,4 +1,4 @@
-"""Makes films, moving 3-D pages, sheets of pictures and datasets from recordings, in a process of its own."""
+"""Makes films, animated 3-D pages, sheets of pictures and datasets from recordings, in a separate process."""
 
 from __future__ import annotations
 
@@ -47,24 +47,23 @@ from workbench.page.widgets.templates import counted, sentence
 from workbench.share.commands import What
 from workbench.share.scene_html import seconds_a_step, write_scene_html
 
-MOST_SAID = 5
+MAX_SENTENCES = 5
 """Maximum number of sentences about recordings that the page shows."""
 EVERY_CAMERA = ""
 
 
 @dataclass(frozen=True)
 class MakeRequest:
-    """What to make, and from which recordings."""
+    """A request: what to make, and from which recordings."""
 
     what: What
     sources: tuple[Source, ...]
     folder: Path
-    """Folder of the files; for a dataset the folder that becomes the dataset, for ManiSkill's demonstrations their
-    ``.h5`` file."""
+    """Folder for the files; for a dataset the folder of the dataset, for ManiSkill's demonstrations their ``.h5`` file."""
     camera: str = EVERY_CAMERA
     """Camera of a film."""
     eye: FilmEye | None = None
-    """The viewpoint of a scene; None: a usual one."""
+    """The viewpoint of a scene; None for the default."""
     export: ExportOptions = ExportOptions()
     """Options of a dataset."""
 
@@ -82,36 +81,36 @@ class Made:
     words: str
     """Summary of what was made."""
     left_out: tuple[str, ...] = ()
-    """A sentence for each recording that nothing was made of, with its name and the reason."""
+    """A sentence for each recording from which nothing was made, with its name and the reason."""
     damaged: tuple[str, ...] = ()
-    """A sentence for each damaged file of a recording of which the rest was used."""
+    """A sentence for each damaged file of a recording whose other files were used."""
     incomplete: tuple[str, ...] = ()
-    """A sentence for each recording that lacks something of what was made."""
+    """A sentence for each recording that lacks a part of the request."""
     sizes: tuple[int, ...] = ()
-    """Bytes of each file, for downloads."""
+    """Size of each file in bytes, for downloads."""
 
     @property
     def said(self) -> tuple[str, ...]:
         """Sentences that the page shows."""
         said = (*self.damaged, *self.left_out, *self.incomplete)
-        more = len(said) - MOST_SAID
-        return said[:MOST_SAID] + ((f"And {more} more.",) if more > 0 else ())
+        more = len(said) - MAX_SENTENCES
+        return said[:MAX_SENTENCES] + ((f"And {more} more.",) if more > 0 else ())
 
 
 OnProgress = Callable[[float, str], None]
 
 
 def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None) -> Made:
-    """Make what is wanted from each recording that has it. Used by the page and the command line.
+    """Carry out a request for each recording that has the data. Used by the page and the command line.
 
     Args:
-        on_progress: called with the part that is done, 0..1, and the current work.
+        on_progress: called with the completed share, 0 to 1, and the current work.
 
     Raises:
         UnreadableRecording: a recording is damaged, and nothing can be made.
-        ValueError: it can be made from none of the recordings; the message says which lacks what.
-        OSError: it cannot be written; the message says why. Finished files stay.
-        RuntimeError: this machine has nothing to render with.
+        ValueError: no recording has the data; the message contains what each lacks.
+        OSError: a file cannot be written; the message contains the reason. Finished files stay.
+        RuntimeError: this machine cannot render.
     """
     if wanted.what == "lerobot":
         return _dataset(wanted, on_progress)
@@ -135,7 +134,7 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
             damaged += broken
         except ValueError as error:
             unreadable = unreadable or bool(broken) or isinstance(error, UnreadableRecording)
-            # It does not lack pictures, they cannot be read.
+            # The recording does not lack pictures; they cannot be read.
             why = " ".join(broken) or str(error)
             not_made.append(why if source.stem in why else f"{source.stem}: {why}")
     if not paths:
@@ -148,14 +147,14 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
 
 
 def file_name(what: What, source: str, camera: str = "") -> str:
-    """File name of what is made from the recording `source`, and from its `camera` for a film."""
+    """Name of the file made from the recording `source`, and from its `camera` for a film."""
     suffix = {"film": f".{file_part(camera)}.mp4", "scene": ".scene.mp4", "page": ".html"}
     return source + suffix.get(what, ".sheet.png")
 
 
 @contextlib.contextmanager
 def _reading() -> Iterator[None]:
-    """Raise an error of the system within the block as an error of the recording, not of the disk that is written to."""
+    """Raise an OSError of the block as an error of the recording, not of the output disk."""
     try:
         yield
     except OSError as error:
@@ -241,25 +240,25 @@ def zip_name(names: Sequence[str]) -> str:
 
 
 def _zip(wanted: MakeRequest, on_progress: OnProgress) -> Made:
-    """The recordings' own files in one archive: unpacked they are recordings again."""
-    # A file that holds several recordings is taken once.
+    """Put the recordings' own files into one archive; unpacked, they are recordings again."""
+    # A file with several recordings is added once.
     files = list(dict.fromkeys(file for source in wanted.sources for file in _files_of(source)))
-    # Below what all have in common: recordings in two folders may have the same name.
+    # Paths relative to the common folder, since recordings in two folders may have the same name.
     root = Path(os.path.commonpath([source.path.parent for source in wanted.sources]))
     path = wanted.folder / zip_name([source.stem for source in wanted.sources])
-    # A file may be older than the years that an archive knows.
+    # strict_timestamps=False: a file may be older than the earliest date of a zip archive.
     with new_file(path) as temporary, zipfile.ZipFile(temporary, "w", strict_timestamps=False) as archive:
         for number, file in enumerate(files):
             on_progress(number / len(files), file.name)
-            # What takes space in it, meshes and pictures, is compressed already.
-            # An archive holds no name that is not UTF-8.
+            # Stored, since the large parts, meshes and pictures, are already compressed.
+            # plain_text, since an archive accepts only UTF-8 names.
             archive.write(file, plain_text(str(file.relative_to(root))), zipfile.ZIP_STORED)
     on_progress(1.0, "done")
     return Made((path,), f"{counted(len(files), 'file')} of {counted(len(wanted.sources), 'recording')}")
 
 
 def _files_of(source: Source) -> list[Path]:
-    """The files of a recording; a link is none. Raises ValueError if there are none."""
+    """The files of a recording, without links. Raises ValueError if there are none."""
     if source.kind == "lerobot":
         found = sorted(source.path.rglob("*"))
     else:
@@ -288,33 +287,33 @@ def _counted(
         yield picture
 
 
-# --- Making in a process of its own, while the page continues ------------------------------------
+# --- In a separate process, while the page continues ---------------------------------------------
 
 
 END_SECONDS = 5.0
-SAY_EVERY = 0.1
-"""Seconds between two progress messages. For a sheet of pictures, a message a frame would cost more than the frame."""
+PROGRESS_PERIOD_SECONDS = 0.1
+"""Interval of progress messages. For a sheet of pictures, a message per frame would cost more than the frame."""
 
 
 @dataclass(frozen=True)
 class MakingView:
-    """State of the work."""
+    """State of the present job, and results so far."""
 
     running: bool = False
     done: float = 0.0
-    """Part that is done, 0..1."""
+    """Completed share, 0 to 1."""
     doing: str = ""
     problem: str = ""
-    """Why it failed, in a sentence; empty if it succeeded or was stopped."""
+    """Why the job failed, as a sentence; empty if it succeeded or was stopped."""
     made: tuple[Made, ...] = ()
     """Results so far, newest first."""
 
 
 class Making:
-    """Makes one thing at a time, in another process.
+    """Carries out one request at a time, in a separate process.
 
-    Encoding a film takes a core for a while, and drawing a scene takes a renderer that the server's process must not
-    import: a crash in a driver would take the page along. Work that is stopped leaves no files.
+    Encoding a film uses a core for a while, and drawing a scene needs a renderer that the server's process must not import,
+    since a crash in a driver would end the page. A stopped job leaves no files.
     """
 
     def __init__(self) -> None:
@@ -330,10 +329,10 @@ class Making:
 
     @on_loop
     def start(self, wanted: MakeRequest, download: bool = False) -> bool:
-        """Begin; False if something is being made already.
+        """Start a job; returns False if one is already running.
 
         Args:
-            download: make it in a new temporary folder, which `close` deletes, and not in `wanted.folder`.
+            download: write into a new temporary folder, which `close` deletes, not into `wanted.folder`.
         """
         if self._view.running:
             return False
@@ -343,14 +342,14 @@ class Making:
         return True
 
     def stop(self) -> None:
-        """End the present work and leave no files of it. Returns at once."""
+        """Stop the present job and delete its files. Returns at once."""
         self._stopped = True
 
     def close(self) -> None:
         """Stop, wait for the end of the process, and delete the downloads. Called on another thread than the loop."""
         self.stop()
         if self._task is not None:
-            # One that hangs is ended with this process, by its `machine.processes.family`.
+            # A process that hangs is ended together with this process, by `machine.processes.family`.
             result_of(asyncio.wait([self._task], timeout=END_SECONDS))
         self._aside.end()
         if self._scratch is not None:
@@ -363,7 +362,7 @@ class Making:
         self._view = MakingView(problem=problem, made=(*made, *self._view.made))
 
     def _run(self, wanted: MakeRequest, download: bool) -> list[Made | str]:
-        """What was made, and why not. Runs beside the loop."""
+        """The results, and reasons of failures. Runs off the loop."""
         came: list[Made | str] = []
 
         def take(number: int, one: Made | str) -> None:
@@ -377,7 +376,7 @@ class Making:
         try:
             if download:
                 self._scratch = self._scratch or Path(tempfile.mkdtemp(prefix="workbench-shared-"))
-                # A new folder each time: a file of the same name may exist from before.
+                # A new folder each time: a file of the same name may already exist.
                 wanted = replace(wanted, folder=Path(tempfile.mkdtemp(dir=self._scratch)))
             work = Work(_make, wanted, Made | str, tuple[float, str], "that makes it")
             Processes(1).run(work, Scheduler(range(1), take, hear, lambda: self._stopped))
@@ -396,12 +395,12 @@ class _Stopped(BaseException):
 
 
 def _make(wanted: MakeRequest, queue: ItemQueue) -> None:
-    """Runs in the other process."""
+    """Entry point of the separate process."""
     said_at = 0.0
 
     def on_progress(done: float, doing: str) -> None:
         nonlocal said_at
-        if time.monotonic() - said_at >= SAY_EVERY:
+        if time.monotonic() - said_at >= PROGRESS_PERIOD_SECONDS:
             said_at = time.monotonic()
             queue.send_update((done, doing))
 
@@ -412,9 +411,9 @@ def _make(wanted: MakeRequest, queue: ItemQueue) -> None:
 
     if queue.next() is None:
         return
-    # By a signal: encoding a film has long stretches without progress in which it must be possible to stop.
+    # By a signal, since encoding a film may run for long without progress and must be stoppable then.
     signal.signal(signal.SIGALRM, look)
-    signal.setitimer(signal.ITIMER_REAL, SAY_EVERY, SAY_EVERY)
+    signal.setitimer(signal.ITIMER_REAL, PROGRESS_PERIOD_SECONDS, PROGRESS_PERIOD_SECONDS)
     if wanted.what == "scene":
         os.environ.update(ensure_render_device(install=False).env)
     made: Made | str

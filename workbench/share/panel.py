@@ -1,4 +1,4 @@
-"""The Share tab: make something from the selected or open recordings, download it, or open them in rerun."""
+"""The Share tab: exports the selected or open recordings, offers downloads, and opens recordings in rerun."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ WHAT: dict[str, What] = {
 }
 WHEN = "\u2039date and time\u203a"
 DATASETS: tuple[What, ...] = ("lerobot", "maniskill")
-"""Kinds for which one dataset is made of all recordings, in the folder of recordings."""
+"""Kinds for which all recordings become one dataset, in the folder of recordings."""
 ALL_CAMERAS = "every camera"
 SHARED = {"the selected recordings": False, "the open recordings": True}
 SUCCESSES_HINT = "Leave out recordings that reach success at no step"
@@ -60,15 +60,15 @@ FITTING_HINT = (
     "Leave out recordings that cannot be read, or lack what the first one has; the result names them"
 )
 TASK_HINT = "In words, for policies that take a language instruction; empty: the task's id"
-MOST_SHOWN = 6
-"""Maximum number of results in the list, the newest."""
-MOST_NAMED = 5
-"""Recordings and files that are named before they are made; the others are counted."""
+MAX_RESULTS = 6
+"""Maximum number of results in the list, newest first."""
+MAX_NAMED = 5
+"""Maximum number of recordings and files that are named before they are made; the others are counted."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """The recordings that the tab is about: those selected in the library, or else those that are open."""
+    """The recordings to share: those selected in the library, or those that are open."""
 
     sources: tuple[Source, ...] = ()
     cameras: tuple[str, ...] = ()
@@ -76,14 +76,14 @@ class Chosen:
     selected: bool = False
     """Whether they are the recordings selected in the library."""
     in_view: bool = False
-    """Whether it is the one recording in the 3-D view: a film of the view uses the page's viewpoint."""
+    """Whether it is the only recording in the 3-D view; then a film of the view uses the page's viewpoint."""
     successes: int | None = None
-    """Number of recordings that reach success at some step; None where it is not known of each."""
+    """Number of recordings that reach success at some step; None if that is unknown for some of them."""
 
 
 @dataclass(frozen=True)
 class ShareChoices:
-    """Choices of a person."""
+    """The user's choices."""
 
     opened: bool = False
     """Whether the open recordings are used instead of the selected ones."""
@@ -99,9 +99,9 @@ class SharePanel:
 
     Args:
         server: The page.
-        offers: Downloads of what was made.
-        making: Makes it; outlives this page.
-        folder: Datasets go into ``datasets`` below it.
+        offers: Downloads of the results.
+        making: Carries out requests; outlives this page.
+        folder: Datasets are written into ``datasets`` below it.
     """
 
     does = (
@@ -140,7 +140,7 @@ class SharePanel:
         self._made = gui.add_html("")
 
     def takes_opened(self, both: bool) -> bool:
-        """Whether the person chose the open recordings instead of the selected ones; `both`: there are both."""
+        """Whether to share the open recordings instead of the selected ones; `both`: there are both."""
         self._shared.visible = both
         return both and self._choices.opened
 
@@ -173,7 +173,7 @@ class SharePanel:
         what, is_dataset = choices.what, choices.what in DATASETS
         names = [source.stem for source in chosen.sources]
         files = list(zip(short_names(names), names))
-        self._about.content = render("share_about", files=files, most=MOST_NAMED, selected=chosen.selected)
+        self._about.content = render("share_about", files=files, most=MAX_NAMED, selected=chosen.selected)
         self._shared.show(choices.opened)
         self._whats.show(what)
         self._cameras.show(self._camera(), options=_names(chosen.cameras))
@@ -187,15 +187,15 @@ class SharePanel:
         make = tool("Make", MakeShared(), off=not chosen.sources, tone="main")
         self._tools.content = tools_html([tool("Stop", StopMaking()) if view.running else make])
         will = None if view.running or not names else self._will_make()
-        self._will.content = "" if will is None else render("share_will", **will, most=MOST_NAMED)
+        self._will.content = "" if will is None else render("share_will", **will, most=MAX_NAMED)
         self._made.content = self._html(view)
 
     def _camera(self) -> str:
-        """Chosen camera if these recordings have it, else every camera."""
+        """The chosen camera if these recordings have it, else all cameras."""
         return self._choices.camera if self._choices.camera in self._chosen.cameras else EVERY_CAMERA
 
     def _only_successes(self) -> bool:
-        """Whether only successes are used: as chosen, unless none of the recordings reaches success."""
+        """Whether to use only successes: the user's choice, unless no recording reaches success."""
         return self._choices.only_successes and self._chosen.successes != 0
 
     def _will_make(self) -> dict[str, Any]:
@@ -221,12 +221,12 @@ class SharePanel:
         self._making.start(replace(wanted, camera=self._camera()), download=True)
 
     def _html(self, view: MakingView) -> str:
-        made = [(one, self._links(one)) for one in view.made[:MOST_SHOWN]]
+        made = [(one, self._links(one)) for one in view.made[:MAX_RESULTS]]
         return render("share", view=view, made=made)
 
     def _links(self, made: Made) -> list[tuple[str, str, str, int]]:
-        """Address, name, short name and bytes of each file to download. A dataset stays where it is: the .h5 of
-        demonstrations belongs to the .json next to it."""
+        """Address, name, short name and bytes of each file to download. A dataset is not offered: the .h5 of demonstrations
+        belongs to the .json next to it."""
         paths = made.paths[: len(made.sizes)]
         names = [path.name for path in paths]
         addresses = [self._offers.address(path, download=True) for path in paths]
@@ -236,8 +236,8 @@ class SharePanel:
 def will_make(
     what: What, chosen: Chosen, camera: str, folder: Path, only_successes: bool = False
 ) -> dict[str, Any]:
-    """What a press on *Make* will make, as far as known before the recordings are read: a description, the files with
-    their short names, the folder ``where`` they go (empty for downloads), and a sentence of what to know before."""
+    """Preview of a press on *Make*, as far as known before the recordings are read: a description, the files with their short
+    names, their folder ``where`` (empty for downloads), and a note."""
     names = [source.stem for source in chosen.sources]
     of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
     if what in DATASETS:
@@ -279,7 +279,7 @@ _TIME = re.compile(r"_\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d")
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Names without the time at their end, unless two would become equal."""
+    """Names without the time at their end, unless two names would become equal."""
     short = [_TIME.sub("", name) for name in names]
     return short if len(set(short)) == len(short) else list(names)
 
@@ -299,7 +299,7 @@ def _eye_of(client: viser.ClientHandle) -> FilmEye | None:
 
 
 class Sharing:
-    """Downloads, rerun and work in progress: what outlives the pages. One for each `GatedServer`."""
+    """Downloads, rerun and the running job, which outlive the pages. One object per `GatedServer`."""
 
     def __init__(self, gated_server: GatedServer) -> None:
         self._offers = Downloads(gated_server.add_route)
@@ -313,13 +313,13 @@ class Sharing:
         table: LibraryPanel,
         make_way: Callable[[Callable[[bool], None]], int],
     ) -> SharePart:
-        """The Share tab, in the present container; `make_way` as `RerunView` has it."""
+        """The Share tab, in the present container; for `make_way` see `RerunView`."""
         share = SharePanel(server, self._offers, self._making, library.folder)
         server.gui.add_divider()
         return SharePart(library, table, share, RerunView(server, self._rerun, make_way))
 
     def close(self) -> None:
-        """Stop the present work and delete the downloads."""
+        """Stop the present job and delete the downloads."""
         self._making.close()
 
 
@@ -336,7 +336,7 @@ class SharePart(PagePart[ReviewView]):
         owner.do(command, visitor)
 
     def close(self) -> None:
-        """Called when the page goes."""
+        """Release the part, because the page is removed."""
         self._rerun.end()
 
     def draw(self, view: ReviewView) -> None:

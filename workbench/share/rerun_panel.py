@@ -1,4 +1,4 @@
-"""Serves rerun's web viewer for recordings, and shows it in a panel or a browser tab."""
+"""Serves rerun's web viewer for recordings and shows it in a panel or a browser tab."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from workbench.share.commands import CloseRerun, OpenInRerun
 
 log = logging.getLogger(__name__)
 
-SHARE, LEAST = 0.66, 480
-"""Share of the width between the other panels, and minimum width in pixels. The scene and the timeline have the rest."""
-SETTLES = 0.3
-"""Seconds from a page's request for the panel's content until the panel is placed."""
+WIDTH_SHARE, MIN_WIDTH_PIXELS = 0.66, 480
+"""Share of the width between the other panels, and minimum width. The scene and the timeline have the rest."""
+PLACED_AFTER_SECONDS = 0.3
+"""Time from a page's request for the panel's content until the panel is placed."""
 Moments = Mapping[Path, int]
-"""The step at which each recording is looked at."""
+"""The shown step of each recording."""
 
 PANEL = "rerun"
 _SHOW = "/rerun/show/"
@@ -44,27 +44,26 @@ _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
 
 
 class RerunPages:
-    """The addresses under which rerun shows recordings. One for each `GatedServer`.
+    """The addresses under which rerun shows recordings. One object per `GatedServer`.
 
-    rerun's web viewer is a program of 43 MB that fetches any address it is given and reports its use to its makers.
-    Here it comes from the wheel that wrote the recordings (so file and viewer have one version), packed, under the
-    page's own address: the same cookie and one forwarded port serve it, and a content security policy forbids it
-    other servers.
+    rerun's web viewer is a program of 43 MB that fetches any address it is given and reports its use to its makers. Here it
+    comes from the wheel that wrote the recordings (so file and viewer have the same version), compressed, under the page's
+    own address: the same cookie and one forwarded port suffice, and a content security policy blocks other servers.
 
-    The recordings stand in the viewer's address as whole addresses, with host and port. Only the browser knows the
-    host (behind ``ssh -L`` it is another one), so the opened page is a small one of ours that builds the addresses and
-    redirects to rerun. The step cannot stand there: rerun takes one only for recordings of its own servers. So a few
-    lines of ours in its page send it (``viewer_control``, rerun 0.41: one protobuf message, written by hand) when the
-    recording has come. A rerun without that message opens at the first step.
+    The viewer's address contains the recordings as full addresses, with host and port. Only the browser knows the host
+    (behind ``ssh -L`` it differs), so the opened page is a small one of ours that builds the addresses and redirects to
+    rerun. The address cannot contain the step: rerun accepts one only for recordings of its own servers. So a script of
+    ours in its page sends the step (``viewer_control``, rerun 0.41: one hand-written protobuf message) when the recording
+    has been read. A rerun without that message opens at the first step.
     """
 
     def __init__(self, gated_server: GatedServer, offers: Downloads) -> None:
         self._offers = offers
         self._secret = secrets.token_bytes(32)
         self._shown: dict[str, tuple[tuple[Path, ...], Callable[[], Moments]]] = {}
-        """Recordings by the random part of their address; requests read it on other threads."""
+        """Recordings by the random part of their address; requests read this dict on other threads."""
         self.unpacking = BlockingPool("rerun-viewer")
-        """Unpacks the viewer."""
+        """Decompresses the viewer."""
         headers = {"Content-Security-Policy": VIEWER_POLICY, "Cache-Control": "private, max-age=604800"}
         gated_server.add_route(_VIEWER, _viewer_file, headers)
         gated_server.add_route(_SHOW, self._go_on, {**headers, "Cache-Control": "no-store"})
@@ -73,7 +72,8 @@ class RerunPages:
         """The address, from the root of the server, that opens these ``.rrd`` files together.
 
         Args:
-            moments: called when the address is opened; the step at which each of them begins, if not the first.
+            moments: called when the address is opened; returns the initial step of each recording that does not start at the
+                first.
         """
         paths = tuple(Path(path).absolute() for path in recordings)
         # The same for the same files, and unknown to others.
@@ -87,7 +87,7 @@ class RerunPages:
             return 404, "text/plain; charset=utf-8", b"There is no such recording."
         paths, moments = shown
         names = ", ".join(path.stem for path in paths)
-        # The first step too: rerun follows the data until it reads, at the end of a file, that it shall pause.
+        # Send the first step too: without it rerun follows the data until it reads the pause at the end of a file.
         begins = {**dict.fromkeys(paths, 0), **{path.absolute(): step for path, step in moments().items()}}
         page = render(
             "rerun_go_on",
@@ -123,9 +123,9 @@ class RerunView:
 
     Args:
         server: The page.
-        pages: Where rerun is served.
-        make_way: Called before the panel opens, to make room for it, with a function that folds and unfolds it;
-            returns the pixels between the other panels.
+        pages: Addresses of rerun.
+        make_way: Called before the panel opens, to make room for it, with a function that folds and unfolds it; returns the
+            width in pixels between the other panels.
     """
 
     does = (OpenInRerun, CloseRerun)
@@ -142,10 +142,10 @@ class RerunView:
         self._panel: viser.PanelHandle | None = None
         self._jobs = Jobs(lambda: None, self._failed)
         self._waiting = False
-        """Whether the viewer is being unpacked."""
+        """Whether the viewer is being decompressed."""
         self._problem = ""
         self._drawn: object = None
-        self._width = LEAST
+        self._width = MIN_WIDTH_PIXELS
         self._button = server.gui.add_html("")
         self._words = server.gui.add_html("")
 
@@ -165,7 +165,7 @@ class RerunView:
 
         Args:
             chosen: number of recordings, of which some may have no ``.rrd`` file.
-            moments: the step at which each open one is looked at.
+            moments: the shown step of each open recording.
         """
         self._paths, self._moments = tuple(paths), moments
         lacking = chosen is not None and chosen > len(self._paths)
@@ -185,7 +185,7 @@ class RerunView:
 
     def _address(self, paths: tuple[Path, ...]) -> str:
         def moments() -> Moments:
-            post(lambda: later(SETTLES, self._widen))
+            post(lambda: later(PLACED_AFTER_SECONDS, self._widen))
             return {path: self._moments.get(path, 0) for path in paths}
 
         return self._pages.address(paths, moments)
@@ -193,8 +193,8 @@ class RerunView:
     def _widen(self) -> None:
         """Set the panel's width once a page has placed it.
 
-        viser gives 300 pixels to a panel that is docked next to another, and ignores the width given at docking. The
-        request for the panel's content tells that it is there.
+        viser gives a panel that is docked next to another 300 pixels and ignores the width given at docking. A request for
+        the panel's content shows that it exists.
         """
         if self._panel is not None:
             self._panel.set_width(self._width)
@@ -225,16 +225,16 @@ class RerunView:
             heading = [(path.stem, begins[path]) for path in paths]
             self._server.gui.add_html(render("rerun_frame", address=self._address(paths), heading=heading))
             self._server.gui.add_html(render("tell", command=TellUnfolded(panel=PANEL)))
-        # Next to the scene, with a border that can be dragged.
+        # Docked next to the scene, with a draggable border.
         panel.dock_left()
-        self._width = max(LEAST, round(SHARE * room))
+        self._width = max(MIN_WIDTH_PIXELS, round(WIDTH_SHARE * room))
 
     def _failed(self, failure: JobFailed) -> None:
         self._problem = str(failure)
 
     def _fold(self, folded: bool) -> None:
         if (panel := self._panel) is not None:
-            with suppress(RuntimeError):  # it was closed meanwhile
+            with suppress(RuntimeError):  # the panel was closed meanwhile
                 (panel.minimize if folded else panel.expand)()
 
     @on_loop
@@ -246,6 +246,6 @@ class RerunView:
 
     @on_loop
     def end(self) -> None:
-        """Open nothing any more, because the page goes, and the panel with it."""
+        """Cancel opening, because the page is removed together with the panel."""
         self._jobs.close()
         self._panel = None

@@ -1,4 +1,4 @@
-"""Writes the 3-D view of an episode as one moving HTML file that needs no server and no network."""
+"""Writes the 3-D view of an episode as an animated HTML file that needs no server and no network."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from workbench.page.scene.env_grid import lay_out
 from workbench.page.widgets.templates import counted, render
 from workbench.review.view import outcome_text
 
-TRIANGLES = 80_000
+MAX_TRIANGLES = 80_000
 """Approximate maximum number of triangles. A robot's own meshes have twice that, and the file would be three times
 the size."""
 
-PAUSE = 1.0
-"""Seconds for which the last state is held."""
+PAUSE_SECONDS = 1.0
+"""Time for which the last state is held."""
 
 
 def write_scene_html(
@@ -33,28 +33,27 @@ def write_scene_html(
     eye: FilmEye | None = None,
     on_progress: Callable[[float], None] = lambda done: None,
 ) -> None:
-    """Write the moving scene to a new file at `path`.
+    """Write the animated scene to a new file at `path`.
 
-    viser's page can play what its server would have sent, from a recording in the page itself: the scene is built and
-    moved state by state on a server without viewers, with pauses in between, and recorded. The player repeats without
-    a pause, so the last state is held; its clock includes that pause and is hidden, and our caption shows the
-    episode's time and step.
+    viser's page can play messages of its server from a recording in the page itself: the scene is built and moved state by
+    state on a server without viewers, with pauses in between, and recorded. The player repeats without a pause, so the last
+    state is held; its clock includes that pause and is hidden, and our caption shows the episode's time and step.
 
     Args:
-        path: must not exist.
-        episode: with geometry and poses.
-        eye: the first viewpoint; None: a usual one.
-        on_progress: called with the part that is done, 0..1.
+        path: file, which must not exist.
+        episode: episode with geometry and poses.
+        eye: the initial viewpoint; None for the default.
+        on_progress: called with the completed share, 0 to 1.
 
     Raises:
-        ValueError: the recording holds no scene.
-        OSError: it cannot be written there.
+        ValueError: the recording has no scene.
+        OSError: the file cannot be written.
     """
     if episode.geometry is None or episode.poses is None:
         raise ValueError(f"The recording of {episode.info.task} holds no 3D scene to show.")
     eye = eye or default_eye(episode)
     with new_file(path) as temporary:
-        # viser needs a running server; its address is never shown.
+        # viser needs a running server; nobody gets its address.
         gated_server = open_server(ServerOptions(port=0))
         try:
             page = _recorded(gated_server.server, episode, eye, on_progress)
@@ -86,22 +85,22 @@ def _recorded(
     assert geometry is not None and poses is not None
     env = 0 if geometry.num_envs == 1 else episode.info.env_index
     server.scene.set_up_direction("+z")
-    # viser's own lights: its player returns to them at every repetition, and others would flash.
+    # Use viser's own lights: its player resets to them at every repetition, so others would flash.
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up, camera.fov = eye.position, eye.look_at, eye.up, eye.fovy
     camera.near, camera.far = 0.05, 300.0
-    # All envs of the scene that it came from; the others are NaN and not drawn.
+    # The scene has all envs; the other ones are NaN and not drawn.
     batch = np.full((geometry.num_envs, *poses.shape[1:]), np.nan, np.float32)
     batch[env] = poses[0]
     scene = SceneView(server)
     layout = lay_out(geometry, batch)
-    scene.build(geometry, layout, batch, env, DrawStyle(TRIANGLES))
+    scene.build(geometry, layout, batch, env, DrawStyle(MAX_TRIANGLES))
     recording = server.get_scene_serializer()
     for state, now in enumerate(poses):
         batch[env] = now
         scene.move(batch, layout, env)
         recording.insert_sleep(seconds_a_step(episode))
         on_progress(0.9 * state / len(poses))
-    # The player repeats; without a pause the end cannot be seen.
-    recording.insert_sleep(PAUSE)
+    # The player repeats; without a pause the end would not be visible.
+    recording.insert_sleep(PAUSE_SECONDS)
     return recording.as_html(dark_mode=True)

@@ -1,1 +1,1 @@
-"""Solves the task by planning: the source of actions, the many seeds, and the job."""
+"""Solves the task by planning: as a source of actions, from many seeds, and as a job."""

@@ -19,13 +19,13 @@ from workbench.record.job import Recorded, RecordProgress, record
 from workbench.record.job_worker import RecordOptions, Written
 from workbench.task.description import TaskOptions
 
-_AFTER_SUCCESS = 5
-"""Control steps that an episode continues after its success, to see whether it stays solved."""
+_STEPS_AFTER_SUCCESS = 5
+"""Number of control steps that an episode continues after its success, to check that it stays solved."""
 
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """What to solve, and how."""
+    """Options of solving a task."""
 
     task: str
     """Reference of the task; see `RecordArguments.task`."""
@@ -33,18 +33,18 @@ class SolveOptions:
     seeds: int = 32
     """Number of seeds, from ``options.seed`` on."""
     workers: int = 1
-    """Number of processes, each with a live env, if no executor is given; the result is the same with any number."""
+    """Number of processes, each with a live env, if no executor is given; it does not change the result."""
     pictures: bool = False
     max_steps: int | None = None
     """Maximum number of control steps of an episode; see `RecordArguments.max_steps`."""
     plan: PlanOptions = PlanOptions()
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=1))
-    """Options of the task. Its number of envs is the number of seeds that each process solves at once; the result
-    of a seed does not depend on it."""
+    """Options of the task. The number of envs is the number of seeds that each process solves at once; a seed's result does
+    not depend on it."""
     seconds_per_seed: float | None = None
     """Wall time in seconds after which an episode ends at its next step; see `RecordArguments.seconds_per_seed`."""
     upload: str = ""
-    """Address that episodes are uploaded to; see `RecordArguments.upload`."""
+    """Address to which episodes are uploaded; see `RecordArguments.upload`."""
 
     def recording(self) -> RecordOptions:
         """Options of the recording that solves the task."""
@@ -60,7 +60,7 @@ class SolveOptions:
             workers=self.workers,
             options=self.options,
             plan=self.plan,
-            after_success=_AFTER_SUCCESS,
+            after_success=_STEPS_AFTER_SUCCESS,
         )
 
 
@@ -76,13 +76,13 @@ def solve(
     on_failures: Callable[[Sequence[Failure]], None] = lambda failures: None,
     on_notice: Callable[[str], None] = lambda notice: None,
 ) -> SolveReport:
-    """Solve, recording every episode.
+    """Solve the task from each seed and record every episode.
 
-    Other arguments and errors as of `record`.
+    For other arguments and errors see `record`.
 
     Args:
-        on_report: called after each seed, with what is known so far.
-        on_failures: called at the end with the seeds, by number, that gave no result, if there are some.
+        on_report: called after each seed with the report so far.
+        on_failures: called at the end with the seeds without a result, if there are any.
     """
     began = time.monotonic()
     done: dict[int, Written] = {}

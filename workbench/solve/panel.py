@@ -1,5 +1,4 @@
-"""The folder *Solve* of the Run tab: how actions are planned, the returns of the rollouts, and their paths in the
-3-D view."""
+"""The folder *Solve* of the Run tab: planning options, the returns of the rollouts, and their paths in the 3-D view."""
 
 from __future__ import annotations
 
@@ -52,14 +51,14 @@ TOOL = "the robot's tool"
 BETTER_MODE = "pd_ee_delta_pose"
 USE_MODE = "Plan in end-effector control (resets the envs)"
 USE_MODE_HINT = "Makes the envs anew with this control mode, in which plans are found soonest"
-MOST_TOLD = 4
+MAX_NAMED_ENVS = 4
 """Maximum number of newly solved envs that are named."""
-CHART_HEIGHT = 150
+CHART_HEIGHT_PIXELS = 150
 PREDICTED, ACHIEVED = "#228be6", "#f08c00"
 
 
 class SolvePanel(PagePart[SessionView]):
-    """Shown while the source of actions is *solve*.
+    """The folder; shown while the source of actions is *solve*.
 
     Args:
         server: The page.
@@ -76,7 +75,7 @@ class SolvePanel(PagePart[SessionView]):
         self._told: tuple[tuple[int, int], ...] = ()
         self._shows_rollouts = True
         self._place = 0
-        """Index of the rollout that is looked at, among those that are drawn."""
+        """Index of the chosen rollout among the drawn ones."""
         self._folder = gui.add_folder("Solve", visible=False)
         with self._folder:
             self._status = gui.add_html("")
@@ -85,7 +84,7 @@ class SolvePanel(PagePart[SessionView]):
             self._mode = gui.add_html("")
             self._build_settings()
             self._build_rollouts()
-            self._chart = LineChart(server, self._folder, CHART_HEIGHT)
+            self._chart = LineChart(server, self._folder, CHART_HEIGHT_PIXELS)
 
     def _build_settings(self) -> None:
         server = self._server
@@ -179,7 +178,7 @@ class SolvePanel(PagePart[SessionView]):
         self._look_at.visible = False
         self._looked_at = server.gui.add_html("", visible=False)
 
-    # --- what a person does ----------------------------------------------------------------------
+    # --- commands --------------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
@@ -227,7 +226,7 @@ class SolvePanel(PagePart[SessionView]):
         """Draw the paths of the last plan's rollouts.
 
         Args:
-            offset: (3,) of the selected env on the grid.
+            offset: (3,) offset of the selected env on the grid.
         """
         plan = view.of(SolveView).plan
         there = (
@@ -239,7 +238,7 @@ class SolvePanel(PagePart[SessionView]):
             self._traces.draw(plan.paths, offset, 0 if view.playing else self._place_in(plan))
 
     def _place_in(self, plan: PlannedEnv) -> int:
-        """Index of the rollout that is looked at; 0, the best one, if this plan has fewer."""
+        """Index of the chosen rollout; 0, the best one, if this plan has fewer."""
         return self._place if self._place < len(plan.drawn) else 0
 
     def _draw_saving(self, view: SessionView) -> None:
@@ -273,24 +272,23 @@ class SolvePanel(PagePart[SessionView]):
         self._chart.draw("Reward a step, of the steps that a plan looks ahead", steps, lines)
 
     def _tell(self, view: SessionView) -> None:
-        """Notify every page of newly solved envs, whichever tab is open: a person may not look at this tab while
-        it plans."""
+        """Notify every page of newly solved envs, on any tab: this tab may not be open while it plans."""
         solved = view.of(SolveView).solved
         new = [one for one in solved if one not in self._told]
         self._told = solved
-        for env, step in new[:MOST_TOLD]:
+        for env, step in new[:MAX_NAMED_ENVS]:
             several = view.task is not None and view.task.num_envs > 1
             what = f"Env {env} is solved" if several else "It is solved"
             tell_all(self._server, "Solved", f"{what} at step {step}.", color=None, seconds=8.0)
 
 
 def horizon_seconds(plan: PlanOptions, control_dt: float, has_success: bool = True) -> float:
-    """Horizon of a plan in seconds, also for the usual horizon."""
+    """Horizon of a plan in seconds, also for the default horizon."""
     return plan.steps(control_dt, has_success) * control_dt
 
 
 def offers_better_mode(view: SessionView) -> bool:
-    """Whether the robot has the control mode in which plans are found soonest, and another one is in effect."""
+    """Whether the robot has the control mode in which plans are found fastest, but another one is in effect."""
     if view.task is None or view.task.control_mode == BETTER_MODE:
         return False
     modes = {keyword.name: keyword for keyword in view.task.made.modes}
@@ -298,10 +296,10 @@ def offers_better_mode(view: SessionView) -> bool:
 
 
 def in_words(plan: PlannedEnv, place: int) -> str:
-    """Text of the rollout that is looked at: ``12th of 64: return 3.2, succeeds at step 7``.
+    """Text about the chosen rollout: ``Rollout 12 of 64: return 3.2, success at step 7``.
 
     Args:
-        place: among those that are drawn.
+        place: index among the drawn rollouts.
     """
     number = plan.drawn[place]
     which = "The best rollout" if number == 0 else f"Rollout {number + 1} of {len(plan.returns)}"
@@ -312,7 +310,7 @@ def in_words(plan: PlannedEnv, place: int) -> str:
 
 
 def earned(rows: EnvRows, env: int) -> tuple[str, int] | None:
-    """Return and steps of the env's episode, until its end if it has ended; None if it was not followed from its start."""
+    """Return and steps of the env's episode so far, or until its end; None if it was not followed from its start."""
     if not rows.followed[env]:
         return None
     steps = rows.steps if rows.end[env] < 0 else rows.end
@@ -320,16 +318,16 @@ def earned(rows: EnvRows, env: int) -> tuple[str, int] | None:
 
 
 def is_flat(plan: PlannedEnv) -> bool:
-    """Whether all rollouts earned the same, none of them by a success."""
+    """Whether all rollouts have the same return, and none of them a success."""
     return bool(np.ptp(plan.returns) == 0 and not plan.success_at.any())
 
 
 def solve_html(solve: SolveView, rows: EnvRows | None, env: int, link: LinkTo = no_links) -> str:
-    """HTML of the result of the plan, or of what to do for one.
+    """HTML of the plan's result, or of what to do to get a plan.
 
     Args:
         rows: the table of envs.
-        env: the selected one.
+        env: the selected env.
     """
     plan = solve.plan
     returns: list[tuple[str, str, float]] = []
@@ -347,8 +345,8 @@ def solve_html(solve: SolveView, rows: EnvRows | None, env: int, link: LinkTo = 
     return render(
         "solve",
         solve=solve,
-        solved=solve.solved[:MOST_TOLD],
-        more=max(0, len(solve.solved) - MOST_TOLD),
+        solved=solve.solved[:MAX_NAMED_ENVS],
+        more=max(0, len(solve.solved) - MAX_NAMED_ENVS),
         several=rows is not None and rows.num_envs > 1,
         flat=plan is not None and is_flat(plan),
         returns=returns,

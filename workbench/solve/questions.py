@@ -1,4 +1,4 @@
-"""Questions to a worker for plans. Only for a worker that does not play: its envs are the rollouts."""
+"""Questions to a worker for plans. Only for a worker that does not play: its envs run the rollouts."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from workbench.planning.options import PlanArguments
 
 @dataclass(frozen=True)
 class PlannedEnv:
-    """What was found for one env, and what the last round of its K rollouts earned."""
+    """The plan for one env, and the results of the last round of its K rollouts."""
 
     env: int
     actions: NDArray[np.float32]
     """(S, A) actions for the control steps before the next plan."""
     horizon: int
-    """H, control steps of a rollout."""
+    """H, the number of control steps of a rollout."""
     returns: NDArray[np.float32]
     """(K,) return of each rollout, best first, NaN last."""
     plan: int
-    """Index of the rollout that is the earlier plan, unchanged."""
+    """Index of the rollout that repeats the previous plan unchanged."""
     hold: int
-    """Index of the rollout that holds still."""
+    """Index of the rollout in which the robot holds still."""
     success_at: NDArray[np.int32]
-    """(K,) the step of the horizon at which each succeeded, from 1 on; 0 if it did not."""
+    """(K,) step of the horizon at which each rollout succeeded, from 1; 0 without success."""
     paths: NDArray[np.float32]
-    """(P, H + 1, 3) path of the traced body in some of the rollouts, best first; metres in the env's frame."""
+    """(P, H + 1, 3) paths of the traced body in some of the rollouts, best first; metres in the env's frame."""
     drawn: tuple[int, ...]
     """(P,) indices of the rollouts in `paths`."""
     traced: str
@@ -51,7 +51,7 @@ class PlanActions(Question[Planned]):
     snapshot: bytes
     """A pickled `envs.snapshots.snapshot.Snapshot` of these envs."""
     bodies: tuple[dict[str, bytes], ...]
-    """What each of these envs is built of, from `planning.rollouts.bodies_of`."""
+    """Bodies of each of these envs, from `planning.rollouts.bodies_of`."""
     options: PlanArguments
     traced: str = ""
-    """Name of the body to trace, as in `Settings.traced`."""
+    """Name of the body to trace, see `Settings.traced`."""

@@ -1,4 +1,4 @@
-"""Paths of a body in the rollouts of a plan, as lines in the 3-D view: the best bright, the others faint."""
+"""Draws the paths of a body in the rollouts of a plan as lines in the 3-D view: the best bright, the others faint."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ BEST, CHOSEN = (10, 255, 25), (255, 0, 110)
 lighter than other colours."""
 GOOD, BAD = (10, 60, 200), (70, 75, 85)
 """Colours of the other paths, from the second best to the worst."""
-STEPS = 12
+MAX_SEGMENTS = 12
 """Maximum number of segments of a path: half a second of a hand's path is smooth."""
-THICKNESS = 2.5
-"""Width of the lines in pixels."""
+LINE_PIXELS = 2.5
+"""Width of the lines."""
 
 
 class RolloutTraces:
-    """One node of line segments for all rollouts, so that a plan is one message of some kilobytes."""
+    """The paths of all rollouts as one node of line segments, so that a plan is one message of some kilobytes."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        more = {"thickness": THICKNESS, "thickness_units": "screen"}
+        more = {"thickness": LINE_PIXELS, "thickness_units": "screen"}
         add = partial(server.scene.add_line_segments, "/rollouts", **more)
         self._server = server
         self._lines = InView(add, "points", "colors")
@@ -36,8 +36,8 @@ class RolloutTraces:
 
         Args:
             paths: (P, T, 3) best first, metres in the env's frame.
-            offset: (3,) of the env on the grid.
-            chosen: the one that is looked at; 0 is the best.
+            offset: (3,) offset of the env on the grid.
+            chosen: index of the chosen path; 0 is the best.
         """
         if paths is None or paths.shape[0] == 0 or paths.shape[1] < 2:
             if self._drawn is not None:
@@ -56,8 +56,8 @@ class RolloutTraces:
 
 
 def segments(paths: NDArray[np.float32], chosen: int = 0) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Points and colours (S, 2, 3) of the segments, the bright ones last; without those that are not finite."""
-    kept = np.unique(np.linspace(0, paths.shape[1] - 1, min(STEPS + 1, paths.shape[1])).astype(int))
+    """Points and colours (S, 2, 3) of the segments, the bright ones last; segments that are not finite are left out."""
+    kept = np.unique(np.linspace(0, paths.shape[1] - 1, min(MAX_SEGMENTS + 1, paths.shape[1])).astype(int))
     ways = paths[:, kept]
     share = np.linspace(0, 1, len(ways))[:, None]
     colours = np.array(GOOD) * (1 - share) + np.array(BAD) * share

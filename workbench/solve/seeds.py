@@ -1,4 +1,4 @@
-"""Solves the open task from many seeds in separate processes, as ``workbench solve`` does, and keeps every episode."""
+"""Solves the open task from many seeds in separate processes, like ``workbench solve``, and keeps every episode."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from workbench.task.description import TaskOptions
 from workbench.task.problem import Problem, TaskError
 
 _NICENESS = 10
-"""Niceness of the solving processes: the worker that plays comes first."""
+"""Niceness of the solving processes: the worker that plays has priority."""
 DOES: frozenset[type[Command]] = frozenset({ChooseSeeds, SolveSeeds, StopSolving})
-"""Commands that `apply` takes."""
+"""Commands that `apply` handles."""
 SeedsState = Literal["none", "starting", "solving", "done", "stopped", "failed"]
 RUNNING: tuple[SeedsState, ...] = ("starting", "solving")
 
@@ -37,23 +37,23 @@ class SeedsView:
 
     state: SeedsState = "none"
     serial: int = 0
-    """Grows with every change."""
+    """Increases with every change."""
     report: SolveReport | None = None
     """Report on the finished seeds; of an earlier version if `stale`."""
     total: int = 0
-    """Seeds that were asked for."""
+    """Number of requested seeds."""
     done: float = 0.0
-    """Finished seeds; a seed under way counts in part."""
+    """Number of finished seeds; a running seed counts in part."""
     activity: str = ""
-    """What is being done: the preparation before the first seed, or which seed is at which step."""
+    """Text: the preparation before the first seed, or the current seed and step."""
     stale: bool = False
-    """Whether another version runs since."""
+    """Whether another version has been loaded since."""
     why: str = ""
     """Why solving failed, as text."""
     problem: Problem | None = None
-    """What the author's code raised."""
-    chosen: int = MIN_SEEDS
-    """Seeds that a person chose to solve next."""
+    """Problem of the author's code."""
+    chosen: int = ENOUGH_SEEDS
+    """Number of seeds that the user chose to solve next."""
 
 
 # --- events and effects -----------------------------------------------------------------------------
@@ -72,7 +72,7 @@ class SeedsTold:
 
 @dataclass(frozen=True)
 class SeedsDone:
-    """All seeds are tried."""
+    """All seeds were tried."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class SeedsFailed:
 
 @dataclass(frozen=True)
 class BeginSeeds:
-    """Solve seeds 0 to `seeds` - 1; a running job ends, and keeps what is done."""
+    """Solve seeds 0 to `seeds` - 1; a running job ends and keeps its results."""
 
     task: str
     options: TaskOptions
@@ -101,11 +101,11 @@ class EndSeeds:
 SeedsEvent = SeedsTold | SeedsDone | SeedsFailed
 SeedsEffect = BeginSeeds | EndSeeds
 Change = tuple[SeedsView, list[SeedsEffect]]
-"""The results after an event, and what has to be done."""
+"""The results after an event, and the effects to perform."""
 
 
 def apply(view: SeedsView, event: object, run: Run) -> Change:
-    """The results after an event, and what has to be done.
+    """The results after an event, and the effects to perform.
 
     Args:
         run: the run after the event.
@@ -136,7 +136,7 @@ def _solve(view: SeedsView, run: Run) -> Change:
     if (load := run.running_load()) is None:
         raise Refused("No task is loaded yet.")
     if not isinstance(load.task, str):
-        # Only the texts of a recording's task were cleared, not the file that bears its name.
+        # Only the recorded texts of this task were cleared, not the file with its name.
         why = "this task comes from a recording: open its file to solve it"
         return _changed(view, state="failed", why=why), [EndSeeds()] if view.state in RUNNING else []
     begun = SeedsView("starting", view.serial + 1, total=view.chosen, chosen=view.chosen)
@@ -157,7 +157,7 @@ def _changed(view: SeedsView, **values: Any) -> SeedsView:
 
 @dataclass(frozen=True)
 class _Setup:
-    """What to solve, as fields of `jobs.solve.SolveOptions`, whose module the server cannot import."""
+    """Options as fields of `solve.job.SolveOptions`, whose module the server cannot import."""
 
     task: str
     out: Path
@@ -168,13 +168,13 @@ class _Setup:
 
 
 class SeedsJobs:
-    """Performs the effects: one job at a time. Used on the loop, but for `close`."""
+    """Performs the effects: one job at a time. Used on the loop, except `close`."""
 
     def __init__(self, recordings: Path, happen: Callable[[SeedsEvent], object]) -> None:
         """
         Args:
             recordings: the folder for the episodes.
-            happen: takes what a job comes to.
+            happen: handles the resulting events.
         """
         self._recordings, self._happen = recordings.absolute(), happen
         self._jobs = Jobs(lambda: None, self._failed)
@@ -230,7 +230,7 @@ def _run(setup: _Setup, queue: ItemQueue) -> None:
     if queue.next() is None:
         return
     os.nice(_NICENESS)
-    # One seed at a time: a person looks at each as it is done.
+    # One seed at a time, so that each result is shown as soon as possible.
     options = replace(setup.options, num_envs=1)
     what = SolveOptions(setup.task, setup.out, setup.seeds, setup.workers, plan=setup.plan, options=options)
     report = solve(

@@ -1,4 +1,4 @@
-"""The folder *Solve many seeds* of the Checks tab: result of planning from each seed, and verdicts on the reward."""
+"""The folder *Solve many seeds* of the Checks tab: the result of planning from each seed, and verdicts on the reward."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ HINT = f"From 0 on. That no rule is broken says something from {MIN_SEEDS} seeds
 
 
 class SolveSeedsPanel(PagePart[SessionView]):
-    """A button that solves in the background, a row a seed, and the rules that the reward breaks.
+    """A button that solves in the background, one row per seed, and the rules that the reward breaks.
 
     Args:
         server: The page.
         session: The session.
-        on_look: Called with the recording that a person wants to look at.
+        on_look: Called with the recording that the user opens.
         link: Links the lines of the author's files.
     """
 
@@ -54,7 +54,7 @@ class SolveSeedsPanel(PagePart[SessionView]):
         self._session, self._on_look, self._link = session, on_look, link
         self._open: set[str] = set()
         """Ids of unfolded rules."""
-        # Who comes back from a recording finds the rows that led there.
+        # When the user comes back from a recording, the rows are shown again.
         before = session.view().of(SeedsView)
         with server.gui.add_folder(TITLE, expand_by_default=before.state != "none"):
             self._seeds = Field(server, "Seeds", ChooseSeeds, "seeds", str(before.chosen), hint=HINT)

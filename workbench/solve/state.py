@@ -38,11 +38,11 @@ from workbench.task.description import Stepped
 from workbench.task.problem import Problem
 
 _NICENESS = 5
-"""Niceness of the planning process: between the worker that plays and work that nobody waits for."""
+"""Niceness of the planning process: between the worker that plays and background work."""
 _NOTHING = np.zeros(0, np.float32)
 _NEW_PLAN = ChooseMethod, SetRollouts, SetHorizon, SetNoise, SetTemperature, SetPlanEvery
 DOES: frozenset[type[Command]] = frozenset({ChoosePlannedEnvs, FollowBody, *_NEW_PLAN})
-"""Commands that `apply` takes."""
+"""Commands that `apply` handles."""
 
 
 SolveState = Literal["none", "starting", "planning", "failed"]
@@ -50,45 +50,45 @@ SolveState = Literal["none", "starting", "planning", "failed"]
 
 @dataclass(frozen=True)
 class SolveView:
-    """The plans of one env, and how its episode went so far."""
+    """The plans of one env, and the course of its episode so far."""
 
     state: SolveState = "none"
-    """``starting`` the envs of the rollouts; ``failed``: see `why`."""
+    """``starting``: the envs of the rollouts are being built; ``failed``: see `why`."""
     serial: int = 0
-    """Grows with every change."""
+    """Increases with every change."""
     activity: str = ""
-    """What is being started."""
+    """Text: current work while starting."""
     why: str = ""
     """Why there is no plan, as text."""
     problem: Problem | None = None
-    """What the author's code raised in a rollout."""
+    """Problem of the author's code in a rollout."""
     plan: PlannedEnv | None = None
     """The last plan of the env."""
     plan_step: int = 0
-    """Control step of the episode that the plan was made for, from 0 on."""
+    """Control step of the episode for which the plan was made, from 0."""
     predicted: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
-    """(T,) predicted reward a step of the best rollout from each step of the episode on; NaN where nothing was planned."""
+    """(T,) predicted reward per step of the best rollout, from each step of the episode on; NaN where nothing was planned."""
     achieved: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
-    """(T,) achieved reward a step, over the horizon from each step on, as far as the horizon is over."""
+    """(T,) achieved reward per step over the horizon from each step on, if that horizon has passed."""
     begins: int = 0
-    """The control step of the episode that `predicted` and `achieved` begin with."""
+    """Control step of the episode at which `predicted` and `achieved` begin."""
     solved_at: int = 0
-    """The step of the episode's first success, from 1 on; 0 without one."""
+    """Step of the episode's first success, from 1; 0 without success."""
     solved: tuple[tuple[int, int], ...] = ()
     """Env and step of every env whose episode is solved."""
     steps_per_second: float = 0.0
-    """Env-steps of rollouts that the last plan made a second, restoring and planning included."""
+    """Env-steps of rollouts per second in the last plan, including restoring and planning."""
 
 
 @dataclass(frozen=True)
 class RunningEpisode:
-    """What is known of the running episode of an env."""
+    """The running episode of an env."""
 
     begins: int = 0
-    """Control steps of the env's episode before the first one that is kept here."""
+    """Number of control steps of the env's episode before the first one that is kept here."""
     rewards: tuple[float, ...] = ()
     predicted: Mapping[int, float] = field(default_factory=dict)
-    """Predicted reward a step, by index into `rewards`."""
+    """Predicted reward per step, by index into `rewards`."""
     horizon: int = 1
     plan: PlannedEnv | None = None
     plan_step: int = 0
@@ -98,12 +98,12 @@ class RunningEpisode:
 
 @dataclass(frozen=True)
 class Solving:
-    """What is known of the plans."""
+    """State of planning."""
 
     shared: SolveView = SolveView()
     """The view without the fields of a single env."""
     episodes: Mapping[int, RunningEpisode] = field(default_factory=dict)
-    """By env."""
+    """Running episodes by env."""
 
     @property
     def solved(self) -> tuple[int, ...]:
@@ -132,12 +132,12 @@ class Solving:
 
 @dataclass(frozen=True)
 class RolloutsStart:
-    """The version with the envs of the rollouts is not loaded yet in the planning process."""
+    """The planning process has not loaded the version with the rollouts' envs yet."""
 
 
 @dataclass(frozen=True)
 class PlanActivity:
-    """What the job does now."""
+    """The current work of the job."""
 
     activity: str
 
@@ -149,7 +149,7 @@ class PlanMade:
     wanted: PlanWanted
     envs: tuple[PlannedEnv, ...]
     steps_per_second: float
-    """Env-steps of rollouts."""
+    """Env-steps of rollouts per second."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class BeginPlan:
 
     wanted: PlanWanted
     load: Load
-    """Loads the running version with one env."""
+    """The load of the running version with one env."""
     options: PlanOptions
     traced: str
     """The body to trace."""
@@ -180,11 +180,11 @@ class EndPlan:
 SolverEvent = RolloutsStart | PlanActivity | PlanMade | PlanFailed
 SolverEffect = BeginPlan | EndPlan
 Change = tuple[Solving, list[SolverEffect | Then | Send]]
-"""The plans after an event, and what has to be done."""
+"""The plans after an event, and the effects to perform."""
 
 
 def apply(solving: Solving, event: object, run: Run) -> Change:
-    """The plans after an event, and what has to be done. The last plan stays visible when planning ends.
+    """The plans after an event, and the effects to perform. The last plan stays visible when planning ends.
 
     Args:
         run: the run after the event.
@@ -196,7 +196,7 @@ def apply(solving: Solving, event: object, run: Run) -> Change:
             if event.why_not:
                 refused, asks = _refuse(solving, event.why_not, None)
                 return refused, [EndPlan(), *asks] if runs else asks
-            # One env of the task is enough to make the rollouts' envs like it, and its seed decides nothing.
+            # One env of the task is enough to build the rollouts' envs, and its seed does not matter.
             alone = replace(load, options=replace(load.options, num_envs=1, seed=0))
             settings = run.settings
             begun = _changed(solving, state="planning", activity="", why="", problem=None)
@@ -231,7 +231,7 @@ def _set(**settings: Any) -> Then:
 
 
 def _refuse(solving: Solving, why: str, problem: Problem | None) -> Change:
-    """There is no plan to follow: the worker that plays is paused."""
+    """Pause the worker that plays, since there is no plan."""
     return _changed(solving, state="failed", activity="", why=why, problem=problem), [Then(Asked(PauseRun()))]
 
 
@@ -252,10 +252,10 @@ def _planned(solving: Solving, made: PlanMade) -> Solving:
 
 
 def _stepped(solving: Solving, event: Stepped, planned: bool) -> Solving:
-    """Note what the worker that plays came to.
+    """Record a step of the worker that plays.
 
     Args:
-        planned: the source of its actions is *solve*.
+        planned: whether the source of its actions is *solve*.
     """
     if not planned and not solving.episodes:
         return solving
@@ -282,16 +282,16 @@ def _changed(solving: Solving, **values: Any) -> Solving:
 
 
 class PlanJobs:
-    """Performs the effects: one plan at a time. Used on the loop, but for `close`.
+    """Performs the effects: one plan at a time. Used on the loop, except `close`.
 
-    A process of its own has the same version of the task with the envs of the rollouts. It is started with the first plan,
-    and ends a while after the last.
+    A separate process has the same version of the task with the envs of the rollouts. It is started with the first plan
+    and ends some time after the last.
     """
 
     def __init__(self, happen: Callable[[SolverEvent], object]) -> None:
         """
         Args:
-            happen: takes what a job comes to.
+            happen: handles the resulting events.
         """
         self._happen = happen
         self._process = Background(_NICENESS)
@@ -333,7 +333,7 @@ class PlanJobs:
 
 
 def _curves(episode: RunningEpisode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Predicted and achieved reward a step, from each step of the episode on."""
+    """Predicted and achieved reward per step, from each step of the episode on."""
     rewards = np.array(episode.rewards, np.float32)
     count = max(len(rewards), max(episode.predicted, default=-1) + 1)
     predicted = np.full(count, np.nan, np.float32)

@@ -39,8 +39,8 @@ from workbench.solve.questions import PlanActions, Planned, PlannedEnv
 from workbench.task.blame import blamed
 from workbench.task.open import OpenedTask
 
-MOST_PATHS = 24
-"""Most rollouts whose path is sent to the page."""
+MAX_PATHS = 24
+"""Maximum number of rollouts whose path is sent to the page."""
 
 
 class FollowedPlan:
@@ -49,28 +49,28 @@ class FollowedPlan:
     def __init__(self, send: Callable[[PlanWanted | PlanDropped], None]) -> None:
         """
         Args:
-            send: sends to the server.
+            send: sends an event to the server.
         """
         self._send = send
         self._asked: int | None = None
         self._told = False
-        """Whether the server knows of a request for a plan, and not that it is dropped."""
+        """Whether the server has a request for a plan that was not dropped."""
         self._at = -1
-        """Number of the moment that the next of `_actions` is for."""
+        """Number of the moment for which the next of `_actions` is."""
         self._actions: deque[NDArray[np.float32]] = deque()
         self._env_idx: tuple[int, ...] = ()
 
     @property
     def awaited(self) -> bool:
-        """Whether a plan was requested and has not come."""
+        """Whether a plan was requested and has not arrived."""
         return self._asked is not None and not self._actions
 
     def ready(self, opened: OpenedTask, moment: int, envs: Sequence[int]) -> bool:
-        """Whether there is an action for this moment; if there is none, it is asked for, once.
+        """Whether there is an action for this moment; if not, request a plan, once.
 
         Args:
             moment: `Stepped.number`.
-            envs: to plan for.
+            envs: envs to plan for.
         """
         if self._actions and self._at == moment:
             return True
@@ -81,7 +81,7 @@ class FollowedPlan:
         return False
 
     def take(self, plan: FollowPlan) -> None:
-        """A plan came."""
+        """Take a plan that arrived."""
         if plan.number == self._asked:
             self._at, self._env_idx, self._actions = plan.number, plan.env_idx, deque(plan.actions)
 
@@ -90,17 +90,17 @@ class FollowedPlan:
         action = actions.hold_action(task.parts, task.num_envs)
         planned = self._actions.popleft()
         self._at, self._asked = moment + 1, None
-        # Between two versions a plan of the old one may come for a robot with other joints.
+        # Between two versions a plan of the old one may arrive for a robot with other joints.
         if planned.shape[1] == action.shape[1] and max(self._env_idx, default=-1) < len(action):
             action[list(self._env_idx)] = planned
         return action
 
     def forget(self) -> None:
-        """Drop plans, also one that is under way: something else moves the envs now."""
+        """Drop plans, also a pending one, because something else moves the envs now."""
         self._asked = None
         self._actions.clear()
         if self._told:
-            # Dropped by the worker: the server may get a request after it has sent the pause, and plan in vain.
+            # Tell the server: it may get the request after it has sent the pause, and would plan in vain.
             self._told = False
             self._send(PlanDropped())
 
@@ -115,7 +115,7 @@ def envs_to_plan(settings: Settings, task: TaskEnv, last: StepResult) -> list[in
 
 
 def succeeded(step: StepResult) -> NDArray[np.bool_]:
-    """(N,) whether each env has succeeded; False throughout for a task without success."""
+    """(N,) whether each env has succeeded; all False for a task without success."""
     success = step.evaluate.get("success", np.zeros(len(step.reward)))
     return np.array([bool(np.all(one)) for one in success])
 
@@ -124,7 +124,7 @@ def _wanted(opened: OpenedTask, moment: int, envs: tuple[int, ...]) -> PlanWante
     try:
         snapshot = pickle.dumps(opened.env.snapshot(list(envs)))
     except Exception as error:
-        # A task may keep anything on itself: as for the history (`step_events`), that must not end it.
+        # A task may hold any object: as for the history (`step_events`), that must not stop it.
         return PlanWanted(
             moment, envs, why_not=f"its state cannot be copied: {type(error).__name__}: {error}"
         )
@@ -133,16 +133,16 @@ def _wanted(opened: OpenedTask, moment: int, envs: tuple[int, ...]) -> PlanWante
 
 
 class WorkerPlans:
-    """Makes plans with its own rollout envs, which are built when they are first needed.
+    """Makes plans with its own rollout envs, which are built at the first request.
 
-    An env's plan continues its last one as long as its episode continues; for a snapshot that does not follow from
-    the last plan, a new plan begins.
+    An env's plan continues the last one while its episode continues; for a snapshot that does not follow from the last
+    plan, a new plan begins.
     """
 
     def __init__(self, waits: Callable[[], bool]) -> None:
         """
         Args:
-            waits: whether a request waits, which ends the planning.
+            waits: returns whether a request waits, which ends the planning.
         """
         self._waits = waits
         self._rolled: TaskEnv | None = None
@@ -160,12 +160,12 @@ class WorkerPlans:
     ) -> Planned:
         """
         Args:
-            env_kwargs: with which the task was opened.
-            report: called with how many envs are done, and their total.
+            env_kwargs: keyword arguments with which the task was opened.
+            report: called with the number of finished envs and the total.
 
         Raises:
-            CannotAnswer: a request came, or the task cannot be planned for.
-            TaskError: it raised in a rollout, or while the envs were built.
+            CannotAnswer: a request arrived, or the task cannot be planned for.
+            TaskError: the task raised in a rollout or while the envs were built.
         """
         rolled, planner = self._made(opened, env_kwargs, PlanOptions(**vars(question.options)))
         try:
@@ -192,7 +192,7 @@ class WorkerPlans:
         return Planned(tuple(planned))
 
     def loaded(self, opened: OpenedTask, level: ReloadLevel | None) -> None:
-        """Another version of the task runs in this process."""
+        """Handle that another version of the task runs in this process."""
         if self._rolled is not None and level in SCENE_KEPT:
             put_class(self._rolled.env, opened.loaded.cls)
         else:
@@ -221,7 +221,7 @@ class WorkerPlans:
                 self._rolled = TaskEnv(make_rollout_env(opened.env.env, made_with, options.rollouts))
         if self._planner is None or self._options != options:
             self._next = {}
-            # Quickly restored: a person who waits sees no difference in the last bit of a contact.
+            # Restore quickly, not exactly: differences in the last bit of a contact are not visible.
             self._planner, self._options = RolloutPlanner(self._rolled.env, options, exact=False), options
         return self._rolled, self._planner
 
@@ -229,8 +229,8 @@ class WorkerPlans:
 def _for_page(env: int, plan: Plan, steps: int, traced: str) -> PlannedEnv:
     returns = plan.returns
     order = np.argsort(np.where(np.isfinite(returns), -returns, np.inf), kind="stable")
-    # Evenly from the best to the worst, or the page would show only what is much like the best.
-    drawn = np.unique(np.linspace(0, len(order) - 1, MOST_PATHS).astype(int))
+    # Evenly from the best to the worst, or the page would show only paths similar to the best.
+    drawn = np.unique(np.linspace(0, len(order) - 1, MAX_PATHS).astype(int))
     paths = np.zeros((0, 0, 3), np.float32) if plan.paths is None else plan.paths[order[drawn]]
     return PlannedEnv(
         env,
@@ -248,7 +248,7 @@ def _for_page(env: int, plan: Plan, steps: int, traced: str) -> PlannedEnv:
 
 
 def _body_to_trace(rolled: TaskEnv, name: str) -> int | None:
-    """Index of this body, or of the robot's tool if it has one, else of its last link; None if there is neither."""
+    """Index of the body of this name, else of the robot's tool, else of its last link; None if there is none of these."""
     env = rolled.env
     names = scene_index(env).names
     if name in names:

@@ -1,4 +1,4 @@
-"""The list of tasks that a person may choose from; only what is in it can be opened from a page."""
+"""The list of tasks to choose from; a page can open only listed tasks."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from workbench.task.description import TaskOptions
 from workbench.task.find import FoundTasks, TaskFile, TaskFileReader, find_task_files, read_task_file
 from workbench.task.reference import lasting
 
-LONGEST_SHOWN = 300
+MAX_TEXT_CHARACTERS = 300
 SEARCH_SECONDS = 1.0
 """Pause between two searches of the folder."""
 SEARCH_SHARE = 0.05
-"""Largest share of the time that is spent on searches: a slow folder is searched less often."""
+"""Maximum share of the time spent on searches: a slow folder is searched less often."""
 SHOWN_SECONDS = 2.0
-"""Seconds after `Catalogue.view` for which the list counts as shown; a page asks for it several times a second."""
+"""Time after a call of `Catalogue.view` for which the list counts as shown; a page calls it several times a second."""
 
 
 class Section(Enum):
@@ -51,7 +51,7 @@ class Entry:
     """A row of the list. Its texts are printable, not escaped."""
 
     number: int
-    """Number that a page sends to choose the row; never given to another row while the program runs. 0 for none yet."""
+    """Number that a page sends to choose the row; never reused while the program runs. 0 if not assigned yet."""
     section: Section
     name: str
     about: str
@@ -64,21 +64,21 @@ class Entry:
     options: TaskOptions | None = None
     """Options with which the task was last opened; None for the options of this run."""
     env_id: str = ""
-    """The id whose picture the row shows; empty for none."""
+    """Id of the task whose picture the row shows; empty for none."""
     blank: str = ""
     """Text in place of the picture."""
     lasting: str = ""
-    """The reference as `recents.lasting` has it: the same for each row of a task."""
+    """The reference in the form of `recents.lasting`, which is equal for all rows of a task."""
 
     def matches(self, words: list[str]) -> bool:
-        """Whether its name has all of these words, in lower case, or a word of its other texts begins with them."""
+        """Whether each of these lower-case words occurs in the name or begins a word of the other texts."""
         name, others = self.name.lower(), f" {self.about} {self.section.value}".lower()
         return all(word in name or f" {word}" in others for word in words)
 
 
 @dataclass(frozen=True)
 class CatalogueView:
-    """The list at a moment."""
+    """The list at one moment."""
 
     entries: tuple[Entry, ...] = ()
     """Rows in the order of the sections."""
@@ -93,15 +93,15 @@ class CatalogueView:
 class Catalogue:
     """Lists recent tasks, task files of a folder, examples, recordings and registered ids.
 
-    The list is one value, which is replaced on the loop. It follows the disk while it is shown.
-    A page chooses by number: `entry` knows only what was listed, or typed and found.
+    The list is one value, which is replaced on the loop. It follows the disk while it is shown. A page chooses by number:
+    `entry` knows only rows that were listed, or found by a typed path.
 
     Args:
-        folder: searched for task files.
+        folder: folder to search for task files.
         recordings: folder of recordings.
-        recents: what was opened before.
+        recents: recently opened tasks.
         registered: ManiSkill's tasks.
-        options: for tasks without options of their own.
+        options: options of tasks without their own.
     """
 
     def __init__(
@@ -128,29 +128,29 @@ class Catalogue:
 
     @on_loop
     def refresh(self) -> None:
-        """Search the folder and look at the recent tasks again, and follow them from now on. Returns at once."""
+        """Search the folder and read the recent tasks again, and follow them from now on. Returns at once."""
         self.registered.start()
         if self._following is not None:
-            self._following.cancel()  # a search that is under way may have passed by what has changed
+            self._following.cancel()  # a running search may already have passed changed files
         self._following = begin(self._follow())
 
     def view(self) -> CatalogueView:
-        """The list at this moment. Called again and again while the list is shown."""
+        """The present list. Pages poll it while the list is shown."""
         self._shown_at = time.monotonic()
         return self._view
 
     def entry(self, number: int) -> Entry | None:
-        """The row of this number that is listed or was typed; None if there is none."""
+        """The listed or typed row with this number; None if there is none."""
         listed = next((entry for entry in self._view.entries if entry.number == number), None)
         return self._typed.get(number) if listed is None else listed
 
     async def typed(self, text: str) -> Entry | None:
-        """The row of the task file that a person has typed the path of; None for a text that is no path.
+        """The row of the task file with the typed path; None for a text that is not a path.
 
         Raises:
             NotAPath: the file cannot be opened.
         """
-        aside = BlockingPool("typed-path")  # one for each text: a disk that hangs must not keep the next
+        aside = BlockingPool("typed-path")  # one per text: a disk that hangs must not block the next text
         try:
             found = await aside.run(lambda: self._find_typed(text))
         finally:
@@ -163,7 +163,7 @@ class Catalogue:
 
     @on_loop
     def add_file(self, file: Path, env_id: str) -> Entry:
-        """List a task file of the folder that was just written; returns its row."""
+        """Add a task file that was just written into the folder; returns its row."""
         entry = self._numbered(self._of_folder(TaskFile(file, (env_id,), ())))
         rows = self._on_disk.entries
         if all(row.number != entry.number for row in rows):
@@ -172,12 +172,12 @@ class Catalogue:
         return entry
 
     def close(self) -> None:
-        """End the search and the process of the pictures. Called on another thread than the loop."""
+        """End the search and the process that draws pictures. Must not be called on the loop."""
         do(self._end)
         self.registered.close()
 
     def _end(self) -> None:
-        self._aside.end()  # which cancels a search that is begun later
+        self._aside.end()  # also cancels searches that begin later
         if self._following is not None:
             self._following.cancel()
 
@@ -197,14 +197,14 @@ class Catalogue:
                 await asyncio.sleep(SEARCH_SECONDS)
 
     def _list(self) -> None:
-        """List what is known now."""
+        """Update the list from the present data."""
         registered = self.registered.view
         entries = (*self._on_disk.entries, *self._of_maniskill(registered))
         view = replace(self._on_disk, entries=entries, registered=registered)
         if view != self._view:
             self._view = view
 
-    # --- beside the loop -----------------------------------------------------------------------------
+    # --- off the loop --------------------------------------------------------------------------------
 
     def _search(self) -> CatalogueView:
         """The list without numbers and registered tasks."""
@@ -242,7 +242,7 @@ class Catalogue:
 
     def _of_maniskill(self, registered: RegisteredView) -> Iterator[Entry]:
         why_not = registered.why_not
-        # Tasks that cannot be opened before a download come last.
+        # Tasks without a picture, some of which need a download, come last.
         for env_id in sorted(registered.ids, key=why_not.__contains__):
             why = why_not.get(env_id)
             entry = _entry(Section.REGISTERED, env_id, env_id, "" if why is None else why.text, env_id=env_id)
@@ -272,7 +272,7 @@ class Catalogue:
         return _entry(Section.FOLDER, str(task.path), name, _about(task), file=task.path)
 
     def _place(self, file: Path) -> str:
-        """The folder of a file, as a person would write it."""
+        """Short text for the folder of a file."""
         folder = file.parent
         if folder.is_relative_to(self.folder):
             inside = folder.relative_to(self.folder)
@@ -303,7 +303,7 @@ def _about(task: TaskFile) -> str:
 
 
 def _shown(text: str) -> str:
-    return short_line(os.fsencode(text).decode(errors="replace"), LONGEST_SHOWN)
+    return short_line(os.fsencode(text).decode(errors="replace"), MAX_TEXT_CHARACTERS)
 
 
 @cache

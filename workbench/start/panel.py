@@ -1,4 +1,4 @@
-"""The list of tasks to choose from, on the start page and in the *Open...* dialog."""
+"""The list of tasks, on the start page and in the *Open...* dialog."""
 
 from __future__ import annotations
 
@@ -33,35 +33,35 @@ from workbench.start.typed_path import NotAPath
 from workbench.task.new_task import TEMPLATES
 
 PICTURES = "/task_pictures/"
-"""Prefix of the route of the pictures of registered tasks."""
-LONGEST_WORDS = 4096
-"""Maximum number of characters of the search; a path may be as long."""
-MOST_RECENT = 6
-"""Maximum number of recent tasks that are shown while nothing is searched."""
+"""Prefix of the route for pictures of registered tasks."""
+MAX_SEARCH_CHARACTERS = 4096
+"""Maximum length of the search text; a path may be that long."""
+MAX_RECENT = 6
+"""Maximum number of recent tasks that are shown without a search."""
 OPEN = "Open…"
 NEW_TASK, CREATE = "New task", "Create"
 
 
 class Chooser(Protocol):
-    """Opens what a person chooses."""
+    """Opens tasks that the user chooses."""
 
     @property
     def catalogue(self) -> Catalogue: ...
 
     def choose(self, number: int) -> None:
-        """Open this row of the list; returns at once. A number that is not listed is refused."""
+        """Open this row of the list; returns at once. Raises `Refused` for a number that is not listed."""
         ...
 
     async def create(self, name: str, template: TemplateName) -> None:
         """Write a new task into the folder of the list, and open it.
 
         Raises:
-            ValueError: nothing was written; the message says why.
+            ValueError: nothing was written; the message contains the reason.
         """
         ...
 
     def doing(self) -> str:
-        """Text for the page: what is being done; empty if nothing."""
+        """Text for the page: the work in progress; empty if there is none."""
         ...
 
     def is_open(self, entry: Entry) -> bool:
@@ -71,19 +71,19 @@ class Chooser(Protocol):
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched for."""
+    """A search and its interpretation."""
 
     words: str = ""
     typed: Entry | None = None
-    """The file whose path the words are."""
+    """The file, if the words are its path."""
     why_not: str = ""
     """Why the path in the words cannot be opened."""
 
 
 class TaskList:
-    """A search field and the list, in the present container. `Catalogue.refresh` was called before.
+    """A search field and the list, in the present container. Call `Catalogue.refresh` first.
 
-    Enter in the field opens the best match; the arrows lead from the field to the rows.
+    Enter in the field opens the best match; the arrow keys move from the field to the rows.
     """
 
     does = (
@@ -119,7 +119,7 @@ class TaskList:
             hint="Words in the name or the folder, all of which must be found; or the path of a file",
             live=True,
             enter=OpenFoundTask(),
-            longest=LONGEST_WORDS,
+            longest=MAX_SEARCH_CHARACTERS,
         )
         with server.gui.add_folder(NEW_TASK, expand_by_default=False):
             self._name_field = Field(
@@ -158,7 +158,7 @@ class TaskList:
             case OpenFoundTask():
                 return self._open_found(self._search.words)
             case LookForTasks(words=words):
-                self._look_for(words[:LONGEST_WORDS])
+                self._look_for(words[:MAX_SEARCH_CHARACTERS])
             case ClearTaskSearch():
                 self._look_for("")
             case NameTask(name=name):
@@ -188,7 +188,7 @@ class TaskList:
             self._search = found
 
     async def _read(self, words: str) -> Search:
-        """What the words mean on the disk."""
+        """Look up the words as a path on the disk."""
         try:
             return Search(words, typed=await self._chooser.catalogue.typed(words))
         except NotAPath as error:
@@ -215,12 +215,12 @@ def shown_rows(view: CatalogueView, search: Search) -> dict[Section, list[Entry]
         found.insert(0, typed)
     rows = {section: [entry for entry in found if entry.section is section] for section in Section}
     if not wanted:
-        rows[Section.RECENT] = rows[Section.RECENT][:MOST_RECENT]
+        rows[Section.RECENT] = rows[Section.RECENT][:MAX_RECENT]
     return rows
 
 
 def best_row(rows: Sequence[Entry], is_open: Callable[[Entry], bool]) -> Entry | None:
-    """Row that Enter opens: the first that can be opened and is not open; else one that is open; else the first."""
+    """Row that Enter opens: the first one that can be opened and is not open, else one that is open, else the first."""
     return min(rows, key=lambda row: (row.gone, is_open(row)), default=None)
 
 
@@ -231,12 +231,12 @@ def tasks_html(
     is_open: Callable[[Entry], bool] = lambda entry: False,
     field: str = "",
 ) -> str:
-    """The list.
+    """HTML of the list.
 
     Args:
-        doing: what is being opened, if anything.
-        is_open: whether a row is the open task, which is marked and which Enter does not choose.
-        field: name of the field of the search.
+        doing: text about the work in progress, or empty.
+        is_open: returns whether a row is the open task, which is marked and which Enter does not choose.
+        field: name of the search field.
     """
     found, searched = shown_rows(view, search), bool(search.words.split())
     every = [row for rows in found.values() for row in rows]
@@ -293,7 +293,7 @@ def _note(section: Section, view: CatalogueView, some: bool, searched: bool) -> 
 
 
 def picture_route(catalogue: Catalogue) -> Callable[[str], tuple[int, str, bytes]]:
-    """Gives the picture of a listed id: the name is looked up, and is no path."""
+    """Route handler for the picture of a listed id: the name is looked up and never used as a path."""
 
     def reply(name: str) -> tuple[int, str, bytes]:
         picture = catalogue.registered.picture(name.removesuffix(".jpg"))
@@ -303,7 +303,7 @@ def picture_route(catalogue: Catalogue) -> Callable[[str], tuple[int, str, bytes
 
 
 class OpenDialog(PagePart[object]):
-    """The *Open...* dialog over a page. It is on all open pages, as every dialog of viser's is."""
+    """The *Open...* dialog. Like every dialog of viser it is on all open pages."""
 
     does = (OpenTaskList, *TaskList.does)
 
@@ -315,7 +315,7 @@ class OpenDialog(PagePart[object]):
         self._server, self._chooser = server, chooser
         self._wanted = False
         self._shown: tuple[Dialog, TaskList] | None = None
-        """Opened and closed by `draw`, which alone uses its fields."""
+        """The open dialog; only `draw` opens and closes it and uses its fields."""
 
     def do(self, command: Command, visitor: Visitor) -> Done:
         match command:
@@ -331,11 +331,11 @@ class OpenDialog(PagePart[object]):
         return None
 
     def add_button(self) -> None:
-        """Add the button that opens it to the present container."""
+        """Add the button that opens the dialog to the present container."""
         self._server.gui.add_html(tools_html([tool(OPEN, OpenTaskList())]))
 
     def close(self) -> bool:
-        """Close it; False if it is closed."""
+        """Close the dialog; returns False if it is already closed."""
         was, self._wanted = self._wanted, False
         return was
 

@@ -1,4 +1,4 @@
-"""Remembers which tasks were opened last, and how their envs were made, in the user's state folder."""
+"""Stores the last opened tasks and their options in the user's state folder."""
 
 from __future__ import annotations
 
@@ -19,18 +19,17 @@ from workbench.task.reference import lasting, named_file, split_reference
 log = logging.getLogger(__name__)
 
 RECENT_FILE = "recent_tasks.json"
-MOST_KEPT = 20
-LONGEST = 4096
-"""Longest reference, in characters."""
-LARGEST_KWARGS = 20_000
-"""Most bytes of the keyword arguments of one task."""
+MAX_TASKS = 20
+MAX_REFERENCE_CHARACTERS = 4096
+MAX_KWARGS_BYTES = 20_000
+"""Maximum size of the keyword arguments of one task."""
 
 
 class RecentTask(msgspec.Struct, frozen=True):
-    """A task that was opened, and the options that may be used again."""
+    """A task that was opened, with the options to use again."""
 
     reference: str
-    """An absolute file with or without a class, or a registered id."""
+    """An absolute path with or without a class, or a registered id."""
     num_envs: int = 16
     env_kwargs: dict[str, Any] = {}
     when: str = ""
@@ -48,13 +47,13 @@ class _Document(msgspec.Struct):
 
 
 class RecentTasks:
-    """The tasks that this user opened last, the newest first. Thread-safe; other processes may write too.
+    """The tasks that this user opened last, newest first. Thread-safe; other processes may write too.
 
-    A file that is missing, broken, or that others may write to gives no tasks. An entry that cannot be one is dropped. If
-    the file cannot be written, entries last until the program ends.
+    If the file is missing, broken, or writable by other users, there are no tasks. Invalid entries are dropped. If the file
+    cannot be written, entries last until the program ends.
 
     Args:
-        folder: gives the folder; raises OSError if there is none.
+        folder: returns the folder; raises OSError if there is none.
     """
 
     def __init__(self, folder: Callable[[], Path] = state_folder) -> None:
@@ -69,7 +68,7 @@ class RecentTasks:
             return _newest([*self._this_run, *self._read()])
 
     def add(self, reference: str, options: TaskOptions) -> None:
-        """Note that a task was opened with these options."""
+        """Store that a task was opened with these options."""
         now = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
         task = _checked(RecentTask(lasting(reference), options.num_envs, dict(options.env_kwargs), now))
         if task is None:
@@ -84,22 +83,22 @@ class RecentTasks:
                     text = msgspec.json.format(msgspec.json.encode(_Document(encoded)), indent=1)
                     write_private(RECENT_FILE, text, folder)
             except OSError as error:
-                self._warn_once(f"The tasks that you opened cannot be kept for the next run: {error}")
+                self._warn_once(f"The list of recent tasks cannot be saved for the next run: {error}")
 
     def _read(self) -> list[RecentTask]:
         try:
             content = read_private(RECENT_FILE, self._folder())
         except OSError as error:
-            self._warn_once(f"The tasks that you opened before are not known: {error}")
+            self._warn_once(f"The list of recent tasks cannot be read: {error}")
             return []
         if content is None:
             return []
         try:
             rows = msgspec.json.decode(content, type=_Document).tasks
         except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
-            self._warn_once(f"The list of tasks that you opened before is broken and is made anew: {error}")
+            self._warn_once(f"The list of recent tasks is broken and will be recreated: {error}")
             return []
-        return [task for row in rows[: 10 * MOST_KEPT] if (task := _decoded(row)) is not None]
+        return [task for row in rows[: 10 * MAX_TASKS] if (task := _decoded(row)) is not None]
 
     def _warn_once(self, what: str) -> None:
         if what not in self._warned:
@@ -111,7 +110,7 @@ def _newest(tasks: list[RecentTask]) -> list[RecentTask]:
     first: dict[str, RecentTask] = {}
     for task in tasks:
         first.setdefault(task.reference, task)
-    return list(first.values())[:MOST_KEPT]
+    return list(first.values())[:MAX_TASKS]
 
 
 def _decoded(row: msgspec.Raw) -> RecentTask | None:
@@ -122,15 +121,19 @@ def _decoded(row: msgspec.Raw) -> RecentTask | None:
 
 
 def _checked(task: RecentTask) -> RecentTask | None:
-    """The task, unless its values cannot be those of one: the file may have been written by anybody."""
+    """The task if its values are valid, else None: the file is untrusted."""
     text = task.reference
-    if not 0 < len(text) <= LONGEST or not text.isprintable() or not 1 <= task.num_envs <= MAX_NUM_ENVS:
+    if (
+        not 0 < len(text) <= MAX_REFERENCE_CHARACTERS
+        or not text.isprintable()
+        or not 1 <= task.num_envs <= MAX_NUM_ENVS
+    ):
         return None
     try:
-        # A module's name would find another file in another folder.
+        # The name of a module would lead to another file in another folder.
         if split_reference(text) is not None or (task.file is not None and not text.startswith("/")):
             return None
-        if len(msgspec.json.encode(task.env_kwargs)) > LARGEST_KWARGS:
+        if len(msgspec.json.encode(task.env_kwargs)) > MAX_KWARGS_BYTES:
             return None
     except (OSError, ValueError, TypeError, RuntimeError, RecursionError, msgspec.MsgspecError):
         return None

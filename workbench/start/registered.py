@@ -1,4 +1,4 @@
-"""Lists the tasks that ManiSkill registers and draws a picture of each, in a process that gives way to all others."""
+"""Lists the tasks that ManiSkill registers and renders a thumbnail of each, in a process of the lowest priority."""
 
 from __future__ import annotations
 
@@ -32,24 +32,23 @@ from workbench.machine.processes.wire import Question
 log = logging.getLogger(__name__)
 
 LIST_FILE = "tasks.json"
-MOST_TASKS = 2000
-MOST_TRIES = 2
-"""Attempts to draw a task before `RETRY_SECONDS` has to pass."""
+MAX_TASKS = 2000
+MAX_TRIES = 2
+"""Number of attempts to draw a task before `RETRY_SECONDS` has to pass."""
 RETRY_SECONDS = 7 * 24 * 3600.0
-"""Seconds after which a task that failed so often is tried again: what it lacks may have been downloaded."""
+"""Backoff after `MAX_TRIES` failures: missing files may have been downloaded by then."""
 ANSWER_SECONDS = 120.0
-"""Timeout of the list and of each picture; on two cores with a software renderer most tasks are drawn in 5 s."""
-PICTURES_A_PROCESS = 20
-"""Pictures that one process draws before another is started: SAPIEN keeps the meshes of closed scenes."""
-LONGEST_WHY = 300
-WIDTH, HEIGHT = 160, 120
-LARGEST_PICTURE = 64 * 1024
-"""Most bytes of a cached picture; 160 x 120 pixels take 6 kB."""
-_LOOK_SECONDS = 0.5
-"""Seconds between two checks whether drawing may continue."""
+"""Timeout for the list and for each picture; on two cores with a software renderer most tasks are drawn in 5 s."""
+PICTURES_PER_PROCESS = 20
+"""Number of pictures after which another process is started, since SAPIEN keeps the meshes of closed scenes."""
+MAX_REASON_CHARACTERS = 300
+WIDTH_PIXELS, HEIGHT_PIXELS = 160, 120
+MAX_PICTURE_BYTES = 64 * 1024
+"""Maximum size of a cached picture; 160 x 120 pixels take 6 kB."""
+_POLL_SECONDS = 0.5
+"""Interval at which the job checks whether drawing may continue."""
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
-"""Pattern of an id. Without a dot, a slash and a colon an id cannot be a file or a module, whoever wrote it into the
-cache."""
+"""Pattern of an id. The cache is untrusted: without a dot, a slash and a colon an id cannot be a file or a module."""
 Value = TypeVar("Value")
 
 
@@ -71,7 +70,7 @@ class _Cached(msgspec.Struct):
 
 @dataclass(frozen=True)
 class RegisteredView:
-    """List and pictures at one moment."""
+    """The list and the pictures at one moment."""
 
     ids: tuple[str, ...] = ()
     pictures: frozenset[str] = frozenset()
@@ -79,33 +78,34 @@ class RegisteredView:
     why_not: Mapping[str, NotDrawn] = field(default_factory=dict)
     """Why a task has no picture, by id."""
     doing: str = ""
-    """``listing the tasks``, ``drawing PickCube-v1``; empty if nothing is being done."""
+    """``listing the tasks``, ``drawing PickCube-v1``; empty if there is no work."""
     problem: str = ""
     """Why there is no list, as sentences."""
 
     @property
     def waiting(self) -> int:
-        """Pictures that are still to be made."""
+        """Number of pictures that are still to be made."""
         return len(set(self.ids) - self.pictures - self.why_not.keys())
 
 
 class RegisteredTasks:
-    """ManiSkill's tasks and their pictures, cached by its version below the user's cache folder.
+    """ManiSkill's tasks and their thumbnails, cached by ManiSkill's version below the user's cache folder.
 
-    Importing ManiSkill takes seconds, and every picture needs an env, so both happen in a process of the lowest priority
-    that the kernel knows: it gets what is left over. It ends when all is done.
+    Importing ManiSkill takes seconds, and every picture needs an env, so both happen in a process of the lowest priority,
+    which gets only idle CPU time. It ends when everything is done.
 
     Args:
-        may_work: asked on the loop before every picture; False makes it wait, and frees the memory of the process.
-        folder: for the cached list and pictures; None for the user's cache.
+        may_work: called on the loop before every picture; if it returns False, drawing waits and the process is ended to
+            free its memory.
+        folder: folder of the cached list and pictures; None for the user's cache.
     """
 
     def __init__(self, may_work: Callable[[], bool] = lambda: True, folder: Path | None = None) -> None:
         self._may_work, self._given_folder = may_work, folder
         self.view = RegisteredView()
-        """What is known at this moment."""
+        """The present list and pictures."""
         self.on_change: Callable[[], None] = lambda: None
-        """Called on the loop when there is another view."""
+        """Called on the loop when `view` has changed."""
         self._folder = Path()
         self._disk = BlockingPool("registered-tasks")
         self._process = Background(niceness=LOWEST_NICENESS)
@@ -113,12 +113,12 @@ class RegisteredTasks:
 
     @on_loop
     def start(self) -> None:
-        """Begin to list and to draw, if that has not begun. Returns at once."""
+        """Start listing and drawing, unless already started. Returns at once."""
         if self._work is None:
             self._work = begin(self._list_and_draw())
 
     def picture(self, env_id: str) -> bytes | None:
-        """The JPEG of a listed task; None without one."""
+        """The JPEG of a listed task; None if there is none."""
         return _read_jpeg(self._file(env_id)) if env_id in self.view.pictures else None
 
     def close(self) -> None:
@@ -127,7 +127,7 @@ class RegisteredTasks:
         self._process.close()
 
     def _end(self) -> None:
-        self._disk.end()  # which cancels work that is begun later
+        self._disk.end()  # also cancels work that begins later
         if self._work is not None:
             self._work.cancel()
 
@@ -162,14 +162,14 @@ class RegisteredTasks:
 
     async def _draw_all(self) -> None:
         tried, count = self.view.why_not, 0
-        # A task that failed before comes after all others.
+        # Tasks that already failed come last.
         for env_id in sorted(self.view.ids, key=tried.__contains__):
             if env_id in self.view.pictures or not _may_try(tried.get(env_id)):
                 continue
             while not self._may_work():
                 self._process.end()
                 self._tell(doing="")
-                await asyncio.sleep(_LOOK_SECONDS)
+                await asyncio.sleep(_POLL_SECONDS)
             self._tell(doing=f"drawing {env_id}")
             try:
                 drawn = await self._ask(DrawTask(env_id))
@@ -185,26 +185,26 @@ class RegisteredTasks:
                 return
             self._tell(pictures=self.view.pictures | {env_id})
             count += 1
-            if count % PICTURES_A_PROCESS == 0:
+            if count % PICTURES_PER_PROCESS == 0:
                 self._process.end()
 
     async def _ask(self, question: Question[Value]) -> Value:
-        """Ask the process.
+        """Ask the process a question.
 
         Raises:
-            JobFailed: there is no answer, or not in time.
+            JobFailed: there is no answer, or the timeout has passed.
         """
         try:
             async with asyncio.timeout(ANSWER_SECONDS):
                 return await self._process.ask(question)
         except TimeoutError:
-            self._process.end()  # it may be in an endless loop
+            self._process.end()  # the process may be in an endless loop
             raise JobFailed(f"it took longer than {ANSWER_SECONDS:.0f} s") from None
 
     async def _note_failure(self, env_id: str, why: str, needs_download: bool = False) -> None:
         before = self.view.why_not.get(env_id)
         tries = 1 if before is None else before.tries + 1
-        failed = NotDrawn(why[:LONGEST_WHY], needs_download, tries, time.time())
+        failed = NotDrawn(why[:MAX_REASON_CHARACTERS], needs_download, tries, time.time())
         self._tell(why_not={**self.view.why_not, env_id: failed})
         await self._keep_list()
 
@@ -214,7 +214,7 @@ class RegisteredTasks:
             await self._disk.run(partial(_write, self._folder / LIST_FILE, content))
         except OSError as error:
             log.warning(
-                "The list of ManiSkill's tasks cannot be kept, and is made again in the next run: %s", error
+                "The list of ManiSkill's tasks cannot be cached and is made again in the next run: %s", error
             )
 
     def _find_pictures(self) -> frozenset[str]:
@@ -231,7 +231,7 @@ class RegisteredTasks:
 
 
 def _may_try(before: NotDrawn | None) -> bool:
-    return before is None or before.tries < MOST_TRIES or abs(time.time() - before.last) > RETRY_SECONDS
+    return before is None or before.tries < MAX_TRIES or abs(time.time() - before.last) > RETRY_SECONDS
 
 
 def _version_folder() -> Path:
@@ -246,18 +246,18 @@ def _read_list(folder: Path) -> _Cached:
     try:
         cached = msgspec.json.decode(read_regular_file(folder / LIST_FILE, 1 << 20), type=_Cached)
     except (OSError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
-        return _Cached([])  # made again
+        return _Cached([])  # the list will be made again
     cached.ids = _checked(cached.ids)
     return cached
 
 
 def _checked(ids: Iterable[str]) -> list[str]:
-    return sorted(filter(_ID.fullmatch, ids))[:MOST_TASKS]
+    return sorted(filter(_ID.fullmatch, ids))[:MAX_TASKS]
 
 
 def _read_jpeg(file: Path) -> bytes | None:
     try:
-        content = read_regular_file(file, LARGEST_PICTURE)
+        content = read_regular_file(file, MAX_PICTURE_BYTES)
     except (OSError, ValueError):
         return None
     return content if content.startswith(b"\xff\xd8\xff") else None
@@ -269,14 +269,14 @@ def _write(file: Path, content: bytes) -> None:
 
 
 def _write_jpeg(file: Path, pixels: np.ndarray) -> None:
-    """Write the middle of a picture, in the shape of the cached ones. Raises ValueError for what is no picture."""
+    """Write the centre of a picture at the size of cached ones. Raises ValueError if `pixels` is not a picture."""
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or not 0 < pixels.size < 1 << 26:
         raise ValueError("it is no picture")
     height, width = pixels.shape[:2]
-    scale = max(WIDTH / width, HEIGHT / height)
-    size = max(WIDTH, round(width * scale)), max(HEIGHT, round(height * scale))
+    scale = max(WIDTH_PIXELS / width, HEIGHT_PIXELS / height)
+    size = max(WIDTH_PIXELS, round(width * scale)), max(HEIGHT_PIXELS, round(height * scale))
     image = Image.fromarray(pixels).resize(size, Image.Resampling.BOX)
-    left, top = (size[0] - WIDTH) // 2, (size[1] - HEIGHT) // 2
+    left, top = (size[0] - WIDTH_PIXELS) // 2, (size[1] - HEIGHT_PIXELS) // 2
     written = io.BytesIO()
-    image.crop((left, top, left + WIDTH, top + HEIGHT)).save(written, "JPEG", quality=80)
+    image.crop((left, top, left + WIDTH_PIXELS, top + HEIGHT_PIXELS)).save(written, "JPEG", quality=80)
     _write(file, written.getvalue())

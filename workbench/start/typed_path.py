@@ -1,4 +1,4 @@
-"""Reads what a person typed or pasted into the task search as the path of a task."""
+"""Parses text typed or pasted into the task search as the path of a task."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from workbench.task.reference import check_task_file, file_and_class, find_modul
 
 _QUOTES = ('""', "''", "``", "“”", "‘’")
 _LINE = re.compile(r"(?<=\.py)(:\d+)+$")
-"""A line and a column, as in ``push.py:88``, which messages and editors give."""
+"""A line and a column, as in ``push.py:88``, which messages and editors append."""
 
 
 class NotAPath(ValueError):
-    """A path that cannot be opened; the message is the reason."""
+    """The path cannot be opened; the message is the reason."""
 
 
 def typed_path(text: str, folder: Path) -> tuple[Path, str | None] | None:
     """File and class that a text names; None for a text that does not have the form of a path, such as search words.
 
-    Takes what terminals, editors and file managers give: quotes and spaces around, ``file://``, ``~``, a line behind.
+    Accepts the forms of terminals, editors and file managers: surrounding quotes and spaces, ``file://``, ``~``, a line
+    number at the end.
 
     Args:
-        folder: what a relative path begins at.
+        folder: base of a relative path.
 
     Raises:
-        NotAPath: there is no such file, or it is not one of Python.
+        NotAPath: there is no such file, or it is not a Python file.
     """
     text = text.strip()
     while len(text) > 1 and text[0] + text[-1] in _QUOTES:
@@ -47,6 +48,6 @@ def typed_path(text: str, folder: Path) -> tuple[Path, str | None] | None:
         check_task_file(path)
     except TaskError as error:
         raise NotAPath(error.problem.message) from error
-    except (OSError, RuntimeError, ValueError) as error:  # ValueError: characters that no path can have
+    except (OSError, RuntimeError, ValueError) as error:  # ValueError: characters that a path cannot contain
         raise NotAPath(f"{text} is not a path that can be opened: {error}") from error
     return path, class_name or None

@@ -1,1 +1,1 @@
-"""Decides whether code that a recording names or holds may run."""
+"""Decides whether code that a recording references or contains may run."""

@@ -1,4 +1,4 @@
-"""Decides whether code that a recording names or holds, or a listed file, may run, and asks a person if need be."""
+"""Decides whether code that a recording references or contains, or a listed file, may run; asks the user if necessary."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from workbench.task.content import CannotRead, TaskContent, read_content
 from workbench.task.reference import RecordedTask, TaskName, looks_like_file
 from workbench.trust.store import TrustStore
 
-SHORT_HASH = 12
-LONGEST = 400
-"""Longest name that is shown, in characters."""
+HASH_CHARACTERS = 12
+MAX_NAME_CHARACTERS = 400
+"""Maximum length of a shown name."""
 FOLLOWED = (
     "While it is open live, every save of this file and of the modules beside it runs without asking, whoever saves it. "
     "Rescore uses the file as it is then."
 )
-"""Warning before going live with a file that a recording names."""
+"""Warning before continuing live with a file that a recording references."""
 
 
 class Consent(Enum):
     NO = "no"
     NONE = "none"
-    """No to this and to all other questions of the same call."""
+    """No to this and all other questions of the same call."""
     ONCE = "once"
     """Yes, until the program ends."""
     ALWAYS = "always"
 
 
 class Since(Enum):
-    """How a file differs from the version that was trusted before."""
+    """Difference of a file from the version that was trusted last."""
 
     SAME = "same"
     CHANGED = "changed"
@@ -49,44 +49,44 @@ class CodeFile:
     """A source text that would run."""
 
     name: str
-    """Path of the task's own file; of a module, relative to it."""
+    """Path of the task's own file; for a module, relative to it."""
     hash: str
     """First digits of its SHA-256."""
     text: str
-    """The text, not escaped: escape it before showing it."""
+    """The text, not escaped."""
     since: Since = Since.SAME
 
 
 @dataclass(frozen=True)
 class TrustQuestion:
-    """A question to a person. Texts from recordings are made printable, not escaped."""
+    """A question to the user. Texts from recordings are made printable, not escaped."""
 
     task: str
-    """Task of the recording that names the code; empty for a listed file."""
+    """Task of the recording that references the code; empty for a listed file."""
     recorded_text: bool
-    """Whether the texts are those that the recording holds, not files on disk."""
+    """Whether the texts are those in the recording, not files on disk."""
     files: tuple[CodeFile, ...]
-    """Files that would run; the task's own file first."""
+    """Files that would run, the task's own file first."""
     unseen: tuple[str, ...] = ()
-    """Code that may run and is not among `files`."""
+    """Code that may run but is not among `files`."""
     computed: bool = False
-    """Whether the task computes what it imports, so that its modules are all files of its folder."""
+    """Whether the task computes its imports, so that all files of its folder count as modules."""
     trusted_before: bool = False
     """Whether another version of the same files was trusted; see `CodeFile.since`, unless `nothing_known`."""
     gone: tuple[str, ...] = ()
-    """Modules of the version trusted before that no longer exist."""
+    """Modules of the last trusted version that no longer exist."""
     followed: bool = False
     """Whether later saves of these files run too."""
     agreed: bool = False
-    """Whether these texts may run already; only `followed` is new."""
+    """Whether these texts may already run; only `followed` is new."""
     more: int = 0
     """Number of questions after this one."""
     listed: bool = False
-    """Whether a person chose the file from a list; no recording names it."""
+    """Whether the user chose the file from a list; no recording references it."""
 
     @property
     def file(self) -> str:
-        """A path, or the name of a file that a recording holds."""
+        """A path, or the name of a file in a recording."""
         return self.files[0].name
 
     @property
@@ -96,21 +96,21 @@ class TrustQuestion:
 
     @property
     def modules(self) -> tuple[CodeFile, ...]:
-        """The files besides the task's own."""
+        """All files except the task's own."""
         return self.files[1:]
 
     @property
     def nothing_known(self) -> bool:
-        """Whether the version trusted before is not known file by file."""
+        """Whether the last trusted version is not known file by file."""
         return self.trusted_before and not self.gone and all(one.since is Since.SAME for one in self.files)
 
 
 class NotCleared(Exception):
-    """Code may not run; the message is the reason.
+    """Code must not run; the message is the reason.
 
     Attributes:
         question: The question whose yes would allow it, if there is one.
-        trust_helps: No question is asked about it, but ``--trust`` allows it.
+        trust_helps: Whether no question is asked but ``--trust`` would allow it.
     """
 
     def __init__(self, why: str, question: TrustQuestion | None = None, trust_helps: bool = False) -> None:
@@ -127,44 +127,44 @@ class NotTrusted(Exception):
 
 
 Ask = Callable[[TrustQuestion, Callable[[], bool]], Consent]
-"""Asks a person and waits for the answer. Answers no as soon as its second argument, "stopped", returns true."""
+"""Asks the user and waits for the answer. Returns no as soon as its second argument, "stopped", returns True."""
 
 
 @dataclass(frozen=True)
 class CodeToRun:
-    """Code that a recording names or holds."""
+    """Code that a recording references or contains."""
 
     reference: TaskName
     """The task to open; ignored if `recorded_text` is True."""
     info: EpisodeInfo
     """Info of the recording."""
     recorded_text: bool = False
-    """Whether to run the text that the recording holds."""
+    """Whether to run the text in the recording."""
     followed: bool = False
     """Whether later saves of the file run too."""
 
 
 @dataclass(frozen=True)
 class _Undecided:
-    """Texts that a person has to be asked about."""
+    """Texts that need a question to the user."""
 
     content: TaskContent
     agreed: bool
-    """Whether the texts may run, but not be followed."""
+    """Whether the texts may run, but later saves may not."""
 
 
 class Clearances:
-    """Decides about all code of recordings; each text is asked about once.
+    """Decides about all code of recordings; it asks about each text once.
 
-    A recording is untrusted unless its seal says that it was made here. Its task is opened without a question if it is an
-    id of an installed package, a file that a person named (on the command line, or open live), or the file that this
-    installation had open when it recorded. Of anything else the texts are read, not run, and a person is asked about
-    them; the answer is stored by their hash. The agreed texts run even if the file changes. Only where the file is
-    followed (going live) later saves run too, which is a question of its own.
+    A recording is untrusted unless its seal proves that it was made here. Its task is opened without a question if it is an
+    id of an installed package, a file that the user named (on the command line, or open live), or the file that this
+    installation had open when it recorded. For anything else the texts are read, not run, and the user is asked; the answer
+    is stored by their hash. The approved texts run even if the file changes. Later saves run only if the file is followed
+    (continuing live), which is a separate question.
 
     Args:
-        named: The files that a person named: on the command line, or by having them open live.
-        ask: Asks a person; None if there is none: the answer is no then.
+        named: Returns the files that the user named: on the command line, or by having them open live.
+        ask: Asks the user; None: every answer is no.
         all_trusted: Every answer is yes, for this run (``--trust``).
     """
 
@@ -179,14 +179,14 @@ class Clearances:
 
     @property
     def asks(self) -> bool:
-        """Whether there is a person to ask."""
+        """Whether the user can be asked."""
         return self._ask is not None
 
     def clear(self, code: CodeToRun, stopped: Callable[[], bool] = lambda: False) -> TaskName:
-        """What to open for it; asks if need be, and waits for the answer.
+        """The task to open; asks the user if necessary, and waits for the answer.
 
         Raises:
-            NotCleared: it may not run.
+            NotCleared: the code must not run.
         """
         (cleared,) = self.clear_all([code], stopped)
         if isinstance(cleared, NotCleared):
@@ -196,7 +196,7 @@ class Clearances:
     def clear_all(
         self, codes: Sequence[CodeToRun], stopped: Callable[[], bool] = lambda: False
     ) -> list[TaskName | NotCleared]:
-        """What to open for each of several, or the refusal; asks about each text once."""
+        """The task to open, or the refusal, for each of several; asks about each text once."""
         decisions = [self._without_asking(one) for one in codes]
         to_ask: dict[str, tuple[CodeToRun, _Undecided]] = {}
         for one, decision in zip(codes, decisions):
@@ -227,10 +227,10 @@ class Clearances:
     def clear_file(
         self, file: Path, class_name: str | None = None, stopped: Callable[[], bool] = lambda: False
     ) -> TaskName:
-        """What to open for a file that a person chose from a list, to be followed; asks if need be, as `clear`.
+        """The task to open for a file that the user chose from a list and that will be followed; asks like `clear`.
 
         Raises:
-            NotCleared: it may not run.
+            NotCleared: the code must not run.
         """
         name = str(file) if class_name is None else f"{file}:{class_name}"
         if self._all_trusted or _is_named(str(file), self._named()):
@@ -247,11 +247,11 @@ class Clearances:
                 raise NotCleared(f"{question_text(question)} is not trusted", question)
             if not _is_unchanged(content):
                 raise _changed(content)
-        # These very texts, until the next save: the file may change before it is loaded.
+        # Exactly these texts, until the next save: the file may change before it is loaded.
         return RecordedTask(file.name, content.main, class_name, content.texts)
 
     def _answer(self, question: TrustQuestion, content: TaskContent, stopped: Callable[[], bool]) -> Consent:
-        """Ask the question, and store the answer if it is yes."""
+        """Ask the question; store the answer if it is yes."""
         answer = Consent.NO if self._ask is None or stopped() else self._ask(question, stopped)
         if answer is Consent.ALWAYS:
             self._store.trust(content, question.followed)
@@ -260,8 +260,7 @@ class Clearances:
         return answer
 
     def refused_arguments(self, info: EpisodeInfo, made: InstallationSeal | None = None) -> str | None:
-        """Why an env must not get the arguments of this recording; None if it may. Recordings from elsewhere may name
-        no files."""
+        """Why an env must not get the arguments of this recording; None if it may. Foreign recordings must not name files."""
         if self._all_trusted or (made or made_here(info)) is not InstallationSeal.NO:
             return None
         named = [_printable(text) for text in paths_in_arguments(info)]
@@ -339,10 +338,10 @@ def _changed(content: TaskContent) -> NotCleared:
 
 
 def code_files(content: TaskContent, before: Mapping[str, str] | None = None) -> tuple[CodeFile, ...]:
-    """The files that would run: the task's own first, then changed modules, then the others.
+    """The files that would run: the task's own first, then changed modules, then other modules.
 
     Args:
-        before: `TaskContent.file_sums` of the version trusted before, if any; empty if its files are not known.
+        before: `TaskContent.file_sums` of the last trusted version, if any; empty if its files are not known.
     """
     paths = {content.name(path): path for path in content.texts}
     files: list[CodeFile] = []
@@ -351,8 +350,8 @@ def code_files(content: TaskContent, before: Mapping[str, str] | None = None) ->
         if before and before.get(name) != found:
             since = Since.CHANGED if name in before else Since.NEW
         shown = content.main if paths[name] == content.main else name
-        files.append(CodeFile(_printable(shown), found[:SHORT_HASH], content.texts[paths[name]], since))
-    # Changed modules first: they are hard to find in a long list.
+        files.append(CodeFile(_printable(shown), found[:HASH_CHARACTERS], content.texts[paths[name]], since))
+    # Changed modules first, since they are hard to find in a long list.
     return (*files[:1], *sorted(files[1:], key=lambda file: file.since is Since.SAME))
 
 
@@ -375,7 +374,7 @@ def _is_unchanged(content: TaskContent) -> bool:
 
 
 def paths_in_arguments(info: EpisodeInfo) -> list[str]:
-    """Texts in the recorded arguments of an env that look like a path: a task may open them."""
+    """Texts in the recorded arguments of an env that look like a path, which a task may open."""
     found: list[str] = []
     waiting: list[Any] = [info.env_kwargs, info.reset_options, info.control_mode]
     while waiting:
@@ -399,10 +398,10 @@ def _is_like_a_path(text: str) -> bool:
 
 
 def recorded_content(info: EpisodeInfo) -> TaskContent:
-    """The source text that a recording holds.
+    """The source text in a recording.
 
     Raises:
-        NoRecordedSource: it has none.
+        NoRecordedSource: the recording has none.
     """
     if not info.source or info.source_file is None:
         raise NoRecordedSource("this recording does not hold the text of its task")
@@ -417,7 +416,7 @@ def _approved(code: CodeToRun, content: TaskContent) -> TaskName:
 
 
 def _equals_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
-    """Whether a file has the recorded text; then the recording's seal covers the file, in any folder."""
+    """Whether a file has the recorded text; if so, the recording's seal covers the file, in any folder."""
     try:
         return content.hash == recorded_content(info).hash
     except NoRecordedSource:
@@ -425,7 +424,7 @@ def _equals_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
 
 
 def _printable(text: str) -> str:
-    return short_line(text, LONGEST)
+    return short_line(text, MAX_NAME_CHARACTERS)
 
 
 def _is_named(file: str, named: Iterable[Path]) -> bool:
@@ -434,7 +433,7 @@ def _is_named(file: str, named: Iterable[Path]) -> bool:
 
 
 def question_text(question: TrustQuestion) -> str:
-    """Name and hash of the code that a question is about."""
+    """Name and hash of the code in question."""
     if question.recorded_text:
         return f"the text of {question.file} in recordings of {question.task} ({question.hash})"
     return f"{question.file} ({question.hash})"

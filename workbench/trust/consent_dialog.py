@@ -1,4 +1,4 @@
-"""The dialog that asks whether code named by a recording may run."""
+"""The dialog that asks whether code referenced by a recording may run."""
 
 from __future__ import annotations
 
@@ -23,25 +23,24 @@ DO_NOT, ONCE, ALWAYS = (
     "Run it, and ask again next time",
     "Run it, and don't ask again unless it changes",
 )
-MOST_OF_ONE, MOST_OF_ALL = 200_000, 1_000_000
-"""Maximum number of characters of one text, and of all texts, that go to the page; the page says how much is left
-out."""
-_LOOK = 0.1
-"""Seconds between two checks whether the answer is still wanted."""
+MAX_TEXT_CHARACTERS, MAX_TOTAL_CHARACTERS = 200_000, 1_000_000
+"""Maximum length of one text, and of all texts, that are sent to the page; the page shows how much is left out."""
+_POLL_SECONDS = 0.1
+"""Interval at which the dialog checks whether the answer is still needed."""
 
 
 @dataclass
 class _Pending:
     question: TrustQuestion
     name: str = field(default_factory=lambda: secrets.token_urlsafe(12))
-    """Random: a page that was open before this program was started has no question of this name."""
+    """Random, so that a page of an earlier run of the program cannot answer a question."""
     answer: asyncio.Future[Consent] = field(default_factory=asyncio.Future)
 
 
 class TrustDialog:
     """Asks one question at a time, on every open page; the first answer counts.
 
-    Only a press of one of its buttons is a yes: Escape, a page that closes, and a request that is withdrawn are a no.
+    Only its buttons can give a yes: Escape, a closed page, and a withdrawn request count as no.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -52,20 +51,20 @@ class TrustDialog:
         self._closed = False
 
     def say_no(self) -> bool:
-        """Answer the question that is shown with a no; False if there is none."""
+        """Answer no to the shown question; returns False if there is none."""
         if not self._waiting:
             return False
         self._take(Consent.NO)
         return True
 
     def answer(self, command: AnswerTrust) -> None:
-        """Answer the question that is shown. Raises `Refused` if it is another one, or answered already."""
+        """Answer the shown question. Raises `Refused` if another one is shown, or if it is already answered."""
         is_shown = self._waiting and self._waiting[0].name == command.question
         if not is_shown or not self._take(Consent(command.answer)):
             raise Refused("This question was answered or withdrawn before.")
 
     def _take(self, answer: Consent) -> bool:
-        """Answer the first question; False if it is answered already."""
+        """Answer the first question; returns False if it is already answered."""
         shown = self._waiting[0]
         if shown.answer.done():
             return False
@@ -73,10 +72,10 @@ class TrustDialog:
         return True
 
     def ask(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
-        """Show the question and wait for the answer; called on another thread than the loop.
+        """Show the question and wait for the answer. Must not be called on the loop.
 
         Args:
-            stopped: called often; True withdraws the question.
+            stopped: polled; True withdraws the question.
         """
         return result_of(self._asked(question, stopped))
 
@@ -86,7 +85,7 @@ class TrustDialog:
         try:
             while not self._closed and not stopped():
                 self._keep_shown()
-                await asyncio.wait([pending.answer], timeout=_LOOK)
+                await asyncio.wait([pending.answer], timeout=_POLL_SECONDS)
                 if pending.answer.done():
                     return pending.answer.result()
             return Consent.NO
@@ -100,7 +99,7 @@ class TrustDialog:
         self._closed = True
 
     def _keep_shown(self) -> None:
-        """Open the dialog of the first question, again if a page switch has removed it."""
+        """Open the dialog of the first question, also after a page switch has removed it."""
         if self._window is not None and not self._window.modal.closed:
             return
         pending = self._waiting[0]
@@ -109,7 +108,7 @@ class TrustDialog:
             self._window = Dialog(self._server, TITLE)
             with self._window.modal:
                 gui.add_html(buttons_html(pending.name, pending.question.more))
-                # After the buttons, so that nothing in it has the focus; page.css puts it above them.
+                # After the buttons, so that no element of it gets the focus; page.css puts it above them.
                 gui.add_html(question_html(pending.question))
 
     def _take_down(self) -> None:
@@ -119,7 +118,7 @@ class TrustDialog:
 
 
 def buttons_html(name: str, more: int) -> str:
-    """The answers to the question of this name, after which so many others come."""
+    """The answer buttons of the question with this name; `more` other questions follow."""
     # The first button has the focus: Enter must not run anything.
     rows = [[Tool(DO_NOT, AnswerTrust(question=name, answer="no"), tone="main")]]
     if more:
@@ -132,9 +131,9 @@ def buttons_html(name: str, more: int) -> str:
 def question_html(question: TrustQuestion) -> str:
     """The code that would run, as HTML."""
     files: list[dict[str, object]] = []
-    left = MOST_OF_ALL
+    left = MAX_TOTAL_CHARACTERS
     for file in question.files:
-        shown = file.text[: min(MOST_OF_ONE, left)]
+        shown = file.text[: min(MAX_TEXT_CHARACTERS, left)]
         left -= len(shown)
         left_out = len(file.text) - len(shown)
         said = {"name": file.name, "hash": file.hash, "since": file.since.value, "text": shown}

@@ -1,4 +1,4 @@
-"""Stores, per user, which task texts (`TaskContent.hash`) may run."""
+"""Stores the task texts (`TaskContent.hash`) that may run, per user."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from workbench.task.content import TaskContent
 log = logging.getLogger(__name__)
 
 STORE_FILE = "trusted_tasks.json"
-MOST_KEPT = 5000
-"""Most entries that are kept; the oldest are dropped."""
-MOST_WITH_FILES = 200
-"""Newest entries that keep the hashes of their files: those of 300 modules take 30 kB."""
+MAX_ENTRIES = 5000
+"""Maximum number of entries; the oldest are dropped."""
+MAX_ENTRIES_WITH_FILES = 200
+"""Number of newest entries that keep the hashes of their files: those of 300 modules take 30 kB."""
 
 
 class _Entry(msgspec.Struct, frozen=True):
     hash: str
     file: str
-    """Path of the file when a person was asked, to report that a text has changed."""
+    """Path of the file when the user was asked, to report that a text has changed."""
     when: str
     followed: bool = False
     """Whether later texts saved to `file` may run too."""
     files: dict[str, str] = {}
-    """`TaskContent.file_sums`, to report which file has changed; empty in entries of an earlier version."""
+    """`TaskContent.file_sums`, to report which file has changed; empty if the hashes were dropped."""
 
 
 class _Document(msgspec.Struct):
@@ -41,7 +41,7 @@ class TrustStore:
     """The texts that this user trusts, in a file of the configuration folder.
 
     A store that is missing, broken or owned by another user trusts nothing. If it cannot be written, entries last until the
-    program ends. All methods are thread-safe and see what other processes wrote.
+    program ends. All methods are thread-safe and see entries written by other processes.
     """
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class TrustStore:
             return any((e.hash, e.file, e.followed) == key for e in self._all())
 
     def trusted_before(self, content: TaskContent) -> Mapping[str, str] | None:
-        """`TaskContent.file_sums` of the last other text of this file that was trusted; None if there is none.
+        """`TaskContent.file_sums` of the last trusted other text of this file; None if there is none.
 
         Empty if the hashes were dropped.
         """
@@ -83,23 +83,24 @@ class TrustStore:
             try:
                 with locked(STORE_FILE):
                     kept = [known for known in self._read(repair=True) if known.hash != entry.hash]
-                    self._write([*kept, entry][-MOST_KEPT:])
+                    self._write([*kept, entry][-MAX_ENTRIES:])
             except OSError as error:
-                self._warn_once(f"What you trust cannot be kept, and is asked again in the next run: {error}")
+                self._warn_once(f"Your answer cannot be stored and is asked again in the next run: {error}")
 
     def _all(self) -> Iterator[_Entry]:
-        """Entries of this run, then of the disk, which is read only if those of this run do not match."""
+        """Entries of this run, then those on disk, which are read only if those of this run do not match."""
         yield from self._this_run
         yield from self._read()
 
     def _read(self, repair: bool = False) -> list[_Entry]:
-        """The stored entries. With `repair`, before writing: a broken store is renamed, and OSError is raised."""
+        """The stored entries. With `repair`, for use before writing: an unreadable store raises OSError, a broken one is
+        renamed."""
         try:
             content = read_private(STORE_FILE)
         except OSError as error:
             if repair:
                 raise  # writing now would overwrite its entries
-            self._warn_once(f"What you trusted before is not known: {error}")
+            self._warn_once(f"The stored answers about trusted code cannot be read: {error}")
             return []
         if content is None:
             return []
@@ -112,8 +113,8 @@ class TrustStore:
             return []
 
     def _write(self, entries: Sequence[_Entry]) -> None:
-        older = [msgspec.structs.replace(one, files={}) for one in entries[:-MOST_WITH_FILES]]
-        document = _Document([*older, *entries[-MOST_WITH_FILES:]])
+        older = [msgspec.structs.replace(one, files={}) for one in entries[:-MAX_ENTRIES_WITH_FILES]]
+        document = _Document([*older, *entries[-MAX_ENTRIES_WITH_FILES:]])
         write_private(STORE_FILE, msgspec.json.format(msgspec.json.encode(document), indent=1))
 
     def _warn_once(self, what: str) -> None:

@@ -26,7 +26,7 @@ class CameraEdit(Changes):
         self._run, self.hook_cameras = run, run(sources)
 
     def call(self, key: CameraKey) -> CameraCall:
-        """The call that makes a camera. Raises RefusedEdit if it is not in the author's files."""
+        """The call that makes a camera. Raises RefusedEdit if the call is not in the author's files."""
         uid = key[1]
         if key not in self.hook_cameras.cameras:
             raise RefusedEdit(
@@ -52,12 +52,12 @@ class CameraEdit(Changes):
         return CameraCall(file, node, key, arguments(node, PARAMETERS), run, run.trace)
 
     def verified(self, first: SourceFile, key: CameraKey | None, expected: CameraKey | None) -> SourceEdit:
-        """The edit with all replacements, verified by running it: only `key` changes, and becomes `expected`.
+        """The edit with all replacements, verified by running it: only `key` changes, to `expected`.
 
         Args:
             first: the file to name first if several change.
-            key: the camera to change; None to add one.
-            expected: what replaces it; None to remove it.
+            key: the camera to change; None if one is added.
+            expected: key of the resulting camera; None if it is removed.
 
         Raises:
             RefusedEdit: another camera would change, appear or disappear.

@@ -1,4 +1,4 @@
-"""The cameras that the author's camera hooks make, as a worker reports them, and the calls that make them."""
+"""The cameras made by the author's camera hooks, as reported by a worker, and the calls that make them."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ class HookCamera:
     """Text that identifies the body that the camera is mounted on."""
     site: CallSite | None
     trace: Trace | None
-    """Trace of the call; None if the call is in none of the author's files."""
+    """Trace of the call; None if the call is not in the author's files."""
 
 
 @dataclass(frozen=True, eq=False)
 class HookCameras:
-    """What the camera hooks of the open task return for given texts of the author's files."""
+    """The cameras that the hooks of the open task return for given texts of the author's files."""
 
     cameras: Mapping[CameraKey, HookCamera]
     owners: Mapping[str, tuple[str, str]]
-    """Hook to name and file of the class that defines it; ManiSkill's empty hooks are left out."""
+    """Name and file of the class that defines each hook; ManiSkill's empty hooks are left out."""
 
 
 RunHooks = Callable[[Mapping[str, str]], HookCameras]
-"""Runs the hooks with these texts by path in place of the author's files. Raises RefusedEdit with the reason."""
+"""Runs the hooks with these texts, by path, in place of the author's files. Raises RefusedEdit with the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class CameraCall:
 
     @property
     def key(self) -> ast.expr | ast.keyword | None:
-        """Key of the call, if the call is a value of a dict."""
+        """Key of the call, if it is a value in a dict."""
         outer = self.file.parents[self.node]
         if isinstance(outer, ast.Dict):
             return outer.keys[outer.values.index(self.node)]
@@ -89,14 +89,14 @@ class CameraCall:
 
     @property
     def loop(self) -> ast.AST | None:
-        """The loop within its function that contains the call."""
+        """The loop in its function that contains the call."""
         scope = self.file.scopes(self.node)[0]
         outers = self.file.ancestors(self.node)
         return next((o for o in outers if isinstance(o, LOOPS) and scope in self.file.ancestors(o)), None)
 
 
 def changed_fields(a: CameraSettings, b: CameraSettings) -> list[str]:
-    """The names in `FIELDS` of settings that differ."""
+    """Names in `FIELDS` of the settings that differ."""
     apart = differences(a, b, _SAME)
     return [
         name

@@ -16,7 +16,7 @@ HOOK_OF: dict[CameraKind, str] = {kind: hook for hook, kind in HOOKS.items() if 
 
 
 def needed_imports(settings: CameraSettings, pose: str = "") -> dict[str, str]:
-    """Imports that a `snippet` needs, by the name that each binds."""
+    """Imports that a `snippet` needs, by the name that each import binds."""
     lines = {"CameraConfig": "from mani_skill.sensors.camera import CameraConfig"}
     if not pose:
         lines["sapien"] = "import sapien"
@@ -50,12 +50,12 @@ def returned_expression(file: SourceFile, function: Function) -> ast.expr:
 def append_camera(
     file: SourceFile, value: ast.AST, uid: str, text: Callable[[str], str]
 ) -> list[Replacement]:
-    """Adds `text(indent)` to the cameras of `value`. Raises RefusedEdit."""
+    """Add `text(indent)` to the cameras of `value`. Raises RefusedEdit."""
     start, end = file.inner_span(value)
     indent = file.indent(start)
     called = file.code(value.func) if isinstance(value, ast.Call) else ""
     if isinstance(value, ast.Tuple) and (file.text[start] != "(" or file.items(value)[0][0] == start):
-        # A tuple without brackets.
+        # A tuple without parentheses.
         own = indent + "    "
         held = [file.code(element).replace("\n", "\n    ") for element in value.elts]
         lines = "".join(f"{own}{line},\n" for line in (*held, text(own)))
@@ -84,7 +84,7 @@ def new_hook(
     hook: str,
     text: Callable[[str], str],
 ) -> Replacement:
-    """Adds the hook, which returns the camera `text(indent)`. Raises RefusedEdit."""
+    """Add the hook, which returns the camera `text(indent)`. Raises RefusedEdit."""
     owner, where = hook_cameras.owners.get(hook, ("", ""))
     if where in project.texts:
         raise RefusedEdit(
@@ -116,7 +116,7 @@ def class_named(file: SourceFile, name: str) -> ast.ClassDef:
 def at_end_of_class(
     file: SourceFile, cls: ast.ClassDef, hook: str, text: Callable[[str], str]
 ) -> Replacement:
-    """Adds `text(indent)`, the whole hook, at the end of the class. Raises RefusedEdit."""
+    """Add `text(indent)`, the whole hook, at the end of the class. Raises RefusedEdit."""
     first = file.inner_span(cls.body[0])[0]
     if file.line_at(first) == file.line(cls):
         raise RefusedEdit(f"the class {cls.name} has no body to add {hook} to")
@@ -154,5 +154,5 @@ def snippet(
 
 
 def repr_text(text: str) -> str:
-    """`text` as a Python string in double quotes: JSON's escapes are all valid in Python."""
+    """`text` as a Python string in double quotes; JSON's escapes are all valid in Python."""
     return json.dumps(text, ensure_ascii=False)

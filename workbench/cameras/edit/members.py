@@ -34,14 +34,14 @@ def plan_add(
     settings: CameraSettings,
     run: RunHooks,
 ) -> SourceEdit:
-    """A new fixed camera in the hook of `class_name`, which is added if the class has none.
+    """Add a fixed camera to the hook of `class_name`, which is added if the class has none.
 
     A hook returns one config, a list or tuple of them, or a dict; one config becomes a list. The pose is written as a
     ``look_at`` if the other cameras have one that can express it.
 
     Raises:
-        RefusedEdit: as all plans here, with the reason and the text to copy: a hook that returns anything else (a name, a
-            concatenation, a call of the parent's hook) or in several places.
+        RefusedEdit: the hook returns anything else (a name, a concatenation, a call of the parent's hook) or has several
+            returns. Like all plans here it contains the reason and the text to copy.
     """
     check_camera(settings)
     kind, uid = key
@@ -68,7 +68,7 @@ def plan_add(
 def plan_duplicate(
     sources: Mapping[str, str], key: CameraKey, new_uid: str, settings: CameraSettings, run: RunHooks
 ) -> SourceEdit:
-    """A copy of a camera with `settings`, next to it, on the same mount and in the same form. Raises RefusedEdit."""
+    """Add a copy of a camera next to it, with `settings`, on the same mount and in the same form. Raises RefusedEdit."""
     new_key: CameraKey = (key[0], new_uid)
     with planning(sources, run, new_uid, settings) as edit:
         call = _single_call(edit, key)
@@ -86,7 +86,7 @@ def plan_duplicate(
         text, indent = _renamed_text(call, new_uid), file.indent(file.inner_span(call.node)[0])
 
         def indented(own: str) -> str:
-            # The inner lines keep their indentation relative to the first one.
+            # The inner lines keep their indentation relative to the first line.
             first, *rest = text.split("\n")
             return "\n".join([first, *(own + r[len(indent) :] if r.startswith(indent) else r for r in rest)])
 
@@ -98,7 +98,7 @@ def plan_duplicate(
 def plan_rename(
     sources: Mapping[str, str], key: CameraKey, new_uid: str, settings: CameraSettings, run: RunHooks
 ) -> SourceEdit:
-    """The camera under another name, with a note that observations and `sensor_configs` use the name. Raises RefusedEdit."""
+    """Rename a camera, with a note that observations and `sensor_configs` use the name. Raises RefusedEdit."""
     new_key: CameraKey = (key[0], new_uid)
     with planning(sources, run, new_uid, settings) as edit:
         call = _single_call(edit, key)
@@ -115,7 +115,7 @@ def plan_rename(
 
 
 def plan_remove(sources: Mapping[str, str], key: CameraKey, run: RunHooks) -> SourceEdit:
-    """The camera removed from what its hook returns. Raises RefusedEdit."""
+    """Remove a camera from the result of its hook. Raises RefusedEdit."""
     with planning(sources, run) as edit:
         call = _single_call(edit, key)
         edit.change(call.file, _removal(call))
@@ -162,7 +162,7 @@ def plan_override(
     parse: str,
     more: Sequence[str] = (),
 ) -> SourceEdit:
-    """Adds the hook of `override_text` to `class_name`; `site` is where the parent makes the camera. Raises RefusedEdit."""
+    """Add the hook of `override_text` to `class_name`; `site` is where the parent makes the camera. Raises RefusedEdit."""
     check_camera(settings)
     hook, parent = HOOK_OF[kind], site.function.rpartition(".")[0]
     with planning(sources, run, uid, settings, more) as edit:
@@ -215,7 +215,7 @@ def _is_in_hook(call: CameraCall) -> bool:
 
 
 def _look_at_name(edit: CameraEdit, file: SourceFile, kind: CameraKind) -> str:
-    """The name by which a camera of this file calls look_at, preferring one of that kind; empty if none does."""
+    """The name by which a camera in this file calls look_at, preferably one of that kind; empty if none does."""
     for key in sorted(edit.hook_cameras.cameras, key=lambda key: key[0] != kind):
         trace = edit.hook_cameras.cameras[key].trace
         pose = None if trace is None else trace.parts.get("pose")
@@ -231,7 +231,7 @@ def _look_at_name(edit: CameraEdit, file: SourceFile, kind: CameraKind) -> str:
 
 
 def _renaming(call: CameraCall, new_uid: str) -> list[Replacement]:
-    """Edits of the name at its call alone: a constant that holds it may name other things too."""
+    """Edits of the name only at its call: a constant with the same value may name other things too."""
     file, key, uid = call.file, call.key, call.arguments.get("uid")
     found: list[Replacement] = []
     if isinstance(key, ast.keyword):

@@ -1,4 +1,4 @@
-"""Plans the smallest edit of the author's file that gives a camera new settings."""
+"""Plans the smallest edit of the author's file that changes a camera's settings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ from dataclasses import replace
 
 from workbench.cameras.edit.camera_edit import CameraEdit, check_camera, planning
 from workbench.cameras.edit.hook_cameras import FIELDS, CameraCall, RunHooks, changed_fields, with_fields
-from workbench.cameras.edit.write_pose import ANGLE_STEP, POSITION_STEP, why_not_a_pose, write_pose
+from workbench.cameras.edit.write_pose import (
+    ANGLE_STEP_RADIANS,
+    POSITION_STEP_METRES,
+    why_not_a_pose,
+    write_pose,
+)
 from workbench.envs.camera_data import CameraKey, CameraSettings, setting_text
 from workbench.pictures.camera_conventions import angle_between
 from workbench.source.parsed import RefusedEdit, Replacement
@@ -22,16 +27,17 @@ def plan_edit(
     after: CameraSettings,
     run: RunHooks,
 ) -> SourceEdit:
-    """The edit that changes a camera from `before`, which the running env has, to `after`. Nothing is written.
+    """Plan the edit that changes a camera from `before`, its settings in the running env, to `after`. Nothing is written.
 
-    Runs the files and finds the ``CameraConfig(...)`` call of the camera; changes the arguments that differ; runs the new
-    text and checks that this camera has the new settings and no other camera changed.
+    It runs the files and finds the ``CameraConfig(...)`` call of the camera, changes the arguments that differ, then runs
+    the new text and checks that this camera has the new settings and no other camera changed.
 
     Args:
         sources: the author's files on disk, by path.
 
     Raises:
-        RefusedEdit: also if the settings of the call are not `before`: then other code sets them, and an edit would have no effect.
+        RefusedEdit: also if the settings of the call differ from `before`: then other code sets them, and an edit would have
+            no effect.
     """
     check_camera(after)
     mount: list[str] = []
@@ -84,7 +90,7 @@ def _plan(
 
 
 def _why_not(changes: Changes, call: CameraCall, name: str) -> str | None:
-    """Why an argument cannot be edited in its form; None if it can."""
+    """Reason why an argument cannot be edited in its form; None if it can."""
     part = call.trace.parts.get(name)
     if part is None:
         return "it is given no pose" if name == "pose" else None
@@ -171,7 +177,9 @@ def _check_asked(
         if name == "pose":
             moved = max(abs(a - b) for a, b in zip(found.position, after.position, strict=True))
             turned = angle_between(found.quaternion, after.quaternion)
-            as_requested = as_requested and moved <= POSITION_STEP and turned <= 1.5 * ANGLE_STEP
+            as_requested = (
+                as_requested and moved <= POSITION_STEP_METRES and turned <= 1.5 * ANGLE_STEP_RADIANS
+            )
         elif name == "intrinsic" and found.intrinsic is not None and after.intrinsic is not None:
             flat = [[x for row in matrix for x in row] for matrix in (found.intrinsic, after.intrinsic)]
             as_requested = as_requested and max(abs(a - b) for a, b in zip(*flat, strict=True)) <= 1e-3

@@ -1,4 +1,4 @@
-"""Runs a task's camera hooks in the worker and records where in the author's files each camera is made."""
+"""Runs a task's camera hooks in the worker and records the place in the author's files where each camera is made."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from workbench.source.parsed import RefusedEdit, Trace
 from workbench.source.read_values import trace_call
 
 RecordedCalls = dict[int, tuple[Any, CameraSettings | None, Trace | None]]
-"""``id`` of a config to the config, the settings that it was made with, and its call."""
+"""Config, the settings that it was made with, and its call, by the config's ``id``."""
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def hook_camera(config: Any, recorded: RecordedCalls) -> HookCamera:
 
 
 def owners(task: type) -> dict[str, tuple[str, str]]:
-    """Hook to name and file of the class that defines it, see `HookCameras`."""
+    """Name and file of the class that defines each hook, see `HookCameras`."""
     found: dict[str, tuple[str, str]] = {}
     for hook in HOOKS:
         cls = next((cls for cls in task.__mro__ if hook in vars(cls)), None)

@@ -1,4 +1,4 @@
-"""Writes a new camera pose in the author's own form where that can express it."""
+"""Writes a new camera pose in the author's own form if that can express it."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from workbench.pictures.camera_conventions import angle_between, rotation_matrix
 from workbench.source.parsed import Replacement, SourceFile, TracedValue
 from workbench.source.traced_edits import Changes, list_text, quaternion_texts, same_side, written_value
 
-POSITION_STEP = 1e-4
-"""0.1 mm: the precision of written positions."""
-ANGLE_STEP = 1.745e-4
-"""0.01 degree."""
+POSITION_STEP_METRES = 1e-4
+"""Precision of written positions: 0.1 mm."""
+ANGLE_STEP_RADIANS = 1.745e-4
+"""Precision of written angles: 0.01 degree."""
 _SAPIEN_POSE = ("sapien.Pose", "sapien.core.Pose", "sapien.pysapien.Pose")
 _MANISKILL_POSE = ("mani_skill.utils.structs.Pose", "mani_skill.utils.structs.pose.Pose")
 
 _STILL_AT_TARGET = 3e-5
-_LEAST_DISTANCE = 0.1
-_METRES = (4, 5, 6)
-"""Decimals to try: 0.1 mm, and more if the target is so close that 0.1 mm would turn the camera."""
+_MIN_DISTANCE_METRES = 0.1
+_DECIMALS = (4, 5, 6)
+"""Decimals of metres to try: 0.1 mm, and more if the target is so close that 0.1 mm would rotate the camera."""
 
 
 def why_not_a_pose(changes: Changes, pose: TracedValue) -> str | None:
-    """Why a pose cannot be edited in its form; None if it can."""
+    """Reason why a pose cannot be edited in its form; None if it can."""
     p, q = pose.parts.get("p"), pose.parts.get("q")
     if pose.function == "look_at":
         triples = [
@@ -65,11 +65,12 @@ def _is_vector(part: TracedValue, length: int) -> bool:
 
 
 def write_pose(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
-    """Edit `pose` to that of `after`, in its own form or else with a quaternion.
+    """Edit `pose` to that of `after`, in its own form if possible, else with a quaternion.
 
-    A ``look_at`` stays one while the camera is level and does not look along `up`: the target stays if the camera still
-    looks at it, else it is on the new line of sight at the distance of `after`, or its old one. ManiSkill's ``look_at`` gives no unit
-    quaternion straight down or up (its `left` is the zero vector there), so those poses get a quaternion.
+    A ``look_at`` stays one while the camera is level and does not look along `up`: the target is kept if the camera still
+    looks at it; if not, it is put on the new line of sight, at the distance of `after` or the old one. ManiSkill's
+    ``look_at`` returns no unit quaternion straight down or up (its `left` is the zero vector there), so those poses get a
+    quaternion.
     """
     if pose.function == "look_at":
         if not _look_at(changes, pose, after):
@@ -77,7 +78,7 @@ def write_pose(changes: Changes, pose: TracedValue, after: CameraSettings) -> No
         return
     _position(changes, pose, after.position)
     quaternion = pose.numbers[3:]
-    if angle_between(quaternion, after.quaternion) <= ANGLE_STEP / 10:
+    if angle_between(quaternion, after.quaternion) <= ANGLE_STEP_RADIANS / 10:
         return
     part = pose.parts.get("q")
     if part is not None and part.function and _euler(changes, part, after):
@@ -116,7 +117,7 @@ def _vector(changes: Changes, vector: TracedValue, requested: Sequence[float], d
 
 
 def _written_values(vector: TracedValue, requested: Sequence[float], decimals: int) -> tuple[float, ...]:
-    """The numbers that result from writing `requested`."""
+    """The numbers after rounding by writing `requested`."""
     if vector.literal:
         pairs = zip(vector.parts.values(), requested, strict=True)
         return tuple(written_value(item, number, decimals) for item, number in pairs)
@@ -126,11 +127,11 @@ def _written_values(vector: TracedValue, requested: Sequence[float], decimals: i
 
 
 def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool:
-    """Write eye and target; False if a look_at cannot express the orientation."""
+    """Write eye and target; returns False if a look_at cannot express the orientation."""
     eye, target = pose.parts["eye"], pose.parts["target"]
     up = pose.parts["up"].numbers if "up" in pose.parts else (0.0, 0.0, 1.0)
     forward = rotation_matrix(after.quaternion)[:, 0].tolist()
-    # This close to `up`, 0.1 mm of the target turns the picture.
+    # This close to `up`, 0.1 mm of the target rotates the picture.
     if abs(_cosine(forward, up)) > math.cos(1e-3):
         return False
 
@@ -138,15 +139,15 @@ def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool
         return _turned(look_at(a, b, up), after)
 
     still = error(after.position, target.numbers) <= _STILL_AT_TARGET
-    for decimals in _METRES if still else ():
-        if error(_written_values(eye, after.position, decimals), target.numbers) <= ANGLE_STEP:
+    for decimals in _DECIMALS if still else ():
+        if error(_written_values(eye, after.position, decimals), target.numbers) <= ANGLE_STEP_RADIANS:
             _vector(changes, eye, after.position, decimals)
             return True
-    distance = max(_LEAST_DISTANCE, after.distance or math.dist(pose.numbers[:3], target.numbers))
-    for decimals in _METRES:
+    distance = max(_MIN_DISTANCE_METRES, after.distance or math.dist(pose.numbers[:3], target.numbers))
+    for decimals in _DECIMALS:
         from_eye = _written_values(eye, after.position, decimals)
         requested = [a + distance * b for a, b in zip(from_eye, forward, strict=True)]
-        if error(from_eye, _written_values(target, requested, decimals)) <= ANGLE_STEP:
+        if error(from_eye, _written_values(target, requested, decimals)) <= ANGLE_STEP_RADIANS:
             _vector(changes, eye, after.position, decimals)
             _vector(changes, target, requested, decimals)
             return True
@@ -154,21 +155,21 @@ def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool
 
 
 def look_at_text(name: str, settings: CameraSettings) -> str | None:
-    """A new camera's pose as a call of the look_at `name`; None if that cannot express it."""
+    """A new camera's pose as a call of the look_at function `name`; None if that cannot express it."""
     forward = rotation_matrix(settings.quaternion)[:, 0]
     if abs(_cosine(forward.tolist(), (0.0, 0.0, 1.0))) > math.cos(1e-3):
         return None
     for aimed in (settings, replace(settings, distance=None)):
         target = target_of(aimed).tolist()
-        for decimals in _METRES:
+        for decimals in _DECIMALS:
             eye, point = ([round(x, decimals) for x in numbers] for numbers in (settings.position, target))
-            if _turned(look_at(eye, point), settings) <= ANGLE_STEP:
+            if _turned(look_at(eye, point), settings) <= ANGLE_STEP_RADIANS:
                 return f"{name}(eye={list_text(eye, decimals)}, target={list_text(point, decimals)})"
     return None
 
 
 def _as_quaternion(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
-    """Replace a look_at by a pose with a quaternion, keeping the author's expression of the position."""
+    """Replace a look_at by a pose with a quaternion; keeps the author's expression for the position."""
     file, node = changes.find(pose.at)
     assert isinstance(node, ast.Call)
     height = float(rotation_matrix(after.quaternion)[2, 0])
@@ -188,7 +189,7 @@ def _as_quaternion(changes: Changes, pose: TracedValue, after: CameraSettings) -
     quaternion = f"[{', '.join(quaternion_texts(same_side(after.quaternion, (1, 0, 0, 0))))}]"
     shared = any(read.others is not None for read in pose.reads)
     if len(node.args) + len(node.keywords) == 2 and not shared:
-        # Argument by argument, so that the author's comments between them stay.
+        # Argument by argument, so that the author's comments between them are kept.
         changes.replace(file, node.func, call)
         for index, arg in enumerate((*node.args, *node.keywords)):
             name = ("eye", "target")[index] if isinstance(arg, ast.expr) else arg.arg
@@ -222,8 +223,8 @@ def pose_call(changes: Changes, file: SourceFile) -> str:
 def look_at(
     eye: Sequence[float], target: Sequence[float], up: Sequence[float] = (0, 0, 1)
 ) -> NDArray[np.float64] | None:
-    """The orientation of ManiSkill's ``look_at`` as a quaternion (wxyz); None straight along `up`, where it gives none."""
-    # ManiSkill computes in float32, whose rounding turns the picture if the eye is nearly above its target.
+    """The orientation of ManiSkill's ``look_at`` as a quaternion (wxyz); None straight along `up`, where it has none."""
+    # ManiSkill computes in float32, whose rounding rotates the picture if the eye is nearly above its target.
     seen = np.asarray(target, np.float32).astype(float), np.asarray(eye, np.float32).astype(float)
     forward, upward = np.subtract(*seen), np.asarray(up, float)
     left = np.cross(upward, forward)
@@ -234,7 +235,7 @@ def look_at(
 
 
 def to_euler(quaternion: ArrayLike, near: Sequence[float]) -> tuple[float, float, float]:
-    """Roll, pitch and yaw in radians for transforms3d's ``euler2quat``, of the equivalent ones those closest to `near`."""
+    """Roll, pitch and yaw in radians for transforms3d's ``euler2quat``: the equivalent angles closest to `near`."""
     m = rotation_matrix(quaternion)
     level = math.hypot(m[0, 0], m[1, 0])
     if level > 1e-6:
@@ -242,7 +243,7 @@ def to_euler(quaternion: ArrayLike, near: Sequence[float]) -> tuple[float, float
         yaw = math.atan2(m[1, 0], m[0, 0])
         ways = [(roll, pitch, yaw), (roll + math.pi, math.pi - pitch, yaw + math.pi)]
     else:
-        # Looking along z only the sum or difference of roll and yaw matters: yaw is kept.
+        # Along z only the sum or difference of roll and yaw matters: keep yaw.
         pitch = math.copysign(math.pi / 2, -m[2, 0])
         whole = math.atan2(m[0, 1], m[1, 1]) if pitch > 0 else math.atan2(-m[0, 1], m[1, 1])
         ways = [(whole + near[2] if pitch > 0 else whole - near[2], pitch, near[2])]
@@ -261,7 +262,7 @@ def _euler(changes: Changes, part: TracedValue, after: CameraSettings) -> bool:
         roll, pitch, yaw = (
             written_value(item, w, decimals) for item, w in zip(items, requested, strict=True)
         )
-        if _turned(euler2quat(roll, pitch, yaw), after) <= ANGLE_STEP:
+        if _turned(euler2quat(roll, pitch, yaw), after) <= ANGLE_STEP_RADIANS:
             for item, w in zip(items, requested, strict=True):
                 changes.number(item, w, decimals)
             return True
@@ -269,7 +270,7 @@ def _euler(changes: Changes, part: TracedValue, after: CameraSettings) -> bool:
 
 
 def _turned(quaternion: ArrayLike | None, requested: CameraSettings) -> float:
-    """Radians between `quaternion` and the orientation of `requested`; inf for None."""
+    """Angle in radians between `quaternion` and the orientation of `requested`; inf for None."""
     return math.inf if quaternion is None else angle_between(quaternion, requested.quaternion)
 
 

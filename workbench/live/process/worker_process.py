@@ -275,7 +275,7 @@ class WorkerProcess:
                     # For example a closed terminal. Keep reading: a worker whose pipe is full blocks.
                     too_fast = False
                     if not failed:
-                        report_failure("What the task printed could not be shown", error)
+                        report_failure("The task's output could not be shown", error)
                     failed = True
                 if not piece:
                     return

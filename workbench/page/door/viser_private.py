@@ -299,7 +299,7 @@ class _Terminal(logging.Filter):
     def _callback_failed(self, kind: object, error: BaseException, *_: object) -> None:
         frames = traceback.extract_tb(error.__traceback__)
         place = (frames[-1].filename, frames[-1].lineno) if frames else None
-        self.told.happened(("callback", type(error), place), "What a page asked for failed.", error)
+        self.told.happened(("callback", type(error), place), "A callback of a page failed.", error)
 
 
 _terminal = _Terminal()
