@@ -51,7 +51,7 @@ class SeedsView:
     """Why solving failed, as text."""
     problem: Problem | None = None
     """Problem of the author's code."""
-    chosen: int = ENOUGH_SEEDS
+    chosen: int = MIN_SEEDS
     """Number of seeds that the user chose to solve next."""
 
 
