@@ -106,7 +106,7 @@ def test_no_recording_is_opened_in_this_process(
         raise AssertionError(f"{path} was opened here")
 
     for module in ("maniskill.read", "reader.read_episode"):
-        monkeypatch.setattr(f"workbench.recording.{module}.open_h5", refuse)
+        monkeypatch.setattr(f"workbench.episodes.{module}.open_h5", refuse)
     assert len(rescore_all(RescoreOptions((foreign, author / "recordings")))[0]) == 5
     assert [run.length for run in read_actions(foreign)[0]] == [STEPS, STEPS]
 

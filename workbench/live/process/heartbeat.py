@@ -24,7 +24,7 @@ _FRAME = re.compile(r'^  File "(?P<file>.*)", line (?P<line>\d+|\?\?\?) in (?P<f
 _FATAL = re.compile(r"^Fatal Python error: (?P<what>.+)$", re.MULTILINE)
 _EXIT = re.compile(r"^os\._exit\((?P<code>[^)]*)\)$", re.MULTILINE)
 _MAX_FRAMES = 60
-_OURS = ("/workbench/session/", "/workbench/core/", "/workbench/authoring/", "<frozen runpy>")
+_OURS = ("/workbench/app/", "/workbench/live/", "/workbench/envs/", "/workbench/task/", "<frozen runpy>")
 
 
 @dataclass(frozen=True)
