@@ -423,7 +423,7 @@ def test_a_note_that_cannot_be_kept_is_an_error_and_nothing_is_half_written(
 
 def test_a_scan_that_is_asked_for_is_made_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not when its time comes, which here is in an hour."""
-    for name in ("SCAN_SECONDS", "LONGEST_PAUSE"):
+    for name in ("SCAN_SECONDS", "MAX_PAUSE_SECONDS"):
         monkeypatch.setattr(f"workbench.library.folder.{name}", 3600.0)
     library = Library(tmp_path)
     library.watch()

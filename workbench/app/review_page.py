@@ -411,7 +411,7 @@ class ReviewPage:
         self._cameras.draw(shown)
         self._requests = self._cameras.wanted(shown)
 
-    # --- what a person does ------------------------------------------------------------------------
+    # --- commands ----------------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> Done:
         """Carry out a command of a page. Raises `Refused`."""

@@ -73,7 +73,7 @@ class State:
     checks: of_checks.Checks = of_checks.Checks()
     """The rules of the running version."""
     profile: of_profile.ProfileView = of_profile.ProfileView()
-    """Where the time of a step of the running version goes."""
+    """Time profile of a step of the running version."""
     seeds: of_seeds.SeedsView = of_seeds.SeedsView()
     """The job that solves the task from many seeds."""
     solving: of_solver.Solving = of_solver.Solving()

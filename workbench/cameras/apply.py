@@ -1,4 +1,4 @@
-"""How each event changes the camera studio, and the jobs that follow."""
+"""Applies events to the camera studio, and defines the jobs that follow."""
 
 from __future__ import annotations
 

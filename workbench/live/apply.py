@@ -1,4 +1,4 @@
-"""How each event changes the run, commands among them."""
+"""Applies events, including commands, to the run."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from workbench.live.messages import CameraRequest, DrawPast, Restore
 from workbench.task.description import ShownPictures, Stepped
 
 Scope = Literal["this", "all", "into all"]
-"""Which envs go back: the selected one; all, each to its own state; or all to the selected env's state."""
+"""Envs that go back: the selected one; all, each to its own state; or all to the selected env's state."""
 MAX_REPLAYED_STEPS = 400
 """Maximum number of control steps that are replayed to go back to a moment."""
 

@@ -1,1 +1,1 @@
-"""What every page is made of: commands, the door, widgets, and the 3-D view. Only panels and this folder import viser."""
+"""Parts of every page: commands, the door, widgets, and the 3-D view. Only panels and this folder import viser."""

@@ -53,7 +53,7 @@ def write_scene_html(
         raise ValueError(f"The recording of {episode.info.task} holds no 3D scene to show.")
     eye = eye or default_eye(episode)
     with new_file(path) as temporary:
-        # viser needs a running server; nobody gets its address.
+        # viser needs a running server; its address is never shown.
         gated_server = open_server(ServerOptions(port=0))
         try:
             page = _recorded(gated_server.server, episode, eye, on_progress)

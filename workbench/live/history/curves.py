@@ -89,7 +89,7 @@ class Columns:
 
 
 class Group(Enum):
-    """What a column belongs to."""
+    """Group of a column."""
 
     REWARD = "reward"
     TERM = "reward term"

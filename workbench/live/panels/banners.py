@@ -170,7 +170,7 @@ def _stopped(view: SessionView) -> bool:
 
 
 def _kept(view: SessionView) -> str:
-    """Which version still runs and how to continue, in sentences."""
+    """Text: which version still runs and how to continue."""
     if _stopped(view):
         return "No process runs the task. Restart the worker to load the file as it is now."
     if view.task is None and not (view.problem is not None and view.problem.file):

@@ -28,7 +28,7 @@ view would be empty."""
 
 @dataclass(frozen=True)
 class DrawStyle:
-    """How a scene is drawn."""
+    """Drawing style of a scene."""
 
     triangles: int = 200_000
     """Approximate maximum number of triangles; shapes with many triangles are simplified to fit."""
