@@ -19,6 +19,7 @@ from workbench.machine.loop import BlockingPool, do, post
 from workbench.page.command import Command, Refused
 from workbench.planning.options import PlanOptions
 from workbench.planning.seeds_report import SolveReport, underway_text
+from workbench.planning.verdicts import MIN_SEEDS
 from workbench.task.description import TaskOptions
 from workbench.task.problem import Problem, TaskError
 
