@@ -151,7 +151,7 @@ def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
     describe(tmp_path, "a")
     program = (
         "import sys, os, pathlib, time\n"
-        "from workbench.recording.reader import reading\n"
+        "from workbench.episodes.reader import reading\n"
         "from workbench.episodes.reader.scan import scan_folder\n"
         "folder = pathlib.Path(sys.argv[1])\n"
         "list(reading.read_rows(folder, scan_folder(folder).found.values()))\n"
