@@ -105,7 +105,7 @@ def test_in_a_terminal_it_asks_for_template_and_name_until_they_will_do(
     terminal.type("2\n")
     terminal.says("Name of the task, such as stack_two: ")
     terminal.type("taken\n")
-    terminal.says("There is a file taken.py already")
+    terminal.says("taken.py exists already")
     terminal.type("push it\n")
     terminal.says("such as push_it.")
     terminal.type("push_it\n")

@@ -89,7 +89,7 @@ def test_a_job_goes_on_after_what_is_done(
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "out").glob("*/*")} == made
     # Another one does not take its file.
     assert sweep("--set", "MOST=5,2", "--out", "other", "--job", "s.job") == 2
-    assert "of another job" in capsys.readouterr().err
+    assert "belongs to another job" in capsys.readouterr().err
 
 
 def test_what_is_uploaded_is_a_whole_sweep_and_goes_on(

@@ -156,7 +156,7 @@ def numbers(*shape: int, kind: str = "f4") -> NDArray:
         (of_episode(action=numbers(T, 3)), "actions of shape"),
         (of_episode(terminated=numbers(T + 1, kind="?")), "terminated of shape"),
         (of_episode(texts={"a": ((0, None),) * (MAX_TEXT_LINES + 1)}), "too many entries"),
-        (of_scene(body_kinds=("static",)), "other bodies"),
+        (of_scene(body_kinds=("static",)), "different number of bodies"),
         (of_first("visuals", shape=10**9), "without a shape"),
         (of_first("visuals", bodies=np.array([B])), "bodies that do not exist"),
         (of_first("visuals", bodies=np.array([-1])), "bodies that do not exist"),

@@ -197,7 +197,7 @@ def test_items_are_done_once_also_where_a_worker_dies(address: str, tmp_path: Pa
     run = Run(Setup("killed once", 4, folder=tmp_path), range(9), chunk=3, tries=3, goes_on=True)
     told: list[str] = []
     run.by(Cluster(address, 2, on_death=told.append))
-    assert len(told) == 1 and told[0].startswith("a worker that squares is gone (")
+    assert len(told) == 1 and told[0].startswith("a worker that squares has ended (")
     assert run.squares() == {number: number**2 for number in range(9)} and not run.failures
     pids = {result.pid for result in run.results.values()}
     # What the dead one had done may have died with it.

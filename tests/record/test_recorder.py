@@ -113,7 +113,7 @@ def test_where_it_pays_a_process_makes_the_files(
 def test_the_pictures_that_were_asked_for_are_there_and_are_those_of_the_env(
     renderer: None, tmp_path: Path, asked: bool | tuple[str, ...]
 ) -> None:
-    with pytest.warns(UserWarning, match="draws simplified meshes"):
+    with pytest.warns(UserWarning, match="renders simplified meshes"):
         made = workbench.make("PushCube-v1", 2, obs_mode="rgb", pictures="fast", backend="cpu")
     env = workbench.Recorder(made, tmp_path, pictures=asked)
     observed = [env.reset(seed=0)[0]]

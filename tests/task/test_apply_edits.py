@@ -178,7 +178,7 @@ def test_of_two_files_the_first_is_taken_back_when_the_second_fails(
         refused = refusal(apply, edit)
     assert calls == ["one.py", "other.py", "one.py"]
     assert "other.py cannot be written" in refused
-    assert ("one.py could not be put back" in refused) is not taken_back
+    assert ("one.py could not be restored" in refused) is not taken_back
     assert one.read_text() == ("a = 1\n" if taken_back else "a = 2\n")
     assert other.read_text() == "b = 1\n" and sorted(os.listdir(tmp_path)) == ["one.py", "other.py"]
 

@@ -37,7 +37,7 @@ _warned: set[Path] = set()
 
 
 class NoPolicy(ValueError):
-    """The reference names no policy; the message says why. Not raised by the author's code."""
+    """The reference names no policy; the message gives the reason. Not raised by the author's code."""
 
 
 def find_policy(reference: str, task_folder: Path | None = None) -> tuple[str | Path, str]:

@@ -170,7 +170,7 @@ def solve(
         max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
         seconds_per_seed: wall time limit of a seed: it ends at its next step, solved or not. Which seeds reach it depends
             on the machine and its load, so a second run may differ.
-        pictures: record the images of every camera.
+        pictures: record the pictures of every camera.
         out: folder for the recordings.
         upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
             the folder.
@@ -244,7 +244,7 @@ def sweep(
         actions: random, zero, hold; solve, which plans with rollouts of the task and its own reward; or a policy as
             module:function or file.py:function.
         max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
-        pictures: record the images of every camera.
+        pictures: record the pictures of every camera.
         out: folder for the recordings and results.parquet; default: sweeps/, in a folder named after the task.
         upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
             the folder; results.parquet is in both.

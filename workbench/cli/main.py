@@ -112,7 +112,7 @@ def open_page(
         editor: what a click on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} (an absolute
             path) and {line}. If the browser is on another machine than the file, VS Code opens it over ssh with
             vscode://vscode-remote/ssh-remote+HOST{file}:{line}, where HOST is the machine as your ssh config names it.
-        pictures: how the page renders camera images: exact; fast, with simplified meshes; or auto, which is fast during
+        pictures: how the page renders camera pictures: exact; fast, with simplified meshes; or auto, which is fast during
             motion and exact at rest. Observations and recordings are always exact.
         debug: let a debugger (debugpy, such as VS Code's) attach to the task's process, from this machine only; breakpoint()
             stops in it. Anyone who can log in to this machine can attach too.

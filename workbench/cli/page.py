@@ -57,7 +57,7 @@ def open_in_terminal(
     Args:
         trust: run code that recordings name without asking.
         editor: URL template that opens a line in the author's editor.
-        pictures: how the page renders camera images.
+        pictures: how the page renders camera pictures.
     """
     gated_server = _start_server(at, "Workbench")
     if isinstance(gated_server, int):

@@ -36,7 +36,7 @@ Way = Literal["re-simulated", "corrected", "put there"]
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """How an env reached a recorded state."""
+    """Result of putting an env into a recorded state."""
 
     way: Way
     steps: int
@@ -54,7 +54,7 @@ class ReplayResult:
 
 @dataclass(frozen=True)
 class Beginning:
-    """How an env reached the first state of a run."""
+    """Result of putting an env into the first state of a run."""
 
     differs: bool
     """Whether the reset gave a different state, and the recorded one was restored."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 SourceKind = Literal["workbench", "maniskill", "lerobot"]
-"""Which of the three readers opens a recording."""
+"""The reader that opens a recording."""
 
 
 class UnreadableRecording(ValueError):
@@ -19,7 +19,7 @@ class UnreadableRecording(ValueError):
 
 @dataclass(frozen=True)
 class Source:
-    """Where a recording is."""
+    """Location of a recording."""
 
     path: Path
     """A file of a workbench recording, ManiSkill's ``.h5``, or the folder of a LeRobot dataset."""

@@ -40,7 +40,7 @@ class SweepEpisode:
     """An episode of a point, or the reason why there is none."""
 
     point: int
-    """Its index in `SweepResults.points`."""
+    """Index of the point in `SweepResults.points`."""
     seed: int
     success: bool | None = None
     """Success in any state; None for a task without ``success``, and without an episode."""

@@ -264,7 +264,7 @@ class _ActorPool:
             self._leave(number)
             raise PoolError(str(cause)) from error
         except self._ray.exceptions.RayError as error:
-            how = f"is gone ({type(error).__name__})"
+            how = f"has ended ({type(error).__name__})"
         self._leave(number)
         self._listener.died(number, how, None)
         if self._scheduler.count_left(1):

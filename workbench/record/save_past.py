@@ -244,5 +244,5 @@ def _earlier_text(count: int, kept: int) -> str:
     what = "it was" if kept == 1 else "they were" if count == kept else f"{count} were"
     return (
         f"; {what} played by an earlier version of the file: that source and its rewards are recorded, observations and "
-        "pictures are the present version's"
+        "pictures are the current version's"
     )

@@ -82,19 +82,19 @@ class LiveRecording:
     one_each: bool = False
     """Whether the recording ends after one episode of each env."""
     number: int = 0
-    """Number of the last gatherer: what an older one says changes nothing."""
+    """Number of the last gatherer; events of older ones are ignored."""
     since: float = 0.0
     episodes: int = 0
-    """`since` and `episodes`: as `RecordingStatus` has them."""
+    """`since` and `episodes`: as in `RecordingStatus`."""
     under_way: RunningEpisodes = RunningEpisodes()
     waiting_bytes: int = 0
-    """Bytes of steps that wait for the disk, also those of recordings before."""
+    """Bytes of steps that wait for the disk, including those of earlier recordings."""
     being_written: int = 0
     written: Finished = Finished()
     recovered: tuple[str, ...] = ()
     problem: str | None = None
     continues: Continues | None = None
-    """What is recorded again as soon as all that follows from a load has been asked of the worker."""
+    """Recording to resume once all requests that follow from a load have been sent to the worker."""
     saving: Saving = Saving()
 
     def status(self, run: Run) -> RecordingStatus:

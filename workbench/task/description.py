@@ -102,11 +102,11 @@ class TaskDescription:
     source_hash: str
     """sha256 over `source_files`, 12 hex digits."""
     source: dict[str, str]
-    """Path to text of `source_files`."""
+    """Text of `source_files` by path."""
     backend: str
     """For example ``cpu (batched)`` or ``gpu``."""
     device: str
-    """For example ``cpu`` or ``cuda:0``; with the render device's name."""
+    """For example ``cpu`` or ``cuda:0``, followed by the render device's name."""
     num_envs: int
     max_episode_steps: int | None
     obs_mode: str
@@ -118,12 +118,12 @@ class TaskDescription:
     geometry: SceneGeometry
     cameras: tuple[CameraInfo, ...]
     segmentation: dict[int, str]
-    """Segmentation id to body name."""
+    """Body name by segmentation id."""
     can_render: bool
     pictures: PictureDegree = "exact"
     """Quality of the pictures that its envs render for observations and recordings."""
     chosen: str = ""
-    """Its name in the file: the class, or a robot that is shown in a scene."""
+    """Name of the class, or of a robot that is shown in a scene."""
     others: tuple[str, ...] = ()
     """The other tasks of the file."""
     in_place_of: str | None = None
@@ -161,7 +161,7 @@ class Restored:
     origin: int
     undoes: int | None
     not_carried: dict[str, str]
-    """What could not be restored, with the reason; empty within one version of a task."""
+    """Parts that could not be restored, with the reasons; empty within one version of a task."""
     recording: str = ""
     """Description of the episode and the state that an `EnterRecording` restored; `origin` is then `NO_MOMENT`."""
     how: str = ""
@@ -222,8 +222,8 @@ class RecordArguments:
             module:function or file.py:function; or a file: .npy or .npz with actions, or .h5 with ManiSkill's
             demonstrations, which begin from their own seeds.
         use_env_states: restore the demonstration's env state after each step.
-        pictures: record the images of every camera (--no-pictures is much faster).
-        fast_pictures: render simplified meshes: several times as many images per second without a GPU, slightly different
+        pictures: record the pictures of every camera (--no-pictures is much faster).
+        fast_pictures: render simplified meshes: several times as many pictures per second without a GPU, slightly different
             from a GPU's. The recordings are marked, in their .json and in the review.
         max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
         seconds_per_seed: wall time limit of an episode: it ends at its next step, solved or not. Which episodes reach it

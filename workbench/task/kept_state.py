@@ -168,7 +168,7 @@ def _fresh_names(function: ast.FunctionDef | ast.AsyncFunctionDef, imported: Col
 
 
 def _is_new(value: ast.expr, imported: Collection[str]) -> bool:
-    """Whether an expression gives a value without other references."""
+    """Whether an expression creates a value without other references."""
     if not isinstance(value, ast.Call):
         displays = (ast.Dict, ast.List, ast.Set, ast.Tuple, ast.ListComp, ast.DictComp, ast.SetComp)
         return isinstance(

@@ -66,7 +66,7 @@ class NewTask:
 
 
 class CannotBegin(ValueError):
-    """No task was written; the message is a sentence that says what to do."""
+    """No task was written; the message is a sentence with advice."""
 
 
 def write_new_task(name: str, origin: str, folder: Path) -> NewTask:

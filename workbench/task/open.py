@@ -182,7 +182,7 @@ def open_task(
 def import_task(
     reference: TaskName, options: TaskOptions, source: Mapping[str, str] | None, opening: Opening
 ) -> LoadedTask:
-    """Import a task's class, with `source` in place of the files on disk if given. Raises TaskError."""
+    """Import a task's class, with `source` instead of the files on disk if given. Raises TaskError."""
     opening.on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
     if "render_backend" not in options.env_kwargs and (renderer := find_renderer()) is not None:
         # SAPIEN refuses another device while a material of the author's module or of a failed build is alive.

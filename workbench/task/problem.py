@@ -119,7 +119,7 @@ class Problem:
 
 
 class TaskError(Exception):
-    """The author's code failed, in a load, a step or a reset; `problem` says why.
+    """The author's code failed in a load, a step or a reset; `problem` has the reason.
 
     Args:
         classes: task classes of the file that can be opened, this one first; empty if it has no other.

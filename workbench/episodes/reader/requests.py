@@ -35,7 +35,7 @@ class ReadRows(msgspec.Struct, frozen=True):
 
     folder: Path
     key: bytes
-    """Bytes, since it may be invalid UTF-8; with `sizes` and `times` a `scan.RecordingFiles`."""
+    """Key as bytes, since it may be invalid UTF-8; with `sizes` and `times` it forms a `scan.RecordingFiles`."""
     sizes: dict[str, int]
     times: dict[str, int]
     only_names: bool = False
