@@ -115,7 +115,7 @@ class ScriptedWorker:
             self._send(first, range(count), seeds=np.arange(count))
         elif isinstance(request, Play):
             self._playing = request.playing
-            self._tell(Status(self._playing, 1 / STEP_SECONDS, 1.0))
+            self._tell(Status(self._playing, 1 / STEP_SECONDS, 1.0, handled=request.number))
         elif isinstance(request, SingleStep):
             self._playing = False
             self._step()

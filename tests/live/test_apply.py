@@ -187,6 +187,14 @@ def test_what_takes_long_ends_in_a_pause_or_goes_on_playing() -> None:
     assert state_after(loaded(None, "one"), stopped, Status(True, 1.0, 1.0)).run.state == "stopped"
 
 
+def test_a_status_from_before_a_press_does_not_undo_the_press() -> None:
+    playing = loaded(None, "one"), Asked(PlayRun()), Status(True, 1.0, 1.0, handled=1)
+    pressed = *playing, Asked(PauseRun()), Status(True, 1.0, 1.0, handled=1)
+    assert state_after(*playing).run.playing and not state_after(*pressed).run.playing
+    # From then on the worker may begin by itself, as when a policy's file was mended.
+    assert state_after(*pressed, Status(True, 1.0, 1.0, handled=2)).run.playing
+
+
 def test_before_the_first_env_comes_the_last_and_after_the_last_the_first() -> None:
     there = loaded(None, "one")
     assert state_after(there, Asked(PreviousEnv())).run.env == ENVS - 1

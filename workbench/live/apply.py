@@ -342,7 +342,8 @@ def _set_playing(run: Run, playing: bool) -> Run:
 
 def _play(run: Run, playing: bool) -> Change:
     run = _show_live(run) if playing else run
-    return _set_playing(run, playing), [Send(Play(playing))]
+    run = replace(_set_playing(run, playing), plays_asked=run.plays_asked + 1)
+    return run, [Send(Play(playing, run.plays_asked))]
 
 
 def _reset(run: Run, env_idx: tuple[int, ...] | None) -> Change:
@@ -434,7 +435,7 @@ def _take_status(run: Run, event: Status) -> Run:
     run = replace(
         run,
         policy_failed=run.policy_failed and not event.playing,
-        playing=event.playing,
+        playing=event.playing if event.handled >= run.plays_asked else run.playing,
         steps_per_second=event.steps_per_second,
         real_time_factor=event.real_time_factor,
         recorded_share=event.recorded_share,

@@ -45,7 +45,7 @@ def first_requests(run: Run) -> tuple[Run, list[Request]]:
         run = replace(run, state="error", activity="")
     # A version that failed while it ran would fail again: it is restored paused.
     if run.wants_play and not (recovery.restoring and run.problem_at_run):
-        requests.append(Play(True))
+        requests.append(Play(True, run.plays_asked))
     return run, requests
 
 
@@ -270,6 +270,7 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
     return replace(
         run,
         playing=False,
+        plays_asked=0,
         steps_per_second=0.0,
         real_time_factor=0.0,
         state="stopped" if death.gives_up else "starting",

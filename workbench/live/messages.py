@@ -61,6 +61,8 @@ class Play:
     """Start or pause stepping."""
 
     playing: bool
+    number: int = 0
+    """Number of the request of a person, counting up; 0 for one that nobody made."""
 
 
 @dataclass(frozen=True)
@@ -465,6 +467,7 @@ class Status:
     """Whether and how fast the batch runs."""
 
     playing: bool
+    """As of the last `Play` that the worker has handled."""
     steps_per_second: float
     """Control steps of the whole batch per second of wall time."""
     real_time_factor: float
@@ -474,6 +477,8 @@ class Status:
     recorded_share: float = 0.0
     watched_share: float = 0.0
     """Shares (0 to 1) of the playing time spent on recording every step, and on pictures for the page."""
+    handled: int = 0
+    """Largest `Play.number` that the worker has handled."""
 
 
 @dataclass(frozen=True)

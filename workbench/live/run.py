@@ -87,6 +87,8 @@ class Run:
     """Number of open pages."""
     tried_options: TaskOptions | None = None
     """Options that the user applied and that no load has accepted or refused yet."""
+    plays_asked: int = 0
+    """Number of `Play` requests to this worker. A `Status` from before the last one says nothing about playing."""
     wants_play: bool = False
     policy_failed: bool = False
     """Whether a failure of the policy stopped playing, and playing has not resumed since. `problem` may be None already: a

@@ -115,6 +115,7 @@ class Worker:
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
         self._playing = False
+        self._plays_handled = 0
         self._start_folder = CurrentFolder()
         self._scene = SceneEnv()
         self._chooser = ActionChooser(self._start_folder)
@@ -351,6 +352,7 @@ class Worker:
 
     def _play(self, request: Play) -> None:
         self._playing = request.playing and self._task.opened is not None
+        self._plays_handled = max(self._plays_handled, request.number)
         self._one_planned_step = False
         self._followed.forget()
         self._pacer.start(time.monotonic())
@@ -607,7 +609,7 @@ class Worker:
         self._status_sent = moment
         steps = self._rate.per_second(moment) if self._playing else 0.0
         shares = [self._shares.of(what, moment) if self._playing else 0.0 for what in ("recorded", "watched")]
-        self._line.send(Status(self._playing, steps, steps * self._pacer.control_dt, activity, *shares))
+        self._line.send(Status(self._playing, steps, steps * self._pacer.control_dt, activity, *shares, self._plays_handled))
 
     def _send_rules(self) -> None:
         """Send the rules that the task breaks, if they changed."""
