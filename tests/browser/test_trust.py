@@ -49,7 +49,7 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
         # Enter is pressed on what has the focus, and opens nothing behind the window.
         page.keyboard.press("Enter")
         expect(window).to_be_hidden(timeout=PATIENT)
-        said = page.locator(".wb-bad-text").filter(has_text="is not trusted")
+        said = page.locator(".wb-bad-text").filter(has_text="was not allowed to run")
         expect(said.first).to_be_visible(timeout=PATIENT)
 
         page.get_by_role("tab", name="Review").click()

@@ -130,6 +130,8 @@ def test_the_longest_end_of_the_path_that_names_the_task_is_found_above_the_reco
     assert task_file(path, "Push-v1", moved) == longer
     put(Path(longer), "another task")
     assert task_file(path, "Push-v1", moved) == short
+    beside = put(moved / "push.py")
+    assert task_file(path, "Push-v1", moved) == beside
     here = put(Path.cwd() / "tasks" / "push.py")
     assert task_file(path, "Push-v1", moved) == here, "where one looks from comes first"
 

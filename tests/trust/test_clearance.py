@@ -131,7 +131,7 @@ def test_what_was_recorded_elsewhere_is_asked_about_with_file_hash_and_modules(
 
 def test_without_anybody_to_ask_the_answer_is_no(foreign: Path) -> None:
     for wanted in (todays(foreign), as_recorded(foreign)):
-        with pytest.raises(NotCleared, match=r"push\.py .* is not trusted") as refused:
+        with pytest.raises(NotCleared, match=r"push\.py .* was not allowed to run") as refused:
             Clearances().clear(wanted)
         assert refused.value.question is not None
         assert Clearances(all_trusted=True).clear(wanted)
@@ -385,7 +385,7 @@ def test_a_listed_file_is_asked_about_once_with_its_text_and_its_modules(tmp_pat
 def test_a_no_opens_nothing_and_once_lasts_for_this_run(tmp_path: Path) -> None:
     file, person = listed(tmp_path), Person(Consent.NO)
     clearances = Clearances(ask=person)
-    with pytest.raises(NotCleared, match="is not trusted"):
+    with pytest.raises(NotCleared, match="was not allowed to run"):
         clearances.clear_file(file)
     person.answer = Consent.ONCE
     clearances.clear_file(file)

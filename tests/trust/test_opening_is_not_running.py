@@ -235,7 +235,7 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
     try:
         rescorer.start(find_all_sources((foreign / "recordings",)))
         view = rescored(rescorer, "failed")
-        assert "is not trusted" in view.why and not ran(foreign)
+        assert "was not allowed to run" in view.why and not ran(foreign)
         rescorer.start(find_all_sources((foreign / "recordings",)))
         view = rescored(rescorer, "done", "failed")
         assert view.state == "done" and len(view.verdicts) == 2, view

@@ -297,7 +297,7 @@ def print_question(question: TrustQuestion, out: Console) -> None:
         out.print(escape(plain_text(text)), style=style, soft_wrap=True)
 
     holds = "hold this text" if question.recorded_text else "name this file"
-    print_escaped(f"Recordings of {question.task} that were not made by this installation {holds}:")
+    print_escaped(f"Recordings of {question.task} {holds}, which was not allowed to run here before:")
     for place, file in enumerate(question.files):
         if place == 1:
             print_escaped(_modules_text(question))
@@ -347,7 +347,7 @@ def not_trusted_lines(error: NotTrusted) -> list[str]:
         named.append(f"    and {len(questions) - MAX_QUESTIONS} more")
     return [
         *lines,
-        "Nothing was run: the recordings were not made by this installation, and you have not agreed to run the code that they name:",
+        "Nothing was run: you have not agreed to run the code that the recordings name or hold:",
         *named,
         "Read the code. Then run the command in a terminal, where it asks you (and show prints the text); or add --trust, which "
         "allows the code in this run; or give your own task file with --task.",

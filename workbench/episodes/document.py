@@ -392,7 +392,7 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     """The task's file at `source_path` relative to the recording's `folder`; None if it is not found.
 
     That path is wrong for a copied recording, which is usually opened from the task's own folder. So the end of the path
-    is also tried below the current folder and the folders above the recording; such a file must contain the task's name.
+    is also tried below the current folder, the recording's own, and those above it; such a file must contain the task's name.
     """
     if not source_path:
         return None
@@ -402,7 +402,7 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     parts = [part for part in Path(source_path).parts if part not in ("..", os.sep)]
     if not source_path.endswith(".py") or len(parts) > MAX_PATH_PARTS:
         return None
-    for place in (Path.cwd(), *folder.resolve().parents):
+    for place in (Path.cwd(), folder.resolve(), *folder.resolve().parents):
         for begin in range(len(parts)):
             candidate = place.joinpath(*parts[begin:])
             try:

@@ -294,7 +294,7 @@ class Rescorer:
         if last.problem is not None:
             why = f"the code of {group.info.task} raised"
             if began is None:
-                why = f"{_code_text(group)} cannot be opened. Choose *as recorded*, or start the workbench with --task FILE"
+                why = f"{_code_text(group)} cannot be opened. Choose 'as recorded', or start the workbench with --task FILE"
             raise JobFailed(why, last.problem)
 
 
@@ -312,4 +312,4 @@ def _code_text(group: RescoreGroup) -> str:
     if group.recorded_source:
         return f"{group.info.task} as it was recorded"
     file = named_file(group.reference)
-    return f"{group.info.task} as it is installed" if file is None else f"{group.info.task} of {file}"
+    return f"{group.info.task} as a package registers it" if file is None else f"{group.info.task} of {file}"

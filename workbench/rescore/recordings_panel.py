@@ -78,7 +78,7 @@ def _todays(infos: Sequence[EpisodeInfo], named: Sequence[RecordedTask]) -> str:
 
 def _in_words(reference: RecordedTask) -> str:
     file = named_file(reference)
-    return f"{reference} as it is installed" if file is None else f"{file} as it is now"
+    return f"{reference} as a package registers it" if file is None else f"{file} as it is now"
 
 
 def _recorded(infos: Sequence[EpisodeInfo]) -> str:

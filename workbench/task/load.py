@@ -190,8 +190,15 @@ def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
     if task.approved is None:
         # A file without approval is not opened; `env_id` may look like a path but is never used as one.
         if registry.environment(task.env_id) is None:
+            lost = (
+                ""
+                if task.file is not None
+                else (
+                    ", and its file was found neither in or above the folder of the recording, nor below the current one"
+                )
+            )
             raise task_error(
-                f"a recording names the task {task.env_id!r}, and no installed package registers one of that id. {IMPORT_HINT}"
+                f"a recording names the task {task.env_id!r}, which no installed package registers{lost}. {IMPORT_HINT}"
             )
         return _registered(task.env_id)
     if task.file is None or task.file not in task.approved:

@@ -211,7 +211,7 @@ class Clearances:
                 answer = self._answer(question, undecided.content, stopped)
             none_of_them = none_of_them or answer is Consent.NONE
             if answer in (Consent.NO, Consent.NONE):
-                refused[hash] = NotCleared(f"{question_text(question)} is not trusted", question)
+                refused[hash] = NotCleared(f"{question_text(question)} was not allowed to run", question)
         cleared: list[TaskName | NotCleared] = []
         for one, decision in zip(codes, decisions):
             if not isinstance(decision, _Undecided):
@@ -244,7 +244,7 @@ class Clearances:
             before = None if agreed else self._store.trusted_before(content)
             question = _question(content, before, followed=True, agreed=agreed, listed=True)
             if self._answer(question, content, stopped) in (Consent.NO, Consent.NONE):
-                raise NotCleared(f"{question_text(question)} is not trusted", question)
+                raise NotCleared(f"{question_text(question)} was not allowed to run", question)
             if not _is_unchanged(content):
                 raise _changed(content)
         # Exactly these texts, until the next save: the file may change before it is loaded.
