@@ -40,6 +40,7 @@ from workbench.cli.run_by import (
     shard_of,
     status_in_folder,
 )
+from workbench.envs.step_result import TERM_PREFIX
 from workbench.episodes.reader.reading import recover_confined
 from workbench.episodes.sweep_results import RESULTS, PointSummary, SweepResults, value_text, write_results
 from workbench.episodes.writing.publish import try_folder
@@ -53,7 +54,6 @@ from workbench.sweep.job import Point, Setting, SweepOptions, SweepReport, recor
 
 _MAX_POINTS = 50
 """Maximum number of points that are printed."""
-_TERMS = "reward_terms/"
 
 
 @dataclass(frozen=True)
@@ -225,10 +225,10 @@ def print_points(results: SweepResults) -> None:
     summaries = results.summaries()
     terms = list(dict.fromkeys(name for one in summaries for name in one.means))
     # The terms that sum to the reward if the task reports them, else all its terms.
-    terms = [name for name in terms if name.startswith(_TERMS)] or terms
+    terms = [name for name in terms if name.startswith(TERM_PREFIX)] or terms
     cells = [_cells(one, terms) for one in summaries[:_MAX_POINTS]]
     heads = [*results.names, "success (95 %)", "at the end", "return"]
-    heads = [*heads, *(name.removeprefix(_TERMS) for name in terms)]
+    heads = [*heads, *(name.removeprefix(TERM_PREFIX) for name in terms)]
     widths = [max(map(len, column)) + 2 for column in zip(heads, *(row for _, row in cells), strict=True)]
     first, fit = len(heads) - len(terms), len(heads)
     # Drop columns that do not fit: a table wrapped within words is unreadable.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from workbench.envs.gpu_rules import DeclaredRule, declared_rule
 from workbench.envs.scene.shapes import SceneGeometry
-from workbench.envs.step_result import StepResult
+from workbench.envs.step_result import TERM_PREFIX, StepResult
 
 MAX_SPEED = 20.0
 """Maximum speed of a body in m/s, as a mean over a control step; robots move at a tenth of it."""
@@ -39,6 +39,7 @@ class OutlierKind(Enum):
     UNDER_FLOOR = "under the floor", "bodies-stay"
     DROPPED = "dropped", "bodies-stay"
     ENTRY_NOT_FINITE = "entry not finite", "entries-finite"
+    TERM_NOT_FINITE = "reward term not finite", "reward-finite"
     OBSERVATION_NOT_FINITE = "observation not finite", "observation-finite"
     REWARD_NOT_FINITE = "reward not finite", "reward-finite"
     REWARD_OUT_OF_RANGE = "reward out of range", "reward-normalized"
@@ -374,7 +375,12 @@ def _numbers(step: StepResult) -> list[tuple[OutlierKind, str, NDArray]]:
     )
     entries = [(str(name), np.asarray(value)) for name, value in step.evaluate.items()]
     floats = [
-        (OutlierKind.ENTRY_NOT_FINITE, name, value)
+        # The reward's hook puts its terms into the entries of evaluate.
+        (
+            OutlierKind.TERM_NOT_FINITE if name.startswith(TERM_PREFIX) else OutlierKind.ENTRY_NOT_FINITE,
+            name,
+            value,
+        )
         for name, value in entries
         if value.dtype.kind == "f" and value.ndim
     ]

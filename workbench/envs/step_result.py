@@ -8,6 +8,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+TERM_PREFIX = "reward_terms/"
+"""Prefix of the entries of a `StepResult` that are terms of a dense reward.
+
+``compute_dense_reward`` puts them into ``info["reward_terms"]``, a dict of tensors (N,). The key is the workbench's own,
+since ManiSkill has none for reward terms; it passes ``info`` on unchanged, nested dicts included, so such a file also runs
+in stock ManiSkill. A term that is not one number per env is listed in the table of numbers, without a curve.
+"""
+
 
 @dataclass(frozen=True)
 class OtherEntry:

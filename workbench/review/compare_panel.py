@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import viser
 
+from workbench.envs.step_result import TERM_PREFIX
 from workbench.episodes.episode import NO_SEED
-from workbench.live.history.curves import PREFIX
 from workbench.live.timeline_commands import Seek
 from workbench.machine.text import length
 from workbench.page.command import Command, Refused
@@ -90,10 +90,10 @@ class ReviewComparePanel(PagePart[ReviewView]):
             rows=list(zip(self._differing, presses, strict=False)),
             more=len(self._differing) - len(presses),
             same=", ".join(
-                p.name.removeprefix(PREFIX) for p in differences if p.position is None and not p.values
+                p.name.removeprefix(TERM_PREFIX) for p in differences if p.position is None and not p.values
             ),
             one_sided=", ".join((*one_sided, *found.not_in_both)),
-            prefix=PREFIX,
+            prefix=TERM_PREFIX,
         )
 
     def do(self, command: Command, visitor: Visitor) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.envs.camera_data import CameraInfo, CameraKey, Picture, PictureDegree
+from workbench.envs.step_result import TERM_PREFIX
 from workbench.episodes.episode import CameraTrack, Episode
 from workbench.episodes.reader.reader_process import ReaderBusy
 from workbench.episodes.row import is_stopped
-from workbench.live.history.curves import PREFIX
 from workbench.live.messages import CameraRequest
 
 START = "start"
@@ -155,7 +155,7 @@ def find_events(episode: Episode) -> tuple[EpisodeEvent, ...]:
     limits, and rewards that are not finite."""
     found = [EpisodeEvent(0, "reset", "reset")]
     for name, values in episode.evaluate.items():
-        yes = None if name.startswith(PREFIX) else _flag(values)
+        yes = None if name.startswith(TERM_PREFIX) else _flag(values)
         if yes is not None:
             style: Style = "success" if name == "success" else "fail" if name == "fail" else "other"
             found += [EpisodeEvent(state, name, style) for state in _turns_true(yes)]
@@ -184,9 +184,9 @@ def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDA
     for name, values in episode.evaluate.items():
         if values.dtype.kind not in "fiub":
             continue
-        if name.startswith(PREFIX):
+        if name.startswith(TERM_PREFIX):
             if values.ndim == 1 and len(terms) < MAX_LINES:
-                terms[name.removeprefix(PREFIX)] = (after, _numbers(values)[1:])
+                terms[name.removeprefix(TERM_PREFIX)] = (after, _numbers(values)[1:])
             continue
         label = f"{name} (evaluate)" if name in (REWARD, TERMS, ACTION) else name
         found[label] = dict(_lines(name, values, states))

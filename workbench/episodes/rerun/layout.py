@@ -23,6 +23,7 @@ from transforms3d.quaternions import qconjugate, qmult
 
 from workbench.envs.camera_data import CameraInfo
 from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.envs.step_result import TERM_PREFIX
 from workbench.episodes.encoded_pictures import MILLIMETRES_PER_METRE, Modality, decode
 from workbench.episodes.episode import CameraTrack, Episode, camera_names
 from workbench.episodes.rerun.chunks import LOOK, TimedChunks, series_chunk, static_chunk, static_pose
@@ -35,8 +36,6 @@ ENTRY_TEXTS = "/logs/evaluate"
 OBSERVATION = "/observation/state"
 """All observations except pictures as one batch, as in LeRobot: one entity for each would cost 5 kB per file and 40 B per
 step."""
-REWARD_TERMS = "reward_terms/"
-"""Prefix of the entries of ``evaluate()`` that are terms of the reward."""
 
 _MAX_PIXELS, _MAX_PICTURES = 1 << 20, 1024
 """Maximum pixels and pictures of one chunk, whose pictures are in memory together."""
@@ -168,8 +167,8 @@ def camera_entities(cameras: Sequence[CameraInfo]) -> tuple[str, ...]:
 
 def evaluate_entity(name: str) -> str:
     """Entity of an entry of ``evaluate()``; terms of the reward are below ``/reward``."""
-    if name.startswith(REWARD_TERMS):
-        return rr.new_entity_path(["reward", name[len(REWARD_TERMS) :] or "unnamed"])
+    if name.startswith(TERM_PREFIX):
+        return rr.new_entity_path(["reward", name[len(TERM_PREFIX) :] or "unnamed"])
     return rr.new_entity_path(["evaluate", name or "unnamed"])
 
 
@@ -349,7 +348,7 @@ def _numbers(episode: Episode) -> list[tuple[str, list[str], NDArray]]:
         ("/episode/truncated", [], episode.truncated),
     ]
     for name, column in episode.evaluate.items():
-        series = series_names(name.removeprefix(REWARD_TERMS), column)
+        series = series_names(name.removeprefix(TERM_PREFIX), column)
         found.append((evaluate_entity(name), series, column))
     found += [(batch_entity(name), series_names(name, held), held) for name, held in episode.batch.items()]
     found += [(f"/episode/{name}", [], flag) for name, flag in episode.flags.items()]

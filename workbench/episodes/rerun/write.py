@@ -18,6 +18,7 @@ from rerun.chunk import Chunk
 from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.envs.camera_data import moved_cameras_text
+from workbench.envs.step_result import TERM_PREFIX
 from workbench.episodes.describe import describe
 from workbench.episodes.document import fields_of, json_text
 from workbench.episodes.episode import Episode, EpisodeInfo, acted_by_text, movable_bounds
@@ -25,7 +26,6 @@ from workbench.episodes.rerun.chunks import STEP, property_chunk, static_chunk
 from workbench.episodes.rerun.layout import (
     EVENTS,
     LOGS,
-    REWARD_TERMS,
     WORLD,
     batch_entity,
     camera_entities,
@@ -148,7 +148,7 @@ def arrangement(episode: Episode) -> Arrangement:
     entries = [
         (evaluate_entity(name), column)
         for name, column in episode.evaluate.items()
-        if not name.startswith(REWARD_TERMS)
+        if not name.startswith(TERM_PREFIX)
     ]
     entries += [(batch_entity(name), column) for name, column in episode.batch.items()]
     drawn = (entity for entity, column in entries if 0 < math.prod(column.shape[1:]) <= MAX_SERIES)

@@ -10,15 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from workbench.envs.step_result import StepResult
+from workbench.envs.step_result import TERM_PREFIX, StepResult
 
-PREFIX = "reward_terms/"
-"""Prefix of the entries of a `StepResult` that are terms of a dense reward.
-
-``compute_dense_reward`` puts them into ``info["reward_terms"]``, a dict of tensors (N,). The key is the workbench's own,
-since ManiSkill has none for reward terms; it passes ``info`` on unchanged, nested dicts included, so such a file also runs
-in stock ManiSkill. A term that is not one number per env is listed in the table of numbers, without a curve.
-"""
 MAX_COLUMNS = 64
 """Maximum number of columns: the first ones of `columns_of` are kept."""
 MAX_PARTS = 8
@@ -125,9 +118,9 @@ def columns_of(step: StepResult, joints: Sequence[str] = ()) -> dict[Column, NDA
     terms: dict[Column, NDArray] = {}
     entries: dict[Column, NDArray] = {}
     for name, values in step.evaluate.items():
-        if name.startswith(PREFIX):
+        if name.startswith(TERM_PREFIX):
             if values.size == num_envs:
-                terms[Column(Group.TERM, name.removeprefix(PREFIX))] = values.reshape(num_envs)
+                terms[Column(Group.TERM, name.removeprefix(TERM_PREFIX))] = values.reshape(num_envs)
             continue
         if not values.size:
             continue
@@ -139,7 +132,7 @@ def columns_of(step: StepResult, joints: Sequence[str] = ()) -> dict[Column, NDA
         elif flat.shape[1] <= MAX_PARTS:
             entries |= {Column(Group.EVALUATE, name, k): flat[:, k] for k in range(flat.shape[1])}
     for name, entry in step.others.items():
-        if entry.numbers is not None and entry.numbers.size == 1 and not name.startswith(PREFIX):
+        if entry.numbers is not None and entry.numbers.size == 1 and not name.startswith(TERM_PREFIX):
             entries[Column(Group.EVALUATE, name)] = np.broadcast_to(entry.numbers.reshape(-1), num_envs)
     moved = () if step.qpos is None else step.qpos.T
     positions = {Column(Group.JOINT, name): values for name, values in zip(joints, moved, strict=False)}
@@ -150,9 +143,13 @@ def without_curve(step: StepResult) -> tuple[str, ...]:
     """Names of the reward's terms that are not one number per env."""
     there = {column.name for column in columns_of(step) if column.group is Group.TERM}
     named = [
-        name for name in [*step.evaluate, *step.others] if name.startswith(PREFIX) or name == PREFIX[:-1]
+        name
+        for name in [*step.evaluate, *step.others]
+        if name.startswith(TERM_PREFIX) or name == TERM_PREFIX[:-1]
     ]
-    return tuple(name.removeprefix(PREFIX) for name in named if name.removeprefix(PREFIX) not in there)
+    return tuple(
+        name.removeprefix(TERM_PREFIX) for name in named if name.removeprefix(TERM_PREFIX) not in there
+    )
 
 
 # --- all steps in bounded memory ----------------------------------------------------------------------

@@ -17,8 +17,8 @@ from workbench.envs.camera_data import CameraKind, Picture
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.outliers import OutlierKind
 from workbench.envs.snapshots.packing import WholeSnapshot
-from workbench.envs.step_result import StepResult
-from workbench.live.history.curves import PREFIX, Columns, StepCurves
+from workbench.envs.step_result import TERM_PREFIX, StepResult
+from workbench.live.history.curves import Columns, StepCurves
 from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, EnvTable
 from workbench.live.messages import PastPictures, Pictures, ReplayPath
 from workbench.task.description import NO_MOMENT, Restored, Stepped
@@ -490,7 +490,7 @@ class History:
             reward[to] = then.reward[of]
             for name, values in then.evaluate.items():
                 # evaluate() has no reward terms: only the reward's hook adds them, and it is not called here.
-                if name.startswith(PREFIX) and name not in step.evaluate:
+                if name.startswith(TERM_PREFIX) and name not in step.evaluate:
                     terms.setdefault(name, np.full(values.shape, np.nan, np.float32))[to] = values[of]
 
         kept = np.flatnonzero(~jumped | stepped.resumed)

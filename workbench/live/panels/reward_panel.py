@@ -9,9 +9,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.envs.step_result import OtherEntry, StepResult
+from workbench.envs.step_result import TERM_PREFIX, OtherEntry, StepResult
 from workbench.live.commands import ToggleCurve
-from workbench.live.history.curves import PREFIX, REWARD, SUCCESS, Column, Curves, Group, columns_of
+from workbench.live.history.curves import REWARD, SUCCESS, Column, Curves, Group, columns_of
 from workbench.live.panels.moment import MomentPart
 from workbench.live.timeline_commands import SeekOnCurve
 from workbench.live.view import SessionView
@@ -299,7 +299,7 @@ def number_rows(
             rows.append(_other_row(key, step.others[key], env))
             continue
         values = np.asarray(step.evaluate[key])
-        if key.startswith(PREFIX) and values.ndim == 1:
+        if key.startswith(TERM_PREFIX) and values.ndim == 1:
             rows.append(_earned_row(key, values, step, env))
             continue
         mood = ""
