@@ -1,4 +1,4 @@
-"""Runs the tests with other versions of what the workbench stands on, and writes the table of web_assets/docs/versions.md.
+"""Runs the tests with other versions of what the workbench stands on, and writes the table of web_assets/docs/reference/versions.md.
 
     python -m tests.versions tested nightly                 # ManiSkill's release and nightly build, by constraints.txt
     python -m tests.versions oldest newest --tests fast     # the ends of pyproject.toml's ranges; uv has to be on PATH
@@ -29,7 +29,7 @@ import tomllib
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "web_assets" / "docs" / "versions.md"
+PAGE = ROOT / "web_assets" / "docs" / "reference" / "versions.md"
 SHOWN = ("viser", "rerun-sdk", "sapien", "torch", "numpy", "gymnasium")
 TESTS = {
     "fast": ["--fast"],

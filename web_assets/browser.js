@@ -1,4 +1,5 @@
-// Detects browsers without WebGL 2 or without hardware acceleration.
+// Detects browsers without WebGL 2 or without hardware acceleration. Features to request from viser for the latter: no smoothed
+// edges, no copy of each frame, fewer pixels during motion, a cheap material, a setting that turns its notice off.
 "use strict";
 {
   const SOFTWARE = /swiftshader|llvmpipe|softpipe|software/i; // as in viser's BrowserWarning.tsx

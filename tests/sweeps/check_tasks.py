@@ -6,7 +6,7 @@
 
 Each id gets a process of its own: a task that ends the process or never returns is one row. Nothing can be asked
 there and nothing fetched, and ManiSkill's folder for downloads is an empty one. What is found is read by a person and
-told in web_assets/docs/checked_tasks.md.
+told in web_assets/docs/reference/checked_tasks.md.
 """
 
 from __future__ import annotations
