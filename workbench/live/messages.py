@@ -467,7 +467,7 @@ class Status:
     """Whether and how fast the batch runs."""
 
     playing: bool
-    """As of the last `Play` that the worker has handled."""
+    """Whether stepping goes on, after the last `Play` that the worker has handled."""
     steps_per_second: float
     """Control steps of the whole batch per second of wall time."""
     real_time_factor: float

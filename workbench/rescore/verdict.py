@@ -54,7 +54,7 @@ class Verdict(Generic[Of]):
     """First step of the episode after which success is true, as (recorded, rescored); None if never."""
     fail: tuple[int | None, int | None] = (None, None)
     has: tuple[str, ...] = ("reward",)
-    """Those of reward, success and fail that the record or the current code has."""
+    """Names among reward, success and fail that the record or the current code has."""
     returns: tuple[float, float] = (0.0, 0.0)
     largest: float = 0.0
     """Largest change of one reward."""
