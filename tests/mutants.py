@@ -41,7 +41,7 @@ ENOUGH = 85
 PROTECTED = {
     "episodes/writing/journal": "episodes/writing/test_journal.py",
     "episodes/reader/episode_wire": "episodes/test_episode_wire.py",
-    "episodes/writing/finish": "episodes/writing/test_recover.py episodes/writing/test_finish.py",
+    "episodes/writing/finish_or_recover": "episodes/writing/test_recover.py episodes/writing/test_finish_or_recover.py",
     "library/trash": "library/test_trash.py",
     "episodes/document": "episodes/test_document.py episodes/test_checksums.py",
     "episodes/reader/reading": "episodes/reader/test_sources.py",
@@ -98,7 +98,7 @@ PROTECTED = {
     "rescore/verdict": "rescore/test_verdict.py",
     "rescore/past_scores": "rescore/test_past_scores.py rescore/test_past_rescorer.py",
     "live/process/supervisor": "live/process/test_supervisor.py",
-    "live/recovery": "live/test_versions.py",
+    "live/load_attempts": "live/test_versions.py",
     "live/loading": "live/test_versions.py live/test_live_state.py",
     "live/apply": "live/test_live_state.py live/test_timeline.py live/test_apply.py",
     "live/past": "live/test_timeline.py",

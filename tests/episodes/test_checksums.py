@@ -17,7 +17,7 @@ from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.reader.read_rows import read_found
 from workbench.episodes.reader.scan import scan_folder
 from workbench.episodes.row import UnreadableRecording
-from workbench.episodes.writing.finish import EpisodeFiles
+from workbench.episodes.writing.finish_or_recover import EpisodeFiles
 
 pytestmark = pytest.mark.thorough
 

@@ -22,7 +22,7 @@ from workbench.envs.step_result import OtherEntry
 from workbench.episodes.columns import CUT_MESSAGE, MAX_TEXT_BYTES, TextEntry, TextWriter, text_tracks
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.writing.episode_writer import EpisodeFiles
-from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.finish_or_recover import recover
 
 Maker = Callable[..., Made]
 Others = Mapping[str, OtherEntry]

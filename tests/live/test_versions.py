@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from tests.drive.scenes import description, problem, table_scene
 from tests.drive.session import DEATH, Told, stop_watching, told_session
 from tests.drive.waiting import until
-from workbench.live import recovery
+from workbench.live import load_attempts as recovery
 from workbench.live.commands import PlayRun, RebuildScene, ReloadFile, RestartWorker
+from workbench.live.load_attempts import Recovery
 from workbench.live.messages import Load, Loading, NewProcessNeeded, Play, Settings, TaskFailed
 from workbench.live.process.supervisor import End
-from workbench.live.recovery import Recovery
 
 GOOD, NEW = "x = 1\n", "x = 2\n"
 FILE_WAITS = replace(DEATH, end=End.FILE_WAITS)

@@ -20,7 +20,7 @@ import workbench
 from tests.drive.envs import CPU
 from workbench.episodes.episode import NO_SEED, Episode
 from workbench.episodes.reader.read_episode import read_episode, read_maniskill
-from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.finish_or_recover import recover
 from workbench.machine.processes.family import children
 
 TASKS = Path(__file__).parents[2] / "tasks"

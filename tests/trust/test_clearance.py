@@ -18,7 +18,7 @@ from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.recorded_source import recorded_source, reference_of
 from workbench.episodes.seal import KEY_FILE, InstallationSeal, made_here
-from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.finish_or_recover import recover
 from workbench.machine.folders import user_folder
 from workbench.review.recorded_scene import SceneError, SceneProcess
 from workbench.task.content import read_content

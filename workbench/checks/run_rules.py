@@ -23,8 +23,8 @@ from workbench.checks.evidence.checkup import (
     finding_of,
 )
 from workbench.checks.evidence.over_seeds import OverSeeds
+from workbench.checks.register_rule import RuleCheck, checks_in
 from workbench.checks.results import RuleResult, Seen, Silenced, State, failed, merged
-from workbench.checks.rule_check import RuleCheck, checks_in
 from workbench.checks.rule_table import gpu_rules_of
 from workbench.checks.rules import (
     cameras,

@@ -17,6 +17,7 @@ from workbench.envs.step_result import StepResult
 from workbench.live.events import RunEffect, RunToEnter
 from workbench.live.history.env_table import EnvRows
 from workbench.live.history.moments import EnvMoment, ShownMoment
+from workbench.live.load_attempts import LoadInputs, Recovery
 from workbench.live.messages import (
     Load,
     LoadLevel,
@@ -28,7 +29,6 @@ from workbench.live.messages import (
 )
 from workbench.live.past import Past, Strip
 from workbench.live.process.heartbeat import Busy, own_files_of
-from workbench.live.recovery import LoadInputs, Recovery
 from workbench.task.description import TaskDescription, TaskOptions
 from workbench.task.problem import Problem
 from workbench.task.reference import TaskName, followed_folder, named_file

@@ -18,7 +18,7 @@ from workbench.envs import action_vector as actions
 from workbench.envs.keywords import control_mode_of
 from workbench.envs.maniskill_private import task_class
 from workbench.envs.scene.scene_index import once_a_scene, read_poses, scene_index
-from workbench.envs.snapshots.rng import read_shared_rng, write_shared_rng
+from workbench.envs.snapshots.rng_state import read_shared_rng, write_shared_rng
 from workbench.envs.snapshots.snapshot import Snapshot, restore_snapshot
 from workbench.envs.task_env import EnvOptions, build_env
 from workbench.planning.options import PlanOptions

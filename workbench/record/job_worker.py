@@ -35,7 +35,7 @@ from workbench.envs.step_result import StepResult
 from workbench.episodes.recorded_state import state_distance
 from workbench.episodes.replay import restore_recorded
 from workbench.episodes.writing.episode_writer import EpisodeFiles
-from workbench.episodes.writing.finish import remove_episode
+from workbench.episodes.writing.finish_or_recover import remove_episode
 from workbench.episodes.writing.publish import RecordingError
 from workbench.episodes.writing.upload import remove_uploaded_id, upload_episode
 from workbench.jobs.scheduler import Chunk, ItemQueue

@@ -26,7 +26,7 @@ from workbench.envs.task_env import TaskEnv
 from workbench.episodes.episode import NO_SEED
 from workbench.episodes.reader.reading import recovered_text
 from workbench.episodes.writing.episode_writer import EpisodeFiles
-from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.finish_or_recover import recover
 from workbench.episodes.writing.journal import before_writing
 from workbench.episodes.writing.publish import RecordingError
 from workbench.pictures.render import Request, recorded_pictures, step_pictures

@@ -12,7 +12,8 @@ from tests.drive.episodes import made, write
 from tests.episodes.refused_calls import descriptors
 from workbench.episodes.episode import CameraTrack, Episode
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.episodes.rerun import layout, read
+from workbench.episodes.rerun import entities as layout
+from workbench.episodes.rerun import read
 from workbench.episodes.row import UnreadableRecording
 
 

@@ -24,7 +24,7 @@ from tests.episodes.verify_rrd import verify_rrd
 from workbench.envs.camera_data import CameraInfo
 from workbench.episodes.episode import Episode
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.episodes.rerun.layout import VIEWER_TEXELS, body_entities
+from workbench.episodes.rerun.entities import VIEWER_TEXELS, body_entities
 from workbench.episodes.rerun.read import read_properties
 
 Entities = dict[str, dict[str, Column]]

@@ -26,7 +26,7 @@ from tests.episodes.read_rrd import read_rrd
 from tests.episodes.verify_rrd import verify_rrd
 from workbench.episodes.episode import Episode
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.episodes.rerun import layout
+from workbench.episodes.rerun import entities as layout
 from workbench.episodes.rerun import write as rrd
 from workbench.episodes.rerun.viewer import quiet_environment, rerun_command
 from workbench.episodes.writing.from_journal import episode_in

@@ -25,7 +25,7 @@ from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.rerun.read import read_properties
 from workbench.episodes.writing.episode_writer import EpisodeFiles
-from workbench.episodes.writing.finish import episode_stem, recover
+from workbench.episodes.writing.finish_or_recover import episode_stem, recover
 from workbench.episodes.writing.journal import FOLDER
 from workbench.episodes.writing.publish import RecordingError
 

@@ -24,7 +24,7 @@ from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.seal import InstallationSeal, made_here
 from workbench.episodes.writing.episode_writer import EpisodeWriter
 from workbench.episodes.writing.files_process import FilesProcess
-from workbench.episodes.writing.finish import make_files
+from workbench.episodes.writing.finish_or_recover import make_files
 from workbench.episodes.writing.journal import claim
 from workbench.episodes.writing.publish import RecordingError
 from workbench.record.gather import EpisodeFinisher, GatheredEpisode

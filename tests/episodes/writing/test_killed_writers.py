@@ -18,7 +18,7 @@ from tests.drive.episodes import made as small
 from tests.episodes.verify_rrd import verify_rrd
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.reader.reading import recover_confined
-from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.finish_or_recover import recover
 from workbench.episodes.writing.journal import FOLDER
 from workbench.machine.processes.confinement import landlock_version
 

@@ -17,7 +17,7 @@ from tests.drive.waiting import until
 from workbench.envs.camera_data import CameraInfo
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.writing import episode_writer
-from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.finish_or_recover import recover
 from workbench.episodes.writing.publish import RecordingError
 
 Maker = Callable[..., Made]

@@ -22,7 +22,7 @@ from tests.drive.waiting import until
 from tests.episodes.refused_calls import descriptors, refused
 from workbench.envs.scene.shapes import Mesh
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.finish_or_recover import recover
 from workbench.episodes.writing.journal import FOLDER, Journal, JournalEntry
 from workbench.episodes.writing.publish import RecordingError
 

@@ -14,7 +14,7 @@ import pytest
 from moto.server import ThreadedMotoServer
 
 from workbench.episodes.reader.read_episode import read_episode
-from workbench.episodes.writing.finish import EpisodeFiles
+from workbench.episodes.writing.finish_or_recover import EpisodeFiles
 from workbench.episodes.writing.publish import RecordingError
 from workbench.episodes.writing.upload import remove_uploaded_id, upload_episode
 from workbench.jobs.scheduler import Scheduler, ThisProcess, Work

@@ -9,7 +9,7 @@ from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Not
 from workbench.checks.evidence.places import Module
 from workbench.checks.evidence.tensor_watch import TensorUses
 from workbench.checks.evidence.time_step import EVERY_STEP
-from workbench.checks.rule_check import rule
+from workbench.checks.register_rule import rule
 from workbench.envs.broken_rule import Place
 
 _ONE_FOR_EACH_ENV = {"num_envs", "_num_envs", "_objs", "_bodies", "sub_scenes"}

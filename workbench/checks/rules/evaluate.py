@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.episode_batches import Episodes
 from workbench.checks.evidence.over_seeds import first_kind, together, tried
+from workbench.checks.register_rule import outlier_check, rule
 from workbench.checks.results import Seen
-from workbench.checks.rule_check import outlier_check, rule
 from workbench.envs.action_vector import hold_action
 from workbench.envs.broken_rule import Place
 from workbench.machine.text import listed, of

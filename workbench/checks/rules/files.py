@@ -15,7 +15,7 @@ from mani_skill.utils import assets
 
 from workbench.checks.evidence.checkup import Checkup, Found, Note
 from workbench.checks.evidence.places import Module
-from workbench.checks.rule_check import rule
+from workbench.checks.register_rule import rule
 from workbench.checks.rules.source import HOOKS
 from workbench.envs.assets import assets_at
 from workbench.envs.broken_rule import Place

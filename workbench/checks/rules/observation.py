@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.odd_states import odd_states
 from workbench.checks.evidence.over_seeds import together, tried
+from workbench.checks.register_rule import outlier_check, rule
 from workbench.checks.results import Seen
-from workbench.checks.rule_check import outlier_check, rule
 from workbench.envs.broken_rule import Place
 from workbench.envs.state_columns import flat_names, split_flat
 from workbench.machine.text import of

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.over_seeds import together, tried
+from workbench.checks.register_rule import rule
 from workbench.checks.results import Seen
-from workbench.checks.rule_check import rule
 from workbench.envs.action_vector import random_action
 from workbench.envs.broken_rule import Place
 from workbench.envs.maniskill_private import agents, apply_and_fetch, objects_of

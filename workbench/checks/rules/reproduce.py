@@ -13,7 +13,7 @@ from workbench.checks.evidence.builds import shapes_of_env
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown, read_obs
 from workbench.checks.evidence.random_calls import first_draw, global_draw, torch_draw
 from workbench.checks.evidence.time_step import EVERY_STEP
-from workbench.checks.rule_check import rule
+from workbench.checks.register_rule import rule
 from workbench.envs.action_vector import random_action
 from workbench.envs.maniskill_private import apply_and_fetch
 from workbench.envs.state_columns import env_states, flat_names, split_flat

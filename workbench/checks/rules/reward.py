@@ -13,8 +13,8 @@ from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Not
 from workbench.checks.evidence.episode_batches import Episodes
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, SHORT, OddStates, odd_states
 from workbench.checks.evidence.over_seeds import first_kind, tried
+from workbench.checks.register_rule import outlier_check, rule
 from workbench.checks.results import Seen
-from workbench.checks.rule_check import outlier_check, rule
 from workbench.checks.rules.evaluate import flags
 from workbench.envs.broken_rule import Place
 from workbench.envs.outliers import REWARD_RANGES, ROUNDING

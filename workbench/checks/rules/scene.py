@@ -15,8 +15,8 @@ from workbench.checks.evidence.builds import Built
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.meshes import is_hollow, triangles_in
 from workbench.checks.evidence.over_seeds import together, tried
+from workbench.checks.register_rule import rule
 from workbench.checks.results import Seen
-from workbench.checks.rule_check import rule
 from workbench.checks.rules.placement import immovable
 from workbench.envs.broken_rule import Place
 from workbench.envs.maniskill_private import envs_of, named_to_hide, objects_of

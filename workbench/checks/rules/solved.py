@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
-from workbench.checks.rule_check import rule
+from workbench.checks.register_rule import rule
 from workbench.envs.task_env import TaskEnv, given_arguments
 from workbench.planning.planned_episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner

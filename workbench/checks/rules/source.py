@@ -16,7 +16,7 @@ from mani_skill.utils.building import ActorBuilder, ArticulationBuilder
 
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note
 from workbench.checks.evidence.random_calls import global_draw
-from workbench.checks.rule_check import rule
+from workbench.checks.register_rule import rule
 from workbench.checks.rules.devices import EVERY_STEP
 from workbench.checks.rules.reward import REWARD_HOOKS
 from workbench.envs.assets import robots_of

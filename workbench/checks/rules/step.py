@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note
 from workbench.checks.evidence.episode_batches import SeenOutlier
 from workbench.checks.evidence.over_seeds import together, tried
+from workbench.checks.register_rule import outlier_check
 from workbench.checks.results import Seen
-from workbench.checks.rule_check import outlier_check
 from workbench.checks.rules.placement import where_placed
 from workbench.envs.scene.scene_index import scene_index
 from workbench.machine.text import listed, of

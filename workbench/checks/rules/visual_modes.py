@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown, leaf_rows
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, write_all
-from workbench.checks.rule_check import rule
+from workbench.checks.register_rule import rule
 from workbench.checks.rules.observation import place_of_leaf
 from workbench.envs import maniskill_private
 from workbench.envs.evaluate_entries import split_entries

@@ -19,7 +19,13 @@ from workbench.envs.scene.scene_index import in_every_env, present_states, scene
 from workbench.envs.simulation.cpu_system import batched_system
 from workbench.envs.simulation.state_layout import BODY
 from workbench.envs.snapshots.cpu_state import CpuState, make_cpu_exact_point, read_cpu_state, write_cpu_state
-from workbench.envs.snapshots.rng import RngReader, RngState, SharedRng, read_shared_rng, write_shared_rng
+from workbench.envs.snapshots.rng_state import (
+    RngReader,
+    RngState,
+    SharedRng,
+    read_shared_rng,
+    write_shared_rng,
+)
 from workbench.envs.snapshots.task_state import TaskState, read_task_state, write_task_state
 
 

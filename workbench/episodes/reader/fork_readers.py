@@ -157,7 +157,7 @@ class _Reader:
         if isinstance(request, ReadSweep):
             return _sweep(request)
         assert isinstance(request, Recover)
-        from workbench.episodes.writing.finish import recover
+        from workbench.episodes.writing.finish_or_recover import recover
 
         return Recovered([files.rrd.name for files in recover(request.folder)])
 

@@ -31,7 +31,7 @@ from workbench.episodes.maniskill.read import leaves
 from workbench.episodes.maniskill.read import read_maniskill as read_maniskill
 from workbench.episodes.maniskill.safe_h5 import open_h5
 from workbench.episodes.maniskill.write import TRAJECTORY
-from workbench.episodes.rerun.layout import (
+from workbench.episodes.rerun.entities import (
     CAMERAS,
     OBSERVATION,
     batch_entity,

@@ -16,7 +16,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
-from workbench.episodes.rerun.layout import CAMERAS
+from workbench.episodes.rerun.entities import CAMERAS
 
 _COPIED_BYTES = 1 << 16
 """Number of bytes that are copied at once: the capacity of a pipe."""

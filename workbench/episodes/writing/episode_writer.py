@@ -21,8 +21,8 @@ from workbench.episodes.columns import TEXT, Layout, TextWriter
 from workbench.episodes.encoded_pictures import Modality, encode
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.writing.files_process import FilesProcess
-from workbench.episodes.writing.finish import EpisodeFiles as EpisodeFiles
-from workbench.episodes.writing.finish import make_files
+from workbench.episodes.writing.finish_or_recover import EpisodeFiles as EpisodeFiles
+from workbench.episodes.writing.finish_or_recover import make_files
 from workbench.episodes.writing.from_journal import Header, header_text
 from workbench.episodes.writing.journal import (
     FOLDER,

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from workbench.episodes.writing.finish import EpisodeFiles, stem_begin
+from workbench.episodes.writing.finish_or_recover import EpisodeFiles, stem_begin
 from workbench.episodes.writing.publish import RecordingError
 
 _INSTALL = {

@@ -14,7 +14,7 @@ from tests.drive.rows import append
 from tests.episodes.refused_calls import descriptors, refused
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.episodes.writing.episode_writer import EpisodeWriter
-from workbench.episodes.writing.finish import SUFFIXES, recover
+from workbench.episodes.writing.finish_or_recover import SUFFIXES, recover
 from workbench.episodes.writing.journal import FOLDER
 from workbench.episodes.writing.publish import RecordingError
 

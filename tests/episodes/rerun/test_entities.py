@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from workbench.envs.scene.shapes import SceneGeometry
-from workbench.episodes.rerun.layout import body_entities
+from workbench.episodes.rerun.entities import body_entities
 
 NAME = st.text(st.sampled_from("ab/ c.ä"), max_size=6) | st.sampled_from(["cameras", "cameras/a", "a/b", "a"])
 

@@ -14,7 +14,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from workbench.envs.snapshots.rng import RngReader, read_shared_rng, write_shared_rng
+from workbench.envs.snapshots.rng_state import RngReader, read_shared_rng, write_shared_rng
 
 CPU = torch.device("cpu")
 
