@@ -608,12 +608,11 @@ class Worker:
             return
         self._status_sent = moment
         steps = self._rate.per_second(moment) if self._playing else 0.0
-        shares = [self._shares.of(what, moment) if self._playing else 0.0 for what in ("recorded", "watched")]
-        self._line.send(
-            Status(
-                self._playing, steps, steps * self._pacer.control_dt, activity, *shares, self._plays_handled
-            )
+        recorded, watched = (
+            self._shares.of(what, moment) if self._playing else 0.0 for what in ("recorded", "watched")
         )
+        speed = steps * self._pacer.control_dt
+        self._line.send(Status(self._playing, steps, speed, activity, recorded, watched, self._plays_handled))
 
     def _send_rules(self) -> None:
         """Send the rules that the task breaks, if they changed."""
