@@ -18,7 +18,7 @@ PACKAGE = Path(__file__).parents[2] / "workbench"
 
 
 def test_threads_parse_at_once_while_garbage_is_collected() -> None:
-    text, failures = (PACKAGE / "core" / "maniskill_private.py").read_text(), []
+    text, failures = (PACKAGE / "envs" / "maniskill_private.py").read_text(), []
 
     def parse(depth: int) -> None:
         if depth:
