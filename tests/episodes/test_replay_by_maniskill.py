@@ -17,7 +17,7 @@ from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
-HERE = Path(__file__).parents[1] / "session"
+HERE = Path(__file__).parents[1] / "live"
 POLICIES = {
     "PickCube-v1": HERE / "lifter.py",
     "PushCube-v1": HERE.parent / "browser" / "pusher.py",

@@ -114,6 +114,6 @@ def test_a_worker_that_tells_steps_as_fast_as_it_can_does_not_hold_up_a_press(tm
 
         threading.Thread(target=press, daemon=True).start()
         assert taken.wait(5) and flooding.is_alive()
-        until(lambda: Play(False) in told.asked(Play), "the pause")
+        until(lambda: any(not play.playing for play in told.asked(Play)), "the pause")
         ends.set()
         flooding.join()

@@ -97,7 +97,7 @@ def test_a_body_that_is_hidden_is_hidden_in_both(env: Any) -> None:
 
 
 def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
-    with pytest.warns(UserWarning, match="other"):
+    with pytest.warns(UserWarning, match="simplified meshes"):
         env: Any = workbench.make("PickCube-v1", 1, obs_mode="rgb", pictures="fast")
     obs, _ = env.reset(seed=0)
     inner = env.unwrapped

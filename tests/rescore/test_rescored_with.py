@@ -40,7 +40,7 @@ def test_the_file_that_a_recording_names_is_named(file: Path) -> None:
     assert f"{file}" in todays.told and todays.file is None and text.recorded
     held = source_hash({file.name: file.read_text()}, Path())
     assert f"(version {held})" in text.told, "of the text that it holds, whatever it says of it"
-    assert "Push-v1 as it is installed" in codes_for([recorded(None)], [])[0].told
+    assert "Push-v1 as a package registers it" in codes_for([recorded(None)], [])[0].told
 
 
 def test_a_copy_with_that_task_is_a_choice_and_other_files_are_none(file: Path, tmp_path: Path) -> None:

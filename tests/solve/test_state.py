@@ -58,7 +58,7 @@ def test_what_an_episode_came_to_is_kept_until_it_is_over(played: Told) -> None:
     played.tell(PlanWanted(5, (0,), why_not="it cannot be copied"))
     solve = played.view.of(SolveView)
     assert solve.state == "failed" and "cannot be copied" in solve.why
-    assert played.asked(Play) == [Play(False)] and not played.view.playing
+    assert [play.playing for play in played.asked(Play)] == [False] and not played.view.playing
     played.tell(PlanDropped())
     assert played.view.of(SolveView).state == "failed", "it is said until something is planned"
     change(action_source="random")

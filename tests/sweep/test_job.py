@@ -199,7 +199,7 @@ def test_an_argument_of_the_constructor_is_given_to_it(several: Path) -> None:
     ("given", "why"),
     [
         ("SCALE=4", "SCALE of several.py may be Base.SCALE or several.SCALE: give one of these names"),
-        ("weight=4", "weight of several.py may be Swept.__init__.weight or several.weight: name one"),
+        ("weight=4", "weight of several.py may be Swept.__init__.weight or several.weight: give one"),
         ("talll=true", "did you mean tall?"),
         ("parts.HERE=1", "only constants of this file can be set, not those of modules that it imports"),
         ("ANGLE=1", "ANGLE (line 9 of several.py) is computed, `math.pi / 2`"),

@@ -65,8 +65,8 @@ def test_a_task_of_maniskill_is_copied_with_its_class_wherever_it_is_named(tmp_p
         ("a" * (MAX_NAME_CHARACTERS + 1), f"at most {MAX_NAME_CHARACTERS}"),
         ("torch", "is the name of a library"),
         ("queue", "such as queue_task."),
-        ("taken", "There is a file taken.py already"),
-        ("workbench_minimal", "an id of minimal.py already"),
+        ("taken", "taken.py exists already"),
+        ("workbench_minimal", "already an id of minimal.py"),
         ("HERE", "HERE-v1, which is already an id of mine.py"),
     ],
 )
@@ -93,7 +93,7 @@ def test_a_file_that_appears_at_the_last_moment_is_not_written_over(
         (tmp_path / "push.py").write_text("mine")
 
     monkeypatch.setattr(os, "fsync", saved_meanwhile)
-    with pytest.raises(CannotBegin, match="There is a file push.py already"):
+    with pytest.raises(CannotBegin, match="push.py exists already"):
         write_new_task("push", "minimal", tmp_path)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
