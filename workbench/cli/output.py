@@ -297,7 +297,7 @@ def print_question(question: TrustQuestion, out: Console) -> None:
         out.print(escape(plain_text(text)), style=style, soft_wrap=True)
 
     holds = "hold this text" if question.recorded_text else "name this file"
-    print_escaped(f"Recordings of {question.task} {holds}, which was not allowed to run here before:")
+    print_escaped(f"Recordings of {question.task} {holds}, which you have not allowed for good:")
     for place, file in enumerate(question.files):
         if place == 1:
             print_escaped(_modules_text(question))
