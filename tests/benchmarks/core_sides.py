@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from tests.drive.render_device import RENDER_BACKEND
+
 
 def steps_per_second(step: Callable[[], object], seconds: float) -> float:
     for _ in range(10):
@@ -149,7 +151,7 @@ def picture_seconds(env_id: str, num_envs: int, seconds: float) -> dict[str, flo
     """
     small = {"sensor_configs": {"width": 128, "height": 128}, "obs_mode": "rgb"}
     batched = make_batched(env_id, num_envs, render=True, **small)
-    stock = make_stock(env_id, render_backend="cpu", **small)
+    stock = make_stock(env_id, render_backend=RENDER_BACKEND, **small)
     stock.reset(seed=0)
     batched.reset(seed=0)
     cameras = [s.camera._render_cameras for s in batched._sensors.values()]

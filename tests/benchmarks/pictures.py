@@ -27,6 +27,7 @@ from core_sides import make_batched, random_stepper
 from numpy.typing import NDArray
 
 from tests.benchmarks.table import Row, keep  # `core` has put the repository on the path
+from tests.drive.render_device import RENDER_BACKEND
 
 Part = Literal["pictures", "steps"]
 TABLETOP = (
@@ -287,7 +288,7 @@ def async_rate(num_envs: int, seconds: float) -> tuple[float, float]:
 
     def make() -> gym.Env:
         return CPUGymWrapper(
-            gym.make("PushCube-v1", obs_mode="rgb", sim_backend="physx_cpu", render_backend="cpu")
+            gym.make("PushCube-v1", obs_mode="rgb", sim_backend="physx_cpu", render_backend=RENDER_BACKEND)
         )
 
     envs = gym.vector.AsyncVectorEnv([make] * num_envs, context="spawn")

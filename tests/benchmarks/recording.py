@@ -32,6 +32,8 @@ import numpy as np
 import torch
 import tyro
 
+from tests.drive.render_device import RENDER_BACKEND
+
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from mani_skill.utils.wrappers.record import RecordEpisode
 
@@ -207,7 +209,7 @@ def finish(side: str, wrapped: Any) -> None:
 def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: int) -> None:
     mode: dict[str, Any] = {"obs_mode": "state", "render_backend": "none"}
     if camera:
-        mode = {"obs_mode": "state+rgb+depth+segmentation", "render_backend": "cpu"}
+        mode = {"obs_mode": "state+rgb+depth+segmentation", "render_backend": RENDER_BACKEND}
     env = workbench.make(options.task, num_envs, backend="cpu", max_episode_steps=-1, **mode)
     rng = np.random.default_rng(0)
     shape = (steps, num_envs, env.action_space.shape[-1])  # type: ignore[index]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.drive.render_device import RENDER_BACKEND
 from tests.drive.session import TASKS, live_session, step, wait_until
 from workbench.envs.camera_data import CameraKey
 from workbench.live.events import PagesCounted
@@ -68,7 +69,7 @@ def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
         'CameraConfig("base_camera", shader_config=OWN, ',
     )
     line = next(n for n, text in enumerate(file.read_text().splitlines(), 1) if "shader_config=OWN" in text)
-    with live_session(file, tmp_path / "recordings", draw=True, render_backend="cpu") as session:
+    with live_session(file, tmp_path / "recordings", draw=True, render_backend=RENDER_BACKEND) as session:
         session.change(
             cameras=(CameraRequest(SENSOR[1], "sensor", ("depth",)), CameraRequest(HUMAN[1], "human"))
         )
@@ -94,7 +95,7 @@ def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_picture_that_never_comes(tmp_path: Path) -> None:
     file = task(tmp_path, HANGS)
-    with live_session(file, tmp_path / "recordings", draw=True, render_backend="cpu") as session:
+    with live_session(file, tmp_path / "recordings", draw=True, render_backend=RENDER_BACKEND) as session:
         session.change(cameras=(CameraRequest(HUMAN[1], "human"),))
         session.happen(PagesCounted(1))
         view = wait_until(session, lambda v: HUMAN in v.failed_cameras, "the end of the picture")

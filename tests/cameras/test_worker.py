@@ -16,6 +16,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
+from tests.drive.render_device import RENDER_BACKEND, RENDER_DEVICE
 from workbench.app.worker.questions import QUESTIONS
 from workbench.cameras import worker as under_test
 from workbench.cameras.worker import WorkerCameras
@@ -99,7 +100,9 @@ class Desk:
 def opened(renderer: None, task_file: Path) -> Iterator[OpenedTask]:
     small = task_file.with_name("small.py")
     small.write_text(task_file.read_text().replace("512", "64"))
-    opened = open_task(str(small), TaskOptions(2, env_kwargs={"obs_mode": "rgb", "render_backend": "cpu"}))
+    opened = open_task(
+        str(small), TaskOptions(2, env_kwargs={"obs_mode": "rgb", "render_backend": RENDER_BACKEND})
+    )
     yield opened
     opened.env.close()
 
@@ -135,6 +138,7 @@ def test_sensors_come_first_and_each_kind_as_soon_as_it_is_there(desk: Desk) -> 
     assert desk.first == [False, True] and desk.heartbeat.read().doing == "drawing"
 
 
+@pytest.mark.skipif(RENDER_DEVICE == "cuda", reason="a GPU draws exact pictures throughout")
 def test_pictures_are_fast_while_something_moves_and_exact_when_it_stands_still(desk: Desk) -> None:
     def next_picture(*degree: str) -> Any:
         desk.makes()

@@ -36,9 +36,10 @@ def child_process() -> None:
 @pytest.fixture(scope="session")
 def renderer() -> None:
     """For whatever renders in the tests' process. The device is kept: with the last one go its shaders, 5 s an env."""
+    from tests.drive.render_device import RENDER_DEVICE
     from workbench.envs.backends import keep_render_device
 
-    keep_render_device("cpu")
+    keep_render_device(RENDER_DEVICE)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -73,10 +74,11 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     if not session.config.getoption("fast") and any(
         item.get_closest_marker("render") for item in session.items
     ):
+        from tests.drive.render_device import RENDER_DEVICE
         from workbench.envs.backends import find_renderer, keep_render_device
 
         if find_renderer() is not None:  # else each test that renders fails, with the reason
-            keep_render_device("cpu")
+            keep_render_device(RENDER_DEVICE)
 
 
 class Guard:

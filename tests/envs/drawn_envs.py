@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tests.drive import envs
+from tests.drive.render_device import RENDER_BACKEND
 
 SEED = 3
 
@@ -18,6 +19,6 @@ def batched(task: Any, num_envs: int = 2, render: bool = True, **kwargs: Any) ->
 
 def stock(task: str, **kwargs: Any) -> Any:
     """ManiSkill's own single env."""
-    env = envs.stock(task, render_backend="cpu", **kwargs)
+    env = envs.stock(task, render_backend=RENDER_BACKEND, **kwargs)
     env.reset(seed=SEED)
     return env

@@ -12,6 +12,7 @@ import sapien
 import sapien.render
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
+from tests.drive.render_device import RENDER_DEVICE
 from workbench.envs import backends
 from workbench.envs.backends import give_brdf_table
 
@@ -31,7 +32,9 @@ def test_it_is_the_one_that_sapien_computes_to_the_bit(tmp_path: Path, renderer:
     # What it drew before stays a part of it, or the compiler drops its textures and the renderer misses them.
     drawn = f"{DRAWN}\n  outColor.rgb = outColor.rgb * 1e-30 + texture(samplerBRDFLUT, inUV).rgb;"
     shader.write_text(text.replace(DRAWN, drawn))
-    scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device("cpu"))])
+    scene = sapien.Scene(
+        [sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device(RENDER_DEVICE))]
+    )
     before = sapien.render.get_camera_shader_dir()
     # Pictures of floats: the last camera of the process may have had bytes.
     set_shader_pack(PREBUILT_SHADER_CONFIGS["default"])

@@ -18,6 +18,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.drive.envs import PUSH_CUBE, batched, stock
+from tests.drive.render_device import RENDER_DEVICE
 from tests.envs.stock_env import Bare
 from workbench.envs import action_vector as actions
 from workbench.envs import backends
@@ -292,3 +293,8 @@ def test_what_is_named_goes_before_what_a_task_is_registered_with_and_that_befor
     assert (made({"calm": 1}).reward_mode, made({"calm": 1}).calm) == ("dense", 1)
     both = made({"calm": 1, "reward_mode": "none", "num_envs": 5}, calm=2)
     assert (both.reward_mode, both.calm, both.num_envs) == ("none", 2, 2)
+
+
+def test_a_process_renders_on_one_device_and_who_asks_for_a_second_is_told_which(renderer: None) -> None:
+    with pytest.raises(RuntimeError, match=f"renders on '{RENDER_DEVICE}'"):
+        backends.keep_render_device("cpu" if RENDER_DEVICE == "cuda" else "pci:0")

@@ -13,10 +13,15 @@ import torch
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.pose import Pose
 
+from tests.drive.render_device import RENDER_BACKEND
 from tests.envs.by_hand import by_hand
 from tests.envs.stock_env import Bare
 
-RENDERED = {"obs_mode": "rgb+depth+segmentation", "render_backend": "cpu", "render_mode": "rgb_array"}
+RENDERED = {
+    "obs_mode": "rgb+depth+segmentation",
+    "render_backend": RENDER_BACKEND,
+    "render_mode": "rgb_array",
+}
 
 COLOURS = [[1.0, 0, 0, 1], [0, 1.0, 0, 1], [0, 0, 1.0, 1]]
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.drive.episodes import Made, Track
+from tests.drive.render_device import RENDER_BACKEND
 from workbench.envs.camera_data import CameraInfo
 from workbench.envs.scene.read_scene import read_geometry
 from workbench.envs.scene.scene_index import read_poses
@@ -40,7 +41,7 @@ def record_stock(task: str, size: int = SIZE, steps: int = STEPS, **kwargs: Any)
         task,
         num_envs=1,
         obs_mode="rgb+depth+segmentation",
-        render_backend="cpu",
+        render_backend=RENDER_BACKEND,
         sensor_configs={"width": size, "height": size},
         **kwargs,
     )

@@ -16,6 +16,7 @@ from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.structs.pose import Pose
 
 from tests.gpu.conftest import Simulation
+from workbench.envs.backends import BackendUnavailable
 from workbench.envs.task_env import EnvOptions, make_env
 from workbench.pictures.render import take_pictures
 
@@ -116,3 +117,9 @@ def test_cpu_simulation_is_drawn_by_the_gpu(renderer: str) -> None:
     rgb = obs["sensor_data"]["base_camera"]["rgb"]
     assert rgb.shape == (N, 128, 128, 3) and rgb.float().std() > 1
     env.close()
+
+
+@pytest.mark.gpu
+def test_fast_pictures_are_refused_where_a_gpu_draws(renderer: str) -> None:
+    with pytest.raises(BackendUnavailable):
+        make_env(PushCubeEnv, EnvOptions(N, "cpu", pictures="fast", kwargs={"render_backend": renderer}))

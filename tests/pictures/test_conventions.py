@@ -16,6 +16,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from numpy.testing import assert_allclose
 
+from tests.drive.render_device import RENDER_BACKEND
 from tests.envs.stock_env import Bare, batch_of
 from workbench.pictures import camera_conventions as frames
 from workbench.pictures.camera_conventions import LookAt
@@ -55,7 +56,7 @@ class Posed(Bare):
 
 
 def test_matrices_are_those_of_maniskills_cameras(renderer: None) -> None:
-    env: Any = batch_of(Posed, 2, obs_mode="rgb", render_backend="cpu")
+    env: Any = batch_of(Posed, 2, obs_mode="rgb", render_backend=RENDER_BACKEND)
     for i, eye in enumerate(Posed.EYES):
         camera = env._sensors[f"c{i}"]
         theirs = {key: value[0].numpy() for key, value in camera.get_params().items()}

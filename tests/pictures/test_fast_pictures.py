@@ -13,6 +13,7 @@ import sapien.render
 import torch
 
 import workbench
+from tests.drive.render_device import RENDER_DEVICE
 from tests.envs.drawn_envs import batched
 from workbench.envs.maniskill_private import camera_components
 from workbench.pictures.render import take_pictures
@@ -96,6 +97,7 @@ def test_a_body_that_is_hidden_is_hidden_in_both(env: Any) -> None:
         body.visibility = 1.0
 
 
+@pytest.mark.skipif(RENDER_DEVICE == "cuda", reason="a GPU draws exact pictures")
 def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
     with pytest.warns(UserWarning, match="simplified meshes"):
         env: Any = workbench.make("PickCube-v1", 1, obs_mode="rgb", pictures="fast")

@@ -13,6 +13,7 @@ from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs import Pose
 
+from tests.drive.render_device import RENDER_BACKEND
 from tests.envs.drawn_envs import batched, stock
 from workbench.envs.camera_data import Picture
 from workbench.envs.scene.scene_index import scene_index
@@ -32,9 +33,9 @@ def assert_same(picture: Picture, obs: dict[str, torch.Tensor], float_shader: bo
     """Exactly what ManiSkill observed; depth as its whole millimetres."""
     assert picture.rgb is not None and picture.depth is not None and picture.segmentation is not None
     e = picture.env
-    np.testing.assert_array_equal(picture.rgb, obs["rgb"][e].numpy())
-    np.testing.assert_array_equal(picture.segmentation, obs["segmentation"][e, ..., 0].numpy())
-    millimetres = obs["depth"][e, ..., 0].numpy()
+    np.testing.assert_array_equal(picture.rgb, obs["rgb"][e].cpu().numpy())
+    np.testing.assert_array_equal(picture.segmentation, obs["segmentation"][e, ..., 0].cpu().numpy())
+    millimetres = obs["depth"][e, ..., 0].cpu().numpy()
     assert picture.depth.dtype == np.float32 and picture.depth.min() >= 0
     beyond = millimetres == -32768  # what ManiSkill gives for all that is farther than 32.767 m
     assert (picture.depth[beyond] > 32.7).all()
@@ -64,9 +65,11 @@ def test_float_shaders_agree_too() -> None:
     (picture,) = take_pictures(env, 0, [("base_camera", "sensor", (*ALL, *more))])
     assert_same(picture, obs, float_shader=True)
     assert picture.position is not None and picture.normal is not None and picture.depth is not None
-    np.testing.assert_array_equal(picture.position, obs["position"][0].numpy().astype(np.float32) / 1000)
-    np.testing.assert_array_equal(picture.normal, obs["normal"][0].numpy())
-    np.testing.assert_array_equal(picture.albedo, obs["albedo"][0].numpy())
+    np.testing.assert_array_equal(
+        picture.position, obs["position"][0].cpu().numpy().astype(np.float32) / 1000
+    )
+    np.testing.assert_array_equal(picture.normal, obs["normal"][0].cpu().numpy())
+    np.testing.assert_array_equal(picture.albedo, obs["albedo"][0].cpu().numpy())
     np.testing.assert_allclose(-picture.position[..., 2], picture.depth, atol=1e-3)
     lengths = np.linalg.norm(picture.normal, axis=-1)
     np.testing.assert_allclose(lengths[picture.depth > 0], 1, atol=1e-2)
@@ -80,7 +83,7 @@ def test_human_pictures_are_maniskills_rendering(make: Any, obs_first: bool) -> 
     if obs_first:  # leaves the goal hidden
         env.get_obs(env.get_info())
     taken = [take_pictures(env, e, [("render_camera", "human", ["rgb"])])[0] for e in range(env.num_envs)]
-    wanted = env.render_rgb_array().numpy()
+    wanted = env.render_rgb_array().cpu().numpy()
     for picture in taken:
         np.testing.assert_array_equal(picture.rgb, wanted[picture.env])
     env.close()
@@ -130,8 +133,10 @@ def test_cameras_are_described_and_stand_where_maniskill_says() -> None:
     cameras = {**env._sensors, **env._human_render_cameras}
     for name, camera in cameras.items():
         assert (info[name].width, info[name].height) == (camera.config.width, camera.config.height)
-        np.testing.assert_allclose(info[name].intrinsic, camera.camera.get_intrinsic_matrix()[0].numpy())
-        wanted = camera.camera.get_global_pose().raw_pose.expand(2, 7).numpy()
+        np.testing.assert_allclose(
+            info[name].intrinsic, camera.camera.get_intrinsic_matrix()[0].cpu().numpy()
+        )
+        wanted = camera.camera.get_global_pose().raw_pose.expand(2, 7).cpu().numpy()
         for e in range(2):
             (picture,) = take_pictures(env, e, [(name, info[name].kind, ["rgb"])])
             np.testing.assert_allclose(picture.pose[:3], wanted[e, :3], atol=1e-5)
@@ -159,7 +164,9 @@ class FarWallEnv(PickCubeEnv):
 
 @pytest.mark.parametrize("shader", ["minimal", "default"])
 def test_depth_is_metres_also_where_maniskills_own_ends(shader: str) -> None:
-    env: Any = FarWallEnv(render_backend="cpu", reward_mode="none", sensor_configs={"shader_pack": shader})
+    env: Any = FarWallEnv(
+        render_backend=RENDER_BACKEND, reward_mode="none", sensor_configs={"shader_pack": shader}
+    )
     env.reset(seed=0)
     (picture,) = take_pictures(env, 0, [("far", "sensor", ["depth", "segmentation"])])
     assert picture.depth is not None and picture.segmentation is not None

@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 import torch
 
+from tests.drive.render_device import RENDER_BACKEND
+
 Make = Callable[..., Any]
 
 
@@ -81,9 +83,9 @@ def test_what_evaluate_says_is_what_the_poses_say(make: Make) -> None:
 def test_the_sensor_camera_sees_cube_and_target_and_nothing_far_away(
     seed: int, make: Make, renderer: None
 ) -> None:
-    env = make("push_cube", render_backend="cpu", obs_mode="rgb+depth+segmentation")
+    env = make("push_cube", render_backend=RENDER_BACKEND, obs_mode="rgb+depth+segmentation")
     obs, _ = env.reset(seed=seed)
-    data = obs["sensor_data"]["base_camera"]
+    data = {name: picture.cpu() for name, picture in obs["sensor_data"]["base_camera"].items()}
     base = env.unwrapped
     for actor, pixels in ((base.cube, 20), (base.goal, 300)):
         seen = data["segmentation"] == actor.per_scene_id.reshape(-1, 1, 1, 1)

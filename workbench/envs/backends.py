@@ -172,6 +172,12 @@ def give_brdf_table(camera: sapien.render.RenderCameraComponent) -> None:
 _kept: dict[str, sapien.render.RenderSystem] = {}
 
 
+def sapien_device(render_backend: str) -> str:
+    """SAPIEN's name of the device behind a ``render_backend`` of ManiSkill: ``cpu``, ``cuda``, ``cuda:1``, ``pci:...``."""
+    kind, colon, index = render_backend.partition(":")
+    return {"gpu": "cuda", "sapien_cpu": "cpu", "sapien_cuda": "cuda"}.get(kind, kind) + colon + index
+
+
 def keep_render_device(device: str) -> None:
     """Keep a render device for the life of the process: ``cpu``, ``cuda``, ``cuda:1``, or ManiSkill's names for them.
 
@@ -180,17 +186,29 @@ def keep_render_device(device: str) -> None:
     drivers it may also avoid a failure after some 28 make and close cycles (ManiSkill #1474, #1477).
 
     Raises:
-        RuntimeError: the machine has no such render device.
+        RuntimeError: the machine has no such render device, or this process keeps another.
     """
-    kind, colon, index = device.partition(":")
-    name = {"gpu": "cuda", "sapien_cpu": "cpu", "sapien_cuda": "cuda"}.get(kind, kind) + colon + index
+    name = sapien_device(device)
     if name in _kept:
         return
     try:
         _kept[name] = _render_system(name)
     except RuntimeError as error:
+        if _kept and _exists(name):
+            raise RuntimeError(
+                f"SAPIEN has one render device in a process, and this one renders on {next(iter(_kept))!r}: "
+                f"{name!r} can be had in another process only."
+            ) from error
         raise RuntimeError(
             f"SAPIEN cannot render on {name!r}: {error}. It needs a Vulkan driver: a GPU's own, or Mesa's "
             "software driver from version 24.3 on. `workbench doctor` says which one is found and what to "
             "install; without one, make the env with render_backend='none'."
         ) from error
+
+
+def _exists(device: str) -> bool:
+    try:
+        sapien.Device(device)
+    except RuntimeError:
+        return False
+    return True

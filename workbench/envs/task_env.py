@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from workbench.envs import action_vector as actions
 from workbench.envs import maniskill_private
 from workbench.envs.assets import refuse_downloads, require_assets, robots_of
-from workbench.envs.backends import Backend, BackendUnavailable, choose_backend, keep_render_device
+from workbench.envs.backends import (
+    Backend,
+    BackendUnavailable,
+    choose_backend,
+    keep_render_device,
+    sapien_device,
+)
 from workbench.envs.broken_rule import BrokenRules, warn_of
 from workbench.envs.camera_data import PictureDegree
 from workbench.envs.cpu_scene import batched_class, refuse_unbuilt_env
@@ -127,7 +133,8 @@ def build_env(
     kwargs["render_backend"] = backend.render_backend if wanted == "found" else wanted
     if kwargs["render_backend"] != "none":
         keep_render_device(kwargs["render_backend"])
-    if backend.simulation == "gpu" and options.pictures == "fast":
+    drawn_by_gpu = sapien_device(kwargs["render_backend"]).startswith("cuda")
+    if options.pictures == "fast" and (backend.simulation == "gpu" or drawn_by_gpu):
         raise BackendUnavailable(_NO_FAST_PICTURES)
     try:
         with refuse_downloads(task.__name__):
@@ -144,8 +151,8 @@ def build_env(
 
 
 _NO_FAST_PICTURES = (
-    "Fast pictures are for envs that are simulated on the CPU: a GPU draws exact ones as fast. Leave pictures out with "
-    "GPU simulation, or use the backend cpu."
+    'Fast pictures are for renderers in software: a GPU draws exact ones sooner. Leave out pictures="fast"; on the '
+    "command line, --fast-pictures."
 )
 
 

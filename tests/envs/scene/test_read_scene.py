@@ -17,6 +17,7 @@ from mani_skill.utils.structs import Pose
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from tests.drive.render_device import RENDER_BACKEND, RENDER_DEVICE
 from tests.envs.drawn_envs import batched, stock
 from workbench.envs.scene.read_scene import read_geometry
 from workbench.envs.scene.scene_index import read_poses, scene_index
@@ -93,7 +94,9 @@ def redrawn(
     geometry: SceneGeometry, poses: NDArray[np.float32], env: Any, shader: str, texture: str
 ) -> NDArray:
     """`texture` of the env's human camera, in a scene made anew from env 0 of `geometry`."""
-    scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device("cpu"))])
+    scene = sapien.Scene(
+        [sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device(RENDER_DEVICE))]
+    )
     scene.set_ambient_light([0.3, 0.3, 0.3])
     scene.add_directional_light([1, 1, -1], [1, 1, 1])
     scene.add_directional_light([0, 0, -1], [1, 1, 1])
@@ -243,7 +246,7 @@ def odd_shapes(tmp_path: Path) -> Any:
     )
     wedge.export(tmp_path / "wedge.obj")
     OddShapesEnv.mesh_file = str(tmp_path / "wedge.obj")
-    env: Any = OddShapesEnv(render_backend="cpu", reward_mode="none")
+    env: Any = OddShapesEnv(render_backend=RENDER_BACKEND, reward_mode="none")
     env.reset(seed=0)
     yield env
     env.close()

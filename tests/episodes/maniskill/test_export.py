@@ -16,6 +16,7 @@ import pytest
 from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
 from mani_skill.utils.wrappers.record import RecordEpisode
 
+from tests.drive.render_device import RENDER_BACKEND
 from workbench.cli.main import main
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.record.job import record
@@ -112,7 +113,7 @@ def test_pictures_that_were_observed_are_as_maniskills_recorder_writes_them(
         options = TaskOptions(num_envs=1, seed=seed, env_kwargs={"obs_mode": obs_mode})
         given = str(tmp_path / "actions.npy")
         record(RecordOptions(task, tmp_path / name, 1, actions=given, pictures=pictures, options=options))
-    stock: Any = gym.make(task, obs_mode=obs_mode, render_backend="cpu")
+    stock: Any = gym.make(task, obs_mode=obs_mode, render_backend=RENDER_BACKEND)
     stock = RecordEpisode(stock, str(tmp_path), trajectory_name="theirs", save_video=False)
     stock.reset(seed=seed)
     for action in actions:

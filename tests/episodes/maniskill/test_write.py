@@ -18,6 +18,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from numpy.typing import NDArray
 
 from tests.drive.episodes import Made
+from tests.drive.render_device import RENDER_BACKEND
 from workbench.envs.scene.shapes import SceneGeometry
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.reader.read_episode import read_episode, read_maniskill
@@ -181,7 +182,7 @@ def test_their_cameras_are_read_too(recorded: Any, tmp_path: Path) -> None:
         num_envs=1,
         obs_mode="rgb+depth+segmentation",
         robot_uids="panda_wristcam",
-        render_backend="cpu",
+        render_backend=RENDER_BACKEND,
         sensor_configs={"width": 96, "height": 96},
     )
     env = RecordEpisode(env, str(tmp_path), trajectory_name="theirs", save_video=False)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.drive.render_device import RENDER_BACKEND
 from tests.drive.session import draw_past, live_session, wait_until
 from workbench.live.commands import Step
 from workbench.live.events import MomentShown, PagesCounted
@@ -40,7 +41,7 @@ CAMERA = ("sensor", "base_camera")
 def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> None:
     file = tmp_path / "task.py"
     file.write_text(TASK)
-    with live_session(file, tmp_path / "recordings", draw=True, render_backend="cpu") as session:
+    with live_session(file, tmp_path / "recordings", draw=True, render_backend=RENDER_BACKEND) as session:
         view = session.view()
         assert view.task is not None
         (cube,) = (number for number, name in view.task.segmentation.items() if name == "cube")
