@@ -69,7 +69,9 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
         threads.append(threading.active_count())
     for found in seen.values():
         for name, count in found[-1].items():
-            assert count <= found[1][name] + (40 if name == "messages" else 0), (name, found)
+            # A busy machine can rest for as long as `drawn_whole` waits, and then an early count lacks some parts.
+            early = max(counts[name] for counts in found[:2])
+            assert count <= early + (40 if name == "messages" else 0), (name, found)
     assert max(threads[4:]) <= max(threads[:4])
     before = session.view().step_serial
     wait_until(session, lambda view: view.step_serial > before, "a step of the env that plays on")
