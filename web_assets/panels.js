@@ -4,6 +4,7 @@
 //   data-which="3f2a"      id of the page's content: when the user returns to it, its last open tab is restored (data-anew: the first)
 //     data-says              report the open tab to the server
 //   data-open-tab="Studio" open this tab, and in it data-open-fold
+//   data-toggle="timeline-open"  add or remove this attribute of <html>, for the style sheet
 "use strict";
 {
   const KEEPS = "workbench tab of ";
@@ -45,6 +46,8 @@
     if (tab) press(tab);
     if (dataset.openFold) openFold(dataset.openFold, performance.now() + FOLD_COMES);
   };
+
+  wb.arrivals.toggle = ({ dataset }) => document.documentElement.toggleAttribute(`data-${dataset.toggle}`);
 
   function followTabs() {
     const mark = marker();

@@ -39,7 +39,6 @@ from workbench.live.panels.inspect_panel import ForceArrows, InspectPanel
 from workbench.live.panels.log_panel import LogPanel
 from workbench.live.panels.reward_panel import CurvesPanel, NumbersPanel
 from workbench.live.panels.run_panel import RunPanel
-from workbench.live.panels.timeline_panel import HEIGHT_PIXELS as TIMELINE_HEIGHT
 from workbench.live.panels.timeline_panel import TimelinePanel
 from workbench.live.panels.version_panel import VersionPanel
 from workbench.live.panels.view_panel import ViewPanel
@@ -59,19 +58,21 @@ from workbench.page.commands import (
     TellUnfolded,
     ToggleTable,
     ToggleTheme,
+    ToggleTimeline,
 )
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
+from workbench.page.widgets.frame import add_bar
 from workbench.page.widgets.hotkeys import add_hints, key_rows, register
 from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart, Parts
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Done, Visitor, Visitors
-from workbench.record.panel import RecordPanel
+from workbench.record.panel import RecordPanel, record_tool
 from workbench.rescore.past_panel import PastRescorePanel, RescoredAbove
 from workbench.solve.panel import SolvePanel
 from workbench.solve.seeds_panel import SolveSeedsPanel
@@ -86,6 +87,7 @@ DOES: frozenset[type[Command]] = frozenset(
         TellUnfolded,
         TellDrawnInSoftware,
         ToggleTable,
+        ToggleTimeline,
         FrameScene,
         ToggleTheme,
         ToggleOnlySelected,
@@ -161,23 +163,26 @@ class Page:
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH_PIXELS)
-        # Used until the task has loaded, and permanently if it fails to load.
         file = named_file(session.reference)
-        server.gui.set_panel_label(str(session.reference) if file is None else file.name)
+        # viser's header stands in the bar, which has the name.
+        server.gui.set_panel_label(" ")
 
-        status = StatusLine(server, clock)
         # A hash, since the path may be long.
         which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
         self._open_tabs = OpenTabs(visitors)
         server.gui.add_html(render("which", which=which, anew=False, says=True))
-        marks = Marks(server, session, self._open_tabs)
         self._opening = None if chooser is None else OpenDialog(server, chooser)
-        if self._opening is not None:
-            self._opening.add_button()
+        with add_bar(server):
+            name = str(session.reference) if file is None else file.name
+            if self._opening is not None:
+                self._opening.add_button(name)
+            status = StatusLine(server, clock)
+            marks = Marks(server, session, self._open_tabs)
+            server.gui.add_html(render("help_link"))
         self._in_software = stage.in_software
         self._in_software.ask()
         run_tab, in_tabs = self._add_tabs(dark)
-        self._timeline = TimelinePanel(server, session, clock)
+        self._timeline = TimelinePanel(server, session, clock, record_tool)
         self._add_table_of_envs()
         banner = Banner(server, self._link, self._is_own)
         busy_banner = BusyBanner(server, self._link)
@@ -327,6 +332,8 @@ class Page:
                 self._in_software.told_by(visitor)
             case ToggleTable():
                 self._toggle_envs()
+            case ToggleTimeline():
+                visitor.send(render("toggle_timeline"))
             case FrameScene():
                 self.frame(session.view())
             case ToggleTheme():
@@ -405,7 +412,6 @@ class Page:
         if view.scene_serial != self._scene_serial or self._layout is None:
             self._scene_serial = view.scene_serial
             self._layout = lay_out(task.geometry, step.poses)
-            self._server.gui.set_panel_label(task.env_id)
             self._built = None
         looks = self._in_software.looks(self._view_panel.looks, task.geometry, self._layout, one)
         built = (one, looks)
@@ -420,7 +426,6 @@ class Page:
             pictures = without_the_viewpoint(pictures, view.pictures)
         offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
         placed = self._studio.draw_in_view(view, offset)
-        self._timeline.fold(self._studio.looks_through)
         self._frustums.draw(task.cameras, pictures, offset, SMALL_METRES if alone else LARGE_METRES, placed)
         self._forces.draw(self._inspect.forces(view), offset)
         self._solve.draw_in_view(view, offset)
@@ -428,19 +433,19 @@ class Page:
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
         if self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size)):
             self._waits_for_human = alone
-            self._framing.frame_new(lambda aspect, height: self._viewpoint(view, aspect, height))
+            self._framing.frame_new(lambda aspect: self._viewpoint(view, aspect))
         if self._waits_for_human and any(kind == "human" for kind, _ in view.pictures):
             # The human camera's pose arrives with its first picture, after the scene.
             self._waits_for_human = False
             self.frame(view, untouched_only=True)
-        self._framing.frame_untouched(lambda aspect, height: self._viewpoint(view, aspect, height))
+        self._framing.frame_untouched(lambda aspect: self._viewpoint(view, aspect))
 
     def frame(self, view: SessionView, untouched_only: bool = False) -> None:
         """Frame the scene in every open page (or only untouched ones) and in pages opened later."""
         if self._layout is not None and view.task is not None:
-            self._framing.frame(lambda aspect, height: self._viewpoint(view, aspect, height), untouched_only)
+            self._framing.frame(lambda aspect: self._viewpoint(view, aspect), untouched_only)
 
-    def _viewpoint(self, view: SessionView, aspect: float, height: float) -> Viewpoint:
+    def _viewpoint(self, view: SessionView, aspect: float) -> Viewpoint:
         assert self._layout is not None and view.task is not None, "asked only where a scene is drawn"
         if self._view_panel.only_selected or view.task.num_envs == 1:
             human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
@@ -448,8 +453,8 @@ class Page:
             acting = None
             if human is None and view.step is not None:
                 acting = acting_box(view.task.geometry, view.step.poses, self._layout)
-            return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height, fovy, acting)
-        return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
+            return frame_one(self._layout, human, aspect, fovy, acting)
+        return frame_all(self._layout, aspect)
 
     async def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
         post(lambda: self._clicked(event))

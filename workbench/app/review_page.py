@@ -23,7 +23,7 @@ from workbench.library.panel import LibraryPanel
 from workbench.library.rows import OpenVersion
 from workbench.live.commands import TogglePlay
 from workbench.live.messages import CameraRequest
-from workbench.live.panels.timeline_panel import MAX_MARKS, TimeBar, strip_values, walk_tools
+from workbench.live.panels.timeline_panel import MAX_MARKS, TimeBar, event_tools, play_tool, strip_values
 from workbench.live.panels.view_panel import ViewPanel
 from workbench.live.timeline_commands import (
     GoToFirst,
@@ -44,7 +44,10 @@ from workbench.page.commands import (
     TellUnfolded,
     ToggleTable,
     ToggleTheme,
+    ToggleTimeline,
 )
+from workbench.page.widgets.fields import Field, choice
+from workbench.page.widgets.frame import add_bar
 from workbench.page.widgets.hotkeys import key_rows, register
 from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart, Parts
@@ -53,11 +56,11 @@ from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Done, Visitor
 from workbench.rescore.recording_jobs import Rescorer
 from workbench.rescore.recordings_panel import RescoreChoices, RescorePanel
-from workbench.review.commands import RescoreChosen
+from workbench.review.commands import ChoosePlaybackSpeed, RescoreChosen
 from workbench.review.compare_panel import ReviewComparePanel
 from workbench.review.curves_panel import ReviewCurves, ReviewNumbers
 from workbench.review.panel import ReviewPanel
-from workbench.review.playback import Review
+from workbench.review.playback import SPEEDS, Review
 from workbench.review.scene_view import ReviewIn3D, shown_together
 from workbench.review.state import MAX_OPEN
 from workbench.review.view import PictureReader, ReviewView, column_at, outcome_text
@@ -87,6 +90,7 @@ DOES: frozenset[type[Command]] = frozenset(
         TellUnfolded,
         TellDrawnInSoftware,
         ToggleTable,
+        ToggleTimeline,
         FrameScene,
         ToggleTheme,
         RescoreChosen,
@@ -146,14 +150,17 @@ class ReviewPage:
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH_PIXELS)
-        server.gui.set_panel_label("Recordings")
-        self._status = server.gui.add_html("")
+        server.gui.set_panel_label(" ")  # viser's header stands in the bar
         self._opening = OpenDialog(server, open_task)
-        self._opening.add_button()
+        with add_bar(server):
+            self._opening.add_button()
+            if shared.session is not None:
+                server.gui.add_html(tools_html([tool(BACK, ShowLive())]))
+            self._status = server.gui.add_html("")
+            server.gui.add_html(render("help_link"))
         self._open_tabs = OpenTabs(shared.visitors)
         server.gui.add_html(render("which", which="review", anew=anew, says=False))
         shared.stage.in_software.ask()
-        self._add_way_back()
         review_tab, in_tabs = self._add_tabs(dark)
         self._timeline = ReviewTimeline(server, review)
         self._in_3d = ReviewIn3D(server, review, shared.stage)
@@ -169,10 +176,6 @@ class ReviewPage:
         )
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", rows=key_rows(shared.visitors.commands, kinds)))
-
-    def _add_way_back(self) -> None:
-        if self._shared.session is not None:
-            self._server.gui.add_html(tools_html([tool(BACK, ShowLive())]))
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
         """Returns the Review tab, which gets more content later, and the parts of all tabs."""
@@ -428,6 +431,8 @@ class ReviewPage:
                 self._shared.stage.in_software.told_by(visitor)
             case ToggleTable():
                 self._show_library(not self._library_open)
+            case ToggleTimeline():
+                visitor.send(render("toggle_timeline"))
             case FrameScene():
                 self._in_3d.frame()
             case ToggleTheme():
@@ -454,9 +459,7 @@ class ReviewPage:
 
 # --- The timeline of a review -------------------------------------------------------------------------
 
-
-PLAY, PAUSE = "play", "pause"
-FIRST, LAST = "first", "last"
+SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 
 
 class ReviewTimeline(TimeBar[ReviewView]):
@@ -465,13 +468,26 @@ class ReviewTimeline(TimeBar[ReviewView]):
     Each of several recordings has its own line on the strip, shifted by its alignment.
     """
 
-    does = (StepBack, StepForward, PreviousEvent, NextEvent, Seek, GoToFirst, GoToLast)
+    does = (
+        TogglePlay,
+        ChoosePlaybackSpeed,
+        StepBack,
+        StepForward,
+        PreviousEvent,
+        NextEvent,
+        Seek,
+        GoToFirst,
+        GoToLast,
+    )
 
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         super().__init__(server, "step of the timeline", Seek, "step")
         self._review = review
         self._drawn: tuple[object, ...] = ()
         self._fixed: dict[str, object] = {}
+
+    def _add_speed(self, server: viser.ViserServer) -> Field:
+        return choice(server, "Speed", ChoosePlaybackSpeed, "speed", SPEED_NAMES, 1.0)
 
     def do(self, command: Command, visitor: Visitor) -> None:
         self._review.do(command, visitor.name)
@@ -480,10 +496,16 @@ class ReviewTimeline(TimeBar[ReviewView]):
         if not self._draw_panel(bool(view.opened)):
             return
         self._show_slider(view.first, view.last, view.position)
-        back, forward = walk_tools()[:2], walk_tools()[2:]
-        play = tool(PAUSE if view.playing else PLAY, TogglePlay())
-        ends = tool(FIRST, GoToFirst()), tool(LAST, GoToLast())
-        self._walk.content = tools_html([ends[0], *back, play, *forward, ends[1]])
+        buttons = [
+            ("first", tool("First step", GoToFirst())),
+            ("back", tool("Step back", StepBack())),
+            play_tool(view.playing),
+            ("step", tool("Step forward", StepForward())),
+            ("last", tool("Last step", GoToLast())),
+        ]
+        self._transport.content = render("transport", tools=buttons)
+        self._speed.show(view.speed)
+        self._walk.content = tools_html(event_tools())
         wanted = (view.position, view.selected, view.opened_serial, view.anchors, view.align)
         if wanted == self._drawn:
             return

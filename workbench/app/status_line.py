@@ -12,8 +12,10 @@ from workbench.live.panels.moment import MomentPart
 from workbench.live.panels.timeline_panel import ago_in_words, step_in_words
 from workbench.live.panels.version_panel import took
 from workbench.live.process.heartbeat import Busy
+from workbench.live.timeline_commands import ContinueFromHere
 from workbench.live.view import SessionView
 from workbench.machine.text import rate_text
+from workbench.page.widgets.hotkeys import with_key
 from workbench.page.widgets.parts import Clock
 from workbench.page.widgets.templates import counted, place, render
 from workbench.record.state import RecordingStatus
@@ -97,6 +99,8 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "news": _news(view) if fresh else "",
         "at": step_in_words(view),
         "ago": ago_in_words(view.timeline),
+        "can_continue": ContinueFromHere() if view.timeline.can_continue else None,
+        "continue_hint": with_key(ContinueFromHere),
         "moving": moving and known and not planning,
         "plan": view.of(SolveView).plan if planning and not starting else None,
         "behind": moving and slow,

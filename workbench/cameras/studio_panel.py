@@ -171,11 +171,6 @@ class StudioPanel(PagePart[SessionView]):
         """The modality to render of the chosen camera."""
         return self._picture.shows
 
-    @property
-    def looks_through(self) -> bool:
-        """Whether a page looks through the chosen camera."""
-        return self._look.any
-
     # --- in the view -------------------------------------------------------------------------------------
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> dict[CameraKey, PlacedFrustum]:

@@ -50,6 +50,12 @@ class ToggleTable(Command, frozen=True):
     key = "b"
 
 
+class ToggleTimeline(Command, frozen=True):
+    """Open or close the timeline under the transport, on this page."""
+
+    key = "t"
+
+
 class FrameScene(Command, frozen=True):
     """Frame the scene."""
 

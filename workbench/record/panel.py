@@ -30,6 +30,14 @@ SAVE_BEFORE = "Save the previous episode"
 STOP, STOP_WAITING, STOP_SAVING = "Stop recording", "Stop waiting", "Stop saving"
 
 
+def record_tool(view: SessionView) -> Tool:
+    """The transport's button that starts and stops recording."""
+    recording = view.of(RecordingStatus)
+    off = not recording.active and (view.task is None or view.state == "stopped")
+    hint = with_key(ToggleRecording, STOP if recording.active else RECORD_HINT)
+    return Tool(STOP if recording.active else RECORD, ToggleRecording(), hint, on=recording.active, off=off)
+
+
 class RecordPanel(MomentPart):
     """Three buttons, each of which also stops what it started, and a status text.
 

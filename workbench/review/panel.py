@@ -11,7 +11,6 @@ import viser
 from workbench.envs.camera_data import moved_cameras_text
 from workbench.episodes.episode import acted_by_text
 from workbench.episodes.recorded_source import recorded_version
-from workbench.live.commands import TogglePlay
 from workbench.page.command import Command
 from workbench.page.widgets.fields import by_name, choice, tick
 from workbench.page.widgets.hotkeys import with_key
@@ -22,7 +21,6 @@ from workbench.page.widgets.visitors import Visitor
 from workbench.review.commands import (
     AlignRecordings,
     ArrangeRecordings,
-    ChoosePlaybackSpeed,
     CloseRecording,
     ContinueLive,
     LoopPlayback,
@@ -32,13 +30,12 @@ from workbench.review.commands import (
     SelectRecording,
     ToggleOverlaid,
 )
-from workbench.review.playback import SPEEDS, Review
+from workbench.review.playback import Review
 from workbench.review.state import MAX_OVERLAID
 from workbench.review.view import Opened, ReviewView, outcome_text
 
 MAX_CODE_CHARACTERS = 200_000
 """Maximum length of one file's text."""
-SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 GHOSTS, GRID = "overlaid", "side by side"
 TRY_AGAIN = "Try again"
 GO_LIVE, STAY = "Continue live from here", "Stay here"
@@ -57,12 +54,10 @@ class ReviewPanel(PagePart[ReviewView]):
     """
 
     does = (
-        TogglePlay,
         NextRecording,
         PreviousRecording,
         SelectRecording,
         CloseRecording,
-        ChoosePlaybackSpeed,
         LoopPlayback,
         OpenAgain,
         ArrangeRecordings,
@@ -82,7 +77,6 @@ class ReviewPanel(PagePart[ReviewView]):
         gui = server.gui
         self._arranged = GHOSTS
         self._tools = gui.add_html("")
-        self._speed = choice(server, "Speed", ChoosePlaybackSpeed, "speed", SPEED_NAMES, 1.0)
         self._loop = tick(server, "Loop", LoopPlayback, "on", False)
         self._problems = gui.add_html("")
         self._again = gui.add_html("")
@@ -124,13 +118,11 @@ class ReviewPanel(PagePart[ReviewView]):
 
     def draw(self, view: ReviewView) -> None:
         there = bool(view.opened)
-        self._speed.visible = self._loop.visible = there
+        self._loop.visible = there
         live = GO_LIVE if len(view.opened) < 2 else f"{GO_LIVE} ({letter(view.selected)})"
         live = STAY if self._going() else live
-        play = tool("Pause" if view.playing else "Play", TogglePlay(), tone="main")
         go_live = Tool(live, ContinueLive(), with_key(ContinueLive, GO_LIVE_HINT))
-        self._tools.content = tools_html([play], [go_live]) if there else ""
-        self._speed.show(view.speed)
+        self._tools.content = tools_html([go_live]) if there else ""
         self._loop.show(view.loop)
         self._problems.content = render("review_problems", problems=view.problems, loading=view.loading)
         again = bool(view.not_opened) and not view.loading

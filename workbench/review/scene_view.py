@@ -14,7 +14,6 @@ from workbench.cameras.frustums import SMALL_METRES, CameraFrustums, without_the
 from workbench.envs.camera_data import CameraInfo, CameraKey, Picture
 from workbench.envs.scene.shapes import BodyKind, Material, SceneGeometry, Visual, fingerprint
 from workbench.episodes.episode import CameraTrack
-from workbench.live.panels.timeline_panel import HEIGHT_PIXELS as TIMELINE_HEIGHT
 from workbench.machine.loop import post
 from workbench.page.command import Refused
 from workbench.page.scene.bodies import DrawStyle
@@ -283,19 +282,18 @@ class ReviewIn3D:
                 front = np.array([layout.high[0], (layout.low[1] + layout.high[1]) / 2, layout.floor_height])
                 label.draw(letter(index), front + layout.offsets[index])
 
-    def _viewpoint(self, aspect: float, height: float) -> Viewpoint:
+    def _viewpoint(self, aspect: float) -> Viewpoint:
         scene, view = self._scene, self._view
         assert scene is not None, "asked only where a scene is drawn"
-        covered = TIMELINE_HEIGHT / height
         if len(scene.layout.offsets) > 1 and not scene.ghosts:
-            return frame_all(scene.layout, aspect, covered)
+            return frame_all(scene.layout, aspect)
         human = human_camera(view)
         if human is not None:
-            return frame_one(scene.layout, as_picture(human), aspect, covered, human.info.fovy)
+            return frame_one(scene.layout, as_picture(human), aspect, human.info.fovy)
         moments = [[int(part * one.length) for one in view.opened] for part in (0.0, 0.5, 1.0)]
         poses = np.concatenate([scene.poses(moment) for moment in moments])
         acting = acting_box(scene.geometry, poses, scene.layout)
-        return frame_one(scene.layout, None, aspect, covered, acting=acting)
+        return frame_one(scene.layout, None, aspect, acting=acting)
 
     async def _on_click(self, event: viser.SceneClickEvent) -> None:
         post(lambda: self._clicked(event))

@@ -12,6 +12,7 @@ from workbench.machine.loop import begin
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.dialog import Dialog
 from workbench.page.widgets.fields import Field, choice
+from workbench.page.widgets.hotkeys import with_key
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render, sentence
 from workbench.page.widgets.tools import tool, tools_html
@@ -38,7 +39,8 @@ MAX_SEARCH_CHARACTERS = 4096
 """Maximum length of the search text; a path may be that long."""
 MAX_RECENT = 6
 """Maximum number of recent tasks that are shown without a search."""
-OPEN = "Open…"
+OPEN = "Open a task…"
+HINT = with_key(OpenTaskList, "Open a task")
 NEW_TASK, CREATE = "New task", "Create"
 
 
@@ -330,9 +332,9 @@ class OpenDialog(PagePart[object]):
                 return shown[1].do(command, visitor)
         return None
 
-    def add_button(self) -> None:
-        """Add the button that opens the dialog to the present container."""
-        self._server.gui.add_html(tools_html([tool(OPEN, OpenTaskList())]))
+    def add_button(self, name: str = "") -> None:
+        """Add the button that opens the dialog, with the name of the open task, to the present container."""
+        self._server.gui.add_html(render("open_task", name=name or OPEN, command=OpenTaskList(), hint=HINT))
 
     def close(self) -> bool:
         """Close the dialog; returns False if it is already closed."""

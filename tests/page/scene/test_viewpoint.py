@@ -28,14 +28,11 @@ from workbench.page.scene.viewpoint import (
 @given(
     size=st.tuples(st.floats(0.05, 60), st.floats(0.05, 60), st.floats(0.05, 10)),
     aspect=st.floats(0.35, 3.5),
-    covered=st.floats(0, 0.45),
 )
 @settings(max_examples=80)
-def test_whole_box_is_in_the_picture_above_what_is_covered(
-    size: tuple[float, float, float], aspect: float, covered: float
-) -> None:
+def test_the_whole_box_is_in_the_picture(size: tuple[float, float, float], aspect: float) -> None:
     low, high = -np.array(size) / 2, np.array(size) / 2
-    viewpoint = frame_box(low, high, aspect, covered)
+    viewpoint = frame_box(low, high, aspect)
     forward = viewpoint.look_at - viewpoint.position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1])
@@ -46,19 +43,19 @@ def test_whole_box_is_in_the_picture_above_what_is_covered(
     depth = corners @ forward
     assert (depth > 0).all()
     assert (corners @ up <= np.tan(FOV_RADIANS / 2) * depth).all()
-    assert (corners @ up >= -(1 - 2 * covered) * np.tan(FOV_RADIANS / 2) * depth).all()
+    assert (corners @ up >= -np.tan(FOV_RADIANS / 2) * depth).all()
     assert (np.abs(corners @ right) <= np.tan(FOV_RADIANS / 2) * aspect * depth).all()
 
 
-def test_the_human_camera_s_picture_is_above_what_is_covered() -> None:
+def test_the_human_camera_s_picture_fits_the_view() -> None:
     geometry, poses = table_scene(1)
     pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
-    picture, covered, fovy = Picture("render_camera", "human", 0, pose), 0.3, 1.0
-    viewpoint = frame_one(lay_out(geometry, poses), picture, 1.25, covered, fovy)
+    picture, fovy = Picture("render_camera", "human", 0, pose), 1.0
+    viewpoint = frame_one(lay_out(geometry, poses), picture, 1.25, fovy)
     layout = lay_out(geometry, poses)
     depth = 1.5 - float(layout.low[0] + layout.high[0]) / 2
     away = viewpoint.position[0] - (1.5 - depth)
-    for part, place in ((0.0, covered), (1.0, 1.0), (-1.0, -(1 - 2 * covered))):
+    for part, place in ((0.0, 0.0), (1.0, 1.0), (-1.0, -1.0)):
         # A point of the middle plane at the picture's middle, top and bottom: where it is in the view, -1 to 1.
         z = 0.4 + part * depth * np.tan(fovy / 2)
         assert abs((z - viewpoint.position[2]) / (away * np.tan(FOV_RADIANS / 2)) - place) < 1e-5
@@ -79,7 +76,7 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
 ) -> None:
     framing = Framing(server)
 
-    def frame(aspect: float, height: float) -> Viewpoint:
+    def frame(aspect: float) -> Viewpoint:
         return frame_box(np.full(3, -1.0), np.full(3, 1.0), aspect)
 
     framing.frame(frame)

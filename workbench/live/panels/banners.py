@@ -9,7 +9,7 @@ from pathlib import Path
 import viser
 
 from workbench.live.commands import FillEmptyFile, Interrupt, RebuildScene, ReloadFile, RestartWorker
-from workbench.live.panels.timeline_panel import GAP_PIXELS, step_in_words
+from workbench.live.panels.timeline_panel import step_in_words
 from workbench.live.process.heartbeat import Busy
 from workbench.live.view import SessionView
 from workbench.machine.loop import BlockingPool
@@ -22,8 +22,8 @@ from workbench.page.widgets.visitors import Done, Visitor
 from workbench.task.new_task import CannotBegin, fill_blank_file, is_blank
 from workbench.task.problem import Problem
 
-MAX_WIDTH_PIXELS, BUSY_MAX_WIDTH_PIXELS = 520, 460
-"""Maximum widths. The style sheet makes a banner as narrow as the view, so that it does not cover the controls, with
+WIDTH_PIXELS, BUSY_WIDTH_PIXELS = 520, 460
+"""Widths where the view is wide enough: the style sheet keeps a banner within it, or it would cover the controls, with
 which the last good version can still be used."""
 
 FILL = "Write the minimal task into it"
@@ -98,8 +98,7 @@ class Banner(PagePart[SessionView]):
             # A separate element: its text changes, and the other element must not be rewritten.
             self._kept = server.gui.add_html("")
             self._tools = server.gui.add_html("")
-        # At the right edge of the view: on the left are viser's own notifications.
-        self._panel.float(x=-GAP_PIXELS, y=GAP_PIXELS, width=MAX_WIDTH_PIXELS)
+        self._panel.float(width=WIDTH_PIXELS)
         self._drawn: int | None = None
         """Serial of the problem that is drawn."""
 
@@ -213,7 +212,7 @@ class BusyBanner(PagePart[SessionView]):
             self._html = server.gui.add_html("")
             self._traceback = server.gui.add_html("", visible=False)
             self._tools = server.gui.add_html("")
-        self._panel.float(x=-GAP_PIXELS, y=GAP_PIXELS, width=BUSY_MAX_WIDTH_PIXELS)
+        self._panel.float(width=BUSY_WIDTH_PIXELS)
 
     def draw(self, view: SessionView) -> None:
         busy = view.busy

@@ -1,4 +1,4 @@
-"""The Run tab: play, step, reset, speed, seed, env, episode end and the source of actions."""
+"""The Run tab: reset, seed, env, episode end and the source of actions."""
 
 from __future__ import annotations
 
@@ -18,9 +18,6 @@ from workbench.live.commands import (
     ResetSelected,
     SetPolicy,
     SetSeed,
-    SetSpeed,
-    Step,
-    TogglePlay,
 )
 from workbench.live.env_commands import NextEnv, PreviousEnv, SelectEnv
 from workbench.live.events import ActionTold
@@ -115,23 +112,13 @@ def slider_bounds(dimension: ActionDimension) -> tuple[float, float]:
     return (low, high) if low < high else (low, low + 1e-6)
 
 
-SPEEDS: dict[str, float | None] = {
-    "0.1 ×": 0.1,
-    "0.25 ×": 0.25,
-    "0.5 ×": 0.5,
-    "1 ×": 1.0,
-    "2 ×": 2.0,
-    "4 ×": 4.0,
-    "8 ×": 8.0,
-    "unlimited": None,
-}
 EPISODE_ENDS: dict[str, EpisodeEnd] = {
     "reset the env": "reset",
     "keep running": "continue",
     "pause": "pause",
 }
 SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
-STEP, RESET_ALL, RESET_THIS = "Step", "Reset all", "Reset this env"
+RESET_ALL, RESET_THIS = "Reset all", "Reset this env"
 PREVIOUS, NEXT = "‹ previous", "next ›"
 CHOOSE = "choose one"
 KNOWN_HINT = "Functions of one parameter in the files where the command was started and beside the task, and policies used before."
@@ -146,7 +133,7 @@ class RunPanel(PagePart[SessionView]):
         self._session = session
         gui = server.gui
 
-        self._transport = gui.add_html("")
+        self._resets = gui.add_html("")
 
         self._env_folder = gui.add_folder("Environment", visible=False)
         with self._env_folder:
@@ -154,9 +141,6 @@ class RunPanel(PagePart[SessionView]):
             gui.add_html(tools_html([tool(PREVIOUS, PreviousEnv()), tool(NEXT, NextEnv())]))
 
         with gui.add_folder("Episode"):
-            self._speed = choice(
-                server, "Speed", SetSpeed, "speed", SPEEDS, 1.0, hint="Simulated seconds in one second."
-            )
             self._seed = Field(server, "Seed", SetSeed, "seed", "0", hint="A new seed resets every env.")
             self._end = choice(server, "At the end", ChooseEpisodeEnd, "rule", EPISODE_ENDS, "reset")
 
@@ -187,16 +171,9 @@ class RunPanel(PagePart[SessionView]):
         if view.task is not None:
             self._env_folder.visible = envs > 1
             self._sliders.build(view.task.actions)
-        play = tool("Pause" if view.playing else "Play", TogglePlay(), off=not can_act, tone="main")
-        transport = (STEP, Step()), (RESET_ALL, ResetAll()), (RESET_THIS, ResetSelected())
-        self._transport.content = tools_html(
-            [play], [tool(name, command, off=not can_act) for name, command in transport]
-        )
-        speed = None if math.isinf(view.settings.speed) else view.settings.speed
-        # The command line takes speeds that are not in the list.
-        speeds = SPEEDS if speed in SPEEDS.values() else SPEEDS | {f"{speed:g} ×": speed}
+        resets = (RESET_ALL, ResetAll()), (RESET_THIS, ResetSelected())
+        self._resets.content = tools_html([tool(name, command, off=not can_act) for name, command in resets])
         self._env.show(view.selected_env, bounds=(0, max(1, envs - 1)), off=not can_act)
-        self._speed.show(speed, options=speeds, off=not can_act)
         self._seed.show(str(view.seed))
         self._end.show(view.settings.episode_end, off=not can_act)
         self._source.show(view.settings.action_source, off=not can_act)

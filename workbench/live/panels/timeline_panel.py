@@ -12,6 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.live.commands import SetSpeed, Step, TogglePlay
 from workbench.live.events import MomentShown
 from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.live.panels.moment import MomentPart
@@ -33,20 +34,27 @@ from workbench.live.timeline_commands import (
 from workbench.live.view import SessionView
 from workbench.machine.text import number_text
 from workbench.page.command import Command
-from workbench.page.widgets.fields import slider
+from workbench.page.commands import ToggleTimeline
+from workbench.page.widgets.fields import Field, choice, slider
+from workbench.page.widgets.hotkeys import with_key
 from workbench.page.widgets.parts import Clock, PagePart
 from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.tools import Tool, tool, tools_html
 from workbench.page.widgets.visitors import Visitor
 
-GAP_PIXELS = 12
-"""Distance between floating panels and the view's edges; the same in ``view_width.js``."""
-MAX_WIDTH_PIXELS = 760
-HEIGHT_PIXELS = 205
-"""Height of the view that the timeline covers; framing a scene leaves it out."""
 RANGE_PERIOD_SECONDS = 0.5
 """Interval at which the slider's range changes. A slider whose ends move at every step cannot be dragged."""
-LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
+LAST_EVENT, NEXT_EVENT = "‹ event", "event ›"
+SPEEDS: dict[str, float | None] = {
+    "0.1 ×": 0.1,
+    "0.25 ×": 0.25,
+    "0.5 ×": 0.5,
+    "1 ×": 1.0,
+    "2 ×": 2.0,
+    "4 ×": 4.0,
+    "8 ×": 8.0,
+    "unlimited": None,
+}
 EPISODE, EVERYTHING = "this episode", "all episodes"
 GO_ON = "Continue from here"
 UNDO = "undo"
@@ -55,7 +63,10 @@ View = TypeVar("View", contravariant=True)
 
 
 class TimeBar(PagePart[View]):
-    """A slider over time, a strip under it and a row of buttons, across the bottom of the view.
+    """The transport, a row of 60 px under the view, and the timeline that opens below it.
+
+    The row has buttons, the speed and the strip. The timeline has a slider, a legend and further buttons; whether it is open
+    is a matter of each page (`ToggleTimeline`).
 
     Args:
         name: Name of the slider.
@@ -65,23 +76,24 @@ class TimeBar(PagePart[View]):
     def __init__(self, server: viser.ViserServer, name: str, kind: type[Command], field: str) -> None:
         gui = server.gui
         self._panel = gui.add_panel(visible=False, order=10.0)
-        with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
-            self._slider = slider(server, name, kind, field, (-1, 0))
+        with self._panel.add_tab("Timeline"):
+            self._transport = gui.add_html("")
+            self._speed = self._add_speed(server)
             self._strip = gui.add_html("")
+            hint = with_key(ToggleTimeline)
+            gui.add_html(render("unfold_timeline", command=ToggleTimeline(), hint=hint))
+            self._slider = slider(server, name, kind, field, (-1, 0))
             self._add_rows(gui)
             self._walk = gui.add_html("")
-        # Across the bottom of the view: viser docks panels at the sides only.
-        self._panel.float(x=GAP_PIXELS, y=-GAP_PIXELS, width=MAX_WIDTH_PIXELS)
-        self._folded = False
+        # The style sheet puts it under the view: viser docks panels at the sides only.
+        self._panel.float(x=0, y=-1)
+
+    def _add_speed(self, server: viser.ViserServer) -> Field:
+        """Add the choice of speed to the row."""
+        raise NotImplementedError
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
-        """Add rows between the strip and the buttons."""
-
-    def fold(self, wanted: bool) -> None:
-        """Fold the timeline to a bar where it would cover other content, or unfold it if this method folded it."""
-        if wanted != self._folded:
-            self._folded = wanted
-            (self._panel.minimize if wanted else self._panel.expand)()
+        """Add rows between the slider and the buttons."""
 
     def _draw_panel(self, there: bool) -> bool:
         self._panel.visible = there
@@ -101,10 +113,18 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     does = (SeekBack, ZoomTimeline, GoToFirst)
 
     def __init__(
-        self, server: viser.ViserServer, session: LiveSession, clock: Clock = time.monotonic
+        self,
+        server: viser.ViserServer,
+        session: LiveSession,
+        clock: Clock = time.monotonic,
+        record: Callable[[SessionView], Tool] | None = None,
     ) -> None:
+        """
+        Args:
+            record: returns the button that records.
+        """
         super().__init__(server, "step of the past", SeekBack, "steps")
-        self._session, self._clock = session, clock
+        self._session, self._clock, self._record = session, clock, record
         self._episode_only = False
         self._range = (0, 0)
         """Ticks at the slider's ends."""
@@ -114,9 +134,12 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         self._strip_of: object = None
         """Key of the data that the strip was drawn for."""
 
+    def _add_speed(self, server: viser.ViserServer) -> Field:
+        hint = "Simulated seconds in one second."
+        return choice(server, "Speed", SetSpeed, "speed", SPEEDS, 1.0, hint=hint)
+
     def _add_rows(self, gui: viser.GuiApi) -> None:
-        # Exactly one of these two is shown, and they have the same height: viser moves a panel that grows with a delay, its
-        # last row is cut off until then, and a second press on "step" would hit another button.
+        # Exactly one of these two is shown, and they have the same height: nothing moves under the pointer.
         self._hint = gui.add_html("")
         self._travel = gui.add_html("", visible=False)
 
@@ -149,9 +172,29 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     def draw(self, view: SessionView) -> None:
         there = view.task is not None and view.timeline.moments > 0
         if self._draw_panel(there):
+            self._draw_transport(view)
             self._draw_slider(view)
             self._draw_buttons(view)
             self._draw_strip(view)
+
+    def _draw_transport(self, view: SessionView) -> None:
+        live = view.timeline.shown is None
+        can_act = view.task is not None and view.state != "stopped"
+        step = tool("Step", Step(), off=not can_act) if live else tool("Step forward", StepForward())
+        buttons = [
+            ("first", tool("First moment", GoToFirst())),
+            ("back", tool("Step back", StepBack())),
+            play_tool(view.playing, off=not can_act),
+            ("step", step),
+            ("last", tool("Live", GoToLast(), off=live)),
+        ]
+        if self._record is not None:
+            buttons.append(("record", self._record(view)))
+        self._transport.content = render("transport", tools=buttons)
+        speed = None if math.isinf(view.settings.speed) else view.settings.speed
+        # The command line takes speeds that are not in the list.
+        speeds = SPEEDS if speed in SPEEDS.values() else SPEEDS | {f"{speed:g} ×": speed}
+        self._speed.show(speed, options=speeds, off=not can_act)
 
     def _draw_slider(self, view: SessionView) -> None:
         past, now = view.timeline, self._clock()
@@ -172,8 +215,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             else (EPISODE, ZoomTimeline(episode_only=True))
         )
         walk = [
-            *walk_tools(),
-            tool(LIVE, GoToLast(), off=past.shown is None),
+            *event_tools(),
             Tool(zoom[0], zoom[1], zoom[1].help()),
             tool(f"{UNDO} {past.undo or ''}".strip(), UndoReset(), off=past.undo is None),
         ]
@@ -198,15 +240,16 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             self._strip.content = strip_html(strip, view, self._seek_to)
 
 
-def walk_tools() -> list[Tool]:
-    """Buttons that go one step or event back or forward."""
-    kinds = {
-        LAST_EVENT: PreviousEvent(),
-        LAST_STEP: StepBack(),
-        NEXT_STEP: StepForward(),
-        NEXT_EVENT: NextEvent(),
-    }
-    return [tool(name, command) for name, command in kinds.items()]
+def play_tool(playing: bool, off: bool = False) -> tuple[str, Tool]:
+    """The icon and the button that play or pause."""
+    return ("pause" if playing else "play"), tool(
+        "Pause" if playing else "Play", TogglePlay(), off=off, tone="main"
+    )
+
+
+def event_tools() -> list[Tool]:
+    """Buttons that go to the event before or after."""
+    return [tool(LAST_EVENT, PreviousEvent()), tool(NEXT_EVENT, NextEvent())]
 
 
 def continue_tools(view: SessionView) -> list[Tool]:

@@ -27,7 +27,6 @@ SCRIPTS = (
     "input.js",
     "panels.js",
     "curve_clicks.js",
-    "view_width.js",
 )
 """Scripts of ``web_assets/`` injected into viser's index.html, in load order."""
 STYLES = "panels/page.css"

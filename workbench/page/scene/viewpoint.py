@@ -21,11 +21,8 @@ from workbench.page.widgets.parts import Clock
 
 FOV_RADIANS = 0.75
 """Vertical field of view. viser's default of 75 degrees distorts the edges of a grid."""
-DEFAULT_ASPECT = 1.25
+DEFAULT_ASPECT = 1.385
 """Aspect ratio (width over height) of the view in a 1280 x 720 window, used until a page has sent its own."""
-DEFAULT_HEIGHT_PIXELS = 720.0
-"""Height of the view, used until a page has sent its own."""
-MAX_COVERED_SHARE = 0.45
 FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
 """Direction from the scene to the eye: ManiSkill's robots face +x, so they are seen from there, slightly from the side."""
 
@@ -38,16 +35,12 @@ class Viewpoint:
     look_at: NDArray[np.float64]
 
 
-def frame_box(low: NDArray, high: NDArray, aspect: float = DEFAULT_ASPECT, covered: float = 0.0) -> Viewpoint:
-    """The closest upright view from the front and above with the whole box in its uncovered part.
+def frame_box(low: NDArray, high: NDArray, aspect: float = DEFAULT_ASPECT) -> Viewpoint:
+    """The closest upright view from the front and above with the whole box in it.
 
     Let the camera be at ``target - d * forward - k * up``. A corner c, relative to the target, is inside the picture when
-    ``|right . c| <= tan(fov_x / 2) * (d + forward . c)``, and when ``up . c + k`` lies between ``-(1 - 2 * covered)`` and 1
-    times ``tan(fov_y / 2) * (d + forward . c)``. So d is the largest of the bounds from corners and pairs of corners, and k
-    is the middle of the range that remains.
-
-    Args:
-        covered: Share of the picture's height, from below, that the timeline covers.
+    ``|right . c| <= tan(fov_x / 2) * (d + forward . c)`` and ``|up . c + k| <= tan(fov_y / 2) * (d + forward . c)``. So d is
+    the largest of the bounds from corners and pairs of corners, and k is the middle of the range that remains.
     """
     target = (np.asarray(low, np.float64) + high) / 2
     forward = -FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
@@ -57,63 +50,55 @@ def frame_box(low: NDArray, high: NDArray, aspect: float = DEFAULT_ASPECT, cover
     corners = box_corners(low, high) - target
     tall = np.tan(FOV_RADIANS / 2)
     wide = tall * float(np.clip(aspect, 0.3, 4.0))
-    below = tall * (1 - 2 * float(np.clip(covered, 0.0, MAX_COVERED_SHARE)))
     ahead, height = corners @ forward, corners @ up
-    pairs = height[:, None] - height - tall * ahead[:, None] - below * ahead
+    pairs = height[:, None] - height - tall * (ahead[:, None] + ahead)
     distance = 1.04 * max(
         float((np.abs(corners @ right) / wide - ahead).max()),
-        float(pairs.max()) / (tall + below),
+        float(pairs.max()) / (2 * tall),
         0.3,
     )
-    least = float((-below * (distance + ahead) - height).max())
+    least = float((-tall * (distance + ahead) - height).max())
     most = float((tall * (distance + ahead) - height).min())
     look_at = target - up * (least + most) / 2
     return Viewpoint(position=look_at - forward * distance, look_at=look_at)
 
 
-def frame_all(layout: EnvLayout, aspect: float = DEFAULT_ASPECT, covered: float = 0.0) -> Viewpoint:
-    return frame_box(*layout.box_of_all(), aspect, covered)
+def frame_all(layout: EnvLayout, aspect: float = DEFAULT_ASPECT) -> Viewpoint:
+    return frame_box(*layout.box_of_all(), aspect)
 
 
 def frame_one(
     layout: EnvLayout,
     picture: Picture | None,
     aspect: float = DEFAULT_ASPECT,
-    covered: float = 0.0,
     fovy: float = FOV_RADIANS,
     acting: tuple[NDArray, NDArray] | None = None,
 ) -> Viewpoint:
-    """The view of one env at the origin, in the uncovered part of the picture.
+    """The view of one env at the origin.
 
-    With a human camera: from its direction, at a distance at which its picture fits the uncovered part, centred there.
+    With a human camera: from its direction, at a distance at which its picture fits the view.
 
     Args:
         picture: Picture of the human camera; only its pose is used.
-        covered: See `frame_box`.
         fovy: The human camera's vertical field of view, radians.
         acting: Box to frame without a human camera; None takes the whole env.
     """
     if picture is None:
         low, high = (layout.low, layout.high) if acting is None else acting
-        return frame_box(low, high, aspect, covered)
-    covered = float(np.clip(covered, 0.0, MAX_COVERED_SHARE))
+        return frame_box(low, high, aspect)
     position = picture.pose[:3].astype(np.float64)
     forward = SO3(picture.pose[3:].astype(np.float64)).apply(np.array([1.0, 0.0, 0.0]))
     centre = (layout.low + layout.high) / 2
     # The page orbits around its look-at point, which must therefore be at the depth of the env.
     depth = max(float((centre - position) @ forward), 0.2)
     tall = float(np.tan(FOV_RADIANS / 2))
-    left = min(1 - covered, float(np.clip(aspect, 0.3, 4.0)))
-    away = depth * float(np.tan(fovy / 2)) / (tall * left)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    length = float(np.linalg.norm(right))
-    up = np.cross(right / length, forward) if length > 1e-6 else np.zeros(3)
-    look_at = position + forward * depth - up * covered * tall * away
+    away = depth * float(np.tan(fovy / 2)) / (tall * min(1.0, float(np.clip(aspect, 0.3, 4.0))))
+    look_at = position + forward * depth
     return Viewpoint(position=look_at - forward * away, look_at=look_at)
 
 
-Frame = Callable[[float, float], Viewpoint]
-"""Returns the viewpoint for a view of this aspect ratio (width over height) and height in pixels."""
+Frame = Callable[[float], Viewpoint]
+"""Returns the viewpoint for a view of this aspect ratio (width over height)."""
 
 
 MAX_SCENES = 8
@@ -176,7 +161,7 @@ class Framing:
 
     def frame(self, frame: Frame, untouched_only: bool = False, but: Set[int] = frozenset()) -> None:
         """Frame the scene in every open page (or only untouched ones) and in pages opened later."""
-        usual = frame(DEFAULT_ASPECT, DEFAULT_HEIGHT_PIXELS)
+        usual = frame(DEFAULT_ASPECT)
         self._server.initial_camera.position = usual.position
         self._server.initial_camera.look_at = usual.look_at
         for number, client in self._server.get_clients().items():
@@ -204,7 +189,7 @@ class Framing:
         return _is_at(client, begins) or (position is not None and _is_at(client, position))
 
     def _point(self, client: viser.ClientHandle, frame: Frame) -> None:
-        viewpoint = frame(aspect_of(client), client.camera.image_height or DEFAULT_HEIGHT_PIXELS)
+        viewpoint = frame(aspect_of(client))
         client.camera.position = viewpoint.position
         client.camera.look_at = viewpoint.look_at
         # Last: a caller that waits for this may close the page, and viser warns about writes to a closed page.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import viser
-
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor, Visitors
 
@@ -15,8 +13,6 @@ class OpenTabs:
         self._visitors = visitors
         self._open: dict[str, str] = {}
         """Name of the open tab, by page."""
-        self._opening: dict[str, viser.GuiHtmlHandle] = {}
-        """Element that last opened a tab, by page."""
 
     def pages_at(self, name: str) -> frozenset[int]:
         """Client ids of the pages that have this tab open."""
@@ -25,10 +21,7 @@ class OpenTabs:
 
     def open(self, visitor: Visitor, name: str, fold: str = "") -> None:
         """Open a tab, and a fold in it, on a page."""
-        before = self._opening.pop(visitor.name, None)
-        if before is not None:
-            before.remove()
-        self._opening[visitor.name] = visitor.client.gui.add_html(render("open_tab", tab=name, fold=fold))
+        visitor.send(render("open_tab", tab=name, fold=fold))
 
     def said(self, visitor: Visitor, name: str) -> None:
         """Store the open tab that a page reports."""

@@ -51,6 +51,14 @@ class Visitor:
     page_width: int = 0
     """Width of the page in CSS pixels at its last connection; 0 before the first."""
 
+    _sent: viser.GuiHtmlHandle | None = None
+
+    def send(self, html: str) -> None:
+        """Add an element to this page, which acts on it (``arrivals`` in ``input.js``); it replaces the one before."""
+        if self._sent is not None:
+            self._sent.remove()
+        self._sent = self.client.gui.add_html(html)
+
     def tell(self, text: str, title: str = "Not possible") -> None:
         self.client.add_notification(title, text, color="orange", auto_close_seconds=NOTICE_SECONDS)
 
