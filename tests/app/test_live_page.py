@@ -79,9 +79,10 @@ def opened(
 def test_says_what_it_waits_for_and_then_shows_the_scene(opened: Opened) -> None:
     # The fixture drew it before there was a task.
     run = opened.panels.part("Run")
-    assert run.button("Play").command is None and not run.presses(ResetAll())
+    transport = opened.panels.part("Timeline")
+    assert transport.button("Play").command is None and not run.presses(ResetAll())
     view = opened.load()
-    assert run.button("Play").command is not None and run.presses(ResetAll())
+    assert transport.button("Play").command is not None and run.presses(ResetAll())
     assert run.field("Selected").bounds == (0, 2)
     assert all(opened.panels.bodies(name) for name in ("cube", "panda_hand", "ground"))
     assert "3 envs" in opened.panels.html("wb-status")
@@ -122,7 +123,7 @@ def test_while_steps_go_on_a_press_is_shown_at_once_and_the_robots_move_with_eve
     wait_until(session, lambda view: view.state == "running" and view.steps_per_second > 0, "the play")
     for _ in range(2):
         opened.page.redraw()
-        assert opened.panels.part("Run").shows("Pause")
+        assert opened.panels.part("Timeline").shows("Pause")
         before, serial = hand.batched_positions.copy(), session.view().step_serial
         wait_until(session, lambda view, serial=serial: view.step_serial > serial + 5, "further steps")
         opened.page.redraw()
@@ -132,7 +133,7 @@ def test_while_steps_go_on_a_press_is_shown_at_once_and_the_robots_move_with_eve
     assert opened.panels.field("Selected").value == 1
     session.do(PauseRun())
     opened.page.redraw()
-    assert opened.panels.part("Run").shows("Play")
+    assert opened.panels.part("Timeline").shows("Play")
     wait_until(session, lambda view: view.state == "paused", "the pause")
 
 

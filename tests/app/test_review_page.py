@@ -230,12 +230,12 @@ def test_the_strip_has_each_recording_where_it_is_aligned(shown: Reviewed) -> No
     assert strip["legend"] == [("success", "success")] and strip["bands"] == [("0.0", "100.0")]
     assert strip["lines"] == [("70.0", "wb-cursor wb-past")]
     html = shown.html("wb-timeline")
-    assert ">step 7 / 10, 0.35 s<" in html and '<span class="wb-num">success</span>' in html
+    assert ">step 7 / 10<" in html and ">0.35 s<" in html and '<span class="wb-num">success</span>' in html
     assert "stroke:" not in html and "aligned at" not in html
     shown.open(1, 2)
     shown.seek(8)
     assert strip_of(shown)["extents"] == [("0.0", "100.0", "#228be6"), ("0.0", "60.0", "#f08c00")]
-    assert ">A: step 8 / 10, 0.40 s<" in shown.html("wb-timeline")
+    assert ">A: step 8 / 10<" in shown.html("wb-timeline")
     shown.select(1)
     shown.review.do(AlignRecordings(at="first success"))
     shown.draw()
@@ -248,7 +248,7 @@ def test_the_strip_has_each_recording_where_it_is_aligned(shown: Reviewed) -> No
     assert float(strip["lines"][1][0]) == pytest.approx(100 * (place + 7) / 13, abs=1e-3)
     shown.seek(-3)
     html = shown.html("wb-timeline")
-    assert ">B: step 0 / 6, 0.00 s<" in html and "(no state there)" in html
+    assert ">B: step 0 / 6<" in html and "(no state there)" in html
     assert "aligned at first success" in html and "stroke:#f08c00" in html
     rows = re.findall(r"<tr data-do.*?</tr>", shown.part("Review").html("wb-opened-list"), re.DOTALL)
     assert len(rows) == 2 and "wb-selected" in rows[1] and "wb-selected" not in rows[0]
@@ -259,8 +259,7 @@ def test_the_strip_has_each_recording_where_it_is_aligned(shown: Reviewed) -> No
 
 def test_the_timeline_has_its_buttons_and_is_not_drawn_again_where_nothing_moved(shown: Reviewed) -> None:
     shown.open(1)
-    buttons = shown.html("wb-tools")
-    assert ">play<" in buttons and shown.presses(TogglePlay())
+    assert shown.shows("Play") and shown.presses(TogglePlay())
     (strip,) = (html for html in shown.htmls() if "wb-timeline" in html.content)
     points = re.findall(r'<polyline points="([^"]*)"', strip.content)
     places = [float(point.partition(",")[0]) for line in points for point in line.split()]
@@ -272,7 +271,7 @@ def test_the_timeline_has_its_buttons_and_is_not_drawn_again_where_nothing_moved
     assert "step 3 / 10" in strip.content
     shown.review.do(TogglePlay())
     shown.draw()
-    assert ">pause<" in shown.html("wb-tools")
+    assert shown.shows("Pause")
     shown.review.do(TogglePlay())
 
 

@@ -92,7 +92,9 @@ class Controls(HTMLParser):
         button = None
         if "data-do" in has or has.get("aria-disabled") == "true":
             does = COMMANDS.decode(*json.loads(has["data-do"])) if "data-do" in has else None
-            button = SeenButton("", does, has.get("aria-pressed") == "true", has.get("title", ""))
+            button = SeenButton(
+                has.get("aria-label", ""), does, has.get("aria-pressed") == "true", has.get("title", "")
+            )
             self.buttons.append(button)
         self._open.append(button)
         self._labelled = tag == "span" and self._field is not None and not self._field.names

@@ -99,9 +99,9 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
         for narrower in (600, 500, 400):
             before, at = at, shows(narrower, at)
             assert np.linalg.norm(at) != np.linalg.norm(before), narrower
-        assert np.allclose(at, frame(400 / 720, 720).position)
+        assert np.allclose(at, frame(400 / 720).position)
         begins = np.array(server.initial_camera.position)
-        assert np.allclose(shows(399, begins), frame(399 / 720, 720).position), "where it begins came after"
+        assert np.allclose(shows(399, begins), frame(399 / 720).position), "where it begins came after"
         moved = at + 0.1
         assert np.allclose(shows(300, moved), moved), "the view is the person's"
         (client,) = server.get_clients().values()

@@ -170,9 +170,9 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         return super().urgent(view), self._episode_only
 
     def draw(self, view: SessionView) -> None:
-        there = view.task is not None and view.timeline.moments > 0
-        if self._draw_panel(there):
-            self._draw_transport(view)
+        self._draw_panel(True)
+        self._draw_transport(view)
+        if view.task is not None and view.timeline.moments > 0:
             self._draw_slider(view)
             self._draw_buttons(view)
             self._draw_strip(view)
@@ -182,8 +182,8 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         can_act = view.task is not None and view.state != "stopped"
         step = tool("Step", Step(), off=not can_act) if live else tool("Step forward", StepForward())
         buttons = [
-            ("first", tool("First moment", GoToFirst())),
-            ("back", tool("Step back", StepBack())),
+            ("first", tool("First moment", GoToFirst(), off=not view.timeline.moments)),
+            ("back", tool("Step back", StepBack(), off=not view.timeline.moments)),
             play_tool(view.playing, off=not can_act),
             ("step", step),
             ("last", tool("Live", GoToLast(), off=live)),
