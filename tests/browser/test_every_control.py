@@ -28,8 +28,8 @@ WebSocket.prototype.send = function (text) {
     return send.call(this, text);
 };
 """
-LEAVES = "show_recordings", "show_live", "continue_live"
-"""What shows another page is not pressed."""
+LEAVES = "show_recordings", "show_live", "continue_live", "toggle_timeline"
+"""What shows another page, or folds what is to be pressed, is not pressed."""
 PRESSED = "[data-do]" + "".join(f":not([data-do*={name}])" for name in LEAVES) + ", [data-copy]"
 MOST = 150
 TRIES = 5
@@ -70,12 +70,15 @@ class Board:
                 return key, part
         return None
 
-    def press(self, part: Locator) -> bool:
-        """Whether the server was asked for something, or a text was copied."""
+    def close_dialog(self) -> None:
         dialog = self.page.locator(".mantine-Modal-overlay")
         if dialog.count():
             self.page.keyboard.press("Escape")
             expect(dialog).to_have_count(0)
+
+    def press(self, part: Locator) -> bool:
+        """Whether the server was asked for something, or a text was copied."""
+        self.close_dialog()
         before = self.page.evaluate("asked")
         # Playwright's own would wait for a picture to be stable, which is drawn anew while it waits.
         part.evaluate("p => p.scrollIntoView({block: 'center'})")
@@ -101,6 +104,7 @@ class Board:
             # Again: what is drawn anew at that moment moves away from under the mouse.
             if not any(self.press(part) or not part.is_visible() for _ in range(TRIES)):
                 dead.append(f"{where}: {what!r} ({key[:60]})")
+            self.close_dialog()
         raise AssertionError(f"{where} has no end of parts to press")
 
 

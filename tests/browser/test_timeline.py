@@ -68,6 +68,24 @@ def test_arrow_keys_walk_through_the_past_and_end_is_live(desk: Desk) -> None:
 
 
 @pytest.mark.slow
+def test_the_timeline_folds_to_a_transport_of_one_row_whose_strip_still_goes_to_the_past(desk: Desk) -> None:
+    page = desk.page
+    slider, play = page.get_by_label("step of the past").last, desk.button("Play")
+    expect(slider).to_be_visible()
+    opened = play.bounding_box()
+    desk.press("t")
+    expect(slider).to_be_hidden()
+    strip, folded = desk.box(".wb-strip"), desk.box("[data-floating-window]:has(.wb-transport)")
+    closed = play.bounding_box()
+    assert folded["height"] <= 61 and strip["height"] > 40
+    assert closed is not None and opened is not None and closed["x"] == opened["x"]
+    page.mouse.click(strip["x"] + 1, strip["y"] + 20)
+    until(lambda: "past" in page.locator(".wb-timeline").inner_text(), "the first moment")
+    desk.press("End", "t")
+    expect(slider).to_be_visible()
+
+
+@pytest.mark.slow
 def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk) -> None:
     desk.page.get_by_role("button", name="this episode").click()
     expect(desk.page.locator(SLIDER)).to_have_attribute("min", str(-STEPS))

@@ -195,12 +195,13 @@ OF_RERUN = re.compile(r"fonts\.googleapis\.com|rerun-io/rerun/releases|tel\.reru
 def new_page(
     browser: Browser, width: int = 1280, height: int = 720, drawn: bool = True
 ) -> tuple[Page, list[str]]:
-    """A page, and the console errors and uncaught exceptions that it has so far.
+    """A page with the timeline open, and the console errors and uncaught exceptions that it has so far.
 
     Args:
         drawn: Whether the 3-D view is drawn at all times; without it, for `picture_of_view` alone.
     """
     page = browser.new_page(viewport={"width": width, "height": height})
+    page.add_init_script("document.documentElement?.setAttribute('data-timeline-open', '')")
     if not drawn:
         page.add_init_script(DRAWN_WHEN_LOOKED_AT)
     errors: list[str] = []
