@@ -201,7 +201,9 @@ def new_page(
         drawn: Whether the 3-D view is drawn at all times; without it, for `picture_of_view` alone.
     """
     page = browser.new_page(viewport={"width": width, "height": height})
-    page.add_init_script("document.documentElement?.setAttribute('data-timeline-open', '')")
+    page.add_init_script(
+        "addEventListener('DOMContentLoaded', () => document.documentElement.setAttribute('data-timeline-open', ''))"
+    )
     if not drawn:
         page.add_init_script(DRAWN_WHEN_LOOKED_AT)
     errors: list[str] = []
