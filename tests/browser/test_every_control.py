@@ -28,8 +28,8 @@ WebSocket.prototype.send = function (text) {
     return send.call(this, text);
 };
 """
-LEAVES = "show_recordings", "show_live", "continue_live", "toggle_timeline"
-"""What shows another page, or folds what is to be pressed, is not pressed."""
+LEAVES = "show_recordings", "show_live", "continue_live", "toggle_timeline", "open_task_list"
+"""What shows another page or a dialog, or folds what is to be pressed, is not pressed."""
 PRESSED = "[data-do]" + "".join(f":not([data-do*={name}])" for name in LEAVES) + ", [data-copy]"
 MOST = 150
 TRIES = 5

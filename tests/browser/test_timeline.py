@@ -89,9 +89,6 @@ def test_the_timeline_folds_to_a_transport_of_one_row_whose_strip_still_goes_to_
 def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk) -> None:
     desk.page.get_by_role("button", name="this episode").click()
     expect(desk.page.locator(SLIDER)).to_have_attribute("min", str(-STEPS))
-    assert abs(desk.box(".wb-strip")["width"] - desk.box(SLIDER)["width"]) < 8, (
-        "a strip as wide as the slider"
-    )
     # By its own click, which waits until the panel, whose height has changed, stands still.
     desk.page.locator(SLIDER).last.click()
     desk.comes_to(STEPS // 2)
