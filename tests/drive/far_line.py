@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit, urlunsplit
 
+PORTS = range(20_000, 32_000)
+"""Below those that the kernel gives to clients: a page that connects again and again to a port that nobody listens on would
+at some time be given that very port as its own, be connected to itself, and keep the line from coming back."""
 PIECE = 4096
 """Bytes that are relayed at once; small, so that connections share the line."""
 
@@ -29,7 +33,7 @@ class FarLine:
     room: int = 2 << 20
     """Bytes a connection that wait in it: the window of a channel of ssh."""
     port: int = 0
-    """Its near end; 0 takes any free one."""
+    """Its near end; 0 takes any free one of `PORTS`."""
     down: int = 0
     """Bytes that reached the browsers so far."""
     up: int = 0
@@ -98,7 +102,12 @@ class FarLine:
             with contextlib.suppress(asyncio.CancelledError):
                 await asyncio.gather(carry(reader, out, "up"), carry(back, writer, "down"))
 
-        server = await asyncio.start_server(accept, "127.0.0.1", self.port)
+        for near in [self.port] if self.port else random.sample(PORTS, 20):
+            with contextlib.suppress(OSError):
+                server = await asyncio.start_server(accept, "127.0.0.1", near)
+                break
+        else:
+            raise OSError(f"port {near} is taken")
         self.port = server.sockets[0].getsockname()[1]
         self.loop = asyncio.get_running_loop()
         ready.set()
