@@ -298,7 +298,7 @@ def edit_failed_to_load(studio: Studio) -> Studio:
     if not shown.loading or shown.edit is None:
         return studio
     undone = shown.stage == "undone"
-    hint = "it has the change; revert it if that is the reason"
+    hint = "the camera's change is in it; revert the change if that is the reason"
     if undone:
         hint = "the camera's change was reverted"
     does = "does" if len(shown.edit.changes) == 1 else "do"

@@ -196,8 +196,8 @@ def keep_render_device(device: str) -> None:
     except RuntimeError as error:
         if _kept and _exists(name):
             raise RuntimeError(
-                f"SAPIEN has one render device in a process, and this one renders on {next(iter(_kept))!r}: "
-                f"{name!r} can be had in another process only."
+                f"SAPIEN allows one render device per process, and this process renders on {next(iter(_kept))!r}: "
+                f"use another process for {name!r}."
             ) from error
         raise RuntimeError(
             f"SAPIEN cannot render on {name!r}: {error}. It needs a Vulkan driver: a GPU's own, or Mesa's "

@@ -143,7 +143,7 @@ class Past:
         return self.seek(at)
 
     def seek_step(self, env: int, step: int) -> Past:
-        """Go to a control step of this env's shown episode, through its jumps back; or to the nearest kept one."""
+        """Go to a control step of this env's shown episode, or to the nearest kept one; jumps back do not end an episode."""
         episode_backwards = self.history.episode_backwards(env, self.history.segment_at(env, self.at)[1])
         serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in episode_backwards}
         if not serials:

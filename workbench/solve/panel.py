@@ -50,7 +50,7 @@ SAVE_SOLVED = "Save the solved episode"
 TOOL = "the robot's tool"
 BETTER_MODE = "pd_ee_delta_pose"
 USE_MODE = "Plan in end-effector control (resets the envs)"
-USE_MODE_HINT = "Makes the envs anew with this control mode, in which plans are found soonest"
+USE_MODE_HINT = "Rebuilds the envs with this control mode, in which plans are found soonest"
 MAX_NAMED_ENVS = 4
 """Maximum number of newly solved envs that are named."""
 CHART_HEIGHT_PIXELS = 150

@@ -227,7 +227,7 @@ class Checkup:
             raise NotApplicable("it is a robot in a scene of ManiSkill's")
 
     def at_most(self, wanted: int) -> int:
-        """The number of envs to make for a wish of `wanted`: 1 if the checkup has one env."""
+        """Number of envs to make if `wanted` are wanted: 1 if the checkup has one env."""
         return wanted if self.num_envs > 1 else 1
 
     @contextmanager

@@ -306,7 +306,7 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         raise NotKnown(f"no {which} episode succeeds")
     if not times:
         raise NotKnown(
-            "where success is true, it is so from the reset on"
+            "success becomes true in no episode after its reset"
             if at_reset
             else "success comes at the last step only"
         )

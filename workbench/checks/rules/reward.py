@@ -178,9 +178,9 @@ def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             row.count,
         )
     elif any(row.names == ("no success",) for row in rows):
-        raise NotKnown("evaluate() has no success: which states pay most is not known")
+        raise NotKnown("evaluate() has no success, so it is not known in which states the reward is largest")
     elif not any(row.tried for row in rows):
-        raise NotKnown("no tried episode succeeds, where the reward is largest")
+        raise NotKnown("no tried episode succeeds, and the reward is largest at success")
 
 
 def paid_at_success(seen: OddStates, mode: str) -> float | None:

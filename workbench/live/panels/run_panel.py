@@ -38,7 +38,7 @@ from workbench.task.description import ActionDimension
 ENVS = {"the selected env": "selected", "all envs": "all"}
 """Choices of a field *Envs*, with their values in commands."""
 HOLD = "Hold still"
-MOVED_HINT = "Whose robot a slider moves. The sliders show what the robot of the selected env is told."
+MOVED_HINT = "Whose robot a slider moves. The sliders show the action of the selected env."
 DEFAULT_BOUND = 1.0
 """Bound of the slider of a dimension without bounds: from -1 to 1."""
 
