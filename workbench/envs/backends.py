@@ -131,7 +131,7 @@ def choose_backend(wanted: Backend, render: bool) -> ChosenBackend:
 
 
 def unused_gpu_text(wanted: Backend) -> str | None:
-    """Notice that ``auto`` does not simulate on the GPU that there is; None if there is nothing to notice."""
+    """Notice that ``auto`` simulates on the CPU although GPU simulation is available; else None."""
     if wanted != "auto" or why_no_gpu_simulation() is not None:
         return None
     return (

@@ -268,8 +268,8 @@ class Past:
         )
 
     def episode(self, env: int) -> tuple[int, int]:
-        """Serials of the first and the last moment of this env's episode that contains the shown moment. Moments in between
-        that the env later went back over are included."""
+        """Serials of the first and the last moment of this env's episode that contains the shown moment. The moments in
+        between that it abandoned by going back are included."""
         end = self.history.segment_at(env, self.at)[1]
         begin = min((moment.serial for moment, _ in self.history.episode_backwards(env, end)), default=end)
         return begin, end

@@ -85,7 +85,7 @@ def findings_of_shaders(cameras: Iterable[CameraInfo]) -> list[Finding]:
 
 
 def here_without_ray_tracing() -> str:
-    """What this machine does with ray traced cameras, as a sentence; empty where it traces rays."""
+    """What this machine does with ray traced cameras, as a sentence; empty if it can trace rays."""
     why = why_no_ray_tracing()
     if why is None:
         return ""
