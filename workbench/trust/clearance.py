@@ -268,7 +268,7 @@ class Clearances:
             return None
         return (
             f"a recording of {_printable(info.task)} that was not made here names files for its env to read "
-            f"({', '.join(named[:3])}), which it may only with --trust on the command line"
+            f"({', '.join(named[:3])}), which needs --trust on the command line"
         )
 
     def _without_asking(self, code: CodeToRun) -> TaskName | NotCleared | _Undecided:
