@@ -21,8 +21,8 @@ HASH_CHARACTERS = 12
 MAX_NAME_CHARACTERS = 400
 """Maximum length of a shown name."""
 FOLLOWED = (
-    "While it is open live, every save of this file and of the modules beside it runs without asking, whoever saves it. "
-    "Rescore uses the file as it is then."
+    "While it is open live, every save of this file and of the modules next to it runs without asking, whoever saves it. "
+    "Rescore uses the file as it is at that time."
 )
 """Warning before continuing live with a file that a recording references."""
 
