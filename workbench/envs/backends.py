@@ -161,8 +161,8 @@ def give_brdf_table(camera: sapien.render.RenderCameraComponent) -> None:
 
     Otherwise SAPIEN computes the table for the first picture of the process, from 268 million samples: 5 to 19 s on a
     software driver. With this table the first picture takes 0.1 s, and is the same to the bit. The table is that of the
-    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU, SAPIEN's own takes no time and is
-    left.
+    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN computes its
+    own at once, so it is kept.
     """
     scene = camera.entity.scene
     if not scene.render_system.device.is_cuda():

@@ -252,8 +252,8 @@ def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] |
 
 
 def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each episode, in rollouts and odd states, that has success and a higher reward elsewhere; and one for the reward
-    at success, if that is one number."""
+    """A row for each episode, of rollouts or odd states, whose reward is higher elsewhere than at success. One more row for the
+    reward at success, if it is the same number in all states."""
     _require_dense(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     every = _scored(checkup)

@@ -134,7 +134,10 @@ SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
 STEP, RESET_ALL, RESET_THIS = "Step", "Reset all", "Reset this env"
 PREVIOUS, NEXT = "‹ previous", "next ›"
 CHOOSE = "choose one"
-KNOWN_HINT = "Functions of one parameter in the files of the folder where the command was started and of the task's folder, and policies used before."
+KNOWN_HINT = (
+    "Functions with one parameter, from the files in the task's folder and in the folder where the command was started; "
+    "and policies used before."
+)
 
 
 class RunPanel(PagePart[SessionView]):
