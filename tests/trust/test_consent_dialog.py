@@ -133,11 +133,15 @@ def test_the_window_says_what_would_run_and_escapes_it() -> None:
     assert "<script>" not in said and "<b><" not in said and "&lt;script&gt;.py" in said
     assert "&lt;/pre&gt;" in said and "\\u202e" in said, "the text, escaped"
     assert all(one.name in said and one.hash in said and one.text in said for one in many)
-    assert "It imports from beside it (300)" in said and "trusted" not in said and "every save" not in said
+    assert (
+        "It imports these modules next to it (300)" in said
+        and "trusted" not in said
+        and "every save" not in said
+    )
     held = (CodeFile("push.py", "0" * 12, ""), HELPER)
     said = question_html(TrustQuestion("<i>Push</i>-v1", True, held))
     assert "&lt;i&gt;Push" in said and "hold the text of their task" in said
-    assert "what it may import (1)" in said and "It imports" not in said
+    assert "the modules that it may import (1)" in said and "It imports" not in said
 
 
 def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
