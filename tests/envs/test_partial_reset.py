@@ -1,4 +1,4 @@
-"""A reset of some envs leaves the controllers of the others alone, and says whose fault it is when it fails."""
+"""A partial reset leaves the other envs' controllers alone, and its errors name the envs and buffers at fault."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
 
@@ -26,7 +26,7 @@ def made(task: str | type[BaseEnv] = PICK_CUBE, num_envs: int = 4, **kwargs: Any
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("control_mode", ["pd_joint_target_delta_pos", "pd_ee_target_delta_pose"])
-def test_an_env_that_is_not_reset_goes_on_to_the_target_that_it_had(control_mode: str) -> None:
+def test_an_env_that_is_not_reset_keeps_its_target(control_mode: str) -> None:
     env = made(control_mode=control_mode)
     rng = np.random.default_rng(0)
     chosen = [rng.uniform(-1, 1, env.action_space.shape).astype(np.float32) for _ in range(12)]
@@ -43,7 +43,7 @@ def test_an_env_that_is_not_reset_goes_on_to_the_target_that_it_had(control_mode
     env.close()
 
 
-def test_the_first_observation_after_it_shows_that_target_too() -> None:
+def test_the_first_observation_after_a_partial_reset_shows_kept_targets() -> None:
     env = made(control_mode="pd_joint_target_delta_pos", obs_mode="state_dict")
     env.reset(seed=[1, 2, 3, 4])
     for _ in range(5):
@@ -57,7 +57,7 @@ def test_the_first_observation_after_it_shows_that_target_too() -> None:
 
 
 class Starts(Bare):
-    """Where its box begins is drawn by each env's own generator, put into the scene and kept on the task."""
+    """Each env's generator draws the box's start position, which the scene and `start` hold."""
 
     def _load_scene(self, options: dict) -> None:
         builder = self.scene.create_actor_builder()
