@@ -73,7 +73,7 @@ def test_under_the_floor_is_measured_from_the_lowest_still_point() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "reward", "reasons"),
+    ("mode", "reward", "reason"),
     [
         ("sparse", 1.0, None),
         ("sparse", -1.0, None),
@@ -88,14 +88,14 @@ def test_under_the_floor_is_measured_from_the_lowest_still_point() -> None:
     ],
 )
 def test_a_reward_outside_its_modes_range_or_not_finite_is_an_outlier(
-    mode: str, reward: float, reasons: str | None
+    mode: str, reward: float, reason: str | None
 ) -> None:
     watch, poses = watched(3, mode)
     step = step_of(poses)
     rewards = step.reward.copy()
     rewards[1] = reward
     sights = watch.check(replace(step, reward=rewards))
-    assert [sight.reason(1) for sight in sights] == ([] if reasons is None else [reasons])
+    assert [sight.reason(1) for sight in sights] == ([] if reason is None else [reason])
     assert all(np.flatnonzero(sight.envs).tolist() == [1] for sight in sights)
 
 
