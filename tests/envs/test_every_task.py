@@ -42,7 +42,7 @@ def test_a_task_with_an_upstream_fault_does_the_rest(renderer: None) -> None:
     assert row.outcome == "upstream" and row.after_restore, row
 
 
-# --- faults of ManiSkill's own --------------------------------------------------------------------------
+# --- faults of ManiSkill's own ----------------------------------------------------------------------
 
 
 # One task for each; the sweep has the others, and DrawSVG-v1 with its hundreds of bodies.
@@ -78,10 +78,10 @@ def test_a_fault_that_upstream_fixed_fails_the_exercise(
     # Patch the function's globals: pytest may have imported its module twice.
     monkeypatch.setitem(exercise.__globals__, "faults_of", lambda env_id: {mended.stage: mended})
     row = exercise("MS-CartpoleBalance-v1")
-    assert row.outcome == "failed" and "upstream mended" in row.notes[0], row
+    assert row.outcome == "failed" and "upstream fixed" in row.notes[0], row
 
 
-# --- all of them, each in a child process -----------------------------------------------------------------
+# --- all of them, each in a child process -----------------------------------------------------------
 
 
 @pytest.mark.slow
