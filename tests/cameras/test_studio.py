@@ -274,8 +274,10 @@ def test_a_picked_pixel_returns_the_point_seen_there(session: Session) -> None:
     cube = view.step.poses[0, list(view.task.geometry.body_names).index("cube")]
     # From the side away from the robot, level with the cube.
     x, y, z = (float(v) for v in cube[:3])
-    beside = replace(camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0))
-    session.happen(CameraPlaced(BASE, beside))
+    next_to_cube = replace(
+        camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0)
+    )
+    session.happen(CameraPlaced(BASE, next_to_cube))
     session.do(PickPixel(x=0.5, y=0.5))
     picked = settled(session, lambda s: s.results.picked is not None, "the pixel").results.picked
     assert picked.body == "cube" and abs(picked.depth - 0.38) < 2e-3

@@ -136,7 +136,7 @@ def same(ours: Any, stock: Any) -> bool:
     return ours == stock or type(ours) is type(stock)
 
 
-def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
+def test_info_equals_stock_maniskills(odd_task: Path) -> None:
     ours: Any = workbench.make(odd_task, 1, **CPU, rules="stop")
     stock: Any = gym.make("OddEntries-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
     for env in (ours, stock):

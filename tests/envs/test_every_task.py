@@ -72,11 +72,11 @@ def test_a_fault_that_upstream_fixed_fails_the_exercise(
     renderer: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     faulty = FAULTS[0]
-    mended = Fault(
+    fixed = Fault(
         ("MS-CartpoleBalance-v1",), faulty.stage, faulty.file, faulty.line, faulty.why, faulty.upstream
     )
     # Patch the function's globals: pytest may have imported its module twice.
-    monkeypatch.setitem(exercise.__globals__, "faults_of", lambda env_id: {mended.stage: mended})
+    monkeypatch.setitem(exercise.__globals__, "faults_of", lambda env_id: {fixed.stage: fixed})
     row = exercise("MS-CartpoleBalance-v1")
     assert row.outcome == "failed" and "upstream fixed" in row.notes[0], row
 

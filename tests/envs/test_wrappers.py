@@ -127,7 +127,7 @@ def record(env: Any, tmp_path: Path, **kwargs: Any) -> Any:
     return RecordEpisode(env, str(tmp_path), trajectory_name="episodes", **{"save_video": False, **kwargs})
 
 
-def test_recorded_episodes_are_what_happened(child_process: None, tmp_path: Path) -> None:
+def test_recorded_episodes_equal_the_steps_taken(child_process: None, tmp_path: Path) -> None:
     env = ManiSkillVectorEnv(record(made(max_episode_steps=5), tmp_path), ignore_terminations=True)
     obs, _ = env.reset(seed=[3, 4, 5, 6])
     seen, actions, states = [obs], [], [env.base_env.get_state_dict()]
@@ -163,7 +163,7 @@ def test_recorded_episodes_are_what_happened(child_process: None, tmp_path: Path
             assert trajectory["truncated"][:].tolist() == [False] * 4 + [True] * (env_of != 2)
 
 
-def test_stock_maniskill_replays_what_was_recorded(child_process: None, tmp_path: Path) -> None:
+def test_stock_maniskill_replays_recorded_episodes(child_process: None, tmp_path: Path) -> None:
     """ManiSkill's own tool replays in its single CPU env, from the recorded first state."""
     env = record(made(num_envs=2, max_episode_steps=6), tmp_path)
     env.reset(seed=[3, 4])

@@ -22,8 +22,8 @@ VENV = ROOT / ".venv-gpu"
 PYTHON = VENV / "bin" / "python"
 HOME = VENV / "home"
 """HOME during the checks: SAPIEN stores PhysX's GPU library there and not in the user's own home."""
-MINUTES = 8
-FETCH_SECONDS = 120
+TIMEOUT_MINUTES = 8
+DOWNLOAD_TIMEOUT_SECONDS = 120
 TEST_PACKAGES = ("pytest", "pytest-timeout")
 
 
@@ -52,13 +52,21 @@ def main() -> None:
     command = [str(PYTHON), "-m", "pytest", "-m", "gpu", "-v", "-rs", "--timeout", "150", "tests/gpu"]
     environment = {**os.environ, "HOME": str(HOME), "MS_ASSET_DIR": str(assets())}
     done = subprocess.run(
-        ["timeout", "--signal=INT", "--kill-after=20", str(60 * MINUTES), *command, *pytest_arguments],
+        [
+            "timeout",
+            "--signal=INT",
+            "--kill-after=20",
+            str(60 * TIMEOUT_MINUTES),
+            *command,
+            *pytest_arguments,
+        ],
         cwd=ROOT,
         env=environment,
     )
     if done.returncode in (124, 137):
         print(
-            f"The checks did not end within {MINUTES} minutes; the results above are valid.", file=sys.stderr
+            f"The checks did not end within {TIMEOUT_MINUTES} minutes; the results above are valid.",
+            file=sys.stderr,
         )
     sys.exit(done.returncode)
 
@@ -119,7 +127,7 @@ def place_physx(library: Path | None) -> None:
             subprocess.run(
                 [str(PYTHON), "-c", "import sapien.physx as p; p.enable_gpu()"],
                 env={**os.environ, "HOME": str(HOME)},
-                timeout=FETCH_SECONDS,
+                timeout=DOWNLOAD_TIMEOUT_SECONDS,
                 check=True,
                 capture_output=True,
             )

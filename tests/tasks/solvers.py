@@ -15,10 +15,10 @@ def open_drawer(obs: torch.Tensor) -> torch.Tensor:
     """Solve articulated.py: lower the closed fingers behind the handle and pull."""
     tcp, handle = obs[:, 18:21], obs[:, 25:28]
     behind = handle + torch.tensor([0.021, 0.0, 0.0])
-    beside = (tcp[:, :2] - behind[:, :2]).norm(dim=1) > 0.012
+    not_above = (tcp[:, :2] - behind[:, :2]).norm(dim=1) > 0.012
     hooked = (tcp[:, 2] < handle[:, 2] + 0.01) & ((tcp[:, 1] - handle[:, 1]).abs() < 0.04)
     target = behind.clone()
-    target[beside, 2] = handle[beside, 2] + 0.08
+    target[not_above, 2] = handle[not_above, 2] + 0.08
     target[hooked] = behind[hooked] - torch.tensor([0.03, 0.0, 0.01])
     return torch.cat([_towards(target - tcp), torch.full((len(obs), 1), SHUT)], dim=1)
 
@@ -53,14 +53,14 @@ def _lift(
     """
     above = offset.clone()
     above[:, 2] += 0.1
-    beside = offset[:, :2].norm(dim=1) > 0.01
+    not_above = offset[:, :2].norm(dim=1) > 0.01
     there = offset.norm(dim=1) < 0.015
     taken = _taken(fingers, offset)
     up = torch.zeros_like(offset)
     up[:, 2] = (0.16 - height).clamp(-0.02, 0.02)
     if may is not None:
         up[~may] = 0
-    move = torch.where((beside & ~taken)[:, None], above, offset)
+    move = torch.where((not_above & ~taken)[:, None], above, offset)
     move = torch.where(taken[:, None], up, move)
     hand = torch.where(there | taken, SHUT, OPEN)
     return torch.cat([_towards(move), hand[:, None]], dim=1)

@@ -101,7 +101,7 @@ def test_a_restored_episode_is_repeatable(
         assert [s[env] for s in first] == [s[env] for s in second]
 
 
-# A seed for which the uninterrupted run differs in envs without `begin_anew`.
+# With this seed the uninterrupted run differs in envs without `begin_anew`.
 def test_after_begin_anew_a_restore_equals_the_uninterrupted_run(stack: BaseEnv) -> None:
     stack.reset(seed=list(range(218, 218 + N)))
     after(stack, random_actions(stack, 5, 218))
