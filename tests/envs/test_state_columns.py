@@ -57,7 +57,7 @@ def test_kinematic_actors_have_zero_velocity_even_after_a_write() -> None:
 
 class Observes(PICK_CUBE):
     evaluated: ClassVar[list[int]] = []
-    """On the class, since reading the names restores the env's own attributes."""
+    """Kept on the class, since reading the names restores the env's own attributes."""
 
     def evaluate(self) -> dict[str, Any]:
         self.evaluated.append(1)

@@ -300,7 +300,7 @@ def test_applied_writes_are_not_reported(run: Hook) -> None:
 
 
 def test_targets_that_a_controller_sets_between_substeps_are_reported(strict: Any) -> None:
-    """On the GPU they are never applied: ManiSkill applies targets before the first substep only."""
+    """The GPU never applies such targets: ManiSkill applies targets before the first substep only."""
     strict.reset(seed=[0, 1, 2])
     controller = strict.agent.controller.controllers["arm"]
     stock = controller.before_simulation_step

@@ -190,7 +190,7 @@ class SetsJointsOneByOne(Written):
 
 
 class ChangesWhatIsFixedOnTheGpu(Written):
-    """The same numbers for all envs: ManiSkill's setters take one."""
+    """Sets the same numbers in all envs, since ManiSkill's setters take one value."""
 
     resets = 0
 

@@ -41,7 +41,7 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = tuple(sorted(file.stem for file in (ROOT / "tasks").glob("*.py")))
 FROM_TEMPLATES = tuple(f"template {template.name}" for template in TEMPLATES)
 COMMAND_TIMEOUT_SECONDS = 1800.0
-"""For one command; generous for a busy machine."""
+"""Timeout of one command; generous for a busy machine."""
 ALONE = ("--workers", "1", "--num-envs", "2")
 FEW_CANDIDATES = "--rollouts", "4", "--knots", "2"
 FEW: Mapping[str, Sequence[str]] = {

@@ -74,7 +74,7 @@ class Row:
     seconds: float = 0.0
     """CPU seconds of all episodes, including opening the task."""
     returns: dict[str, float] = field(default_factory=dict)
-    """For a control task, the mean reward per step of random and of zero actions."""
+    """Mean reward per step of random and of zero actions; for control tasks only."""
     error: str = ""
     """Why it cannot be planned."""
     day: str = ""
