@@ -59,8 +59,8 @@ def test_a_task_can_be_opened_checked_recorded_rescored_exported_and_solved(
 def require_success(task: str, walked: Iterable[Ran]) -> None:
     for ran in walked:
         assert ran.code in (0, 1) or (ran.command == "solve" and task in NO_PLAN and ran.code == 2), ran.err
-        if ran.told is not None and ran.command in ("open", "check"):
-            states = {one["rule"]: one["state"] for one in ran.told["rules"]}
+        if ran.output is not None and ran.command in ("open", "check"):
+            states = {one["rule"]: one["state"] for one in ran.output["rules"]}
             assert states.keys() == RULES and ran.rules("failed") == {}
             if task not in built_in():
                 assert ran.broken == []
