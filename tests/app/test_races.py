@@ -15,7 +15,7 @@ from websockets.sync.connection import Connection
 from tests.drive.panels import Panels
 from tests.drive.session import wait_until
 from tests.drive.tabs import handshake, tabs_of
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from workbench.app.live_page import Page
 from workbench.app.server import App
 from workbench.app.session import Session
@@ -50,7 +50,7 @@ class Pressing:
             self._channel.send(json.dumps({"n": self._sent, "do": [name, fields]}))
 
     def hears(self, count: int = 1) -> list[dict[str, Any]]:
-        return [json.loads(self._channel.recv(PATIENCE)) for _ in range(count)]
+        return [json.loads(self._channel.recv(TIMEOUT_SECONDS)) for _ in range(count)]
 
 
 class Two:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.drive.live import HandedSession
+from tests.drive.live import StubSession
 from tests.drive.panels import Panels
 from tests.drive.scenes import description, running, table_scene
 from workbench.cameras.commands import ReturnToKept, SaveCameraChange, ToggleWantedObject
@@ -129,7 +129,7 @@ def looked_at(now: CameraSettings = SETTINGS, in_file: CameraSettings = SETTINGS
 
 
 def test_a_placement_is_compared_with_that_of_the_file_before_it_was_saved(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraCompare(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
 
@@ -148,7 +148,7 @@ def test_a_placement_is_compared_with_that_of_the_file_before_it_was_saved(panel
 
 
 def test_a_placement_that_was_kept_is_what_it_is_then_compared_with_and_returns_to(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraCompare(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
     session.shown = looked_at()
@@ -165,7 +165,7 @@ def test_a_placement_that_was_kept_is_what_it_is_then_compared_with_and_returns_
 
 
 def test_a_box_around_the_eye_is_searched_until_one_is_written(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraSuggest(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
 
@@ -189,7 +189,7 @@ def test_a_box_around_the_eye_is_searched_until_one_is_written(panels: Panels) -
 
 
 def test_a_camera_is_measured_over_what_was_chosen(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraReportPanel(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
     session.shown = looked_at()
@@ -213,7 +213,7 @@ class Writing:
     """The places where changes of the file are asked for."""
 
     def __init__(self, panels: Panels) -> None:
-        self.panels, self.session = panels, HandedSession()
+        self.panels, self.session = panels, StubSession()
         above = panels.server.gui.add_folder(None)
         self.part = WriteToFile(panels.server, cast(Any, self.session), lambda _, lens: lens, above)
         panels.visitors.do = self.do
@@ -294,7 +294,7 @@ def why_not(do: Callable[[], object]) -> str:
 
 
 def test_a_pasted_calibration_is_read_as_was_chosen(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraExport(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
     session.shown = looked_at()

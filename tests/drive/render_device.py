@@ -1,4 +1,4 @@
-"""The one device on which this machine's tests render: SAPIEN has one in a process, under one name."""
+"""The device on which this machine's tests render: SAPIEN allows one per process, under one name."""
 
 import torch
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import heard, runs, save, wait_until
+from tests.drive.session import after_worker_reply, runs, save, wait_until
 from workbench.app.session import Session
 from workbench.live.commands import ChooseClass, PauseRun, PlayRun, RebuildScene, ReloadFile, Step
 from workbench.live.events import EnvsReset
@@ -58,7 +58,7 @@ def played(session: Session, steps: int) -> SessionView:
     session.do(PauseRun())
     wait_until(session, lambda v: not v.playing and v.state == "paused", "the pause")
     # What the worker sends after it has paused comes before its answer.
-    return heard(session)
+    return after_worker_reply(session)
 
 
 def test_a_patch_keeps_moment_past_and_selection_and_shows_new_numbers_while_paused(

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from tests.drive.session import Told, heard, live_session, start_over, step, wait_until
+from tests.drive.session import Told, after_worker_reply, live_session, start_over, step, wait_until
 from workbench.app.session import Session
 from workbench.live.commands import PauseRun, PlayRun, Step
 from workbench.live.events import ActionTold, EnvsReset, PagesCounted
@@ -53,7 +53,7 @@ def test_a_single_step_ends_playing(session: Session) -> None:
     session.do(Step())
     serials = []
     for _ in range(20):  # a worker that played on would take some ten steps meanwhile
-        serials.append(heard(session).step_serial)
+        serials.append(after_worker_reply(session).step_serial)
     session.change(speed=1.0)
     assert len(set(serials)) == 1 and session.view().state == "paused"
 

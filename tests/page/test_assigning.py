@@ -14,7 +14,7 @@ import pytest
 import viser
 import viser.uplot as uplot
 
-from tests.drive.panels import told_so_far
+from tests.drive.panels import messages_sent
 
 Make = Callable[[viser.ViserServer], Any]
 LINES = np.zeros((2, 2, 3), np.float32)
@@ -94,9 +94,9 @@ def server() -> Iterator[viser.ViserServer]:
 
 
 def sent_by(server: viser.ViserServer, handle: Any, name: str, value: object) -> int:
-    before = told_so_far(server)
+    before = messages_sent(server)
     setattr(handle, name, value)
-    return told_so_far(server) - before
+    return messages_sent(server) - before
 
 
 @pytest.mark.parametrize(("kind", "name", "value"), SKIPPED)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from workbench.machine.loop import do, result_of
 from workbench.start import catalogue as catalogue_module
 from workbench.start import registered as registered_module
@@ -180,14 +180,14 @@ def test_what_changes_behind_a_search_that_is_under_way_is_found_by_the_next(
     def slow(*asked: Any) -> Any:
         found = search(*asked)
         passed_by.set()
-        go_on.wait(PATIENCE)
+        go_on.wait(TIMEOUT_SECONDS)
         return found
 
     catalogue, file = made(), tmp_path / "work" / "push.py"
     file.write_text(TASK)
     monkeypatch.setattr(catalogue_module, "find_task_files", slow)
     catalogue.refresh()
-    assert passed_by.wait(PATIENCE)
+    assert passed_by.wait(TIMEOUT_SECONDS)
     file.unlink()
     catalogue.refresh()
     go_on.set()

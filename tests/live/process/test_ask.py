@@ -16,7 +16,7 @@ from typing import Any
 import psutil
 import pytest
 
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from tests.live.hazards import calm, provoke, provoked, write_task
 from workbench.cameras.questions import MeasureCamera
 from workbench.live.messages import Answer, Load, Progress, Request, Reset
@@ -51,7 +51,7 @@ class Line:
         self.calls.put(request)
 
     def next(self) -> int:
-        return self.calls.get(timeout=PATIENCE).number
+        return self.calls.get(timeout=TIMEOUT_SECONDS).number
 
     def take(self, event: Answer | Progress) -> None:
         do(lambda: self.asker.take(event))
@@ -81,13 +81,13 @@ def begun(work: Coroutine[Any, Any, Any]) -> Future[Any]:
 def test_two_that_ask_at_once_each_hear_their_own_whatever_comes_first() -> None:
     line = Line()
     asked = [line.ask(Reset((env,), env)) for env in range(2)]
-    calls: list[Any] = [line.calls.get(timeout=PATIENCE) for _ in range(2)]
+    calls: list[Any] = [line.calls.get(timeout=TIMEOUT_SECONDS) for _ in range(2)]
     line.take(Answer(99, why="nobody's"))
     for call in reversed(calls):
         line.take(Answer(call.number, why=f"env {call.request.env_idx[0]}"))
     for env, future in enumerate(asked):
         with pytest.raises(JobFailed, match=f"env {env}"):
-            future.result(timeout=PATIENCE)
+            future.result(timeout=TIMEOUT_SECONDS)
 
 
 def test_progress_comes_in_order_before_the_answer_and_an_answer_brings_its_problem() -> None:
@@ -99,12 +99,12 @@ def test_progress_comes_in_order_before_the_answer_and_an_answer_brings_its_prob
         line.take(Progress(number, done, 3, pack(f"state {done}")))
     line.take(Answer(number, why="no such camera", problem=PROBLEM))
     with pytest.raises(JobFailed, match="no such camera") as failed:
-        asked.result(timeout=PATIENCE)
+        asked.result(timeout=TIMEOUT_SECONDS)
     assert failed.value.problem is PROBLEM and heard == [(done, 3, f"state {done}") for done in range(3)]
     asked = line.ask(question(0))
     line.take(Answer(line.next(), pack(("no", "report"))))
     with pytest.raises(JobFailed, match="unreadable"):
-        asked.result(timeout=PATIENCE)
+        asked.result(timeout=TIMEOUT_SECONDS)
 
 
 def test_who_is_stopped_waits_no_longer_and_a_late_answer_is_nobody_s() -> None:
@@ -118,7 +118,7 @@ def test_who_is_stopped_waits_no_longer_and_a_late_answer_is_nobody_s() -> None:
     assert second != number
     line.take(Answer(second, why="mine"))
     with pytest.raises(JobFailed, match="mine"):
-        again.result(timeout=PATIENCE)
+        again.result(timeout=TIMEOUT_SECONDS)
 
 
 # --- a process in the background ---------------------------------------------------------------------------
@@ -156,10 +156,10 @@ def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another
         assert asked.cancel()
     else:
         with pytest.raises(JobFailed):
-            asked.result(timeout=PATIENCE)
+            asked.result(timeout=TIMEOUT_SECONDS)
     until(lambda: not (pid and psutil.pid_exists(pid)), "its end")
     calm(file)
-    in_turns(background, job, lambda: background.ensure(job, load)).result(timeout=PATIENCE)
+    in_turns(background, job, lambda: background.ensure(job, load)).result(timeout=TIMEOUT_SECONDS)
     assert background.pid is not None
 
 
@@ -195,15 +195,15 @@ def test_what_is_loaded_is_loaded_once_and_what_dies_or_fails_is_loaded_anew(
         other = load_of(tmp_path / "other")
         assert await background.ensure(job, replace(load, level="rebuilt"), or_else=other) == 1
 
-    first = in_turns(background, job, work).result(timeout=PATIENCE)
-    in_turns(background, job, lambda: again(first)).result(timeout=PATIENCE)
+    first = in_turns(background, job, work).result(timeout=TIMEOUT_SECONDS)
+    in_turns(background, job, lambda: again(first)).result(timeout=TIMEOUT_SECONDS)
 
 
 @pytest.mark.parametrize("aside", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_job_that_was_begun_last_comes_first_and_what_gave_way_is_done_again(
     background: Background, tmp_path: Path, aside: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(askers, "_CANCEL_TIMEOUT_SECONDS", PATIENCE)  # also of a machine that is busy
+    monkeypatch.setattr(askers, "_CANCEL_TIMEOUT_SECONDS", TIMEOUT_SECONDS)  # also of a machine that is busy
     load = load_of(tmp_path)
     done, under_way, seen = list[str](), threading.Event(), threading.Event()
     pids = set[int | None]()
@@ -231,9 +231,9 @@ def test_the_job_that_was_begun_last_comes_first_and_what_gave_way_is_done_again
     job.report = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
     # It would go on for ever if it did not give way.
     side = in_turns(background, job, lambda: side_work(job), "low" if aside else "person")
-    assert under_way.wait(PATIENCE)
-    in_turns(background, waiting, lambda: somebody_waits(waiting)).result(PATIENCE)
-    side.result(PATIENCE)
+    assert under_way.wait(TIMEOUT_SECONDS)
+    in_turns(background, waiting, lambda: somebody_waits(waiting)).result(TIMEOUT_SECONDS)
+    side.result(TIMEOUT_SECONDS)
     assert done == ["begins", "answered", "begins", "ends"] and told[-1] == askers.WAITING
     assert len(pids) == 1, "what was left gave its answer in time, and its process goes on"
 
@@ -256,7 +256,7 @@ def test_two_that_are_stopped_at_once_leave_the_process_to_the_next(background: 
     do(stop)
     until(lambda: all(task.done() for task in tasks), "their end")
     assert all(task.cancelled() for task in tasks)
-    assert in_turns(background, Job("next"), at_once).result(PATIENCE) == "done"
+    assert in_turns(background, Job("next"), at_once).result(TIMEOUT_SECONDS) == "done"
 
 
 @pytest.mark.slow
@@ -281,7 +281,7 @@ def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes
 
     stopped, before, aside, last = (Job("one of four") for _ in range(4))
     fails = in_turns(background, last, lambda: work(last, waits=True))
-    assert has_it.wait(PATIENCE)
+    assert has_it.wait(TIMEOUT_SECONDS)
     low = in_turns(background, aside, nothing, "low")
     queue = in_turns(background, before, lambda: work(before))
     given_up = in_turns(background, stopped, lambda: work(stopped))
@@ -289,9 +289,9 @@ def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes
     os.kill(pids[0] or 0, signal.SIGKILL)
     do(killed.set)
     with pytest.raises(ProcessDied, match="SIGKILL"):
-        fails.result(timeout=PATIENCE)
-    queue.result(timeout=PATIENCE)
-    low.result(timeout=PATIENCE)
+        fails.result(timeout=TIMEOUT_SECONDS)
+    queue.result(timeout=TIMEOUT_SECONDS)
+    low.result(timeout=TIMEOUT_SECONDS)
     assert done == ["person", "low"] and pids[1] == background.pid not in (None, pids[0])
 
 
@@ -300,7 +300,7 @@ def test_a_process_that_nobody_wants_is_ended_and_one_that_is_wanted_is_not(
     background: Background, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     load, job = load_of(tmp_path), Job("rescoring")
-    in_turns(background, job, lambda: background.ensure(job, load)).result(PATIENCE)
+    in_turns(background, job, lambda: background.ensure(job, load)).result(TIMEOUT_SECONDS)
     monkeypatch.setattr(askers, "IDLE_SECONDS", 0.0)
     first = background.pid
     assert first is not None, "it is kept for the next job"
@@ -308,7 +308,7 @@ def test_a_process_that_nobody_wants_is_ended_and_one_that_is_wanted_is_not(
     async def look() -> None:
         assert background.has_loaded(load) and background.pid == first
 
-    in_turns(background, job, look).result(PATIENCE)
+    in_turns(background, job, look).result(TIMEOUT_SECONDS)
     until(lambda: background.pid is None, "its end")
     assert not psutil.pid_exists(first)
 
@@ -323,4 +323,4 @@ def test_a_long_question_outside_a_turn_is_no_idleness(
         await background.ensure(job, load)
         return await background.ensure(job, replace(load, level="rebuilt"))
 
-    assert begun(work()).result(PATIENCE) == 1
+    assert begun(work()).result(TIMEOUT_SECONDS) == 1

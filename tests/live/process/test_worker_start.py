@@ -13,7 +13,7 @@ import pytest
 
 from tests.drive.processes import workers_of
 from tests.drive.session import live_session, wait_until
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from tests.live.hazards import write_task
 from workbench.live.process import worker_process, worker_start
 from workbench.live.process.worker_process import WorkerProcess
@@ -59,7 +59,7 @@ def is_fork(worker: WorkerProcess) -> bool:
 
 def ends_as_asked(worker: WorkerProcess) -> bool:
     """With as much time as a busy machine may need."""
-    worker.stop(grace=PATIENCE)
+    worker.stop(grace=TIMEOUT_SECONDS)
     return worker.exit_code() == 0
 
 

@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 from tests.drive.tabs import handshake, tabs_of
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from workbench.commands import COMMANDS
 from workbench.live.commands import SetSeed, Step, TogglePlay
 from workbench.live.env_commands import NextEnv, SelectEnv
@@ -45,7 +45,7 @@ class House:
         return None
 
     async def _wait(self, command: Command, visitor: Visitor) -> None:
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(TIMEOUT_SECONDS):
             while not self.go_on.is_set():
                 await asyncio.sleep(0.01)
         self.came.append((visitor.name, command))
@@ -78,7 +78,7 @@ def say(channel: Connection, number: int, name: str, **fields: Any) -> None:
 
 
 def reply(channel: Connection) -> dict[str, Any]:
-    return json.loads(channel.recv(PATIENCE))
+    return json.loads(channel.recv(TIMEOUT_SECONDS))
 
 
 def test_commands_are_done_in_order_and_each_is_answered(house: House) -> None:
@@ -159,7 +159,7 @@ def test_what_is_no_command_ends_that_connection_and_no_other(house: House, raw:
     with house.open(one) as channel, house.open(other) as beside:
         channel.send(raw)
         with pytest.raises(ConnectionClosed) as closed:
-            channel.recv(PATIENCE)
+            channel.recv(TIMEOUT_SECONDS)
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
         say(beside, 1, "step")
         assert reply(beside) == {"n": 1}
@@ -169,7 +169,7 @@ def test_what_is_no_command_ends_that_connection_and_no_other(house: House, raw:
 def test_who_is_no_open_page_is_sent_away(house: House) -> None:
     for name in ("", "made-up", house.names()[0][:-1]):
         with house.open(name) as channel, pytest.raises(ConnectionClosed):
-            channel.recv(PATIENCE)
+            channel.recv(TIMEOUT_SECONDS)
     address, how = handshake(house.gated_server.url.replace("token=", "token=x"))
     del how["subprotocols"]
     with pytest.raises(InvalidHandshake):
