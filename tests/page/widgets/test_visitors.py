@@ -1,4 +1,4 @@
-"""The channel of commands: numbered, in order, one reply each; what is no command ends it."""
+"""The command channel: numbered commands, in order, one reply each; an invalid message closes it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from workbench.page.widgets.visitors import PATH, Done, Visitor, Visitors
 
 @dataclass
 class House:
-    """Two open pages, and what they asked for."""
+    """Two open pages, and the commands that they sent."""
 
     gated_server: GatedServer
     visitors: Visitors
@@ -81,7 +81,7 @@ def reply(channel: Connection) -> dict[str, Any]:
     return json.loads(channel.recv(TIMEOUT_SECONDS))
 
 
-def test_commands_are_done_in_order_and_each_is_answered(house: House) -> None:
+def test_commands_run_in_order_and_each_is_answered(house: House) -> None:
     one, other = house.names()
     with house.open(one) as channel, house.open(other) as beside:
         for number in range(1, 21):
@@ -95,7 +95,7 @@ def test_commands_are_done_in_order_and_each_is_answered(house: House) -> None:
     assert (other, Step()) in house.came
 
 
-def test_a_page_that_waits_does_not_hold_up_another(house: House) -> None:
+def test_a_page_that_waits_does_not_block_another(house: House) -> None:
     one, other = house.names()
     with house.open(one) as channel, house.open(other) as beside:
         say(channel, 1, "next_env")
@@ -120,7 +120,7 @@ def test_a_page_that_waits_does_not_hold_up_another(house: House) -> None:
         ("set_seed", {"seed": True}),
     ],
 )
-def test_what_a_command_does_not_take_is_refused_in_words_and_the_next_is_done(
+def test_invalid_fields_are_refused_with_a_reason_and_the_next_command_runs(
     house: House, name: str, fields: dict[str, Any]
 ) -> None:
     with house.open(house.names()[0]) as channel:
@@ -131,7 +131,7 @@ def test_what_a_command_does_not_take_is_refused_in_words_and_the_next_is_done(
     assert [command for _, command in house.came] == [SetSeed(seed=12)]
 
 
-def test_a_command_that_fails_costs_itself_alone(house: House, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_command_affects_nothing_else(house: House, caplog: pytest.LogCaptureFixture) -> None:
     with house.open(house.names()[0]) as channel:
         say(channel, 1, "toggle_play")
         say(channel, 2, "step")
@@ -154,7 +154,7 @@ def test_a_command_that_fails_costs_itself_alone(house: House, caplog: pytest.Lo
         b"\xff\xfe",
     ],
 )
-def test_what_is_no_command_ends_that_connection_and_no_other(house: House, raw: str | bytes) -> None:
+def test_an_invalid_message_closes_only_its_own_connection(house: House, raw: str | bytes) -> None:
     one, other = house.names()
     with house.open(one) as channel, house.open(other) as beside:
         channel.send(raw)
@@ -166,7 +166,7 @@ def test_what_is_no_command_ends_that_connection_and_no_other(house: House, raw:
     assert [command for _, command in house.came] == [Step()]
 
 
-def test_who_is_no_open_page_is_sent_away(house: House) -> None:
+def test_a_client_that_is_not_an_open_page_is_refused(house: House) -> None:
     for name in ("", "made-up", house.names()[0][:-1]):
         with house.open(name) as channel, pytest.raises(ConnectionClosed):
             channel.recv(TIMEOUT_SECONDS)
@@ -176,8 +176,8 @@ def test_who_is_no_open_page_is_sent_away(house: House) -> None:
         connect(f"{address.rstrip('/')}{PATH}?page={house.names()[0]}", proxy=None, **how)
 
 
-def test_each_command_says_what_it_does_and_has_a_key_of_its_own() -> None:
+def test_each_command_has_a_description_and_a_unique_key() -> None:
     helps = [kind.help() for kind in COMMANDS]
     assert all(helps) and len(set(helps)) == len(helps)
     for kind, key in COMMANDS.keys().items():
-        assert isinstance(kind(), Command) and key.command in COMMANDS, "a key asks with default values"
+        assert isinstance(kind(), Command) and key.command in COMMANDS, "a key sends default values"
