@@ -119,7 +119,7 @@ def test_going_live_in_the_open_task_is_immediate_and_switches_the_page_even_if_
     desk.go(0, state=3)
     assert desk.person.asked == 0 and desk.opened == [] and desk.app.shared.session is desk.live
     until(lambda: desk.live.view().timeline.entered, "the recorded state")
-    desk.is_led_to_the_live_page()
+    desk.wait_for_the_live_page()
     assert not desk.go_live.can_go_home()
 
 
@@ -130,7 +130,7 @@ def test_a_failure_while_going_live_shows_the_live_page_but_an_earlier_failure_d
     time.sleep(0.2)  # time in which a failure would switch the page
     assert desk.go_live.going() == "restoring Push-v1 at step 2 …" and desk.shown == []
     desk.live._take(TaskFailed(problem(), kept=True))
-    desk.is_led_to_the_live_page()
+    desk.wait_for_the_live_page()
 
 
 def test_another_task_is_opened_next_to_the_open_one_after_consent(desk: Desk) -> None:
@@ -145,7 +145,7 @@ def test_another_task_is_opened_next_to_the_open_one_after_consent(desk: Desk) -
     assert desk.opened == ["Pull-v1"] and desk.go_live.can_go_home()
     until(lambda: not desk.live.view().playing, "the pause of the hidden task")
     until(lambda: desk.other.view().timeline.entered, "the recorded state")
-    desk.is_led_to_the_live_page()
+    desk.wait_for_the_live_page()
     desk.part.draw(desk.app.shared.recordings.review.view())
     desk.panels.press("Back to the first task")
     assert desk.app.shared.session is desk.live and not desk.go_live.can_go_home()
