@@ -1,7 +1,7 @@
-"""Takes the pictures of the gallery, one of each example: .venv/bin/python tests/browser/gallery_pictures.py [NAME ...]
+"""Takes the gallery's pictures, one per example: .venv/bin/python tests/browser/gallery_pictures.py [NAME ...]
 
 Not a test. It opens each example on the real page and writes ``web_assets/screenshots/dark/gallery_NAME.webp`` and
-``light/``. Names choose among `VIEWS`; without one, all are taken, in some fifteen minutes.
+``light/``. Names select from `VIEWS`; without any, all are taken, in about fifteen minutes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.take_screenshots import POLICY, Desk, as_a_new_person, picture_of
+from tests.browser.take_screenshots import POLICY, Desk, picture_of, with_empty_settings
 from tests.drive.page import browser_at, close_notice, new_page, open_workbench
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
@@ -111,7 +111,7 @@ def take(browser: Browser, name: str, view: View) -> None:
 
 
 def turn(page: Page, view: View) -> None:
-    """Drag the view, and turn the wheel over it."""
+    """Rotate the view by a drag and zoom it with the wheel."""
     x, y = MIDDLE
     page.mouse.move(x, y)
     if view.turned != (0, 0):
@@ -146,7 +146,7 @@ def main(names: list[str]) -> None:
     unknown = set(names) - VIEWS.keys()
     if unknown:
         sys.exit(f"no such picture: {', '.join(sorted(unknown))}; there are {', '.join(VIEWS)}")
-    as_a_new_person()
+    with_empty_settings()
     for name, view in VIEWS.items():
         if not names or name in names:
             with browser_at(chromium) as browser:

@@ -1,4 +1,4 @@
-"""Finds what a person would call badly laid out: text that is cut or covered, buttons that touch."""
+"""Finds layout defects: text that is cut off or covered, buttons that touch."""
 
 FAULTS = r"""() => {
     const faults = new Set();
