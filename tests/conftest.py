@@ -196,7 +196,7 @@ def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 _searched = 0
-"""How many modules there were when garbage was last searched for among all objects."""
+"""Number of loaded modules at the last full garbage collection."""
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -186,12 +186,12 @@ class LeaveOut(Operator):
 class Mutant:
     module: str
     number: int
-    """Of the line, from 1."""
+    """1-based line number."""
     line: str
     becomes: str
-    """Both stripped: how `REASONS` knows it again, wherever the line moves."""
+    """Line and replacement are stripped, so ``--lived`` finds the mutant again after the line has moved."""
     code: str
-    """The whole file with the slip in it."""
+    """The whole file with the mutation."""
 
 
 @dataclass(frozen=True)

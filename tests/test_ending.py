@@ -46,7 +46,7 @@ def test_a_hanging_worker_ends_with_its_server(tmp_path: Path, number: signal.Si
     provoke(file, "build", "catch")
     with open_workbench(str(file), "--num-envs", "1", "--no-spare", cwd=tmp_path) as opened:
         server = psutil.Process(opened.process.pid)
-        until(lambda: provoked(file), "the building of the task")
+        until(lambda: provoked(file), "the build of the task")
         processes = [server, *server.children(recursive=True)]
         began = time.monotonic()
         server.send_signal(number)
@@ -83,7 +83,7 @@ def test_ctrl_c_ends_everything_that_can_be_running(tmp_path: Path) -> None:
         until(lambda: list((tmp_path / "recordings").glob("*.rrd")), "the first episodes")
         file.write_text(file.read_text().replace("> 0.05}", "> 0.06}"))
         opened.wait_for_line("patched", 90)
-        until(lambda: len(workers_of(server)) == 3, "the spare worker and the judging one")
+        until(lambda: len(workers_of(server)) == 3, "the spare worker and the rescoring process")
         provoke(file, "evaluate", "catch")
         until(lambda: provoked(file), "the loop")
         processes = [server, *server.children(recursive=True)]

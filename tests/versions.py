@@ -73,7 +73,7 @@ class Result:
     date: str
     maniskill: str
     versions: tuple[str, ...]
-    """Of `SHOWN`."""
+    """Versions of the packages in `SHOWN`."""
     passed: int
     failed: int
     skipped: int

@@ -90,7 +90,7 @@ EVENTS = st.one_of(
     st.builds(solver.PlanFailed, why, problems),
 )
 SEQUENCES = st.lists(st.tuples(EVENTS, st.sampled_from(RUNS)), max_size=40)
-"""Each event with the run after it."""
+"""(event, run after the event) pairs."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Feature:
     begins: type
     """The effect that begins its job."""
     ends: tuple[type, ...]
-    """The effect that ends the job, and what the job tells last."""
+    """The effect that ends the job, and the job's last event."""
 
 
 def without_before(apply: Callable[[Any, object, Run], Any]) -> Callable[[Any, object, Run, Run], Any]:

@@ -26,7 +26,7 @@ import pathlib, time
 while not pathlib.Path(__file__).with_name("drawn").exists():
     time.sleep(0.01)
 """
-"""A worker that was forked has loaded the task before a busy page is drawn for the first time."""
+"""Delays the load: a forked worker would load the task before a busy page is drawn for the first time."""
 
 
 @pytest.fixture(scope="module")

@@ -189,7 +189,7 @@ def test_a_press_retries_an_unreadable_recording(shown: Reviewed, folder: Path) 
     for path in files:
         path.write_bytes(b"cut off")
     shown.review.open([row.id])
-    until(lambda: not shown.review.view().loading, "that it cannot be read")
+    until(lambda: not shown.review.view().loading, "the failed read")
     shown.draw()
     assert "was not opened" in shown.part("Review").html() and shown.shows(TRY_AGAIN)
     for path, content in files.items():

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from tests.browser.take_screenshots import Desk
 
 SIZE = (960, 540)
-"""Of the page in the film, which it is taken at 1280 x 720 for."""
+"""Size of the page in the film, in pixels; it is taken at 1280 x 720."""
 STRIP = 64
-"""Pixels below it, for what happens."""
+"""Height in pixels of the caption strip below the page."""
 MAX_BYTES = 3_000_000
 QUALITIES = (80, 70, 60, 50, 40)
 REWARD = ("reach = 1 - torch.tanh(5 * distance)", "reach = 1 - torch.tanh(3 * distance)")

@@ -26,9 +26,9 @@ from workbench.machine.doctor import find_chromium, how_to_get_chromium
 ROOT = Path(__file__).parents[2]
 SOLVERS = ROOT / "tests" / "tasks" / "solvers.py"
 SIZE = (1120, 780)
-"""Of the page, whose timeline is cut off; help pages show the picture a little smaller."""
+"""Size of the page in pixels; its timeline is cut off. Help pages show the picture a little smaller."""
 MIDDLE = (390, 250)
-"""Of the view above the timeline, in pixels."""
+"""Middle of the view above the timeline, in pixels."""
 QUALITY = 70
 HAND = ("--env", "control_mode=pd_ee_delta_pos")
 
@@ -41,22 +41,22 @@ class View:
     envs: int = 16
     steps: int = 20
     policy: str = ""
-    """A function of `SOLVERS` or `POLICY`, as the page lists it; random actions without one."""
+    """A function in `SOLVERS` or `POLICY`, as the page lists it; empty for random actions."""
     arguments: tuple[str, ...] = ()
     keys: tuple[str, ...] = ()
-    """Pressed at the end."""
+    """Keys to press at the end."""
     turned: tuple[int, int] = (0, 0)
-    """Pixels that the view is dragged by, to be seen from another side."""
+    """Pixels by which the view is dragged, to rotate it."""
     nearer: int = 0
     """Notches of the mouse wheel."""
     show: str = ""
-    """What the Inspect tab shows."""
+    """The Inspect tab's choice."""
     all_cameras: bool = False
-    """Whether each is drawn, on the Cameras tab and in the view."""
+    """Draw every camera, on the Cameras tab and in the view."""
 
 
 ONE = ("o", "f")
-"""Shows one env, and frames it."""
+"""Keys that show one env and frame it."""
 VIEWS: dict[str, View] = {
     "minimal": View("Run"),
     "push_cube": View("Reward", 4, 13, "pusher.py:act", HAND, ONE, (-220, 0), 3),

@@ -99,4 +99,4 @@ FAULTS = r"""() => {
     });
     return [...faults].sort();
 }"""
-"""JavaScript: a line for each fault that is seen on the page now."""
+"""JavaScript that returns a line for each layout defect on the page."""

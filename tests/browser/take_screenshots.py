@@ -47,7 +47,7 @@ FRAME_SECONDS = 4.0
 class Desk:
     page: Page
     file: Path
-    """The task: a copy of the example."""
+    """The task file, a copy of the example."""
     theme: Literal["dark", "light"] = "dark"
 
     def tab(self, name: str) -> None:
@@ -447,7 +447,7 @@ SHOTS: dict[str, Callable[[Browser], None]] = {
     "sweep": shoot_sweep,
     "tutorial": shoot_tutorial,
 }
-"""``page`` takes run, cameras and banner too, ``review`` library and compare, ``tutorial`` all of its own."""
+"""``page`` also takes run, cameras and banner, ``review`` also library and compare, ``tutorial`` all of the tutorial."""
 
 
 def with_empty_settings() -> None:

@@ -26,7 +26,7 @@ FOLDERS = {
     "Suggest a placement": "Search",
     "Matrices and files": "Download",
 }
-"""And a button in each."""
+"""Report folders, and a button in each."""
 
 PLACES_OF_A_PILL = """
 window.places = [];
@@ -37,7 +37,7 @@ const look = () => {
 };
 look();
 """
-"""Frame by frame, from when there is one."""
+"""Records the button's place in every frame, from its first appearance."""
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +72,7 @@ def back_to_the_file(page: Page) -> None:
             press_tool(page, "Reset to file")
         return status.is_visible()
 
-    until(back, "the camera as the file has it")
-
-
-"""By how many pixels each scrollbar lies over the boxes that it scrolls."""
+    until(back, "the camera at the file's pose")
 
 
 def press(page: Page, name: str) -> None:
@@ -167,4 +164,7 @@ def test_placements_are_suggested_with_pictures_and_can_be_used(page: Page) -> N
     expect(page.locator(".wb-offer").first).to_contain_text(re.compile(r"cube: in (\d) of \1 envs"))
     take.first.click()
     expect(page.locator(".wb-offer").first).to_contain_text("in use")
-    until(lambda: not np.allclose(shown_matrix(page), before, atol=1e-3), "the camera where it was suggested")
+    until(
+        lambda: not np.allclose(shown_matrix(page), before, atol=1e-3),
+        "the camera at the suggested placement",
+    )

@@ -29,7 +29,7 @@ WebSocket.prototype.send = function (text) {
 };
 """
 LEAVES = "show_recordings", "show_live", "continue_live"
-"""What shows another page is not pressed."""
+"""Commands that show another page; their parts are not pressed."""
 PRESSED = "[data-do]" + "".join(f":not([data-do*={name}])" for name in LEAVES) + ", [data-copy]"
 MAX_PRESSES = 150
 TRIES = 5

@@ -19,7 +19,7 @@ from tests.drive.waiting import until
 
 pytestmark = pytest.mark.slow
 PICTURES = Path(__file__).parents[2] / "test-results" / "firefox"
-"""A picture of each tab, to be looked at."""
+"""A picture of each tab, for visual inspection."""
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from workbench.page.widgets.visitors import PATH, Visitor, Visitors
 pytestmark = pytest.mark.browser
 ROWS = 12
 DELAY_SECONDS = 0.2
-"""Seconds each way, over the far line."""
+"""One-way delay of the far line, in seconds."""
 MAX_SEED = 99
 
 
@@ -52,11 +52,11 @@ class SmallPage:
     came: list[Command] = field(default_factory=list)
     seed: int = 7
     swapped: bool = False
-    """The rows stand in another order."""
+    """Whether the rows are in another order."""
     still: bool = False
-    """They are not redrawn."""
+    """Whether the rows are not redrawn."""
     drawn_pause: bool = False
-    """What the page is told of the tick *Pause*."""
+    """The value that the page gets for the *Pause* checkbox."""
 
     def do(self, command: Command, visitor: Visitor) -> None:
         if isinstance(command, SetSeed):

@@ -149,7 +149,7 @@ def test_keys_move_down_and_the_page_scrolls_along(shown: Shown) -> None:
 def test_the_search_updates_while_typing(shown: Shown) -> None:
     field = shown.page.get_by_role("textbox").first
     field.fill("even r1")
-    until(lambda: shown.seeds() == [18, 16, 14, 12, 10], "what has those words")
+    until(lambda: shown.seeds() == [18, 16, 14, 12, 10], "the rows with those words")
     field.fill("zebra")
     expect(shown.page.get_by_text("No recording has “zebra”.")).to_be_visible()
     shown.page.get_by_text("Clear the filter").click()

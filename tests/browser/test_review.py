@@ -17,7 +17,7 @@ from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
 LATE_UPDATE_ERROR = "Tried to update non-existent component"
-"""What viser's page says in its console when a thing goes that was written to in the same moment."""
+"""Console error of viser's page when a component is removed while an update to it is in flight."""
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ window.requestAnimationFrame = (draw) => soon(() => setTimeout(() => {
 }, 60));
 """
 MIN_FRAMES = 60
-"""viser decides after ten quarters of a second in which frames follow each other."""
+"""viser decides after 2.5 s of continuous frames."""
 CANVAS = "document.querySelector('canvas[data-engine]')"
 Show = Callable[..., Page]
 
@@ -130,7 +130,7 @@ def test_meshes_are_simplified_only_while_every_page_uses_software_rendering(
     until(lambda: len(gated_server.server.get_clients()) == 1, "the page")
     assert not in_software.all_pages
     in_software.ask()
-    until(lambda: in_software.all_pages, "the page says so")
+    until(lambda: in_software.all_pages, "the page's report")
     geometry, poses = table_scene(100)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32))
@@ -142,8 +142,8 @@ def test_meshes_are_simplified_only_while_every_page_uses_software_rendering(
     other = show(GPU_JS)
     until(lambda: len(gated_server.server.get_clients()) == 2, "the other page")
     assert in_software.all_pages
-    until(lambda: not in_software.all_pages, "the other page has said nothing for long enough")
+    until(lambda: not in_software.all_pages, "the timeout of the other page's report")
     assert in_software.looks(DrawStyle(), geometry, layout, alone=False) == DrawStyle()
     other.close()
-    until(lambda: in_software.all_pages, "the other page is gone")
+    until(lambda: in_software.all_pages, "the end of the other page")
     page.close()

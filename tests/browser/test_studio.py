@@ -205,7 +205,7 @@ def test_a_camera_is_added_at_the_viewpoint_renamed_and_removed(page: Page, task
     until(lambda: sight.evaluate("e => e.naturalWidth") == 128, "its picture, before it is written")
     assert task_file.read_text() == before
     leave = page.get_by_role("button", name="Discard the change")
-    until(lambda: bottom_of(leave) < HEIGHT, "the last of it in sight")
+    until(lambda: bottom_of(leave) < HEIGHT, "the last control in view")
     leave.click()
     expect(page.locator(".wb-diff:visible")).to_have_count(0)
     button(page, "Add human view")

@@ -17,7 +17,7 @@ from workbench.machine.processes.family import family
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ARGUMENTS = "--num-envs 2 --env render_backend=none".split()
-"""Without pictures there are no shaders to wait for."""
+"""Without pictures there are no shaders to compile."""
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from tests.browser.take_screenshots import Desk
 
 SETTLE_SECONDS = 10.0
-"""Seconds after a save in which a busy machine too has built the envs again."""
+"""Time after a save in which even a busy machine has rebuilt the envs."""
 CHECK_TIMEOUT_MS = 300_000
-"""Milliseconds until all rules are checked there."""
+"""Timeout for checking all rules on a busy machine."""
 
 
 def take_steps(desk: Desk) -> None:

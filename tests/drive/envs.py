@@ -15,7 +15,7 @@ from workbench.envs.gpu_rules import Degree, Finding
 from workbench.envs.task_env import EnvOptions, make_env
 
 CPU: Any = {"backend": "cpu", "render_backend": "none"}
-"""For `workbench.make`, without a renderer."""
+"""Arguments of `workbench.make` for the CPU without a renderer."""
 PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 PUSH_CUBE: Any = REGISTERED_ENVS["PushCube-v1"].cls
 

@@ -25,7 +25,7 @@ class FarLine:
     bits_per_second: float = float("inf")
     """Rate limit of each direction."""
     delay: float = 0.0
-    """One-direction delay in seconds."""
+    """One-way delay in seconds."""
     room: int = 2 << 20
     """Buffer per connection in bytes: the window of an ssh channel."""
     port: int = 0

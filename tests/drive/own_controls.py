@@ -20,7 +20,7 @@ class SeenField:
     label: str = ""
     names: list[str] = field(default_factory=list)
     asks: list[tuple[str, dict[str, Any], str]] = field(default_factory=list)
-    """Of each input: the command, its other fields, and the field that what is entered goes into."""
+    """For each input: the command, its other fields, and the field that takes the entered value."""
     values: list[Any] = field(default_factory=list)
     off: bool = False
     options: dict[str, Any] = field(default_factory=dict)

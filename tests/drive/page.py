@@ -32,7 +32,7 @@ from tests.drive.waiting import until
 from workbench.machine.kept_choices import keep_check_after_save
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
-"""The example task; what is edited is a copy of it."""
+"""The example task; tests edit copies of it."""
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox",
     "--use-angle=swiftshader",

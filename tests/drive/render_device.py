@@ -3,6 +3,6 @@
 import torch
 
 RENDER_DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-"""SAPIEN's name."""
+"""SAPIEN's name for the device."""
 RENDER_BACKEND = "gpu" if torch.cuda.is_available() else "cpu"
-"""ManiSkill's name, for ``render_backend``."""
+"""ManiSkill's name for the device, for ``render_backend``."""

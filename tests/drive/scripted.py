@@ -35,9 +35,9 @@ from workbench.live.process.worker_process import Output
 from workbench.task.description import Restored, Stepped, TaskDescription
 
 STEP_SECONDS = 0.02
-"""Between two steps while it plays."""
+"""Time between two steps while playing."""
 Evaluate = Callable[[np.ndarray], dict[str, np.ndarray]]
-"""The entries of `evaluate()`, of the elapsed steps of each env."""
+"""Computes the entries of `evaluate()` from the elapsed steps of each env."""
 
 
 def no_success(elapsed: np.ndarray) -> dict[str, np.ndarray]:

@@ -74,11 +74,11 @@ class Tab:
     frames: int = 0
     megabytes: float = 0.0
     open: bool = False
-    """Connected, and all that there was at that time has come."""
+    """Whether the tab is connected and has received the full page state."""
     commands: dict[str, str] = field(default_factory=dict)
-    """The commands of the palette: the id of each, by its label."""
+    """Id of each palette command, by label."""
     name: str = ""
-    """Name of the page, with which it asks for commands."""
+    """Name of the page, which it sends with commands."""
 
 
 class Tabs:

@@ -91,7 +91,7 @@ COMMANDS = st.one_of(
     st.builds(Seek, step=st.integers(-3, 20), episode_only=st.booleans()),
 ).map(Asked)  # fmt: skip
 DRAW = object()
-"""Pictures are wanted of what is shown."""
+"""Stands for a request for pictures of the shown moment."""
 EVENTS = st.one_of(
     COMMANDS,
     st.builds(loaded, LEVELS, st.sampled_from(["one", "two"])),

@@ -167,7 +167,7 @@ def test_a_list_that_is_not_shown_does_not_follow_its_folder(
 
     until(rests, "an end of the searches")
     before = len(searches)
-    until(lambda: catalogue.view() and len(searches) > before, "another search, once somebody looks")
+    until(lambda: catalogue.view() and len(searches) > before, "another search, once the list is shown")
 
 
 def test_a_change_during_a_search_is_found_by_the_next_search(

@@ -118,7 +118,7 @@ def test_a_path_instead_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Pat
         library.watch()
         (row,) = until(lambda: library.view().rows, "its row")
         review.open((row.id,))
-        until(lambda: "no env" in "".join(one.scene for one in review.view().opened), "the word for it")
+        until(lambda: "no env" in "".join(one.scene for one in review.view().opened), "the explanation")
     finally:
         review.close()
         library.close()

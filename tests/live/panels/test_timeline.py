@@ -146,7 +146,7 @@ def test_zoom_to_episode_starts_the_slider_at_the_episode(lived: EnvMoment) -> N
     lived.panels.do(GoToLast())
     lived.draw()
     lived.panels.ask(UndoReset())
-    view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the episode before")
+    view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the end of the jump back")
     assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
 

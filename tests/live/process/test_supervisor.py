@@ -166,8 +166,8 @@ def test_the_true_cause_of_a_death_is_reported_at_any_time() -> None:
         one.until_dead(1)
         for moment in range(20):
             one.until(lambda: one.worker.pid is not None, "the next worker")
-            heard, number = len(one.events), (signal.SIGKILL, signal.SIGSEGV, signal.SIGABRT)[moment % 3]
-            one.until(lambda count=heard + 2 * moment: len(one.events) >= count, "the moment")
+            received, number = len(one.events), (signal.SIGKILL, signal.SIGSEGV, signal.SIGABRT)[moment % 3]
+            one.until(lambda count=received + 2 * moment: len(one.events) >= count, "the moment")
             os.kill(one.worker.pid or 0, number)
             death = one.until_dead(moment + 2)
             assert (death.why, death.end) == (f"was killed by {number.name}", End.DIED), moment
@@ -224,11 +224,11 @@ def test_an_interrupt_stops_work_but_no_idle_or_debugged_worker() -> None:
     with supervised() as one:
         one.worker.interrupt()
         one.worker.send(do("held_by_a_debugger 1.5"))
-        one.until(lambda: any(busy is not None and busy.held for busy in one.busy), "that it is held")
+        one.until(lambda: any(busy is not None and busy.held for busy in one.busy), "the debugger")
         one.worker.interrupt()
         one.worker.send(load("mended"))
-        one.until(lambda: "mended" in one.activities, "the load, for which it is not ended")
-        one.until(lambda: one.busy[-1] is None, "that it goes on")
+        one.until(lambda: "mended" in one.activities, "the load by the same worker")
+        one.until(lambda: one.busy[-1] is None, "the end of the debugger")
         assert "interrupted" not in one.activities and one.deaths == []
         one.worker.send(do("work 600"))
         one.until_busy()
@@ -243,7 +243,7 @@ def test_a_worker_that_ignores_an_interrupt_is_reported() -> None:
         one.worker.send(do("work_on 600"))
         assert not one.until_busy().ignores_interrupt
         one.worker.interrupt()
-        one.until(lambda: one.until_busy().ignores_interrupt, "that it is deaf")
+        one.until(lambda: one.until_busy().ignores_interrupt, "the ignored interrupt")
 
 
 def test_a_load_waits_only_for_short_work() -> None:
@@ -255,7 +255,7 @@ def test_a_load_waits_only_for_short_work() -> None:
         assert one.worker.load_pending
         one.until(lambda: "mended" in one.activities, "the load")
         assert "interrupted" in one.activities and one.deaths == []
-        one.until(lambda: not one.worker.load_pending, "that it was taken up")
+        one.until(lambda: not one.worker.load_pending, "the start of the load")
 
 
 @pytest.mark.slow
@@ -273,7 +273,7 @@ def test_a_save_during_the_first_requests_of_a_new_worker_is_loaded_after_them()
         for first, last in ((saved_meanwhile, "saved"), (has_it, "the end")):
             one.first_requests = first
             os.kill(one.worker.pid or 0, signal.SIGKILL)
-            one.until(lambda last=last: last in one.activities, f"that it says {last}")
+            one.until(lambda last=last: last in one.activities, f"the activity {last}")
         assert (
             "brought back" not in one.activities[one.activities.index("saved") :]
             and one.activities.count("again") == 1
@@ -371,7 +371,7 @@ def test_without_a_startable_worker_it_gives_up_until_asked(
 def test_memory_use_is_reported_and_ends_the_worker_above_the_limit() -> None:
     limit = 600 << 20
     with supervised(WorkerOptions(memory_limit=limit)) as one:
-        one.until(lambda: one.worker.vitals.memory > 0, "a look")
+        one.until(lambda: one.worker.vitals.memory > 0, "a memory reading")
         vitals = one.worker.vitals
         assert (vitals.memory_limit, vitals.spare_memory, vitals.spare_ready) == (limit, None, False)
         one.worker.send(do("fill_memory 700"))
@@ -402,7 +402,7 @@ def test_a_spare_replaces_a_dead_worker(monkeypatch: pytest.MonkeyPatch) -> None
         os.kill(first or 0, signal.SIGKILL)
         one.until_greeted(2)
         assert one.worker.pid not in (None, first)
-        one.until(lambda: not one.worker.vitals.spare_ready, "that it is no spare any more")
+        one.until(lambda: not one.worker.vitals.spare_ready, "the use of the spare")
 
 
 @pytest.mark.slow

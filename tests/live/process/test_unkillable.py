@@ -236,7 +236,7 @@ DEATHS = [
     ("thread", "exit code 1", ...),
 ]
 QUICK = ("segfault",)
-"""The others end the process in the same ways, and each costs a new one."""
+"""Deaths in the quick run; the others are similar, and each needs a new process."""
 
 
 @pytest.mark.parametrize(

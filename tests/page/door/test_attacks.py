@@ -456,7 +456,7 @@ def check(raw: bytes) -> None:
 
 
 INPUTS = {"GuiUpdateMessage", "GuiFormDirtyMessage", "GuiFormSubmitMessage"}
-"""What viser hears of inputs, which no page of ours has."""
+"""viser's messages about inputs, which our pages do not have."""
 
 
 def test_viser_handles_only_known_message_types(gated_server, bystander):
@@ -515,7 +515,7 @@ def test_a_link_cannot_send_our_page_to_another_server(gated_server, browser, mo
         with monkeypatch.context() as without_policy:
             without_policy.setattr(responses, "page_policy", lambda authority: "frame-ancestors 'self'")
             page.goto(f"{link}{first}", wait_until="domcontentloaded")
-            until(lambda: came, "the attack, which is real")
+            until(lambda: came, "the attack, which works without the policy")
         page.goto("about:blank")
         page.goto(f"{link}{second}", wait_until="domcontentloaded")
         page.wait_for_selector("canvas", timeout=60_000)

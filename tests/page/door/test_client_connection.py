@@ -24,7 +24,7 @@ from workbench.page.door.gated_server import GatedServer
 pytestmark = pytest.mark.thorough
 
 BITS_PER_SECOND, DELAY_SECONDS = 2e6, 0.04
-"""A slow line: 250 kB a second, 80 ms there and back."""
+"""A slow line: 250 kB/s, 80 ms round trip."""
 
 
 @dataclass

@@ -164,7 +164,7 @@ def test_any_data_without_the_token_is_refused(fuzzed, raw):
 # Log lines ------------------------------------------------------------------------------------
 
 MAX_LINES = 20
-"""Of a terminal, whatever a few hundred connections do in some seconds."""
+"""Maximum terminal lines from a few hundred connections in some seconds."""
 
 
 def reset(sock: socket.socket) -> None:

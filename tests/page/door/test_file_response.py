@@ -16,8 +16,8 @@ from tests.drive.waiting import until
 from workbench.page.door.file_response import BLOCK_BYTES, FileReply
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
-LARGE = 48 * 2**20
-"""More bytes than the kernel takes of a connection whose other end does not read."""
+LARGE_BYTES = 48 * 2**20
+"""More than the kernel buffers for a connection whose other end does not read."""
 
 
 @pytest.fixture(scope="module")
@@ -100,10 +100,10 @@ def test_a_file_that_grows_is_sent_only_up_to_the_announced_length(
 ) -> None:
     address, path = file
     path.touch()
-    os.truncate(path, LARGE + 100)
+    os.truncate(path, LARGE_BYTES + 100)
     raw, got = started(gated_server, address)
-    os.truncate(path, LARGE + 10 * BLOCK_BYTES)
-    assert rest(raw, got) == (LARGE + 100, LARGE + 100)
+    os.truncate(path, LARGE_BYTES + 10 * BLOCK_BYTES)
+    assert rest(raw, got) == (LARGE_BYTES + 100, LARGE_BYTES + 100)
 
 
 def test_a_file_that_shrinks_is_cut_off_and_not_padded(
@@ -111,11 +111,11 @@ def test_a_file_that_shrinks_is_cut_off_and_not_padded(
 ) -> None:
     address, path = file
     path.touch()
-    os.truncate(path, LARGE)
+    os.truncate(path, LARGE_BYTES)
     raw, got = started(gated_server, address)
-    os.truncate(path, LARGE // 2)
+    os.truncate(path, LARGE_BYTES // 2)
     announced, count = rest(raw, got)
-    assert announced == LARGE and count <= LARGE // 2
+    assert announced == LARGE_BYTES and count <= LARGE_BYTES // 2
     until(lambda: open_files(path) == 0, "the end of the reading")
 
 
@@ -124,7 +124,7 @@ def test_a_client_that_leaves_midway_keeps_no_file_open_and_logs_nothing(
 ) -> None:
     address, path = file
     path.touch()
-    os.truncate(path, LARGE)
+    os.truncate(path, LARGE_BYTES)
     raw, _ = started(gated_server, address)
     assert open_files(path) == 1
     raw.close()
@@ -138,7 +138,7 @@ def test_the_file_is_not_read_ahead_for_a_client_that_does_not_read(
 ) -> None:
     address, path = file
     path.touch()
-    os.truncate(path, LARGE)
+    os.truncate(path, LARGE_BYTES)
     raw, _ = started(gated_server, address)
     with raw:
         still, at = 0, -1
@@ -146,7 +146,7 @@ def test_the_file_is_not_read_ahead_for_a_client_that_does_not_read(
             assert ask(gated_server, "/workbench/logo.svg")[0] == 200
             before, at = at, position(path)
             still = still + 1 if at == before else 0
-        assert 0 < at < LARGE, "the whole file is in memory"
+        assert 0 < at < LARGE_BYTES, "the whole file is in memory"
 
 
 @pytest.mark.parametrize("kind", ["missing", "folder"])

@@ -31,14 +31,14 @@ def gated_server() -> Iterator[GatedServer]:
 def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
     """A page that connected earlier; call it to check that it still works and still receives broadcasts."""
     bell, shown = Bell(gated_server), gated_server.server.gui.add_html("0")
-    heard: list[str] = []
+    received: list[str] = []
 
     def listen(connection: Connection) -> None:
         for frame in connection:
             assert isinstance(frame, bytes)
             for message in messages_in(frame):
                 if message["type"] == "GuiUpdateMessage" and "content" in message["updates"]:
-                    heard.append(message["updates"]["content"])
+                    received.append(message["updates"]["content"])
 
     with client(gated_server) as reader, client(gated_server) as other:
         thread = threading.Thread(target=listen, args=(reader,))
@@ -47,7 +47,7 @@ def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
         def works() -> None:
             bell.rings(other)
             shown.content = str(bell.rung)
-            until(lambda: str(bell.rung) in heard, "what all pages are told")
+            until(lambda: str(bell.rung) in received, "the broadcast")
 
         works()
         yield works

@@ -110,7 +110,7 @@ def test_code_injected_as_html_does_not_run(gated_server, browser):
             page.wait_for_timeout(50)  # for Playwright to receive them
             return {what: sum(what in complaint for complaint in complaints) for what in refused}
 
-        until(lambda: were() == refused, "the browser's word that each was refused", seen=were)
+        until(lambda: were() == refused, "the browser's report of each refusal", seen=were)
         assert page.title() != "ran"
     handle.remove()
 

@@ -75,7 +75,7 @@ def test_a_page_that_does_not_report_in_time_counts_as_using_a_gpu(
     assert in_software.all_pages, "nothing changes before the page's report is overdue"
     until(lambda: not in_software.all_pages, "the time is over")
     in_software.told_by(server.visitor(2))
-    until(lambda: in_software.all_pages, "it says so late")
+    until(lambda: in_software.all_pages, "the late report")
     server.come(3)
     until(lambda: not in_software.all_pages, "the time is over")
     server.leave(3)
@@ -98,7 +98,7 @@ def test_meshes_are_simplified_in_the_background_for_software_rendering() -> Non
     server.pages[1].camera.position = np.array([50.0, 0.0, 30.0])
     until(
         lambda: in_software.looks(DrawStyle(), geometry, layout, alone=False).error > 4 * near,
-        "still simpler ones for an eye that is far away",
+        "even simpler meshes for a distant eye",
     )
     server.leave(1)
 
