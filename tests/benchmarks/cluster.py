@@ -212,8 +212,8 @@ def on_paper(rate: float, messages: float, taken: float, kept: float, envs: int)
     yield (
         f"Computed for {MANY:,} cores: {results:,.0f} such episodes a second. The post carries {parts['the broker']:,.0f}, the "
         f"process that deals takes {parts['the process that deals']:,.0f}, the job file keeps {parts['the job file']:,.0f}. "
-        f"The first limit is {name}, from {most / rate:,.0f} cores on. Beyond it use `--shard`, one driver for each part, and "
-        f"`merge`. Give each worker ten chunks of {envs} envs or more: the last chunk ends alone."
+        f"The first limit is {name}, from {most / rate:,.0f} cores on. Beyond that use `--shard`, one driver for each part, and "
+        f"`merge`. Give each worker ten chunks of {envs} envs or more: during the last chunk, other workers idle."
     )
 
 

@@ -196,7 +196,7 @@ def snapshots(options: Options, kept: list[Row]) -> Iterator[str]:
         kept.append(Row(what, 1e3 * took[ours], 1e3 * took[other], "ms", "less", "core.py"))
     yield f"## Snapshots of {envs}"
     yield ""
-    yield "The exact restore gives every env a PhysX scene without a past, so that it goes on in the same way to the"
+    yield "The exact restore gives every env a new PhysX scene, so that it goes on in the same way to the"
     yield "last bit each time. The quick one keeps the scene: contacts may then be solved in another order, and what"
     yield "is in contact differs, from the last bit on, after the first step."
     yield ""

@@ -4,7 +4,7 @@ One run of each task is made and kept; then it is gone back to, at moments of it
 the very actions of the run. Printed is the largest difference of any env at any of the moments from the run that was
 not interrupted: of any number of the state (velocities included), and of any joint (rad; m of sliding ones).
 
-    put there       `TaskEnv.restore`: a PhysX scene without a past, and the state of the moment
+    put there       `TaskEnv.restore`: a new PhysX scene, and the state of the moment
     quick           the same with ``fresh_physics=False``
     warmed          put there some steps earlier, the steps made again, then put at the moment quickly
     lived through   the run's first moment put there, and every action up to the moment made again

@@ -222,7 +222,7 @@ def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
     planned(session)
     session.do(SaveCameraChange())
     view = wait_until(session, in_studio(lambda s: "does not load" in s.edit_state.message), "the failure")
-    assert "revert it if that is the reason" in view.of(StudioView).edit_state.message
+    assert "revert the change if that is the reason" in view.of(StudioView).edit_state.message
     assert view.problem is not None and "too narrow" in view.problem.message
     assert there(session, BASE).fov == 1.0, "the version before goes on"
     session.do(RevertCameraChange())

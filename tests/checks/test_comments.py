@@ -44,7 +44,7 @@ def test_a_comment_that_lacks_a_reason_or_names_no_rule_is_told() -> None:
     )
     found = comments_without_effect({"a.py": text})
     assert [(one.line, one.message) for one in found] == [
-        (1, "off[reward-rows] silences nothing until a reason stands behind it"),
+        (1, "off[reward-rows] silences nothing until a reason follows it"),
         (2, "no rule is called reward-row (did you mean reward-rows?)"),
         (3, "the comment names no rule, as in off[reward-rows]"),
         (5, "no rule is called nothing_like_it"),

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit, urlunsplit
 
+PORTS = range(20_000, 32_000)
+"""Below the kernel's ephemeral ports: a page that keeps reconnecting to a port without a listener could be given that very
+port as its own, connect to itself, and keep the relay from coming back."""
 PIECE_BYTES = 4096
 """Bytes relayed at once; small, so that connections share the line."""
 
@@ -29,7 +33,7 @@ class FarLine:
     room: int = 2 << 20
     """Buffer per connection in bytes: the window of an ssh channel."""
     port: int = 0
-    """Port that the browser connects to; 0 takes any free one."""
+    """Port that the browser connects to; 0 takes any free one of `PORTS`."""
     down: int = 0
     """Bytes delivered to the browsers so far."""
     up: int = 0
@@ -98,7 +102,12 @@ class FarLine:
             with contextlib.suppress(asyncio.CancelledError):
                 await asyncio.gather(carry(reader, out, "up"), carry(back, writer, "down"))
 
-        server = await asyncio.start_server(accept, "127.0.0.1", self.port)
+        for near in [self.port] if self.port else random.sample(PORTS, 20):
+            with contextlib.suppress(OSError):
+                server = await asyncio.start_server(accept, "127.0.0.1", near)
+                break
+        else:
+            raise OSError(f"port {near} is taken")
         self.port = server.sockets[0].getsockname()[1]
         self.loop = asyncio.get_running_loop()
         ready.set()

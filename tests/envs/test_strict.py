@@ -564,8 +564,8 @@ _ANT = [
     "The pose of 'camera_mount' is set with 4 rows, and 2 are wanted",
 ]
 _ROTATE_VALVE = [
-    "self.rotate_direction is left with a row for each",
-    "self.rest_qpos is left with a row for each",
+    "self.rotate_direction now has rows for only",
+    "self.rest_qpos now has rows for only",
 ]
 UPSTREAM_BREAKS = {
     # control/ant.py lines 179 and 186: the camera follows the torso of one step ago.

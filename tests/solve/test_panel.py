@@ -95,8 +95,8 @@ def test_without_a_plan_it_says_why_there_is_none() -> None:
     failed = solve_html(SolveView("failed", why="it is <b>random", problem=problem()), None, 0)
     assert "it is &lt;b&gt;random: KeyError" in failed and "push.py:88" in failed
     flat = replace(PLAN, returns=np.ones(5, np.float32), success_at=np.zeros(5, np.int32))
-    assert "nothing leads on" in solve_html(replace(SOLVED, plan=flat), None, 0)
-    assert "nothing leads on" not in solve_html(SOLVED, None, 0)
+    assert "show no direction" in solve_html(replace(SOLVED, plan=flat), None, 0)
+    assert "show no direction" not in solve_html(SOLVED, None, 0)
 
 
 def test_controls_ask_for_other_plans(solve: Solve) -> None:

@@ -127,7 +127,7 @@ def test_a_value_is_followed_to_where_it_is_written(text: str, what: str) -> Non
         ("X = 1\nX += 1\nnote(X)", "`X` cannot be read in the file: it is computed"),
         ("L = [1, 2]\nL[0] = 3\nnote(L)", "`L` cannot be read in the file: a part of it is set"),
         ("for x in (1,):\n    note(x)", "`x` cannot be read in the file: it changes in a loop"),
-        ("L = [1, 2]\nnote(L[int(0)])", "`L[int(0)]` depends on what only the running task knows"),
+        ("L = [1, 2]\nnote(L[int(0)])", "`L[int(0)]` depends on a value that only the running task has"),
         ('D = {**{"x": 1}, "y": 2}\nnote(D["y"])', '`D["y"]` is computed when the task runs'),
         (
             "class A(list):\n    def __eq__(self, other):\n        return self.pop() == other\n"

@@ -123,7 +123,7 @@ def problem_of(body: str, folder: Path, rules: Any = None) -> Problem:
 @pytest.mark.parametrize(
     ("body", "stage", "words"),
     [
-        (SHRUNK, "reset", "self.target is left with a row for each of the 1 envs"),
+        (SHRUNK, "reset", "self.target now has rows for only 1 of"),
         (REWARD, "returns", "compute_dense_reward() returned a float32 tensor of shape (4, 1)"),
         (OBSERVATION, "returns", "_get_obs_extra() returned 'goal' as a float32 tensor of shape (3,)"),
     ],

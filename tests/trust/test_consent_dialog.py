@@ -138,14 +138,14 @@ def test_the_dialog_shows_the_code_that_would_run_escaped() -> None:
         one.name in dialog_html and one.hash in dialog_html and one.text in dialog_html for one in many
     )
     assert (
-        "It imports from beside it (300)" in dialog_html
+        "It imports these modules next to it (300)" in dialog_html
         and "trusted" not in dialog_html
         and "every save" not in dialog_html
     )
     held = (CodeFile("push.py", "0" * 12, ""), HELPER)
     dialog_html = question_html(TrustQuestion("<i>Push</i>-v1", True, held))
     assert "&lt;i&gt;Push" in dialog_html and "hold the text of their task" in dialog_html
-    assert "what it may import (1)" in dialog_html and "It imports" not in dialog_html
+    assert "the modules that it may import (1)" in dialog_html and "It imports" not in dialog_html
 
 
 def test_changes_since_trust_was_given_are_marked_per_file() -> None:

@@ -43,7 +43,7 @@ SENSOR = "_default_sensor_configs"
 KEY: CameraKey = ("sensor", "cam")
 LIST = WRITTEN["a list, positional to the end"]
 WHY_NOT = {
-    "edit": "smaller than what is written|is given by [*] or",
+    "edit": "smaller than the precision|is given by [*] or",
     "add": "2 returns",
     "duplicate": "is in no list or dict",
     "rename": "$.",

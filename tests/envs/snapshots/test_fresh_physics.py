@@ -1,4 +1,4 @@
-"""An env gets a PhysX scene without a past, and everything that knew its bodies still knows them."""
+"""An env gets a new PhysX scene, and everything that knew its bodies still knows them."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
 

@@ -149,7 +149,7 @@ def test_a_click_on_a_curve_seeks_its_step_and_a_dropped_step_is_refused(live: L
     kept = TimelineView(30, 50, 30, tick=31)
     live.show(replace(view, timeline=kept))
     assert (
-        "Step 7 is no longer in memory: the oldest that is, step 31, is shown" in live.part("Reward").html()
+        "Step 7 is no longer in memory: step 31 is shown, the oldest one there" in live.part("Reward").html()
     )
     live.do(SeekOnCurve(step=40))
     live.show(replace(view, timeline=replace(kept, shown=39, tick=40)))
