@@ -152,7 +152,9 @@ def test_banner_and_timeline_are_as_narrow_as_the_view_and_cover_no_control(at_s
     assert before is not None
     for width in (1280, 760, 1000):
         page.set_viewport_size({"width": width, "height": before["height"]})
-        until(lambda: page.evaluate(LAYOUT_OK_JS) == [2, True], f"both next to the controls at {width} pixels")
+        until(
+            lambda: page.evaluate(LAYOUT_OK_JS) == [2, True], f"both next to the controls at {width} pixels"
+        )
     page.set_viewport_size(before)
 
 
