@@ -1,4 +1,4 @@
-"""Whatever is asked and whatever a worker says, in any order: the state can be drawn, and is the same for who comes late."""
+"""Any commands and worker events in any order: the state can be drawn, and a page that opens later shows the same."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def fails(kept: bool, at_run: bool) -> Act:
 
 
 def places(told: Told) -> None:
-    """A camera somewhere else, if there is one that can be placed."""
+    """Move a camera, if there is one that can be moved."""
     camera = told.view.of(StudioView).camera(BASE)
     if camera is not None and camera.now is not None:
         x, y, z = camera.now.position
@@ -107,7 +107,7 @@ def told_first() -> Iterator[Told]:
 @contextmanager
 def page() -> Iterator[Live]:
     live = Live(viser.ViserServer(host="127.0.0.1", port=0, verbose=False), Clock())
-    live.page.do(TellUnfolded(panel=TABLE), live.visitor)  # folded, it is drawn for each task alone
+    live.page.do(TellUnfolded(panel=TABLE), live.visitor)  # folded, it is only drawn for a new task
     try:
         yield live
     finally:
@@ -120,12 +120,12 @@ def draw(live: Live, told: Told) -> None:
 
 
 def panels_of(live: Live) -> dict[str, object]:
-    """All but the 3-D view, where the first moment that is drawn decides how far apart the envs stand."""
+    """Everything but the 3-D view, where the first drawn moment decides the spacing of the envs."""
     return {name: value for name, value in live.all_drawn().items() if not name.startswith("in the view")}
 
 
 def plain(value: object) -> Any:
-    """What can be compared, without times of the day and what is not of the state."""
+    """The comparable part of a value, without clock times and anything outside the state."""
     if isinstance(value, np.ndarray):
         return value.shape, value.astype(object).ravel().tolist().__repr__()
     if is_dataclass(value) and not isinstance(value, type):
@@ -156,7 +156,7 @@ def test_the_same_sequence_gives_the_same_state(sequence: list[tuple[str, Act]])
     parts, again_parts = ({**view.pop("features"), **view} for view in (first, again))
     assert parts.keys() == again_parts.keys()
     for name, value in parts.items():
-        # The task's file is in another folder each time.
+        # Each run has the task's file in another folder.
         if name not in ("task", str(RecordingStatus), "refused", "problem", "loads", str(StudioView)):
             assert value == again_parts[name], name
 
@@ -164,7 +164,7 @@ def test_the_same_sequence_gives_the_same_state(sequence: list[tuple[str, Act]])
 @pytest.mark.thorough
 @settings(max_examples=12)
 @given(SEQUENCES)
-def test_a_page_that_comes_in_the_middle_shows_what_one_shows_that_was_there_from_the_start(
+def test_a_page_that_opens_midway_shows_the_same_as_one_open_from_the_start(
     sequence: list[tuple[str, Act]],
 ) -> None:
     with told_first() as told, page() as there, page() as late:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.drive.live import HandedSession
+from tests.drive.live import StubSession
 from tests.drive.panels import Panels
 from tests.drive.scenes import description, running, table_scene
 from workbench.cameras.commands import ReturnToKept, SaveCameraChange, ToggleWantedObject
@@ -131,7 +131,7 @@ def view_of_camera(
 
 
 def test_a_saved_placement_is_compared_with_the_files_previous_one(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraCompare(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
 
@@ -150,7 +150,7 @@ def test_a_saved_placement_is_compared_with_the_files_previous_one(panels: Panel
 
 
 def test_a_kept_placement_becomes_the_comparison_and_can_be_restored(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraCompare(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
     session.shown = view_of_camera()
@@ -167,7 +167,7 @@ def test_a_kept_placement_becomes_the_comparison_and_can_be_restored(panels: Pan
 
 
 def test_the_search_box_surrounds_the_eye_until_one_is_typed(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraSuggest(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
 
@@ -191,7 +191,7 @@ def test_the_search_box_surrounds_the_eye_until_one_is_typed(panels: Panels) -> 
 
 
 def test_a_camera_is_measured_over_the_chosen_set(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraReportPanel(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
     session.shown = view_of_camera()
@@ -215,7 +215,7 @@ class Writing:
     """The folder that requests edits of the file, with a scripted session."""
 
     def __init__(self, panels: Panels) -> None:
-        self.panels, self.session = panels, HandedSession()
+        self.panels, self.session = panels, StubSession()
         above = panels.server.gui.add_folder(None)
         self.part = WriteToFile(panels.server, cast(Any, self.session), lambda _, lens: lens, above)
         panels.visitors.do = self.do
@@ -298,7 +298,7 @@ def refusal_of(do: Callable[[], object]) -> str:
 
 
 def test_a_pasted_calibration_is_read_in_the_chosen_convention_and_units(panels: Panels) -> None:
-    session = HandedSession()
+    session = StubSession()
     folder = CameraExport(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
     session.shown = view_of_camera()

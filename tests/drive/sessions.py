@@ -1,4 +1,4 @@
-"""Fixtures: sessions that tests share, with a real worker on a real task, and with a worker that is the test."""
+"""Fixtures: shared sessions with a real worker on a real task, and sessions whose worker is the test."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def session(
     task_file: Path,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Session]:
-    """Without a renderer, unless the file says that it ``DRAWS``."""
+    """A session shared by the tests of a file; without a renderer unless the file sets ``DRAWS``."""
     with live_session(
         task_file, tmp_path_factory.mktemp("recordings"), draw=getattr(request.module, "DRAWS", False)
     ) as session:
@@ -27,7 +27,7 @@ def session(
 
 @pytest.fixture
 def told(tmp_path: Path) -> Iterator[Told]:
-    """Its worker has said nothing yet."""
+    """A session whose worker has sent nothing yet."""
     with told_session(tmp_path / "recordings") as told:
         told.asked(object)
         yield told

@@ -12,7 +12,7 @@ from typing import Literal
 
 import pytest
 
-from tests.drive.panels import Clock, Panels, told_so_far
+from tests.drive.panels import Clock, Panels, messages_sent
 from tests.drive.waiting import until
 from tests.episodes.library_files import describe
 from workbench.library.commands import (
@@ -423,9 +423,9 @@ def test_an_edit_that_is_not_possible_any_more_says_why(
 def test_a_table_that_has_not_changed_is_not_sent_again(table: Table, library: Library) -> None:
     table.press_row(newest(0, 1)[0])
     library.refresh()
-    before = told_so_far(table.panels.server)
+    before = messages_sent(table.panels.server)
     table.draw()
-    assert told_so_far(table.panels.server) == before
+    assert messages_sent(table.panels.server) == before
     shown = [html.content for html in table.panels.htmls()]
     table.press_row(newest(1, 2)[0])
     now = [html.content for html in table.panels.htmls()]

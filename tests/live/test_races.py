@@ -1,4 +1,4 @@
-"""What several do at once in a session, and what fails once: each counts, and costs nothing else."""
+"""Concurrent commands all count, and a single failure affects nothing else."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from workbench.machine.processes.watched_thread import listen, stop_listening
 
 
 class FailsOnce(ToldWorker):
-    """Cannot take one request of a kind."""
+    """Fails on the first request of one kind."""
 
     fails: type[Request] | None = None
 
@@ -27,7 +27,7 @@ class FailsOnce(ToldWorker):
         super().send(request)
 
 
-def test_an_effect_that_fails_once_is_told_and_costs_nothing_else(tmp_path: Path) -> None:
+def test_an_effect_that_fails_once_is_reported_and_affects_nothing_else(tmp_path: Path) -> None:
     said: list[str] = []
     listen(said.append)
     try:
@@ -44,7 +44,7 @@ def test_an_effect_that_fails_once_is_told_and_costs_nothing_else(tmp_path: Path
             assert len(told.asked(SingleStep)) == 1
             told.session.do(ResetAll())
             assert len(told.asked(Reset)) == 1
-            # What follows from what a worker says ends neither the worker nor what else follows.
+            # A failed effect of a worker's event ends neither the worker nor the other effects.
             assert said == []
             worker.fails = Settings
             told.load("rebuilt")
@@ -56,7 +56,7 @@ def test_an_effect_that_fails_once_is_told_and_costs_nothing_else(tmp_path: Path
         stop_listening(said.append)
 
 
-def test_presses_of_two_pages_at_once_count_once_each(tmp_path: Path) -> None:
+def test_concurrent_presses_on_two_pages_each_count_once(tmp_path: Path) -> None:
     with told_session(tmp_path) as told:
         told.play(2)
         told.asked(object)
@@ -73,7 +73,7 @@ def test_presses_of_two_pages_at_once_count_once_each(tmp_path: Path) -> None:
         assert len(told.asked(SingleStep)) == 200
 
 
-def test_a_slider_that_is_dragged_on_one_page_swallows_no_key_of_another(tmp_path: Path) -> None:
+def test_a_slider_dragged_on_one_page_does_not_swallow_keys_of_another(tmp_path: Path) -> None:
     with told_session(tmp_path) as told:
         told.play(5)
         told.asked(object)
@@ -93,7 +93,7 @@ def test_a_slider_that_is_dragged_on_one_page_swallows_no_key_of_another(tmp_pat
         assert len(told.asked(SingleStep)) == 50
 
 
-def test_a_worker_that_tells_steps_as_fast_as_it_can_does_not_hold_up_a_press(tmp_path: Path) -> None:
+def test_a_worker_that_floods_steps_does_not_delay_a_press(tmp_path: Path) -> None:
     with told_session(tmp_path) as told:
         told.play(1)
         ends = threading.Event()

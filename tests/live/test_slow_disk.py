@@ -1,4 +1,4 @@
-"""A disk that hangs keeps what needs it, and nothing else."""
+"""A hung disk blocks only the work that needs it."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from workbench.task.watch import SourceWatcher
 
 @pytest.fixture
 def disk() -> Iterator[threading.Event]:
-    """It goes on when this is set."""
+    """The disk hangs until this event is set."""
     disk = threading.Event()
     yield disk
     disk.set()
 
 
 def answers(told: Told) -> bool:
-    """Whether a press on Step reaches the worker, and what comes of it the page."""
+    """Whether a press on Step reaches the worker, and its result the page."""
     told.asked(object)
     told.session.do(Step())
     told.step()
     return len(told.asked(SingleStep)) == 1 and told.view.timeline.last > 0
 
 
-def test_files_that_cannot_be_watched_keep_neither_a_step_nor_the_end(
+def test_files_that_cannot_be_watched_block_neither_a_step_nor_the_exit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
 ) -> None:
     with told_session(tmp_path, task=str(tmp_path / "push.py")) as told:
@@ -56,10 +56,10 @@ def test_files_that_cannot_be_watched_keep_neither_a_step_nor_the_end(
         assert told.view.problem == problem and answers(told)
 
 
-def test_a_disk_that_hangs_as_a_version_comes_keeps_no_step(
+def test_a_disk_that_hangs_during_a_load_blocks_no_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
 ) -> None:
-    """After a save, and after the death of a worker, it is looked whether the files are still those of the version."""
+    """After a save and after a worker's death, the files are compared with those of the version."""
     file = str(tmp_path / "push.py")
     with told_session(tmp_path, task=file) as told:
         told.play(2)
@@ -80,10 +80,10 @@ def test_a_disk_that_hangs_as_a_version_comes_keeps_no_step(
             assert hangs.wait(60)
             assert answers(told)
             worker.join(20)
-            assert not worker.is_alive() and answers(told), "what the worker says next is taken"
+            assert not worker.is_alive() and answers(told), "the worker's next event is handled"
 
 
-def test_a_recording_that_cannot_be_written_keeps_no_step(
+def test_a_recording_that_cannot_be_written_blocks_no_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
 ) -> None:
     with told_session(tmp_path / "kept") as told:

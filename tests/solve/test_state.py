@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, Told, heard, live_session, start_over, step, wait_until
+from tests.drive.session import TASKS, Told, after_worker_reply, live_session, start_over, step, wait_until
 from workbench.app.session import Session
 from workbench.live.commands import Interrupt, PauseRun, PlayRun, Step
 from workbench.live.messages import PlanDropped, PlanWanted, Play
@@ -109,7 +109,7 @@ def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(ses
         session, lambda view: not view.playing and view.of(SolveView).state == "none", "the pause"
     )
     serial = session.view().step_serial
-    view = heard(session)
+    view = after_worker_reply(session)
     assert view.step_serial - serial <= 1 and view.of(SolveView).state == "none"
 
 

@@ -1,4 +1,4 @@
-"""What a session keeps of its past: how much, which rewards, and what it says happened."""
+"""The history of a session: its size, its rewards and its events."""
 
 # The views are of a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false
@@ -25,7 +25,7 @@ def picture(env: int, size: int = 64, kind: CameraKind = "sensor", name: str = "
 
 
 def pictured(told: Told) -> list[int]:
-    """Serials of the moments of which there is a picture of the selected env."""
+    """Serials of the moments that have a picture of the selected env."""
     session, found = told.session, []
     session.change(cameras=(EYE,))
     for serial in range(told.view.timeline.first, told.view.timeline.last):
@@ -41,7 +41,7 @@ def events(told: Told, env: int) -> list[tuple[int, int]]:
 
 
 def rewards(told: Told) -> list[list[float]]:
-    """Of the running episode of each env."""
+    """Rewards of each env's running episode."""
     return [row[np.isfinite(row)].tolist() for row in told.session.env_rows().rewards]
 
 
@@ -55,12 +55,12 @@ def test_memory_is_bounded_and_the_oldest_goes_first(tmp_path: Path) -> None:
         assert [one.serial for one in moments_of(told.session)] == [*range(timeline.first, 500)]
         strip = told.session.look(lambda run: run.strip(0, 499))
         assert strip.reward.tolist() == [*range(timeline.first, 500)] == [*range(strip.low, 500)]
-        assert told.view.curves.serial == 499, "of the curves every step stays"
+        assert told.view.curves.serial == 499, "the curves keep every step"
         told.session.do(Seek(step=1))
-        assert told.view.timeline.shown == timeline.first, "the nearest that is kept"
+        assert told.view.timeline.shown == timeline.first, "the nearest kept moment"
 
 
-def test_parts_of_a_snapshot_are_kept_and_counted_as_long_as_a_moment_needs_them(tmp_path: Path) -> None:
+def test_snapshot_parts_are_kept_and_counted_while_a_moment_needs_them(tmp_path: Path) -> None:
     with told_session(tmp_path, history_bytes=40_000) as told:
         told.load()
         told.reset(part_keys=(1, 2), new_parts={1: bytes(3000), 2: bytes(500)})
@@ -69,7 +69,7 @@ def test_parts_of_a_snapshot_are_kept_and_counted_as_long_as_a_moment_needs_them
         second = told.view.timeline.used - with_both - 100
         told.step(part_keys=(2, 99))
         told.session.happen(MomentShown(2))
-        assert not told.view.timeline.can_continue, "a part never came"
+        assert not told.view.timeline.can_continue, "a part never arrived"
         told.session.happen(MomentShown(1))
         assert told.view.timeline.can_continue
         told.session.happen(MomentShown(None))
@@ -80,7 +80,7 @@ def test_parts_of_a_snapshot_are_kept_and_counted_as_long_as_a_moment_needs_them
         assert abs(timeline.used - timeline.moments * second - 600) < 0.1 * second, "parts 2 and 3 are left"
 
 
-def test_the_newest_moment_is_kept_whatever_it_takes_and_only_that(tmp_path: Path) -> None:
+def test_the_newest_moment_alone_is_kept_at_any_size(tmp_path: Path) -> None:
     with told_session(tmp_path, history_bytes=1) as told:
         told.play(2)
         alone = told.view.timeline.used
@@ -89,34 +89,34 @@ def test_the_newest_moment_is_kept_whatever_it_takes_and_only_that(tmp_path: Pat
         told.step(2)
         timeline = told.view.timeline
         assert (timeline.first, timeline.last, timeline.used) == (4, 4, alone), (
-            "nothing of what went is counted"
+            "dropped moments are not counted"
         )
 
 
-def test_pictures_belong_to_the_moment_that_they_show_and_fill_half_at_most(tmp_path: Path) -> None:
+def test_pictures_belong_to_the_moment_they_show_and_fill_at_most_half(tmp_path: Path) -> None:
     with told_session(tmp_path, history_bytes=400_000) as told:
         told.play(29)
         empty = told.view.timeline.used
         told.tell(Pictures((picture(0),), 5.0, 12), Pictures((picture(1),), 5.0, 13))
-        assert pictured(told) == [12], "it comes late, and is of the step of its number"
+        assert pictured(told) == [12], "a late picture belongs to the step with its number"
         each = (told.view.timeline.used - empty) // 2
         assert each >= 64 * 64 * 3
         told.tell(PastPictures(12, (picture(0, 32),)))
         smaller = told.view.timeline.used
-        assert smaller - empty == 2 * each - 3 * (64 * 64 - 32 * 32), "one in the place of another"
+        assert smaller - empty == 2 * each - 3 * (64 * 64 - 32 * 32), "one replaces another"
         told.tell(PastPictures(5000, (picture(0),)))
         for serial in (5, 2, *range(14, 29)):
             told.tell(PastPictures(serial, (picture(0),)))
         kept = pictured(told)
-        assert 12 not in kept and kept == list(range(29 - len(kept), 29)), "those that came first are gone"
+        assert 12 not in kept and kept == list(range(29 - len(kept), 29)), "the oldest pictures are dropped"
         timeline = told.view.timeline
-        assert timeline.moments == 30, "steps are not dropped for pictures"
+        assert timeline.moments == 30, "no step is dropped for pictures"
         assert timeline.used - empty == len(kept) * each <= 200_000 < (len(kept) + 1) * each
         told.step(300)
         assert told.view.timeline.used <= 400_000 and pictured(told) == []
 
 
-def test_a_moment_that_is_gone_back_to_has_the_reward_and_its_terms_of_its_record_in_each_env(
+def test_after_going_back_each_env_has_the_recorded_reward_and_terms(
     told: Told,
 ) -> None:
     reach = "reward_terms/reach"
@@ -136,7 +136,7 @@ def test_a_moment_that_is_gone_back_to_has_the_reward_and_its_terms_of_its_recor
     assert reach not in told.view.step.evaluate, "no env has a term"
 
 
-def test_a_reset_of_others_is_no_reward_of_zero_and_one_that_was_resumed_keeps_its_own(played: Told) -> None:
+def test_a_partial_reset_adds_no_zero_reward_and_a_resumed_env_keeps_its_reward(played: Told) -> None:
     played.reset((1,))
     np.testing.assert_array_equal(played.view.step.reward, [3, np.nan, 3])
     played.resume()
@@ -149,7 +149,7 @@ def test_a_reset_of_others_is_no_reward_of_zero_and_one_that_was_resumed_keeps_i
     assert rewards(played) == [[1, 2, 3, 4], [1], [1, 2, 3, 4]]
 
 
-def test_what_a_newer_version_says_of_a_moment_is_not_its_record(played: Told) -> None:
+def test_a_rescored_moment_keeps_its_recorded_reward(played: Told) -> None:
     recorded, used = played.view.step, played.view.timeline.used
     for version in ("b", "c"):
         played.load("patched", source_hash=version)
@@ -158,7 +158,7 @@ def test_what_a_newer_version_says_of_a_moment_is_not_its_record(played: Told) -
     assert 0 < played.view.timeline.used - used < 2500, "its bytes are counted once"
 
 
-def test_the_rewards_of_an_episode_come_through_what_it_was_put_back_to(told: Told) -> None:
+def test_rewards_of_an_episode_follow_where_it_went_back_to(told: Told) -> None:
     told.play(4)
     told.back((0,), (1,), 2)
     told.step()
@@ -169,7 +169,7 @@ def test_the_rewards_of_an_episode_come_through_what_it_was_put_back_to(told: To
     assert rewards(told) == [[1, 2, 3], [1, 2, 3, 4, 5], [1, 2, 3, 4, 5]]
 
 
-def test_events_are_the_first_success_of_an_episode_truncations_and_jumps(told: Told) -> None:
+def test_events_are_first_successes_truncations_and_jumps(told: Told) -> None:
     told.play(0)
     told.step(success=(1,))
     told.step(success=(1,))
@@ -188,7 +188,7 @@ def test_events_are_the_first_success_of_an_episode_truncations_and_jumps(told: 
     assert events(told, 0)[1:] == [(5, RESET), (7, FAIL)]
     told.load("rebuilt")
     told.reset()
-    assert events(told, 1) == [(0, RESET)], "nothing of the past of another scene"
+    assert events(told, 1) == [(0, RESET)], "no event from another scene's past"
 
 
 def test_a_task_without_a_robot_has_steps_with_rewards(told: Told) -> None:

@@ -31,7 +31,7 @@ from workbench.page.scene.viewpoint import (
     covered=st.floats(0, 0.45),
 )
 @settings(max_examples=80)
-def test_whole_box_is_in_the_picture_above_what_is_covered(
+def test_the_whole_box_is_visible_above_the_covered_part(
     size: tuple[float, float, float], aspect: float, covered: float
 ) -> None:
     low, high = -np.array(size) / 2, np.array(size) / 2
@@ -50,7 +50,7 @@ def test_whole_box_is_in_the_picture_above_what_is_covered(
     assert (np.abs(corners @ right) <= np.tan(FOV_RADIANS / 2) * aspect * depth).all()
 
 
-def test_the_human_camera_s_picture_is_above_what_is_covered() -> None:
+def test_the_human_cameras_picture_is_above_the_covered_part() -> None:
     geometry, poses = table_scene(1)
     pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
     picture, covered, fovy = Picture("render_camera", "human", 0, pose), 0.3, 1.0
@@ -59,14 +59,14 @@ def test_the_human_camera_s_picture_is_above_what_is_covered() -> None:
     depth = 1.5 - float(layout.low[0] + layout.high[0]) / 2
     away = viewpoint.position[0] - (1.5 - depth)
     for part, place in ((0.0, covered), (1.0, 1.0), (-1.0, -(1 - 2 * covered))):
-        # A point of the middle plane at the picture's middle, top and bottom: where it is in the view, -1 to 1.
+        # Points of the middle plane at the picture's middle, top and bottom, as view coordinates from -1 to 1.
         z = 0.4 + part * depth * np.tan(fovy / 2)
         assert abs((z - viewpoint.position[2]) / (away * np.tan(FOV_RADIANS / 2)) - place) < 1e-5
 
 
-def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:
+def test_a_single_env_is_seen_from_the_tasks_human_camera() -> None:
     geometry, poses = table_scene(1)
-    # At x = 1.5, turned half round z: it looks along -x.
+    # At x = 1.5, rotated by pi about z: it looks along -x.
     pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
     viewpoint = frame_one(lay_out(geometry, poses), Picture("render_camera", "human", 0, pose))
     np.testing.assert_allclose(viewpoint.position, pose[:3], atol=1e-6)
@@ -74,7 +74,7 @@ def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:
     np.testing.assert_allclose(towards / np.linalg.norm(towards), [-1, 0, 0], atol=1e-6)
 
 
-def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
+def test_a_page_is_reframed_on_resize_until_the_user_moves_the_view(
     server: viser.ViserServer,
 ) -> None:
     framing = Framing(server)
@@ -87,7 +87,7 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
     with websockets.sync.client.connect(address, **arguments) as page:
 
         def shows(width: int, position: np.ndarray) -> np.ndarray:
-            """Where it looks from after it said that it is so wide."""
+            """The camera position after the page reported this width."""
             page.send(camera_message(position.tolist(), width))
             until(
                 lambda: any(one.camera.image_width == width for one in server.get_clients().values()),
@@ -104,9 +104,11 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
             assert np.linalg.norm(at) != np.linalg.norm(before), narrower
         assert np.allclose(at, frame(400 / 720, 720).position)
         begins = np.array(server.initial_camera.position)
-        assert np.allclose(shows(399, begins), frame(399 / 720, 720).position), "where it begins came after"
+        assert np.allclose(shows(399, begins), frame(399 / 720, 720).position), (
+            "the initial viewpoint arrived later"
+        )
         moved = at + 0.1
-        assert np.allclose(shows(300, moved), moved), "the view is the person's"
+        assert np.allclose(shows(300, moved), moved), "the user's view is kept"
         (client,) = server.get_clients().values()
         for what in ("live", "review"):
             assert framing.is_new(what)
@@ -115,10 +117,10 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
         assert not np.allclose(client.camera.position, moved)
         assert framing.is_new("live")
         framing.frame_new(frame)
-        assert np.allclose(client.camera.position, moved), "back from the review"
+        assert np.allclose(client.camera.position, moved), "the view is kept after the review"
 
 
-def test_what_is_chosen_in_the_view_panel_holds_for_the_pages_to_come(panels: Panels) -> None:
+def test_choices_in_the_view_panel_apply_to_later_pages(panels: Panels) -> None:
     choice = ViewChoice()
     panel = ViewPanel(panels.server, dark=True, chosen=choice)
     panels.visitors.do = panel.do
