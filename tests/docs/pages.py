@@ -1,4 +1,4 @@
-"""README and the docs as tests read them: pages, and the fences of a page."""
+"""Reads README and the docs: pages, and the fences of a page."""
 
 from __future__ import annotations
 
