@@ -36,7 +36,7 @@ TABLETOP = (
 )  # fmt: skip
 OFF_BY = 10
 """A pixel that differs by more than this in a colour (of 255), or in depth (millimetres), counts as off."""
-KEPT_SIZE = 128
+KEPT_SIZE_PIXELS = 128
 """Width and height in pixels for the rows in the table of benchmarks."""
 
 
@@ -191,7 +191,7 @@ def pictures(options: Options, kept: list[Row]) -> Iterator[str]:
         mean = {what: statistics.fmean(got[what] for got in every) for what in every[0]}
         mean |= {what: max(got[what] for got in every) for what in mean if what.startswith("worst")}
         rows.append(_row("mean (worst of all)", mean))
-        if size == KEPT_SIZE:
+        if size == KEPT_SIZE_PIXELS:
             kept.extend(_kept(mean, len(every)))
         yield f"### {size} x {size}"
         yield ""
@@ -210,7 +210,7 @@ def pictures(options: Options, kept: list[Row]) -> Iterator[str]:
 
 
 def _kept(mean: dict[str, float], tasks: int) -> list[Row]:
-    what = f'Pictures, `pictures="fast"`, {KEPT_SIZE} x {KEPT_SIZE}'
+    what = f'Pictures, `pictures="fast"`, {KEPT_SIZE_PIXELS} x {KEPT_SIZE_PIXELS}'
     fast, bare = mean["fast processor"], mean["bare processor"]
     return [
         Row(

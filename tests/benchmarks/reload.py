@@ -34,7 +34,7 @@ from tests.benchmarks.table import Row, keep
 from tests.drive.page import TASK, browser_at, page_on
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
-WIDTH = 100
+WIDTH_PIXELS = 100
 LIMIT_SECONDS = {"patched": 0.3, "cameras": 0.6, "rebuilt": 2.0}
 
 COLD = """
@@ -82,7 +82,7 @@ def edited(level: str, number: int) -> tuple[str, str | None, bool]:
     if level == "cameras":
         size = "width=128, height=128"
         assert good.count(size) == 1
-        return good.replace(size, f"width={WIDTH + number}, height=128"), None, True
+        return good.replace(size, f"width={WIDTH_PIXELS + number}, height=128"), None, True
     return version(number), f"seen_{number}", True
 
 
@@ -99,7 +99,7 @@ def save_to_seen(page: Page, file: Path, level: str, number: int) -> tuple[float
                 && (!picture || (image && image.src && image.src !== before))
                 && (!width || (image && image.naturalWidth === width));
         }""",
-        arg=[entry, picture, before, WIDTH + number if level == "cameras" else 0],
+        arg=[entry, picture, before, WIDTH_PIXELS + number if level == "cameras" else 0],
         polling=10,
     )
     seconds = time.perf_counter() - start

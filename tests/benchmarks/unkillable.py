@@ -39,7 +39,7 @@ HANGS = {"loop": "Interrupt", "slow": "Interrupt", "catch": "Restart", "native":
 DEATHS = ("exit", "segfault", "abort", "kill", "children", "memory")
 OTHERS = ("flood", "read")
 SOCKET_TIMES = """
-// viser's page has its websocket in a worker that it makes of a text: this is put before that text.
+// viser's page creates its websocket in a worker from source text; this code is prepended to that text.
 const inWorker = () => {
     const told = new BroadcastChannel('socket times'), now = () => performance.timeOrigin + performance.now();
     const Socket = self.WebSocket, post = self.postMessage.bind(self);
@@ -75,7 +75,7 @@ NEXT_ENV = """async () => {
     const end = performance.now();
     const sent = () => window.socketTimes.find((time) => time.sent > origin + start)?.sent;
     const arrived = () => window.socketTimes.find((time) => time.arrived > sent())?.arrived;
-    // They are told by a way of their own, which may be the longer one.
+    // The times arrive on a separate channel, which may be slower.
     while (!arrived() && performance.now() - end < 1000) await wait();
     return [end - start, arrived() ? arrived() - sent() : null];
 }"""

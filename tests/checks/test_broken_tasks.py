@@ -25,19 +25,19 @@ BROKEN = {
     "tip_block": ("loop-over-envs", "for i in range(self.num_envs):"),
     "touch_cube": ("camera-sees", ""),
 }
-"""The rule, and how the line of its finding begins."""
+"""The broken rule of each task, and the beginning of the line of its finding."""
 WHEN_SOLVED = {"reach_ball": ("reward-exploited", "def compute_dense_reward(")}
-"""Likewise, of rules that need planned episodes."""
-BESIDES = {
+"""The same for rules that need planned episodes."""
+ALSO_BROKEN = {
     "calm_reach": {"rows-rewritten"},
     "push_to_square": {"reward-changes"},
     "gather_blocks": {"initial-pose", "robot-pose", "overlap-at-load"},
     "knock_can": {"unseeded-random", "actions-replay"},
     "nudge_ball": {"loop-over-envs"},
 }
-"""Rules that the same mistake breaks too."""
+"""Other rules that the same mistake breaks."""
 QUICK = {"knock_can"}
-"""Every rule has tests of its own in the files beside this one."""
+"""Tasks of the quick tests; the other files in this folder test every rule."""
 
 
 def test_every_small_task_is_listed() -> None:
@@ -52,7 +52,7 @@ def test_a_broken_task_breaks_its_rule_at_its_line_and_no_other(name: str, rende
     results = check_rules(RULES.keys() - SOLVE_RULES, str(FOLDER / f"{name}.py"), num_envs=4, seeds=4)
     assert the_finding(results[rule]).code.startswith(line)
     broken = {each for each, result in results.items() if result.state == "broken"}
-    assert broken - {rule} <= BESIDES.get(name, set())
+    assert broken - {rule} <= ALSO_BROKEN.get(name, set())
     assert not [result for result in results.values() if result.state == "failed"]
 
 

@@ -33,7 +33,7 @@ TURNED = (
     '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),',
     '"success": self.agent.robot.qpos[:, 0] > 0.6,',
 )
-"""No random action turns the first joint so far; the largest do it in some twenty steps."""
+"""Success that random actions do not reach, but the largest actions reach in about twenty steps."""
 
 
 def task_of(folder: Path, *edits: tuple[str, str]) -> str:

@@ -22,7 +22,7 @@ IMPORTS = (
     ),
 )
 NEVER = "if self.num_envs > 99: "
-"""What is read only, and does not run."""
+"""Prefix for code that is parsed by the check but never runs."""
 
 
 def source_results(folder: Path, *edits: tuple[str, str]) -> dict[str, RuleResult]:

@@ -33,7 +33,7 @@ EDITS = (
     ("height < -0.1", "height < 1"),
     ('reward[info["fail"]] = 0', 'reward[info["fail"]] = 2  # workbench: off[reward-rows]'),
 )
-"""One breach of a rule that stops, one of a rule that warns, one that is silenced, and a comment that silences nothing."""
+"""A breach of a rule that stops, one of a rule that warns, a silenced one, and a comment that silences nothing."""
 RULES_OF_IT = "success-at-reset,success-and-fail,reward-normalized,reward-finite,reward-rows"
 FEW = ("--num-envs", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
 
@@ -356,7 +356,7 @@ for group in GROUPS:
     if "entry-name" in group.checks:
         group.checks["entry-name"] = {entry}
 """
-"""Breaks checks of the workbench, in each process that imports the task."""
+"""Task code that breaks checks of the workbench in each process that imports it."""
 
 
 @pytest.mark.slow

@@ -132,7 +132,9 @@ def test_each_command_names_the_damaged_recording(
         shutil.rmtree(out, ignore_errors=True)
 
 
-def test_the_intact_recordings_beside_it_are_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_other_recordings_of_the_folder_are_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     ours(tmp_path / "recordings", "whole")
     halve(ours(tmp_path / "recordings", "half").with_suffix(".h5"))
     halve(write_foreign(tmp_path / "recordings"))

@@ -44,7 +44,7 @@ CLIPBOARD = "\x1b]52;c;aGk=\x1b\\"
 LINK = "\x1b]8;;http://127.0.0.1/\x1b\\press me\x1b]8;;\x1b\\"
 EVIL = f"{TITLE}{CLIPBOARD}{LINK}\x1b[2J\x1b[H\x1b[10A\x9b2J\x90q\x9c\x1bc\x07\x08\u202eback"
 BARS = re.compile("\x1b\\[(\\?25[lh]|1A|2K)|\r")
-"""How a bar of ours moves the cursor."""
+"""Cursor movements of our progress bars."""
 COLOURS = re.compile("\x1b\\[[0-9;:]*m")
 
 

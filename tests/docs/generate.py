@@ -52,7 +52,7 @@ CLI_COMMANDS = (
     "doctor",
     "help",
 )
-"""In the order in which a reader meets them; `test_generated.py` compares them with those that there are."""
+"""Commands in reading order; `test_generated.py` compares them with the existing commands."""
 
 
 # --- keys ---------------------------------------------------------------------------------------------
@@ -140,7 +140,7 @@ HOOKS = (
     "_default_sensor_configs",
     "_default_human_render_camera_configs",
 )
-"""The hooks in the order of the page of all rules, about the order in which an author writes them."""
+"""Hooks in their order on the page of all rules, roughly the order in which an author writes them."""
 
 
 def declared_rules() -> list[DeclaredRule]:
@@ -194,9 +194,9 @@ def all_rules_page() -> str:
     lines = [
         "# Rules",
         "",
-        "What [`workbench check`](../checks.md) looks at, by the hook in which a mistake is mended. Where a rule with the degree",
-        "*stop* is broken, the exit code is 1. `workbench help RULE` shows the page of one rule. Those of GPU simulation are also",
-        "checked [while a task runs](../batched_env.md#what-goes-wrong-on-a-gpu-goes-wrong-here). This page is made from the code.",
+        "The rules of [`workbench check`](../checks.md), by the hook that a fix changes. A broken rule with the degree *stop* gives",
+        "the exit code 1. `workbench help RULE` shows the page of one rule. Rules of GPU simulation are also checked",
+        "[while a task runs](../batched_env.md#what-goes-wrong-on-a-gpu-goes-wrong-here). This page is made from the code.",
         "",
     ]
     for hook, rules in by_hook.items():

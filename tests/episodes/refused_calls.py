@@ -25,8 +25,8 @@ CHANGING = (
     "mkdir",
     "rmdir",
 )
-_BESIDE = ("episode-journals",)
-"""Threads that work at moments of their own."""
+_BACKGROUND_THREADS = ("episode-journals",)
+"""Names of threads that make calls at unpredictable times."""
 
 
 @contextmanager
@@ -45,7 +45,7 @@ def refused(
 
     def of(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
         def called(*args: Any, **kwargs: Any) -> Any:
-            if threading.current_thread().name in _BESIDE or (
+            if threading.current_thread().name in _BACKGROUND_THREADS or (
                 real is opened and not _creates(*args, **kwargs)
             ):
                 return real(*args, **kwargs)

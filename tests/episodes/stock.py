@@ -19,7 +19,7 @@ from workbench.episodes.episode import EpisodeInfo
 
 STEPS = 8
 SEED = 3
-SIZE = 96
+SIZE_PIXELS = 96
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Recorded:
     """Camera name to (T + 1, H, W)."""
 
 
-def record_stock(task: str, size: int = SIZE, steps: int = STEPS, **kwargs: Any) -> Recorded:
+def record_stock(task: str, size: int = SIZE_PIXELS, steps: int = STEPS, **kwargs: Any) -> Recorded:
     """Record `steps` random steps of a stock single env."""
     env = gym.make(
         task,

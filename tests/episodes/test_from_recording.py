@@ -197,7 +197,7 @@ def test_todays_files_beside_the_task_are_available_and_outlive_the_folder(
         folder = Path(reference.rpartition(":")[0]).parent
         assert (folder / "meshes" / "part.obj").read_text() == "today's"
         assert {path.name for path in folder.rglob("*")} == {"push_cube.py", "meshes", "part.obj"}
-        assert list(temporary.iterdir()) == [folder], "nothing else was made beside the folder"
+        assert list(temporary.iterdir()) == [folder], "no other folder was made"
     assert not folder.exists()
     assert (file.parent / "meshes" / "part.obj").read_text() == "today's"
 

@@ -23,7 +23,7 @@ from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.writing.episode_writer import EpisodeWriter
 
 def peak():
-    # Not getrusage, whose peak is that of the parent where this process was forked from a larger one.
+    # Not getrusage: after a fork from a larger process its peak is that of the parent.
     (line,) = [line for line in open("/proc/self/status") if line.startswith("VmHWM")]
     return int(line.split()[1]) / 1024
 
@@ -71,7 +71,7 @@ print(json.dumps(dict(appended=appended, finished=peak(), files=sizes, rrd=str(f
 READER = """
 import json, sys, time
 from pathlib import Path
-import rerun.chunk  # noqa: F401  (not what is measured)
+import rerun.chunk  # noqa: F401  (not measured)
 from workbench.episodes.reader.read_episode import read_episode
 
 def peak():

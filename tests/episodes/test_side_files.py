@@ -1,4 +1,4 @@
-"""Files beside a task that are not Python: which are recorded, and how later changes are reported."""
+"""Non-Python files next to a task: which are recorded, and how later changes are reported."""
 
 from __future__ import annotations
 

@@ -35,8 +35,8 @@ ORIGINAL = (
 )
 REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
-IN_THE_JUDGE = "os.getpriority(os.PRIO_PROCESS, 0) == 10"
-"""True in the process that judges: it has a lower priority."""
+IN_RESCORER = "os.getpriority(os.PRIO_PROCESS, 0) == 10"
+"""An expression that is true in the rescoring process, which has a lower priority."""
 
 
 @dataclass
@@ -177,7 +177,7 @@ def test_code_that_raises_is_reported_with_its_line_and_the_record_stays(desk: D
 @pytest.mark.slow
 def test_the_next_save_replaces_a_running_rescoring_while_the_worker_plays(desk: Desk, record) -> None:
     calls = desk.file.with_name("calls")
-    slow = f"if {IN_THE_JUDGE}: time.sleep(0.1) or open({str(calls)!r}, 'a').write('.')"
+    slow = f"if {IN_RESCORER}: time.sleep(0.1) or open({str(calls)!r}, 'a').write('.')"
     desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
     desk.rescored("rescoring")
     session = desk.session
@@ -202,7 +202,7 @@ def test_the_next_save_replaces_a_running_rescoring_while_the_worker_plays(desk:
 @pytest.mark.slow
 def test_a_rescoring_in_an_endless_loop_can_be_stopped_and_the_next_one_runs(desk: Desk, record) -> None:
     loops = desk.file.with_name("loops")
-    loop = f"while {IN_THE_JUDGE} and int(self.elapsed_steps.max()) > 20: open({str(loops)!r}, 'w').close()"
+    loop = f"while {IN_RESCORER} and int(self.elapsed_steps.max()) > 20: open({str(loops)!r}, 'w').close()"
     desk.edit(REWARD, f"{loop}\n        {REWARD}")
     desk.rescored("rescoring")
     until(loops.exists, "the loop")
@@ -222,7 +222,7 @@ def test_a_rescoring_in_an_endless_loop_can_be_stopped_and_the_next_one_runs(des
 
 @pytest.mark.slow
 def test_a_dead_rescoring_process_is_reported_and_replaced_for_the_next_rescoring(desk: Desk, record) -> None:
-    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    slow = f"time.sleep(0.1 if {IN_RESCORER} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD}")
     desk.rescored("rescoring")
     first = background_pid(desk.session)

@@ -146,7 +146,7 @@ class FallingBallEnv(BaseEnv):
         return {}
 
     def get_state_dict(self):
-        return self.scene.get_sim_state()  # BaseEnv's asks the robot
+        return self.scene.get_sim_state()  # BaseEnv's version needs a robot
 
     def _get_obs_extra(self, info):
         return {"ball": self.ball.pose.p}

@@ -22,7 +22,7 @@ from workbench.task.open import OpenedTask, Opening, build_task
 N = 3
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
 DRAWS = f'{SUCCESS} "noise": torch.rand(self.num_envs) + torch.randn(()),'
-"""By torch's own generator, which no env has to itself."""
+"""Draws from torch's global generator, which all envs share."""
 
 
 @pytest.fixture(scope="module")

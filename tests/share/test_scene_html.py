@@ -23,7 +23,7 @@ DRAWN = """before => {
         return Math.abs(x - (-0.3 + 0.03 * step)) < 1e-4;
     });
 }"""
-"""Whether another step is told than before, and the cube is drawn where it was at that step."""
+"""Whether the caption shows another step than before, and the cube is drawn at its pose of that step."""
 
 
 @pytest.fixture

@@ -48,7 +48,7 @@ def test_a_librarys_name_gives_the_library_wherever_it_is_imported(
         assert "RuntimeError" not in str(importlib.import_module(name).__file__)
         assert not str(importlib.import_module(name).__file__).startswith(str(path.parent))
     assert sys.modules[task.cls.__module__].helper.__file__ == str(helper), (
-        "other names are found beside the file"
+        "other names are found next to the file"
     )
     assert task.source_files == (path, helper)
 

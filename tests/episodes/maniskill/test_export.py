@@ -98,7 +98,7 @@ def test_an_export_overwrites_no_file(
 
 
 OBSERVED = "PickCube-v1", 7
-"""Task and seed."""
+"""The observed task and its seed."""
 
 
 @pytest.mark.slow

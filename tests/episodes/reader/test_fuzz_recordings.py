@@ -38,9 +38,9 @@ pytestmark = pytest.mark.usefixtures("child_process")
 
 SEED = int(os.environ.get("WORKBENCH_FUZZ_SEED", "0"))
 MAX_SECONDS = 60.0
-"""Of one damaged recording, all in all; against hanging, not a measure."""
+"""Limit for one damaged recording: it detects hangs and is no performance goal."""
 MAX_GROWTH_BYTES = 1 << 30
-"""Bytes that this process may have grown by; what it holds of a recording goes with it."""
+"""Limit for the growth of this process; data of a closed recording must be freed."""
 HUGE = [b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\x00" * 8, b"\xff" * 8]
 
 

@@ -54,10 +54,10 @@ for episode in range(10**6):
     writer = EpisodeWriter(folder, info, geometry, {}, ("a",), (camera,))
     for k in range(steps + 1):
         append(writer, row(k))
-        # What the parent holds it to: this row was appended then.
+        # Tells the parent that this row was appended at this time.
         sys.stdout.write(f"{episode} {k} {time.time()}\\n")
         sys.stdout.flush()
-        time.sleep(0.002)  # so much as a step takes
+        time.sleep(0.002)  # about the duration of a step
     writer.finish()
     sys.stdout.write(f"{episode} finished\\n")
     sys.stdout.flush()

@@ -51,8 +51,8 @@ def test_a_killed_writer_loses_no_row_that_had_time_to_be_written(
     assert found.length == 5
 
 
-SCHEMA = 200
-"""Bytes with which a journal begins and that hold no data."""
+SCHEMA_BYTES = 200
+"""Length of a journal's schema, which precedes the data."""
 DAMAGE = st.one_of(
     st.tuples(st.just("cut"), st.floats(0, 1)),
     st.tuples(st.just("flip"), st.floats(0, 0.03) | st.floats(0, 0.999)),
@@ -93,7 +93,7 @@ def test_a_truncated_or_changed_journal_gives_its_complete_states_or_is_kept(
     try:
         recover(folder)
     except RecordingError:
-        assert kind == "flip" and place >= SCHEMA
+        assert kind == "flip" and place >= SCHEMA_BYTES
         left_over = [one for one in (folder / FOLDER).iterdir() if one.suffix in (".arrow", ".damaged")]
         assert [one.read_bytes() for one in left_over] == [bytes(content)]
         if left_over[0].suffix == ".damaged":
@@ -103,7 +103,9 @@ def test_a_truncated_or_changed_journal_gives_its_complete_states_or_is_kept(
     found = [read_episode(path) for path in folder.glob("*.json")]
     states = [len(one.poses) for one in found if one.poses is not None]
     # All states are recovered, or all but the last entry, which may look like an unfinished write.
-    assert states == ([whole] if whole > 1 else []) or (kind == "flip" and states == [6] and place >= SCHEMA)
+    assert states == ([whole] if whole > 1 else []) or (
+        kind == "flip" and states == [6] and place >= SCHEMA_BYTES
+    )
     for one in found if kind != "flip" else ():  # a journal has no checksums
         np.testing.assert_array_equal(one.poses, episode.poses[: states[0]])
         np.testing.assert_array_equal(one.action, episode.action[: states[0] - 1])
