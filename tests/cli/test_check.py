@@ -52,7 +52,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> Ended:
     return Ended(int(ended.value.code or 0), printed.out, printed.err)
 
 
-def in_a_process(*words: str) -> subprocess.CompletedProcess[str]:
+def run_in_subprocess(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "workbench.cli.main", *words],
         capture_output=True,
@@ -231,7 +231,7 @@ def test_a_task_that_needs_a_renderer_gets_one(place: Path, child_process: None)
         "--select",
         "runs",
     ]
-    ended = in_a_process(*words)
+    ended = run_in_subprocess(*words)
     assert ended.returncode == 0, ended.stdout + ended.stderr
 
 
@@ -369,7 +369,7 @@ def test_only_the_rule_whose_check_raises_fails(
     files = ("--json-file", "a.json", "--sarif", "a.sarif", "--junit", "a.xml")
     words = ["check", "good.py", "--import", "breaks", "--select", rules, *files]
     words += [*FEW[:4], "--workers", workers, "--env", "render_backend=none"]
-    ended = in_a_process(*words)
+    ended = run_in_subprocess(*words)
     report = json.loads((place / "a.json").read_text())
     assert ended.returncode == 1 and report["fails"] and report["findings"] == []
     of_rule = {one["rule"]: one for one in report["rules"]}
@@ -393,7 +393,7 @@ def test_only_the_rule_that_kills_its_process_fails(place: Path, child_process: 
     (place / "breaks.py").write_text(BREAKS.format(entry="dies"))
     rules = "entry-name,success-at-reset,info-rows,time-limit"
     words = ["check", "good.py", "--import", "breaks", "--select", rules, "--json", *FEW[:4]]
-    ended = in_a_process(*words, "--workers", "2", "--env", "render_backend=none")
+    ended = run_in_subprocess(*words, "--workers", "2", "--env", "render_backend=none")
     report = json.loads(ended.stdout)
     states = {one["rule"]: one["state"] for one in report["rules"]}
     assert ended.returncode == 1 and states.pop("entry-name") == "failed"
@@ -407,7 +407,7 @@ def test_the_command_as_a_job_in_ci_runs_it(place: Path, child_process: None) ->
     """The command runs in subprocesses, without a terminal, on an id without a file here."""
     words = ["check", "PushCube-v1", "--num-envs", "2", "--seeds", "2", "--workers", "2"]
     words += ["--select", "success-at-reset,reward-finite", "--env", "render_backend=none", "--json"]
-    ended = in_a_process(*words)
+    ended = run_in_subprocess(*words)
     assert ended.returncode == 0, ended.stderr
     report = json.loads(ended.stdout)
     assert report["task"]["id"] == "PushCube-v1" and report["counts"] == {"kept": 2}

@@ -50,17 +50,17 @@ def test_a_step_works_as_the_page_says(
         if fence.language == "python":
             write(fence, folder)
         elif fence.language == "diff":
-            goes_wrong(fence, below, folder / FILE, capfd)
+            check_mistake(fence, below, folder / FILE, capfd)
         elif fence.language == "sh":
             for words in commands(fence):
                 if not is_long(words):
-                    type_in(words[1:], capfd)
+                    run_command(words[1:], capfd)
     # After the step, the rules that the mistakes broke are kept, and any envs can be reset and stepped.
     rules_shown = {
         rule for fence in step.fences if fence.language == "text" for rule in _RULE.findall(fence.text)
     }
     rules = ",".join(sorted({"runs", *rules_shown}))
-    printed = type_in(["check", FILE, "--seeds", "8", "--select", rules], capfd)
+    printed = run_command(["check", FILE, "--seeds", "8", "--select", rules], capfd)
     assert " 0 broken" in printed, printed
     if step is STEPS[-1]:
         (recorded,) = (folder / "recordings").glob("*.json")
@@ -75,14 +75,14 @@ def test_a_step_keeps_all_rules_and_opens(
 ) -> None:
     """Except for the rules that the page leaves to the next step."""
     after(STEPS.index(step) + 1, folder)
-    printed = type_in(["check", FILE], capfd)
+    printed = run_command(["check", FILE], capfd)
     assert set(_RULE.findall(printed)) == UNTIL_LATER.get(step.title, set()), printed
     for fence in step.fences:
         for words in commands(fence) if fence.language == "sh" else ():
             if words[1] in OPENS_A_PAGE:
                 opens(words, folder)
             elif words[1] == "record":
-                type_in(words[1:], capfd)
+                run_command(words[1:], capfd)
 
 
 def test_the_whole_page_is_covered() -> None:
@@ -103,14 +103,14 @@ def is_long(words: list[str]) -> bool:
     return words[1] in (*OPENS_A_PAGE, "check")
 
 
-def goes_wrong(fence: Fence, below: Fence | None, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def check_mistake(fence: Fence, below: Fence | None, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Make a mistake, check the rules that the fence below it quotes, and undo it."""
     assert below is not None and below.language == "text", f"{fence.place}: its message is missing below it"
     rules = _RULE.findall(below.text)
     assert rules, f"{below.place} names no rule"
     right = file.read_text()
     file.write_text(mistake(fence, right))
-    printed = type_in(["check", FILE, "--select", ",".join(rules)], capfd)
+    printed = run_command(["check", FILE, "--select", ",".join(rules)], capfd)
     if os.environ.get("WORKBENCH_RENEW") and OF_NUMBERS not in below.text:
         PAGE.write_text(PAGE.read_text().replace(below.text, quoted(printed, rules)))
     else:
@@ -126,7 +126,7 @@ def quoted(printed: str, rules: list[str]) -> str:
     return "\n\n".join(f"{one[1]}\n{wrap.fill(one[2])}" for one in found if one) + "\n"
 
 
-def type_in(words: list[str], capfd: pytest.CaptureFixture[str]) -> str:
+def run_command(words: list[str], capfd: pytest.CaptureFixture[str]) -> str:
     """Run a command in this process; returns its output."""
     linecache.checkcache()
     for known in (REGISTERED_ENVS, gymnasium.registry):

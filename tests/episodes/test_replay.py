@@ -35,7 +35,7 @@ def recorded(task: OpenedTask) -> Recorded:
     return record(task, STEPS, [31, 7, 5], reaching(STEPS, N))
 
 
-def goes_on_as_recorded(task: OpenedTask, recorded: Recorded, env: int, state: int) -> None:
+def assert_continues_as_recorded(task: OpenedTask, recorded: Recorded, env: int, state: int) -> None:
     """Assert that the same actions give the same states and rewards, bit for bit."""
     for t in range(state, STEPS):
         step = task.env.step(recorded.steps[t + 1].action)
@@ -57,7 +57,7 @@ def test_an_env_continues_from_an_entered_state_as_recorded_bit_for_bit(
     for name, values in recorded.steps[state].evaluate.items():
         # Reward terms belong to an action, and no action was taken.
         assert name.startswith("reward_terms/") or np.array_equal(step.evaluate[name][env], values[env]), name
-    goes_on_as_recorded(task, recorded, env, state)
+    assert_continues_as_recorded(task, recorded, env, state)
 
 
 def test_the_other_envs_continue_undisturbed(task: OpenedTask, recorded: Recorded) -> None:

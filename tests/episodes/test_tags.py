@@ -14,19 +14,19 @@ from tests.episodes.refused_calls import descriptors, refused
 from workbench.episodes.document import read_notes, write_into_description, write_notes
 
 
-def of_ours(folder: Path) -> tuple[Path, Callable[[], None]]:
+def our_recording(folder: Path) -> tuple[Path, Callable[[], None]]:
     path = describe(folder, "a", id="a1", tags=["old"], note="typed before")
     return path, lambda: write_into_description(path, ("new",), "typed now")
 
 
-def of_others(folder: Path) -> tuple[Path, Callable[[], None]]:
+def foreign_recording(folder: Path) -> tuple[Path, Callable[[], None]]:
     path = folder / "demo.notes"
     folder.mkdir(exist_ok=True)
     write_notes(path, "traj_0", ("old",), "typed before")
     return path, lambda: write_notes(path, "traj_1", ("new",), "typed now")
 
 
-KINDS = pytest.mark.parametrize("begin", [of_ours, of_others])
+KINDS = pytest.mark.parametrize("begin", [our_recording, foreign_recording])
 
 
 @KINDS

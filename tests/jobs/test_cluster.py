@@ -105,7 +105,7 @@ def bits(recorded: Recorded) -> dict[int, bytes]:
     return {one.seed: one.path.with_suffix(".h5").read_bytes() for one in recorded.written}
 
 
-def workers_of_ray() -> list[psutil.Process]:
+def ray_workers() -> list[psutil.Process]:
     """Processes of actors that run a job."""
     return [
         one
@@ -138,7 +138,7 @@ def test_a_killed_worker_loses_and_duplicates_no_episode(
     def kill(progress: Any) -> None:
         nonlocal killed
         if progress.over is not None and killed < 2:
-            for process in workers_of_ray()[:1]:
+            for process in ray_workers()[:1]:
                 os.kill(process.pid, signal.SIGKILL)
                 killed += 1
 
@@ -196,7 +196,7 @@ def test_failed_seeds_are_reported_with_the_local_line_and_the_others_are_kept(
 def test_items_are_done_once_even_if_a_worker_dies(address: str, tmp_path: Path) -> None:
     run = Run(Setup("killed once", 4, folder=tmp_path), range(9), chunk=3, tries=3, goes_on=True)
     reports: list[str] = []
-    run.by(Cluster(address, 2, on_death=reports.append))
+    run.run_with(Cluster(address, 2, on_death=reports.append))
     assert len(reports) == 1 and reports[0].startswith("a worker that squares has ended (")
     assert run.squares() == {number: number**2 for number in range(9)} and not run.failures
     pids = {result.pid for result in run.results.values()}
@@ -210,7 +210,7 @@ def test_other_versions_are_refused_and_named(
     here = seam.versions_here()
     monkeypatch.setattr(seam, "versions_here", lambda: {**here, "torch": "1.0"})
     with pytest.raises(PoolError, match=re.escape(f"has torch {here['torch']}, and the submitting side 1.0")):
-        Run(Setup(folder=tmp_path), range(8)).by(Cluster(address, 1))
+        Run(Setup(folder=tmp_path), range(8)).run_with(Cluster(address, 1))
 
 
 def test_a_folder_that_a_machine_does_not_see_is_refused(

@@ -53,7 +53,7 @@ def test_each_item_is_done_once_with_equal_results_on_any_executor(
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     folder.mkdir()
     numbers = [*range(10), 12, 20]
-    done = Run(Setup(folder=folder), numbers, chunk=chunk).by(executor)
+    done = Run(Setup(folder=folder), numbers, chunk=chunk).run_with(executor)
     assert sorted(done.results) == numbers and done.steps == len(numbers)
     assert done.results[3] == Squared(3, 9, folder / "3", done.results[3].pid)
     # Each worker opens its task only once.
@@ -72,7 +72,7 @@ def test_items_above_a_lowered_limit_are_skipped_and_all_below_are_done(
         if number == 5:
             run.scheduler.lower(8)
 
-    done = Run(Setup(folder=tmp_path), range(10**6), on_result=enough, chunk=3).by(executor)
+    done = Run(Setup(folder=tmp_path), range(10**6), on_result=enough, chunk=3).run_with(executor)
     assert set(range(8)) <= set(done.results)
     # Items that were already started may still be finished.
     assert len(done.results) < 100
@@ -90,12 +90,12 @@ def test_a_stopped_job_is_resumed_with_the_remaining_items(executor: Executor, t
     kept: dict[int, Squared] = {}
     first = Run(Setup(folder=tmp_path), range(400), stop=lambda: asked, on_result=now, chunk=3)
     first.scheduler.go_on({}, kept.__setitem__)
-    first.by(executor)
+    first.run_with(executor)
     assert 5 <= len(kept) < 400 and kept == first.results
     rest = Run(Setup(folder=tmp_path), range(400), chunk=3)
     more: dict[int, Squared] = {}
     rest.scheduler.go_on(kept, more.__setitem__)
-    rest.by(executor)
+    rest.run_with(executor)
     assert not kept.keys() & more.keys() and rest.steps == len(more)
     assert rest.squares() == {number: number**2 for number in range(400)}
 
@@ -123,7 +123,7 @@ def test_a_failing_process_ends_the_job_and_the_others_finish_their_started_item
     # Item 7 is dealt last, so the other process has all items before it.
     run = Run(Setup(how, 7, folder=tmp_path), range(8))
     with pytest.raises(error, match=says) as raised:
-        run.by(Processes(2))
+        run.run_with(Processes(2))
     if isinstance(raised.value, TaskError):
         assert raised.value.problem == PROBLEM
     begun = {int(path.name.removeprefix(BEGUN)) for path in tmp_path.glob(f"{BEGUN}*")}
@@ -137,7 +137,7 @@ def test_a_failing_process_ends_the_job_and_the_others_finish_their_started_item
 def test_a_killed_process_is_replaced_and_its_chunk_retried(workers: int, tmp_path: Path) -> None:
     run = Run(Setup("killed once", 4, folder=tmp_path), range(9), chunk=3, tries=3, goes_on=True)
     reports: list[str] = []
-    run.by(Processes(workers, reports.append))
+    run.run_with(Processes(workers, reports.append))
     assert reports == ["a process that squares was killed by SIGKILL; its unfinished items are dealt again"]
     assert run.squares() == {number: number**2 for number in range(9)} and not run.failures
     assert len({result.pid for result in run.results.values()}) > 1
@@ -149,7 +149,7 @@ def test_items_that_fail_on_each_try_are_reported_at_the_end_and_the_others_are_
     how: str, stage: str, tmp_path: Path
 ) -> None:
     run = Run(Setup(how, 4, folder=tmp_path), range(9), chunk=3, tries=2, goes_on=True)
-    run.by(Processes(2))
+    run.run_with(Processes(2))
     assert sorted(run.results) == [0, 1, 2, 3, 5, 6, 7, 8]
     (failure,) = run.failures
     assert (failure.numbers, failure.problem.stage) == ((4,), stage)
@@ -160,7 +160,7 @@ def test_items_that_fail_on_each_try_are_reported_at_the_end_and_the_others_are_
 def test_a_task_that_cannot_be_loaded_is_reported_once(executor: Executor, tmp_path: Path) -> None:
     run = Run(Setup("cannot be loaded", folder=tmp_path), range(8), tries=3, goes_on=True)
     with pytest.raises(TaskError, match="it broke") as raised:
-        run.by(executor)
+        run.run_with(executor)
     assert raised.value.problem == PROBLEM and not run.results
 
 
@@ -173,7 +173,7 @@ def test_a_second_interrupt_ends_processes_that_hang(tmp_path: Path) -> None:
 
     run = Run(Setup("hangs", 3, folder=tmp_path), range(10**6), stop=twice)
     with pytest.raises(KeyboardInterrupt):
-        run.by(Processes(2))
+        run.run_with(Processes(2))
     pids = {int(line.split()[2]) for line in run.updates}
     assert len(pids) >= 1
     until(lambda: not any(map(psutil.pid_exists, pids)), "their end")
@@ -187,7 +187,7 @@ def test_a_process_that_does_not_stop_is_waited_for_only_a_limited_time(
     monkeypatch.setattr("workbench.jobs.local_processes._END_SECONDS", 0.2)
     run = Run(Setup(how, 0, folder=tmp_path), range(8), stop=lambda: (tmp_path / "hangs").exists())
     with pytest.raises(PoolError, match="that squares did not end in time"):
-        run.by(Processes(1))
+        run.run_with(Processes(1))
 
 
 # --- dealing, without processes --------------------------------------------------------------------------

@@ -113,21 +113,23 @@ class Run:
         self._on_result = on_result
         if how.pop("goes_on", False):
             how["on_failure"] = self.failures.append
-        self.scheduler: Scheduler[Squared, str | int] = Scheduler(numbers, self.over, self.hear, stop, **how)
+        self.scheduler: Scheduler[Squared, str | int] = Scheduler(
+            numbers, self.take_result, self.take_update, stop, **how
+        )
         self.work = Work(run, setup, Squared, str | int, "that squares")
 
-    def over(self, number: int, result: Squared) -> None:
+    def take_result(self, number: int, result: Squared) -> None:
         assert number not in self.results
         self.results[number] = result
         self._on_result(self, number)
 
-    def hear(self, update: str | int) -> None:
+    def take_update(self, update: str | int) -> None:
         if isinstance(update, int):
             self.steps += update
         else:
             self.updates.append(update)
 
-    def by(self, executor: Executor) -> Run:
+    def run_with(self, executor: Executor) -> Run:
         executor.run(self.work, self.scheduler)
         return self
 

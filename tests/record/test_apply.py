@@ -129,11 +129,11 @@ def first() -> State:
     return State(run, LiveRecording("recordings"), first_studio(None))
 
 
-Passed = tuple[State, SessionEvent, State, list[Effect]]
+AppliedEvent = tuple[State, SessionEvent, State, list[Effect]]
 """The state before, the event, the state after it, and the effects."""
 
 
-def apply_of_these(state: State, event: SessionEvent) -> tuple[State, list[Effect]]:
+def apply_filtered(state: State, event: SessionEvent) -> tuple[State, list[Effect]]:
     """Return the state after an event, and the effects for these features and the run."""
     state, effects = apply(state, event, NOW)
     return state, [
@@ -141,14 +141,14 @@ def apply_of_these(state: State, event: SessionEvent) -> tuple[State, list[Effec
     ]
 
 
-def passed(happened: list[SessionEvent]) -> list[Passed]:
+def apply_all(happened: list[SessionEvent]) -> list[AppliedEvent]:
     """Apply the events in order; a refused event changes nothing."""
     state, steps = first(), []
     for event in happened:
         before = state
         effects: list[Effect] = []
         try:
-            state, effects = apply_of_these(state, event)
+            state, effects = apply_filtered(state, event)
         except Refused as reason:
             assert str(reason)
         steps.append((before, event, state, effects))
@@ -157,14 +157,14 @@ def passed(happened: list[SessionEvent]) -> list[Passed]:
 
 def after(*happened: SessionEvent) -> tuple[State, list[Effect]]:
     """Return the state after the last event, and the effects of that event."""
-    return passed(list(happened))[-1][2:]
+    return apply_all(list(happened))[-1][2:]
 
 
 @given(st.lists(EVENTS, max_size=25))
 def test_any_sequence_is_deterministic_and_records_only_what_was_requested(
     happened: list[SessionEvent],
 ) -> None:
-    steps, again = passed(happened), passed(happened)
+    steps, again = apply_all(happened), apply_all(happened)
     for (before, event, state, effects), (_, _, other, _) in zip(steps, again, strict=True):
         assert (state.recording, state.rescoring) == (other.recording, other.rescoring)
         recording, status = state.recording, state.recording.status(state.run)
@@ -219,7 +219,7 @@ def test_only_a_worker_that_was_handed_over_is_recorded_again() -> None:
 def test_envs_are_reset_after_their_capture_was_requested() -> None:
     state, effects = after(loaded(), Asked(ChooseRecordedEnvs(envs="all")), Asked(ToggleRecording()))
     assert effects[1:] == [Send(SetCapture((0, 1, 2), from_reset=True)), Then(EnvsReset())]
-    _, effects = apply_of_these(state, EnvsReset())
+    _, effects = apply_filtered(state, EnvsReset())
     assert effects == [Send(Reset(None, state.run.seed))]
 
 
@@ -236,26 +236,26 @@ def test_steps_that_wait_for_the_disk_are_bounded(monkeypatch: pytest.MonkeyPatc
 def test_late_events_of_an_older_recording_or_job_change_only_the_waiting_bytes() -> None:
     state, _ = after(loaded(), RESET, STEP, Asked(ToggleRecording()), Asked(RecordNextEpisode()))
     assert state.recording.number == 2
-    changed, effects = apply_of_these(state, StepRecorded(1, 10, (), RunningEpisodes(1, 1, 1), "it failed"))
+    changed, effects = apply_filtered(state, StepRecorded(1, 10, (), RunningEpisodes(1, 1, 1), "it failed"))
     assert effects == [] and changed.recording == replace(state.recording, waiting_bytes=-10)
     state, effects = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveWanted((1,)))
     assert [type(effect) for effect in effects] == [BeginSaving]
     late = RescoringTold(1, RescoreView("done"))
     for event in (EpisodesSaved(1, "saved"), SaveFailed(1, "it failed"), late):
-        assert apply_of_these(state, event) == (state, [])
-    state, _ = apply_of_these(state, EpisodesSaved(2, "saved"))
+        assert apply_filtered(state, event) == (state, [])
+    state, _ = apply_filtered(state, EpisodesSaved(2, "saved"))
     assert state.recording.status(state.run).saving.message == "saved"
 
 
 def test_episodes_are_saved_once_they_are_solved_and_one_job_at_a_time() -> None:
     state, _ = after(loaded(), RESET, STEP)
     with pytest.raises(Refused):
-        apply_of_these(state, Asked(SaveSolved()))
+        apply_filtered(state, Asked(SaveSolved()))
     solved = Solving(episodes={env: RunningEpisode(solved_at=1) for env in (0, 2)})
-    state, (begin,) = apply_of_these(replace(state, solving=solved), Asked(SaveSolved()))
+    state, (begin,) = apply_filtered(replace(state, solving=solved), Asked(SaveSolved()))
     assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [0, 2]
     with pytest.raises(Refused):
-        apply_of_these(state, Asked(SaveSolved()))
+        apply_filtered(state, Asked(SaveSolved()))
 
 
 def test_a_rescoring_stopped_by_a_save_restarts_if_the_version_stays_the_same() -> None:
@@ -272,7 +272,7 @@ def test_a_rescoring_stopped_by_a_save_restarts_if_the_version_stays_the_same() 
     state, _ = after(*begun, Asked(StopRescoring()))
     assert state.rescoring.view.stopped_by is StoppedBy.HAND
     with pytest.raises(Refused):
-        apply_of_these(state, Asked(StopRescoring()))
+        apply_filtered(state, Asked(StopRescoring()))
 
 
 def test_an_episode_saved_from_the_past_does_not_count_as_recorded() -> None:

@@ -184,7 +184,7 @@ def test_an_episode_does_not_depend_on_those_before_it_in_its_process(tmp_path: 
     assert_same(found[1], found[2])
 
 
-class InAnyOrder:
+class RandomOrderExecutor:
     """An executor whose episodes end in a drawn order, with empty files."""
 
     def __init__(self, good: list[bool], slots: int, data: st.DataObject) -> None:
@@ -224,7 +224,7 @@ def test_successes_with_the_lowest_numbers_are_kept(
     seen: list[RecordProgress] = []
     with tempfile.TemporaryDirectory() as folder:
         what = RecordOptions("PushCube-v1", Path(folder), successes=wanted, tries=tries)
-        done = record(what, on_progress=seen.append, executor=InAnyOrder(good, slots, data))
+        done = record(what, on_progress=seen.append, executor=RandomOrderExecutor(good, slots, data))
         left = sorted(path.name for path in Path(folder).iterdir())
     assert [episode.index for episode in done.written] == first
     assert left == sorted(f"v1.{number}{suffix}" for number in first for suffix in (".rrd", ".h5", ".json"))
@@ -317,7 +317,7 @@ def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def tires(tmp_path: Path) -> RecordOptions:
+def failing_policy(tmp_path: Path) -> RecordOptions:
     """Options for two episodes of three steps; the policy raises in the second one."""
     (tmp_path / "tires.py").write_text(
         "asked = 0\n\n\ndef act(obs):\n    global asked\n    asked += 1\n"
@@ -330,9 +330,9 @@ def tires(tmp_path: Path) -> RecordOptions:
     )
 
 
-def test_a_failed_episode_is_no_longer_in_progress(tires: RecordOptions) -> None:
+def test_a_failed_episode_is_no_longer_in_progress(failing_policy: RecordOptions) -> None:
     progress: list[RecordProgress] = []
-    record(tires, on_progress=progress.append)
+    record(failing_policy, on_progress=progress.append)
     assert any(1 in now.running for now in progress)
     last = progress[-1]
     assert [list(failure.numbers) for failure in last.failures] == [[1]]
@@ -340,9 +340,9 @@ def test_a_failed_episode_is_no_longer_in_progress(tires: RecordOptions) -> None
 
 
 def test_episodes_kept_before_a_failure_are_reported(
-    tires: RecordOptions, capsys: pytest.CaptureFixture
+    failing_policy: RecordOptions, capsys: pytest.CaptureFixture
 ) -> None:
-    assert record_in_terminal(tires) == 1
+    assert record_in_terminal(failing_policy) == 1
     printed = capsys.readouterr()
     assert "policy failed" in printed.err and "tired" in printed.err
     assert "without a result, 1 in all: episode 1" in printed.err

@@ -119,7 +119,7 @@ def test_bytes_on_the_disk_no_longer_count_as_waiting(
 ) -> None:
     """A recording ends only if too much waits at once, whatever its total size; the next one starts from zero."""
     monkeypatch.setattr(recording, "MAX_PENDING_BYTES", 10_500)
-    taker = Taker()
+    taker = BlockingRecorder()
     monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: taker)
     with told_session(tmp_path) as told:
         told.play(0)
@@ -157,7 +157,7 @@ def test_bytes_on_the_disk_no_longer_count_as_waiting(
             taker.disk.set()
 
 
-class Taker:
+class BlockingRecorder:
     """Stands in for a recorder; takes a step once the `disk` event is set."""
 
     env_idx = (0,)

@@ -61,7 +61,7 @@ def recorded(
     return history_of(told.session)
 
 
-def drawn(seed: int, rows: int, envs: int) -> tuple[list[StepResult], list[StepResult], np.ndarray]:
+def random_record(seed: int, rows: int, envs: int) -> tuple[list[StepResult], list[StepResult], np.ndarray]:
     """Random recorded steps, rescored steps, and jumps (rows, envs)."""
     rng = np.random.default_rng(seed)
     jumped = np.zeros((rows, envs), bool)
@@ -86,7 +86,7 @@ def drawn(seed: int, rows: int, envs: int) -> tuple[list[StepResult], list[StepR
 def test_differences_equal_those_found_by_plain_loops(
     shared: Told, seed: int, rows: int, envs: int, part: float
 ) -> None:
-    old, new, jumped = drawn(seed, rows, envs)
+    old, new, jumped = random_record(seed, rows, envs)
     history = recorded(shared, old, jumped)
     rescored = RescoredPast(history)
     chosen = [row for run in rescored.runs() for row in run][: max(1, int(part * rows))]
@@ -116,7 +116,7 @@ def test_differences_equal_those_found_by_plain_loops(
                 tuple(float(sum(side[r].reward[env] for r in steps)) for side in (old, new)),
                 len(steps),
                 int(old[min(parted)].elapsed_steps[env]) if parted else None,
-                looked_at(old, new, inside, others, env, parted),
+                expected_moment(old, new, inside, others, env, parted),
             )
     found = {
         (v.of.env, int(v.of.serials[0]) - history.first): (
@@ -136,7 +136,7 @@ def test_differences_equal_those_found_by_plain_loops(
     assert rescored.names()[1] == names
 
 
-def looked_at(
+def expected_moment(
     old: list[StepResult],
     new: list[StepResult],
     inside: list[int],
@@ -154,7 +154,7 @@ def looked_at(
 
 
 def test_the_record_ends_at_a_jump_that_cannot_be_restored(shared: Told) -> None:
-    old, _, _ = drawn(2, 6, 2)
+    old, _, _ = random_record(2, 6, 2)
     jumped = np.zeros((6, 2), bool)
     jumped[[0, 4]] = True
     assert RescoredPast(recorded(shared, old, jumped, [b"b"] * 4 + [b""] * 2)).runs() == [range(4)]
@@ -162,7 +162,7 @@ def test_the_record_ends_at_a_jump_that_cannot_be_restored(shared: Told) -> None
 
 
 def test_a_moment_scored_again_is_compared_again_and_nan_is_a_difference(shared: Told) -> None:
-    old, _, _ = drawn(3, 5, 2)
+    old, _, _ = random_record(3, 5, 2)
     jumped = np.zeros((5, 2), bool)
     jumped[0] = True
     history = recorded(shared, old, jumped)
@@ -183,7 +183,7 @@ def test_a_moment_scored_again_is_compared_again_and_nan_is_a_difference(shared:
 def test_a_rescoring_stopped_before_it_starts_keeps_no_reference_to_the_past(shared: Told) -> None:
     process = Background()
     rescorer = PastRescorer(process, lambda event: None)
-    old, _, jumped = drawn(1, 6, 2)
+    old, _, jumped = random_record(1, 6, 2)
     goes_on = loop.do(asyncio.Event)
 
     async def other_job() -> None:
@@ -210,7 +210,7 @@ def test_a_rescoring_stopped_before_it_starts_keeps_no_reference_to_the_past(sha
 
 
 def test_an_entry_that_only_one_version_has_differs_and_comes_first(shared: Told) -> None:
-    old, _, jumped = drawn(3, 5, 2)
+    old, _, jumped = random_record(3, 5, 2)
     rescored = RescoredPast(recorded(shared, old, jumped))
     assert rescored.names() == (("reward", "success", "height"), frozenset())
     for row in rescored.runs()[0]:
@@ -222,7 +222,7 @@ def test_an_entry_that_only_one_version_has_differs_and_comes_first(shared: Told
 
 
 def test_drift_is_measured_per_env_and_run(shared: Told) -> None:
-    old, _, _ = drawn(1, 6, 2)
+    old, _, _ = random_record(1, 6, 2)
     jumped = np.zeros((6, 2), bool)
     jumped[0] = True
     rescored = RescoredPast(recorded(shared, old, jumped))

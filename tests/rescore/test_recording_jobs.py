@@ -30,7 +30,7 @@ TCP: list[int] = []
 
 
 @dataclass(frozen=True)
-class Held:
+class InMemorySource:
     """An in-memory episode in place of a file."""
 
     run: RecordedRun
@@ -56,8 +56,8 @@ def recorded() -> Recorded:
     return recorded
 
 
-def verdicts_of(task: OpenedTask, files: list[Held], use_env_states: bool) -> list[Verdict]:
-    parts = rescore(task, files, use_env_states=use_env_states, read=Held.read)
+def verdicts_of(task: OpenedTask, files: list[InMemorySource], use_env_states: bool) -> list[Verdict]:
+    parts = rescore(task, files, use_env_states=use_env_states, read=InMemorySource.read)
     return [verdict for part in parts for verdict in part.verdicts]
 
 
@@ -72,7 +72,7 @@ def rescored(
     file = tmp_path / "push_cube.py"
     file.write_text(text)
     task = opened(str(file), num_envs)
-    files = [Held(recorded.run(k).until(STEPS - 3 * k), name=str(k), id=str(k)) for k in range(5)]
+    files = [InMemorySource(recorded.run(k).until(STEPS - 3 * k), name=str(k), id=str(k)) for k in range(5)]
     verdicts = verdicts_of(task, files, use_env_states)
     task.env.close()
     return sorted(verdicts, key=lambda verdict: verdict.of.name)
@@ -110,10 +110,10 @@ def test_unusable_recordings_are_reported_with_a_reason_and_the_others_are_resco
     task = opened(str(TASKS / "push_cube.py"), 2)
     run = recorded.run(0)
     files = [
-        Held(replace(run, action=run.action[:, :3]), name="narrow"),
-        Held(run.until(0), name="empty"),
-        Held(run.until(4), name="fine"),
-        Held(replace(run, env_states={}), name="no states"),
+        InMemorySource(replace(run, action=run.action[:, :3]), name="narrow"),
+        InMemorySource(run.until(0), name="empty"),
+        InMemorySource(run.until(4), name="fine"),
+        InMemorySource(replace(run, env_states={}), name="no states"),
     ]
     by_name = {verdict.of.name: verdict for verdict in verdicts_of(task, files, True)}
     task.env.close()
@@ -172,7 +172,7 @@ def test_a_task_without_a_robot_is_rescored(tmp_path: Path, use_env_states: bool
     low = np.array([step.evaluate["low"][0] for step in steps])
     rows = {name: np.stack([state[name][0] for state in states]) for name in states[0]}
     run = RecordedRun("fallen", 0, {}, np.zeros((10, 0), np.float32), rows, {"low": low}, reward)
-    (verdict,) = verdicts_of(task, [Held(run)], use_env_states)
+    (verdict,) = verdicts_of(task, [InMemorySource(run)], use_env_states)
     task.env.close()
     assert verdict.why_not == "" and reward[0] > reward[-1] and low[-1]
     np.testing.assert_array_equal(verdict.new_reward, reward)

@@ -251,7 +251,7 @@ def test_each_verdict_is_sent_once_however_often_progress_is_reported(
     assert sorted(names) == sorted(file.name for file in files) and len(parts) > EPISODES
 
 
-class Elsewhere:
+class StoringExecutor:
     """An executor that stores its work and does it in this process."""
 
     elsewhere = True
@@ -275,7 +275,7 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
     recording = Recording(0, bytes(source.path), None, source.part, source.id, source.name)
     setup = setup_of([(code, [recording])], 1, use_env_states=False)
 
-    executor = Elsewhere()
+    executor = StoringExecutor()
     (result,) = rescore_recordings(setup, executor)
     assert not result.verdict.why_not and result.verdict.of == source
     assert {file.suffix for file in executor.work.files} == {".rrd", ".h5", ".json"}

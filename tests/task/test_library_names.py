@@ -24,7 +24,7 @@ NOT_IMPORTED = ("colorsys", "sched", "sympy", "jinja2")
 
 
 @pytest.fixture
-def late() -> tuple[str, ...]:
+def not_imported() -> tuple[str, ...]:
     for name in NOT_IMPORTED:
         for loaded in [key for key in sys.modules if key.partition(".")[0] == name]:
             del sys.modules[loaded]
@@ -38,13 +38,13 @@ def plant(write: Write, *names: str) -> None:
 
 @pytest.mark.slow
 def test_a_librarys_name_gives_the_library_wherever_it_is_imported(
-    write: Write, late: tuple[str, ...]
+    write: Write, not_imported: tuple[str, ...]
 ) -> None:
-    plant(write, "numpy", *late)
+    plant(write, "numpy", *not_imported)
     path = write("push.py", "import numpy, helper\n" + TASK, task=True)
     helper = write("helper.py", "SIZE = 1\n")
     task = load_task(str(path))
-    for name in late:
+    for name in not_imported:
         assert "RuntimeError" not in str(importlib.import_module(name).__file__)
         assert not str(importlib.import_module(name).__file__).startswith(str(path.parent))
     assert sys.modules[task.cls.__module__].helper.__file__ == str(helper), (
@@ -84,11 +84,11 @@ def test_a_first_load_that_fails_leaves_no_folder_and_no_finder_behind(write: Wr
 
 
 def test_a_policy_imports_modules_beside_it_but_never_in_place_of_a_library(
-    write: Write, late: tuple[str, ...], capsys: pytest.CaptureFixture
+    write: Write, not_imported: tuple[str, ...], capsys: pytest.CaptureFixture
 ) -> None:
-    plant(write, *late)
+    plant(write, *not_imported)
     write("gains.py", "GAIN = 3\n")
-    imports = "".join(f"import {name}\n" for name in late)
+    imports = "".join(f"import {name}\n" for name in not_imported)
     policy = write("own_policy.py", imports + "from gains import GAIN\ndef act(obs): return GAIN\n")
     before = list(sys.path), list(sys.meta_path)
     sys.modules.pop("gains", None)

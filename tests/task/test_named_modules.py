@@ -36,7 +36,7 @@ REFERENCE = "lab_of_mine.tasks:MinimalEnv"
 
 
 @pytest.fixture(autouse=True)
-def nothing_for_good(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def undo_imports(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Undo imports, which would stay for the rest of the process."""
     monkeypatch.setattr(library_names, "_permanent_folder", False)
     names = set(sys.modules)

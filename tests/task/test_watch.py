@@ -39,7 +39,7 @@ class Calls:
                 return number
         raise AssertionError("too many calls")
 
-    def nothing_before(self, last: Path) -> bool:
+    def comes_next(self, last: Path) -> bool:
         """Save another watched file; returns whether that save is the next call."""
         last.write_text(f"{last.read_text()}# again\n")
         return self.next() == {last.name: last.read_text()}
@@ -101,20 +101,20 @@ def test_every_way_of_saving_is_seen_repeatedly(
     for number in (1, 2, 3):
         save(file, f"a = {number}\n")
         assert calls.next() == {"task.py": f"a = {number}\n"}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
 def test_only_new_content_of_watched_files_counts(file: Path, last: Path, calls: Calls) -> None:
     os.utime(file)
     file.with_name("other.py").write_text("b = 1\n")
     file.write_text(file.read_text())
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
 def test_a_deleted_file_is_reported_once_and_so_is_its_return(file: Path, last: Path, calls: Calls) -> None:
     file.unlink()
     assert calls.next() == {"task.py": None}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
     file.write_text("a = 0\n")
     assert calls.next() == {"task.py": "a = 0\n"}
 
@@ -125,7 +125,7 @@ def test_a_save_that_truncates_first_is_not_seen_empty(file: Path, last: Path, c
         time.sleep(0.12)  # so that it is seen empty
         opened.write("a = 1\n")
     assert calls.next() == {"task.py": "a = 1\n"}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
 def test_a_folder_deleted_and_made_again_is_watched_again(
@@ -151,7 +151,7 @@ def test_a_save_between_reading_and_watching_is_not_lost(
     watcher.follow([path], {str(path): "a = 0\n"})
     assert calls.next() == {"task.py": "a = 1\n"}
     watcher.follow([path, last], {str(path): "a = 1\n"})
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
 def test_files_in_several_folders_are_watched_and_released(
@@ -169,7 +169,7 @@ def test_files_in_several_folders_are_watched_and_released(
     two.write_text("a = 2\n")
     one.write_text("a = 2\n")
     assert calls.next() == {"one.py": "a = 2\n"}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
 def test_a_save_without_a_file_system_event_is_seen_by_polling(
@@ -180,7 +180,7 @@ def test_a_save_without_a_file_system_event_is_seen_by_polling(
     for number in (1, 2):
         file.write_text(f"a = {number}\n")
         assert calls.next() == {"task.py": f"a = {number}\n"}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
 Many = Callable[[int, int], list[Path]]

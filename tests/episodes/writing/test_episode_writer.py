@@ -33,7 +33,7 @@ Maker = Callable[..., Made]
 
 
 @contextmanager
-def little_room(size: int) -> Iterator[None]:
+def size_limit(size: int) -> Iterator[None]:
     """Make writes fail half way, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
@@ -159,7 +159,7 @@ def test_a_discarded_episode_leaves_no_file(make_episode: Maker, tmp_path: Path)
 @pytest.mark.parametrize("room", [0, 4000, 40_000])
 def test_a_full_disk_leaves_the_journal_or_nothing(make_episode: Maker, tmp_path: Path, room: int) -> None:
     episode = wide(make_episode)
-    with little_room(room):
+    with size_limit(room):
         with pytest.raises(RecordingError, match=r"Cannot record Made-v1 .*limit"):
             writer = episode.writer(tmp_path)
             for row in episode.rows():

@@ -36,7 +36,7 @@ def seen(make_episode: Maker) -> Made:
 
 
 @pytest.fixture
-def held_back(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+def encoding_blocked(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
     """Block the encoding of pictures until the event is set."""
     go, encode = threading.Event(), episode_writer.encode
 
@@ -56,12 +56,14 @@ def pictures_of(path: Path) -> list[int]:
     return [int(camera.segmentation[k][0, 0]) for k in range(len(camera.segmentation))]
 
 
-def test_steps_do_not_wait_for_their_pictures(seen: Made, held_back: threading.Event, tmp_path: Path) -> None:
+def test_steps_do_not_wait_for_their_pictures(
+    seen: Made, encoding_blocked: threading.Event, tmp_path: Path
+) -> None:
     writer = seen.writer(tmp_path)
     for row in seen.rows():
         append(writer, row)
-    assert not held_back.is_set()
-    held_back.set()
+    assert not encoding_blocked.is_set()
+    encoding_blocked.set()
     assert pictures_of(writer.finish().json) == list(range(STATES))
 
 
