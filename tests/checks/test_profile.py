@@ -1,4 +1,4 @@
-"""The time of a step of the running version, on a background process that answers what a test tells it."""
+"""The step profile of the running version, with a scripted background process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PROFILE = StepProfile(3, 20, 1.0, (HookTime("evaluate", 1.0, 1.0),), ())
 
 
 class Timer:
-    """Answers with the profile, or fails, once it is let."""
+    """Returns the profile, or fails, once `let` is set."""
 
     def __init__(self) -> None:
         self.let = False
@@ -48,9 +48,7 @@ def timer(told: Told) -> Timer:
     return timer
 
 
-def test_a_step_is_timed_and_its_profile_is_old_as_soon_as_another_version_runs(
-    told: Told, timer: Timer
-) -> None:
+def test_a_step_is_timed_and_its_profile_is_stale_once_another_version_runs(told: Told, timer: Timer) -> None:
     with pytest.raises(Refused):
         told.session.do(TimeStep())
     told.load()
@@ -63,7 +61,7 @@ def test_a_step_is_timed_and_its_profile_is_old_as_soon_as_another_version_runs(
     assert told.view.of(ProfileView).profile == PROFILE and told.view.of(ProfileView).stale
 
 
-def test_a_load_and_a_person_end_it(told: Told, timer: Timer) -> None:
+def test_a_load_and_the_stop_button_end_a_profile(told: Told, timer: Timer) -> None:
     told.load()
     for end in (lambda: told.load("patched"), lambda: told.session.do(StopProfile())):
         told.session.do(TimeStep())
@@ -71,7 +69,7 @@ def test_a_load_and_a_person_end_it(told: Told, timer: Timer) -> None:
         assert told.view.of(ProfileView).state == "stopped"
 
 
-def test_what_the_code_raises_is_shown(told: Told, timer: Timer) -> None:
+def test_an_error_of_the_task_is_shown(told: Told, timer: Timer) -> None:
     told.load()
     timer.let, timer.fails = True, JobFailed("it cannot be timed", problem())
     told.session.do(TimeStep())

@@ -1,4 +1,4 @@
-"""The rules of a running version, on a background process that answers what a test tells it."""
+"""Checks of the running version, with a scripted background process."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def broken(rule: str) -> RuleResult:
 
 
 class ScriptedBackground:
-    """Answers each group with its results, once it is let."""
+    """Returns the results of each group once `let` allows it."""
 
     def __init__(self) -> None:
         self.comes_to: dict[str, RuleResult] = {}
@@ -53,9 +53,9 @@ class ScriptedBackground:
         self.priorities: list[str] = []
         self.loads: list[Load] = []
         self.give_way_after = 99
-        """Results of a group after which a job of higher priority comes, once."""
+        """Number of results of a group after which a job of higher priority preempts it, once."""
         self.dies_at = ""
-        """The rule that ends the process."""
+        """The rule that kills the process."""
         self.fails: JobFailed | None = None
         self.let = threading.Semaphore(1000)
 
@@ -154,7 +154,7 @@ def test_the_same_version_is_not_checked_twice(checks: Told, background: Scripte
     ],
     ids=lambda changed: next(iter(changed)),
 )
-def test_envs_that_are_made_otherwise_are_checked_anew(
+def test_envs_with_other_options_are_checked_again(
     checks: Told, background: ScriptedBackground, changed: dict[str, Any]
 ) -> None:
     load(checks)
@@ -164,7 +164,7 @@ def test_envs_that_are_made_otherwise_are_checked_anew(
     assert len(background.asked) == 4
 
 
-def test_findings_of_the_version_before_stay_until_their_rule_is_checked(
+def test_findings_of_the_previous_version_stay_until_their_rule_is_checked(
     checks: Told, background: ScriptedBackground
 ) -> None:
     background.comes_to = {FIRST: broken(FIRST), SECOND: broken(SECOND)}
@@ -186,7 +186,7 @@ def test_findings_of_the_version_before_stay_until_their_rule_is_checked(
     assert view.before == () and [one.rule for one in view.findings] == [SECOND]
 
 
-def test_a_finding_goes_with_the_line_that_it_is_about(checks: Told, background: ScriptedBackground) -> None:
+def test_a_finding_disappears_with_its_line(checks: Told, background: ScriptedBackground) -> None:
     background.comes_to = {FIRST: broken(FIRST)}
     load(checks)
     ended(checks)
@@ -195,7 +195,7 @@ def test_a_finding_goes_with_the_line_that_it_is_about(checks: Told, background:
     assert checks.view.of(ChecksView).before == () and checks.view.of(ChecksView).findings == ()
 
 
-def test_another_task_has_no_findings_of_the_one_before(checks: Told, background: ScriptedBackground) -> None:
+def test_another_task_starts_without_findings(checks: Told, background: ScriptedBackground) -> None:
     background.comes_to = {FIRST: broken(FIRST)}
     load(checks)
     ended(checks)
@@ -204,7 +204,7 @@ def test_another_task_has_no_findings_of_the_one_before(checks: Told, background
     assert checks.view.of(ChecksView).before == () and checks.view.of(ChecksView).findings == ()
 
 
-def test_a_save_stops_it_and_what_is_known_stays(checks: Told, background: ScriptedBackground) -> None:
+def test_a_save_stops_a_check_and_results_so_far_stay(checks: Told, background: ScriptedBackground) -> None:
     background.hold()
     load(checks)
     background.let.release()
@@ -215,13 +215,13 @@ def test_a_save_stops_it_and_what_is_known_stays(checks: Told, background: Scrip
         StoppedBy.SAVE,
     )
     assert rules_of(checks.view.of(ChecksView)) == [FIRST]
-    # The same text again, or what could not be loaded taken back.
+    # The same text again, or a save that could not be loaded and was undone.
     background.let = threading.Semaphore(10)
     load(checks)
     assert ended(checks).state == "done"
 
 
-def test_a_group_that_gave_way_is_asked_without_the_rules_that_are_known(
+def test_a_preempted_group_is_resumed_without_the_finished_rules(
     checks: Told, background: ScriptedBackground
 ) -> None:
     background.give_way_after = 1
@@ -231,7 +231,7 @@ def test_a_group_that_gave_way_is_asked_without_the_rules_that_are_known(
     assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
 
 
-def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
+def test_a_rule_that_kills_the_process_fails_and_the_others_continue(
     checks: Told, background: ScriptedBackground
 ) -> None:
     background.dies_at = FIRST
@@ -243,7 +243,7 @@ def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
     assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
 
 
-def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
+def test_without_automatic_checks_a_load_marks_the_findings_as_old(
     checks: Told, background: ScriptedBackground
 ) -> None:
     background.comes_to = {FIRST: broken(FIRST)}
@@ -256,7 +256,7 @@ def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
     assert len(background.asked) == 2
 
 
-def test_the_choice_is_kept_and_what_was_not_checked_is_checked_as_soon_as_it_is_wanted(
+def test_turning_automatic_checks_on_is_remembered_and_checks_at_once(
     checks: Told, background: ScriptedBackground
 ) -> None:
     with pytest.raises(Refused):
@@ -270,7 +270,7 @@ def test_the_choice_is_kept_and_what_was_not_checked_is_checked_as_soon_as_it_is
     assert ended(checks).state == "done"
 
 
-def test_what_is_stopped_by_hand_says_so(checks: Told, background: ScriptedBackground) -> None:
+def test_a_check_stopped_by_hand_says_so(checks: Told, background: ScriptedBackground) -> None:
     background.hold()
     load(checks)
     checks.session.do(StopChecks())
@@ -284,7 +284,7 @@ def test_what_is_stopped_by_hand_says_so(checks: Told, background: ScriptedBackg
 
 
 @pytest.mark.slow
-def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_clears_it(
+def test_a_broken_save_is_found_at_its_line_while_playing_and_a_fix_clears_it(
     child_process: None, task_file: Path
 ) -> None:
     text = task_file.read_text()
@@ -302,7 +302,7 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
         (one,) = (each for each in view.of(ChecksView).findings if each.rule == FIRST)
         assert (one.file, one.line, one.degree) == (str(task_file), line, "stop") and bad in one.code
         assert view.playing
-        # Somebody waits for this: the checks give way, and go on.
+        # A person waits for this request: the checks are preempted and then resumed.
         session.happen(SaveWanted((0,)))
         wait_until(session, lambda view: view.of(RecordingStatus).saving.message != "", "the saved episode")
         task_file.write_text(text)

@@ -1,4 +1,4 @@
-"""Recording with a worker that is the test: what is recovered, refused, and what a failure ends."""
+"""Recording with a scripted worker: recovered episodes, refusals, and the effects of failures."""
 
 from __future__ import annotations
 
@@ -24,25 +24,23 @@ from workbench.record.saving_state import SaveWanted
 from workbench.record.state import RecordingStatus, RecordingWanted
 
 
-def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
+def test_a_recovered_episode_is_named_on_the_page_and_in_the_terminal(
     child_process: None, tmp_path: Path
 ) -> None:
     begin(tmp_path, made(5, seed=8))
-    said: list[str] = []
-    with told_session(tmp_path, on_notice=said.append) as told:
-        until(lambda: said, "a word of it")
+    notices: list[str] = []
+    with told_session(tmp_path, on_notice=notices.append) as told:
+        until(lambda: notices, "the notice")
         (rrd,) = tmp_path.glob("*.rrd")
-        assert len(said) == 1 and str(rrd) in said[0]
+        assert len(notices) == 1 and str(rrd) in notices[0]
         assert told.view.of(RecordingStatus).recovered == (str(rrd),)
 
 
-def test_what_is_stopped_or_dies_in_the_middle_of_an_episode_is_written(
-    child_process: None, tmp_path: Path
-) -> None:
+def test_an_episode_cut_off_by_a_stop_or_a_death_is_written(child_process: None, tmp_path: Path) -> None:
     with told_session(tmp_path) as told:
         with pytest.raises(Refused):
             told.session.happen(RecordingWanted())
-        assert told.asked(SetCapture) == [], "before there is a task"
+        assert told.asked(SetCapture) == [], "no task is loaded yet"
         told.play(0)
         with pytest.raises(Refused):
             told.session.do(StopRecording())
@@ -64,27 +62,29 @@ def test_what_is_stopped_or_dies_in_the_middle_of_an_episode_is_written(
         assert len(list(tmp_path.glob("*.rrd"))) == 2
 
 
-def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_not_the_thread(
+def test_an_invalid_step_ends_the_recording_with_a_message_and_keeps_the_thread(
     played: Told,
 ) -> None:
-    said: list[str] = []
-    listen(said.append)
+    notices: list[str] = []
+    listen(notices.append)
     try:
         for _ in range(2):
             played.session.happen(RecordingWanted((0,)))
-            assert played.view.of(RecordingStatus).problem is None, "that of the one before is forgotten"
+            assert played.view.of(RecordingStatus).problem is None, (
+                "the problem of the previous recording is cleared"
+            )
             played.reset((0,))
             now: Any = played.view.step
-            bad: Any = {"state": SimpleNamespace(nbytes=0)}  # what is no array
+            bad: Any = {"state": SimpleNamespace(nbytes=0)}  # not an array
             played.tell(replace(moment(now.elapsed_steps + 1), columns=bad))
             until(lambda: played.view.of(RecordingStatus).problem is not None, "the problem")
             assert not played.view.of(RecordingStatus).active
-        assert said
+        assert notices
     finally:
-        stop_listening(said.append)
+        stop_listening(notices.append)
 
 
-def test_what_cannot_be_saved_of_the_past_is_refused_for_what_is_shown_alone(tmp_path: Path) -> None:
+def test_a_refusal_to_save_the_past_is_shown_only_where_it_applies(tmp_path: Path) -> None:
     with told_session(tmp_path, history_bytes=20_000) as told:
         told.session.happen(SaveWanted((0,)))
         assert told.view.of(RecordingStatus).saving.failed, "no task"
@@ -97,27 +97,29 @@ def test_what_cannot_be_saved_of_the_past_is_refused_for_what_is_shown_alone(tmp
         refused = told.view.of(RecordingStatus).saving
         assert refused.failed and "no longer in memory" in refused.message and refused.progress is None
         told.session.change(selected_env=1)
-        assert not told.view.of(RecordingStatus).saving.message, "it is of env 0"
+        assert not told.view.of(RecordingStatus).saving.message, "the message is about env 0"
         told.session.change(selected_env=0)
         assert told.view.of(RecordingStatus).saving.failed
         told.step()
-        assert not told.view.of(RecordingStatus).saving.message, "it is of the moment before"
+        assert not told.view.of(RecordingStatus).saving.message, "the message is about the previous moment"
         told.reset()
         told.step(2)
         told.reset()
         told.session.happen(SaveWanted((0,), before=True))
-        assert told.view.of(RecordingStatus).saving.failed, "the one before began earlier than what is kept"
+        assert told.view.of(RecordingStatus).saving.failed, (
+            "the previous episode began before the kept history"
+        )
         told.session.happen(RecordingWanted())
-        assert not told.view.of(RecordingStatus).saving.message, "something else is recorded"
+        assert not told.view.of(RecordingStatus).saving.message, "a new recording replaces the message"
         assert moment_at(told.session, 0) is None
 
 
-def test_what_the_disk_has_taken_does_not_wait_any_more(
+def test_bytes_on_the_disk_no_longer_count_as_waiting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However much a recording holds in all: it ends only where too much waits at once, and the next begins anew."""
+    """A recording ends only if too much waits at once, whatever its total size; the next one starts from zero."""
     monkeypatch.setattr(recording, "MAX_PENDING_BYTES", 10_500)
-    taker = Taker()
+    taker = BlockingRecorder()
     monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: taker)
     with told_session(tmp_path) as told:
         told.play(0)
@@ -155,8 +157,8 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
             taker.disk.set()
 
 
-class Taker:
-    """Takes every step, if the disk does."""
+class BlockingRecorder:
+    """Stands in for a recorder; takes a step once the `disk` event is set."""
 
     env_idx = (0,)
 
@@ -173,4 +175,4 @@ class Taker:
         self.taken += 1
 
     def finish(self) -> None:
-        """Nothing is left of it."""
+        """Do nothing; there are no files."""
