@@ -1,4 +1,4 @@
-"""What every test relies on: rerun strict, a configuration folder of its own, a real Chromium by name, no processes left behind."""
+"""Setup for every test: strict rerun, a separate configuration folder, a shared browser, no processes left behind."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-# Before anything imports rerun, which reads it once: a wrong argument raises instead of printing a warning.
+# Before anything imports rerun, which reads this once: a wrong argument raises instead of printing a warning.
 os.environ["RERUN_STRICT"] = "1"
-# For this process and all that it starts: what tests trust and seal must not get into the developer's own folder.
+# For this process and its children: consents and seals of tests must not get into the developer's own folder.
 os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-test-config-")
-# Nor what they opened last.
+# Nor recent tasks.
 os.environ["XDG_STATE_HOME"] = os.path.join(os.environ["XDG_CONFIG_HOME"], "state")
 
 import psutil
@@ -30,7 +30,7 @@ atexit.register(shutil.rmtree, os.environ["XDG_CONFIG_HOME"], ignore_errors=True
 
 MANY_MODULES = 50
 
-# Until the tests begin: what they import is no garbage, and neither are they. It takes a third of the time to collect them.
+# Off during collection: imports and collected tests are not garbage, and searching them takes a third of the time.
 gc.disable()
 
 pytest_plugins = [
@@ -41,7 +41,7 @@ pytest_plugins = [
     "tests.drive.task_files",
 ]
 
-# By itself hypothesis fails an example that takes 0.2 s, which a busy machine makes of any.
+# By default hypothesis fails an example that takes 0.2 s, as any may on a busy machine.
 settings.register_profile("unhurried", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("unhurried")
 
@@ -62,7 +62,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="torch sees no CUDA device"))
 
 
-ONE_AFTER_THE_OTHER = {
+SHARED_SERVER_FILES = {
     **{
         f"tests/browser/test_{name}.py": "tests/browser/test_camera_reports.py"
         for name in ("by_keyboard", "layout", "marks", "page", "timeline")
@@ -72,24 +72,24 @@ ONE_AFTER_THE_OTHER = {
         for name in ("first_steps", "help")
     },
 }
-"""Files that share a page's server with another (tests/browser/conftest.py), so that one process has to run both."""
+"""Files that share a page's server with another file (tests/browser/conftest.py), so one process must run both."""
 
 
-EACH_ALONE = {"tests/test_every_command.py"}
-"""Files of long tests that share nothing: in one process they would go on long after all others."""
+SPLIT_FILES = {"tests/test_every_command.py"}
+"""Files of long independent tests, scheduled one by one: as one unit they would finish long after all others."""
 
 
 def run_together(nodeid: str) -> str:
-    """What runs in one process with this test: its file, or another with which that shares a server."""
+    """Scheduling unit of a test: its file, or the file with which that shares a server."""
     file = nodeid.split("::", 1)[0]
-    return nodeid if file in EACH_ALONE else ONE_AFTER_THE_OTHER.get(file, file)
+    return nodeid if file in SPLIT_FILES else SHARED_SERVER_FILES.get(file, file)
 
 
 def browsers_apart(items: list[pytest.Item]) -> list[pytest.Item]:
-    """The files with a browser spread among the others, which keep their order.
+    """Spread the files with a browser evenly among the others, which keep their order.
 
-    A page, its server and its worker are three processes. Where two pages were open at once most of the time, their tests took 704 s of
-    a process, and 497 spread.
+    A page, its server and its worker are three processes. With two pages open at once most of the time, their tests take 704 s of
+    process time; spread, 497 s.
     """
     files: dict[str, list[pytest.Item]] = {}
     for item in items:
@@ -106,7 +106,7 @@ def browsers_apart(items: list[pytest.Item]) -> list[pytest.Item]:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """As ``--dist loadfile``, but for those."""
+    """``--dist loadfile`` with the units of `run_together`."""
     if config.getoption("dist") != "loadfile":
         return None
     from xdist.scheduler import LoadFileScheduling
@@ -118,7 +118,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
     return Scheduling(config, log)
 
 
-SIGHTS = Path(__file__).parents[1] / "test-results"
+FAILURE_PICTURES = Path(__file__).parents[1] / "test-results"
 """Where a failed test leaves what its pages showed."""
 
 
@@ -133,14 +133,13 @@ def pytest_pyfunc_call() -> None:
 
 
 def name_no_test() -> None:
-    """pytest's variable is another in each test, and a worker is forked only where the environment is as it was."""
+    """Keep the environment constant: pytest's variable differs per test, and a worker is forked only in an unchanged one."""
     os.environ["PYTEST_CURRENT_TEST"] = "a test"
 
 
 @pytest.fixture(autouse=True, scope="module")
 def ids_are_free_again() -> Iterator[None]:
-    """What a module's tests register, as tasks and robots, is gone after them: another file with the same id would count as a
-    second one."""
+    """Unregister the tasks and robots of a module's tests: the same id in another test file would count as a duplicate."""
     before = {name for known in _registries() for name in known}
     yield
     for known in _registries():
@@ -152,7 +151,7 @@ def ids_are_free_again() -> Iterator[None]:
 
 
 def _registries() -> list[dict[str, Any]]:
-    """ManiSkill's ids of tasks and of robots, if it was imported."""
+    """ManiSkill's registries of tasks and robots, if it was imported."""
     tasks = sys.modules.get("mani_skill.utils.registration")
     robots = sys.modules.get("mani_skill.agents.registration")
     return [
@@ -166,10 +165,10 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     report = yield
     if "tests.drive.page" not in sys.modules:
         return report
-    # Of a test that passes too, so that what it expected to raise is not shown with a later one's failure.
+    # Also after a passing test, so that its expected exceptions are not shown with a later failure.
     sights = sys.modules["tests.drive.page"].seen_at_failure(report.failed)
     if report.failed and sights:
-        folder = SIGHTS / re.sub(r"[^\w.-]+", "-", f"{item.nodeid}-{report.when}")[-150:]
+        folder = FAILURE_PICTURES / re.sub(r"[^\w.-]+", "-", f"{item.nodeid}-{report.when}")[-150:]
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         for number, sight in enumerate(sights):
@@ -182,7 +181,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 @pytest.fixture(scope="module")
 def browser(chromium_path: str) -> Iterator[Browser]:
-    """Not one for all files: a thread in which Playwright waits takes no other loop of asyncio."""
+    """A browser for each file: a thread in which Playwright waits cannot run another asyncio loop."""
     from tests.drive.page import browser_at
 
     with browser_at(chromium_path) as browser:
@@ -191,19 +190,19 @@ def browser(chromium_path: str) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the example task in a folder of its own, for tests that edit it."""
+    """A copy of the example task in a separate folder, for tests that edit it."""
     example = Path(__file__).parents[1] / "tasks" / "push_cube.py"
     return Path(shutil.copy(example, tmp_path_factory.mktemp("author")))
 
 
 _searched = 0
-"""How many modules there were when garbage was last searched for among all objects."""
+"""Number of loaded modules at the last full garbage collection."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def imported_modules_are_not_searched_for_garbage() -> None:
-    """BaseEnv calls ``gc.collect()`` whenever it builds or closes: 0.25 s each over torch's own objects, and as long over what later
-    tests import."""
+    """BaseEnv calls ``gc.collect()`` on each build and close: 0.25 s for torch's own objects, and as much for later
+    imports."""
     global _searched
     if len(sys.modules) > _searched + MANY_MODULES:
         _searched = len(sys.modules)
@@ -215,17 +214,17 @@ def imported_modules_are_not_searched_for_garbage() -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def nothing_was_chosen_on_a_page_before() -> Iterator[None]:
-    """A file of tests that presses every button closes the hints too, for whichever file the process runs next."""
+    """Reset page choices: a test file that presses every button also closes the hints for the next file in the process."""
     yield
     Path(os.environ["XDG_CONFIG_HOME"], "workbench", "choices.json").unlink(missing_ok=True)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def no_process_left_behind() -> Iterator[None]:
-    """Workers and browsers that tests started must be gone when the tests are."""
+    """Fail if workers or browsers of the tests are still running at the end."""
     yield
     if "workbench.episodes.reader.reading" in sys.modules:
-        # Both serve the whole process, for as long as that lives.
+        # Both serve the whole process for its lifetime.
         sys.modules["workbench.episodes.reader.reading"].stop_reading()
     if "workbench.live.process.worker_start" in sys.modules:
         sys.modules["workbench.live.process.worker_start"].worker_forks.end()

@@ -1,11 +1,11 @@
-"""Would a test notice? Single slips are planted in a module, and the tests that protect it are run on each.
+"""Mutation testing: plants single mistakes in a module and runs the tests that protect it on each.
 
 Not a test: ``make mutants MODULES="page/door/access envs/snapshots/snapshot"`` runs it, ``MODULES=all`` all of `PROTECTED`. Cosmic Ray
-makes the slips; the rest is here: which of them, in a copy of the tree, and by which tests they should be found.
+makes the mutants; this script selects them, runs them in a copy of the tree, and knows which tests should find them.
 """
 
 # pyright: reportMissingImports=false
-# Cosmic Ray comes with `make mutants`, not with what lint and the tests need.
+# Only `make mutants` installs Cosmic Ray, not the set-up for lint and tests.
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from cosmic_ray.plugins import get_operator
 from parso.python.tree import Keyword
 
 ROOT = Path(__file__).resolve().parents[1]
-LAST = ROOT / "build" / "mutants"
-"""What the last run found, a file for each module: ``--lived`` runs those that lived again."""
-ENOUGH = 85
-"""Percent of a module's mutants that have to die."""
+LAST_RESULTS = ROOT / "build" / "mutants"
+"""Results of the last run, a file per module: ``--lived`` reruns the mutants that lived."""
+MIN_KILLED_PERCENT = 85
+"""Percentage of a module's mutants that must be killed."""
 
 PROTECTED = {
     "episodes/writing/journal": "episodes/writing/test_journal.py",
@@ -119,10 +119,10 @@ PROTECTED = {
     "app/review_page": "app/test_review_page.py -k 'strip or timeline or opened'",
     "app/go_live": "app/test_go_live.py",
     "library/listing": "library/test_listing.py library/test_panel.py",
-    "page/door/gated_server": "page/door/test_gated_server.py page/door/test_socket_and_renewal.py page/door/test_connection_limits.py::test_a_page_that_has_shown_the_token_is_not_hurried"
-    " page/door/test_connection_limits.py::test_what_is_turned_away_is_counted_and_told_once_of_each_kind"
-    " page/door/test_connection_limits.py::test_what_was_not_told_yet_is_told_at_the_end_with_the_total"
-    " -k 'not nothing_is_printed and not command and not palette and not many_that_start'",
+    "page/door/gated_server": "page/door/test_gated_server.py page/door/test_socket_and_renewal.py page/door/test_connection_limits.py::test_a_page_with_the_token_has_no_timeout"
+    " page/door/test_connection_limits.py::test_refused_requests_are_counted_and_logged_once_per_kind"
+    " page/door/test_connection_limits.py::test_a_repeated_message_is_logged_less_and_less_often"
+    " -k 'not only_the_workbench_prints and not command and not palette and not concurrent_starts'",
     "rescore/result_parts": "rescore/test_recordings_panel.py rescore/test_past_panel.py",
     "page/widgets/parts": "page/widgets/test_parts.py",
     "page/widgets/paged": "page/widgets/test_paged.py",
@@ -130,11 +130,11 @@ PROTECTED = {
     "live/panels/timeline_panel": "live/panels/test_timeline.py live/panels/test_timeline_strip.py",
     "page/door/file_response": "page/door/test_file_response.py",
 }
-"""The tests below ``tests/`` that should notice a slip in a module below ``workbench/``: the fast ones among them, since
-each mutant runs them all until one fails."""
+"""Tests under ``tests/`` that should notice a mutant of a module under ``workbench/``; only fast ones, because each
+mutant runs them all until one fails."""
 
-# Each operator with slips that people make; Cosmic Ray's other replacements (a division for a concatenation) die of a
-# TypeError, and would only make the share of dead mutants look better.
+# Operators that imitate human mistakes; Cosmic Ray's other replacements (a division for a concatenation) die of a
+# TypeError, and would only improve the percentage of killed mutants.
 _CORE = (
     *("AddNot", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue", "ReplaceAndWithOr", "ReplaceOrWithAnd"),
     *("ReplaceBreakWithContinue", "ReplaceContinueWithBreak", "ExceptionReplacer", "NumberReplacer"),
@@ -157,7 +157,7 @@ _CORE = (
 
 
 class LeaveOut(Operator):
-    """A line that is forgotten: a call, a raise, or an assignment to something that outlives the function."""
+    """Removes a line: a call, a raise, or an assignment to something that outlives the function."""
 
     def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
         if node.type == "simple_stmt" and self._may_be_missed(node.children[0]):
@@ -186,16 +186,16 @@ class LeaveOut(Operator):
 class Mutant:
     module: str
     number: int
-    """Of the line, from 1."""
+    """1-based line number."""
     line: str
     becomes: str
-    """Both stripped: how `REASONS` knows it again, wherever the line moves."""
+    """Line and replacement are stripped, so ``--lived`` finds the mutant again after the line has moved."""
     code: str
-    """The whole file with the slip in it."""
+    """The whole file with the mutation."""
 
 
 @dataclass(frozen=True)
-class Told:
+class Outcome:
     """How a mutant ended."""
 
     number: int
@@ -206,13 +206,13 @@ class Told:
 
 
 def _is_declaration(node: Any) -> bool:
-    """Whether the node is read by people and type checkers only, or says what a class is."""
+    """Whether the node does not affect behaviour in a test: an annotation, a decorator or a type alias."""
     child, parent = node, node.parent
     while parent is not None:
         if parent.type == "decorator":
             return True
         if parent.type in ("annassign", "tfpdef") and child is not parent.children[0]:
-            # Of ``name: kind = value`` the value is code.
+            # In ``name: kind = value`` only the value is code.
             before = parent.children[parent.children.index(child) - 1]
             if before.get_code().strip() == ":":
                 return True
@@ -226,7 +226,7 @@ def _is_declaration(node: Any) -> bool:
         child, parent = parent, parent.parent
     if node.type == "operator" and node.parent.type == "parameters":
         return True  # the star between parameters
-    # A union of types that is given a name at the module's top.
+    # A union type alias at module level.
     return node.type == "operator" and node.value == "|" and _at_the_top(node)
 
 
@@ -239,17 +239,17 @@ def _at_the_top(node: Any) -> bool:
 
 
 Place = tuple[tuple[int, int], tuple[int, int]]
-"""Where a slip begins and ends: line from 1 and column, each."""
+"""Start and end of a mutation: 1-based line and column, each."""
 
 
-def all_slips(source: str) -> dict[Place, list[tuple[Operator, int]]]:
-    """By place, in the order of the file: the operators that can change it, and at which of their occurrences."""
+def all_mutations(source: str) -> dict[Place, list[tuple[Operator, int]]]:
+    """For each place, in file order: the operators that can change it, and the index of the occurrence in each."""
     at_place: defaultdict[Place, list[tuple[Operator, int]]] = defaultdict(list)
     nodes = list(ast_nodes(get_ast(source)))
     for operator in [*(get_operator(f"core/{name}")() for name in _CORE), LeaveOut()]:
         spots = [(node, *spot) for node in nodes for spot in operator.mutation_positions(node)]
         for occurrence, (node, start, end) in enumerate(spots):
-            # In a file that has to do with paths a slash joins them: nothing else would run.
+            # In a file that uses Path a slash joins paths: with another operator nothing would run.
             joins = node.type == "operator" and node.value == "/" and "import Path\n" in source
             if not joins and not _is_declaration(node):
                 at_place[start, end].append((operator, occurrence))
@@ -270,12 +270,12 @@ def _compiles(code: str) -> bool:
     try:
         compile(code, "mutant", "exec", dont_inherit=True)
     except SyntaxError:
-        return False  # such as {*others} for {**others}: no test is needed for that
+        return False  # such as {*others} for {**others}: that needs no test
     return True
 
 
 def _as_mutant(module: str, source: str, code: str, start: tuple[int, int], end: tuple[int, int]) -> Mutant:
-    """Of the changed file only what stands at the place: Cosmic Ray joins lines before it, and drops their comments."""
+    """Take only the changed place from Cosmic Ray's file: it joins earlier lines and drops their comments."""
     lines = source.splitlines(keepends=True)
     before = "".join(lines[: start[0] - 1]) + lines[start[0] - 1][: start[1]]
     after = lines[end[0] - 1][end[1] :] + "".join(lines[end[0] :])
@@ -286,10 +286,10 @@ def _as_mutant(module: str, source: str, code: str, start: tuple[int, int], end:
 
 
 def sample(module: str, count: int, seed: int) -> list[Mutant]:
-    """``count`` mutants of the module, at as many places as there are, the same ones for the same file and seed."""
+    """``count`` mutants of the module at as many different places as possible, deterministic for file and seed."""
     source = (ROOT / "workbench" / f"{module}.py").read_text(encoding="utf-8")
     chance = random.Random(f"{module} {seed}")
-    places = list(all_slips(source).items())
+    places = list(all_mutations(source).items())
     chosen: list[Mutant] = []
     while len(chosen) < count and places:
         chance.shuffle(places)
@@ -304,7 +304,7 @@ def sample(module: str, count: int, seed: int) -> list[Mutant]:
 
 
 def copy_tree(into: Path) -> None:
-    """What git tracks or would: a mutant is never written into the author's own files."""
+    """Copy the files that git tracks or would track: a mutant is never written into the working tree."""
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     for name in subprocess.run(listed, cwd=ROOT, check=True, capture_output=True).stdout.decode().split("\0"):
         if name and (ROOT / name).is_file():
@@ -350,7 +350,7 @@ def run_tests(tree: Path, module: str, seconds: float) -> str:
         except subprocess.TimeoutExpired:
             code = None
         finally:
-            # Also what the tests started and a killed test left behind.
+            # Also processes that a killed test left behind.
             try:
                 os.killpg(process.pid, signal.SIGKILL)
             except ProcessLookupError:
@@ -362,7 +362,7 @@ def run_tests(tree: Path, module: str, seconds: float) -> str:
     return "passed" if code == 0 else "killed"
 
 
-def try_module(tree: Path, module: str, mutants: list[Mutant]) -> list[Told]:
+def try_module(tree: Path, module: str, mutants: list[Mutant]) -> list[Outcome]:
     """Run the module's tests on each mutant."""
     file = tree / "workbench" / f"{module}.py"
     clean = file.read_text(encoding="utf-8")
@@ -371,57 +371,59 @@ def try_module(tree: Path, module: str, mutants: list[Mutant]) -> list[Told]:
         sys.exit(f"{module}: its tests fail without a mutant\n" + (tree.parent / "output.txt").read_text())
     seconds = time.monotonic() - started
     print(f"{module}: {seconds:.0f} s for its tests", file=sys.stderr, flush=True)
-    told = []
+    outcomes = []
     for mutant in mutants:
         file.write_text(mutant.code, encoding="utf-8")
         try:
             end = run_tests(tree, module, 30 + 4 * seconds)
         finally:
             file.write_text(clean, encoding="utf-8")
-        told.append(Told(mutant.number, mutant.line, mutant.becomes, "lived" if end == "passed" else end))
+        outcomes.append(
+            Outcome(mutant.number, mutant.line, mutant.becomes, "lived" if end == "passed" else end)
+        )
         print(
-            f"  {end if end != 'passed' else 'LIVED'}: {_as_diff(module, told[-1])}",
+            f"  {end if end != 'passed' else 'LIVED'}: {_as_diff(module, outcomes[-1])}",
             file=sys.stderr,
             flush=True,
         )
-    return told
+    return outcomes
 
 
-def _as_diff(module: str, one: Told) -> str:
+def _as_diff(module: str, one: Outcome) -> str:
     return f"workbench/{module}.py:{one.number}: {one.line}  ->  {one.becomes}"
 
 
-def report(module: str, told: list[Told], seconds: float) -> bool:
-    """Print how the mutants of a module ended. True where enough of them were noticed."""
-    lived = [one for one in told if one.end == "lived"]
-    late = [one for one in told if one.end == "timed out"]
-    died = len(told) - len(lived)
-    share = 100 * died // len(told) if told else 100
+def report(module: str, outcomes: list[Outcome], seconds: float) -> bool:
+    """Print how the mutants of a module ended; return whether enough of them were killed."""
+    lived = [one for one in outcomes if one.end == "lived"]
+    late = [one for one in outcomes if one.end == "timed out"]
+    died = len(outcomes) - len(lived)
+    share = 100 * died // len(outcomes) if outcomes else 100
     print(
-        f"{module}: {len(told)} mutants, {died} killed ({len(late)} by time), {len(lived)} lived, "
+        f"{module}: {len(outcomes)} mutants, {died} killed ({len(late)} by time), {len(lived)} lived, "
         f"{share} %, {seconds:.0f} s"
     )
     for one in late:
         print(f"  by time: {_as_diff(module, one)}")
     for one in lived:
         print(f"  NO TEST NOTICES: {_as_diff(module, one)}")
-    return share >= ENOUGH
+    return share >= MIN_KILLED_PERCENT
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("modules", nargs="+", choices=[*PROTECTED, "all"], metavar="module")
-    parser.add_argument("--count", type=int, default=30, help="mutants of each module")
+    parser.add_argument("--count", type=int, default=30, help="mutants per module")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--lived", action="store_true", help="only those that lived the last time")
+    parser.add_argument("--lived", action="store_true", help="only mutants that lived in the last run")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the copy is removed
     good = True
     for module in PROTECTED if "all" in options.modules else options.modules:
         mutants = sample(module, options.count, options.seed)
-        kept, last = LAST / f"{module.replace('/', '.')}.json", []
+        kept, last = LAST_RESULTS / f"{module.replace('/', '.')}.json", []
         if options.lived:
-            last = [Told(**one) for one in json.loads(kept.read_text(encoding="utf-8"))]
+            last = [Outcome(**one) for one in json.loads(kept.read_text(encoding="utf-8"))]
             again = {(one.line, one.becomes) for one in last if one.end == "lived"}
             last = [one for one in last if (one.line, one.becomes) not in again]
             mutants = [mutant for mutant in mutants if (mutant.line, mutant.becomes) in again]
@@ -430,11 +432,11 @@ def main() -> int:
             tree = Path(folder) / "tree"
             tree.mkdir()
             copy_tree(tree)
-            told = try_module(tree, module, mutants)
-        told = last + told
+            outcomes = try_module(tree, module, mutants)
+        outcomes = last + outcomes
         kept.parent.mkdir(parents=True, exist_ok=True)
-        kept.write_text(json.dumps([asdict(one) for one in told], indent=1), encoding="utf-8")
-        good &= report(module, told, time.monotonic() - started)
+        kept.write_text(json.dumps([asdict(one) for one in outcomes], indent=1), encoding="utf-8")
+        good &= report(module, outcomes, time.monotonic() - started)
     return 0 if good else 1
 
 

@@ -1,4 +1,4 @@
-"""Nothing that lies in the folder where a command is started runs, whatever it is called."""
+"""No file in the working directory of a command is executed, whatever its name."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ ENVIRONMENT = {**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1"}
 
 
 def plant(folder: Path, *names: str) -> None:
-    """Files that leave a mark when they run, and break whoever imports them."""
+    """Write files that leave a mark when they run, and break a program that imports them."""
     for name in names:
         (folder / f"{name}.py").write_text(
             "from os import open, O_CREAT\n"
@@ -87,17 +87,17 @@ def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 @contextmanager
 def page(folder: Path, *arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """A page's address, and its process, from which all that is printed after that can be read."""
+    """The page's address, and its process, whose later output can be read."""
     process = start(folder, *arguments, "--port", "0")
     assert process.stdout is not None
     try:
-        said = []
+        output = []
         for line in process.stdout:
-            said.append(line)
+            output.append(line)
             if line.startswith("  page "):
                 break
         else:
-            raise AssertionError("".join(said))
+            raise AssertionError("".join(output))
         yield line.split()[-1], process
     finally:
         process.send_signal(signal.SIGINT)
@@ -109,7 +109,7 @@ def page(folder: Path, *arguments: str) -> Iterator[tuple[str, subprocess.Popen[
 
 
 def await_on_page(url: str, text: str) -> None:
-    """Until the page is sent something with `text` in it."""
+    """Wait until the page receives a message that contains `text`."""
     address, options = handshake(url)
     deadline = time.monotonic() + 90
     with websockets.sync.client.connect(address, **options) as tab:
@@ -119,18 +119,18 @@ def await_on_page(url: str, text: str) -> None:
             assert isinstance(frame, bytes)
             if text in str(messages_in(frame)):
                 return
-    raise AssertionError(f"{text!r} did not come")
+    raise AssertionError(f"{text!r} did not arrive")
 
 
 def finished(process: subprocess.Popen[str]) -> str:
-    said, _ = process.communicate(timeout=200)
-    assert process.returncode == 0, said
-    return said
+    output, _ = process.communicate(timeout=200)
+    assert process.returncode == 0, output
+    return output
 
 
 @pytest.mark.slow
-def test_no_command_runs_what_lies_in_the_current_folder(tmp_path: Path) -> None:
-    """The task lies there too: what is beside it is found, but for what has a library's name."""
+def test_no_command_runs_files_of_the_current_folder(tmp_path: Path) -> None:
+    """The task is there too: modules next to it are found, except those named like a library."""
     plant(tmp_path, *PLANTED)
     (tmp_path / "beside.py").write_text("SIZE = 1\n")
     task = tmp_path / "minimal.py"
@@ -143,8 +143,8 @@ def test_no_command_runs_what_lies_in_the_current_folder(tmp_path: Path) -> None
         "--no-pictures", "--num-envs", "2", "--out", "recordings", *plain,
     )  # fmt: skip
     doctor = start(tmp_path, "doctor")
-    said = finished(recording)
-    assert said.count("numpy.py has the name of a library") == 1
+    output = finished(recording)
+    assert output.count("numpy.py has the name of a library") == 1
     assert "packages" in doctor.communicate(timeout=200)[0]
     episodes = sorted((tmp_path / "recordings").glob("*.json"))
     assert len(episodes) == 2
@@ -154,18 +154,18 @@ def test_no_command_runs_what_lies_in_the_current_folder(tmp_path: Path) -> None
     with page(tmp_path, "open", "minimal.py", "--num-envs", "2", *plain) as (url, process):
         await_on_page(url, "json.py has the name of a library")
         assert process.stdout is not None
-        said = ""
+        output = ""
         for line in process.stdout:
-            said += line
+            output += line
             assert "failed" not in line
             if "numpy.py has the name of a library" in line:
                 break
-        assert "\nloaded" in f"\n{said}"
+        assert "\nloaded" in f"\n{output}"
     assert ran(tmp_path) == []
 
 
-def test_python_m_leaves_the_current_folder_out_as_well(tmp_path: Path) -> None:
-    """As far as we can: what Python itself imports to find the module comes before us."""
+def test_python_m_does_not_use_the_current_folder_either(tmp_path: Path) -> None:
+    """As far as possible: imports that Python itself makes to find the module run before our code."""
     plant(tmp_path, *IMPORTED_FIRST)
     done = subprocess.run(
         [sys.executable, "-m", "workbench.cli.main", "view", "--help"],

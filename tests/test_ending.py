@@ -1,4 +1,4 @@
-"""However ``workbench open`` ends, it leaves no process behind, whatever its worker is doing."""
+"""``workbench open`` leaves no process behind, however it ends and whatever its worker is doing."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from workbench.record.commands import ChooseRecordedEnvs, ToggleRecording
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
-PATIENCE = 15.0
+EXIT_TIMEOUT_SECONDS = 15.0
 
 
 def gone(processes: list[psutil.Process]) -> bool:
-    _, alive = psutil.wait_procs(processes, timeout=PATIENCE)
+    _, alive = psutil.wait_procs(processes, timeout=EXIT_TIMEOUT_SECONDS)
     return not alive
 
 
@@ -41,12 +41,12 @@ def signal_thread(pid: int, thread: int, number: signal.Signals) -> None:
 @pytest.mark.parametrize(
     "number", [pytest.param(signal.SIGINT, id="ctrl-c"), pytest.param(signal.SIGKILL, id="kill -9")]
 )
-def test_a_worker_that_hangs_ends_with_its_server(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_hanging_worker_ends_with_its_server(tmp_path: Path, number: signal.Signals) -> None:
     file = write_task(tmp_path)
     provoke(file, "build", "catch")
     with open_workbench(str(file), "--num-envs", "1", "--no-spare", cwd=tmp_path) as opened:
         server = psutil.Process(opened.process.pid)
-        until(lambda: provoked(file), "the building of the task")
+        until(lambda: provoked(file), "the build of the task")
         processes = [server, *server.children(recursive=True)]
         began = time.monotonic()
         server.send_signal(number)
@@ -55,8 +55,8 @@ def test_a_worker_that_hangs_ends_with_its_server(tmp_path: Path, number: signal
 
 
 @pytest.mark.slow
-def test_a_signal_that_the_kernel_hands_to_another_thread_ends_the_page(tmp_path: Path) -> None:
-    """Python's handler runs in the main thread, which is not woken by it: on a busy machine Ctrl-C did nothing."""
+def test_a_signal_delivered_to_another_thread_ends_the_page(tmp_path: Path) -> None:
+    """Python's handler runs in the main thread, which such a signal does not wake: Ctrl-C must still work."""
     (tmp_path / "recordings").mkdir()
     with open_workbench("recordings", cwd=tmp_path, what="review") as opened:
         server = psutil.Process(opened.process.pid)
@@ -67,10 +67,10 @@ def test_a_signal_that_the_kernel_hands_to_another_thread_ends_the_page(tmp_path
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:
-    """Tabs, one of which reads nothing; a recording; a worker in an endless loop; a spare one and one that judges."""
+def test_ctrl_c_ends_everything_that_can_be_running(tmp_path: Path) -> None:
+    """Tabs, one of which reads nothing; a recording; a worker in an infinite loop; a spare worker and a rescoring process."""
     file = write_task(tmp_path)
-    # Without a renderer: the first picture takes a software renderer some 15 s.
+    # Without a renderer: in software the first picture takes about 15 s.
     arguments = (str(file), "--num-envs", "2", "--env", "render_backend=none")
     with open_workbench(*arguments, cwd=tmp_path) as opened, tabs_of(opened.url) as tabs:
         server = psutil.Process(opened.process.pid)
@@ -83,7 +83,7 @@ def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:
         until(lambda: list((tmp_path / "recordings").glob("*.rrd")), "the first episodes")
         file.write_text(file.read_text().replace("> 0.05}", "> 0.06}"))
         opened.wait_for_line("patched", 90)
-        until(lambda: len(workers_of(server)) == 3, "the spare worker and the judging one")
+        until(lambda: len(workers_of(server)) == 3, "the spare worker and the rescoring process")
         provoke(file, "evaluate", "catch")
         until(lambda: provoked(file), "the loop")
         processes = [server, *server.children(recursive=True)]
@@ -99,8 +99,8 @@ def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_waits_for_the_episodes_that_are_being_written(tmp_path: Path) -> None:
-    """For longer than for a disk that hangs."""
+def test_ctrl_c_waits_for_episodes_that_are_being_written(tmp_path: Path) -> None:
+    """It waits longer than for a hung disk."""
     count = 32
     shutil.copy(TASK, tmp_path)
     arguments = (TASK.name, "--num-envs", str(count), "--env", "render_backend=none", "--no-spare")
@@ -117,13 +117,13 @@ def test_ctrl_c_waits_for_the_episodes_that_are_being_written(tmp_path: Path) ->
     assert not [problem for problem in map(verify_rrd, recordings) if problem is not None]
 
 
-WITHIN_SECONDS = 2.0
+MAX_EXIT_SECONDS = 2.0
 
 
-def ends_while_it_hangs(
+def check_exit_on_hung_disk(
     disk: HungDisk, arguments: tuple[str, ...], what: str, presses: tuple[str, ...]
 ) -> None:
-    """Start the command, let the disk hang, press until a call hangs (the last of `presses` again and again), and end it."""
+    """Start the command, hang the disk, repeat the last of `presses` until a call hangs, and check that Ctrl-C ends it."""
     with open_workbench(*arguments, cwd=disk.folder, what=what, env=disk.environment()) as opened:
         if what == "open":
             opened.wait_for_line("loaded|failed", 90)
@@ -140,7 +140,7 @@ def ends_while_it_hangs(
             assert gone([server])
             seconds = time.monotonic() - began
             assert gone(processes)
-    assert opened.process.returncode == 0 and seconds < WITHIN_SECONDS, opened.lines
+    assert opened.process.returncode == 0 and seconds < MAX_EXIT_SECONDS, opened.lines
 
 
 @pytest.mark.slow
@@ -154,7 +154,7 @@ def ends_while_it_hangs(
         pytest.param("", ("write", "rename"), ("Write the minimal task into the empty file",), id="edit"),
     ],
 )
-def test_ctrl_c_ends_the_live_page_whatever_disk_hangs(
+def test_ctrl_c_ends_the_live_page_with_any_disk_hung(
     tmp_path: Path,
     tmp_path_factory: pytest.TempPathFactory,
     text: str,
@@ -165,7 +165,7 @@ def test_ctrl_c_ends_the_live_page_whatever_disk_hangs(
     file.write_text(text)
     disk = HungDisk(tmp_path, tmp_path_factory.mktemp("aside"), calls)
     arguments = (str(file), "--num-envs", "1", "--env", "render_backend=none", "--no-spare")
-    ends_while_it_hangs(disk, arguments, "open", presses)
+    check_exit_on_hung_disk(disk, arguments, "open", presses)
 
 
 @pytest.mark.slow
@@ -176,7 +176,7 @@ def test_ctrl_c_ends_the_live_page_whatever_disk_hangs(
         pytest.param(("scandir", "open"), "start", ("--recordings", "/nowhere/recordings"), id="search"),
     ],
 )
-def test_ctrl_c_ends_a_list_whatever_disk_hangs(
+def test_ctrl_c_ends_a_list_with_any_disk_hung(
     tmp_path: Path,
     tmp_path_factory: pytest.TempPathFactory,
     calls: tuple[str, ...],
@@ -185,4 +185,4 @@ def test_ctrl_c_ends_a_list_whatever_disk_hangs(
 ) -> None:
     write(tmp_path, made(4, seed=1), pictures=False)
     shutil.copy(TASK, tmp_path)
-    ends_while_it_hangs(HungDisk(tmp_path, tmp_path_factory.mktemp("aside"), calls), arguments, what, ())
+    check_exit_on_hung_disk(HungDisk(tmp_path, tmp_path_factory.mktemp("aside"), calls), arguments, what, ())

@@ -1,4 +1,4 @@
-"""What a user does with a task: every command, on every example, template and built-in task."""
+"""Every command on every example, template and built-in task."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ WITHOUT_SUCCESS, WITHOUT_REWARD, SEVERAL_ROBOTS = "swing_up", "Empty-v1", "two_r
 NO_TABLE, FAILS_IN_PARTIAL_RESETS = "template minimal", "MS-HopperHop-v1"
 QUICK = (WITHOUT_SUCCESS, WITHOUT_REWARD, SEVERAL_ROBOTS, NO_TABLE, FAILS_IN_PARTIAL_RESETS)
 RULES = ALL_RULES.keys() - SOLVE_RULES
-OF_EACH_KIND = WITHOUT_REWARD, FAILS_IN_PARTIAL_RESETS, "PickCube-v1"
-"""Built in, in processes too."""
+BUILT_IN_SAMPLES = WITHOUT_REWARD, FAILS_IN_PARTIAL_RESETS, "PickCube-v1"
+"""Built-in tasks that are also tested in processes."""
 DRAWN = {"TableTopFreeDraw-v1", "DrawSVG-v1"}
-"""Each takes two minutes for its hundreds of bodies; DrawTriangle-v1 is of their kind."""
+"""Excluded: each takes two minutes for its hundreds of bodies; DrawTriangle-v1 is similar and included."""
 WALKED = [*FROM_TEMPLATES, *(one for one in built_in() if one not in DRAWN)]
 OTHER_BODIES_IN_EACH_ENV = (
     "different_objects",
@@ -32,35 +32,35 @@ NO_PLAN = WITHOUT_REWARD, *OTHER_BODIES_IN_EACH_ENV
 
 
 @pytest.mark.timeout(300)
-# Some of ManiSkill's own tasks break rules that only warn.
+# Some of ManiSkill's own tasks break warning rules.
 @pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
 @pytest.mark.parametrize(
     "task", [*QUICK, *(pytest.param(one, marks=pytest.mark.slow) for one in WALKED if one not in QUICK)]
 )
-def test_every_command_takes_each_kind_of_task(
+def test_every_command_works_with_each_kind_of_task(
     task: str, tmp_path: Path, renderer: None, child_process: None
 ) -> None:
-    """With few envs, seeds and rollouts, all in this process."""
+    """Uses few envs, seeds and rollouts, all in this process."""
     require_success(task, walk(task, tmp_path, quick=True))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("task", [*EXAMPLES, *OF_EACH_KIND])
+@pytest.mark.parametrize("task", [*EXAMPLES, *BUILT_IN_SAMPLES])
 def test_a_task_can_be_opened_checked_recorded_rescored_exported_and_solved(
     task: str, tmp_path: Path, child_process: None
 ) -> None:
-    """By the commands as people give them: in processes, with the options that are there by default. With all that are
-    built in it would take two hours; `python -m tests.sweeps.every_command` does it."""
-    # The Checks tab looks at what the command looks at.
+    """Runs the commands in processes with default options, as users do. For all built-in tasks this would take two hours;
+    `python -m tests.sweeps.every_command` does it."""
+    # The Checks tab checks the same as the command.
     require_success(task, walk(task, tmp_path, checks=task in (WITHOUT_SUCCESS, FAILS_IN_PARTIAL_RESETS)))
 
 
 def require_success(task: str, walked: Iterable[Ran]) -> None:
     for ran in walked:
         assert ran.code in (0, 1) or (ran.command == "solve" and task in NO_PLAN and ran.code == 2), ran.err
-        if ran.told is not None and ran.command in ("open", "check"):
-            states = {one["rule"]: one["state"] for one in ran.told["rules"]}
+        if ran.output is not None and ran.command in ("open", "check"):
+            states = {one["rule"]: one["state"] for one in ran.output["rules"]}
             assert states.keys() == RULES and ran.rules("failed") == {}
             if task not in built_in():
                 assert ran.broken == []

@@ -1,4 +1,4 @@
-"""Which part of the workbench may import which."""
+"""Which folder of the workbench may import which."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ORDER = (
 
 
 def modules() -> dict[str, Path]:
-    """Name below the package, with slashes, to file; without ``__init__``."""
+    """File of each module, by its slash-separated name in the package; without ``__init__``."""
     files = (file for file in PACKAGE.rglob("*.py") if file.name != "__init__.py")
     return {file.relative_to(PACKAGE).with_suffix("").as_posix(): file for file in files}
 
@@ -49,7 +49,7 @@ MODULES = modules()
 
 @cache
 def import_statements(file: Path) -> tuple[ast.Import | ast.ImportFrom, ...]:
-    """Also within functions, and of types alone. To parse the whole package takes seconds, so once."""
+    """Import statements, also in functions and for types only. Cached: parsing the whole package takes seconds."""
     return tuple(
         node
         for node in ast.walk(ast.parse(file.read_text()))
@@ -58,7 +58,7 @@ def import_statements(file: Path) -> tuple[ast.Import | ast.ImportFrom, ...]:
 
 
 def imported(file: Path) -> Iterator[tuple[int, str]]:
-    """Line and module below the package, with slashes."""
+    """Line and slash-separated module name in the package, for each import."""
     for node in import_statements(file):
         names: list[str] = []
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "workbench":
@@ -75,16 +75,16 @@ def imported(file: Path) -> Iterator[tuple[int, str]]:
 
 @cache
 def imports() -> dict[str, tuple[tuple[int, str], ...]]:
-    """Of each module. Not of the file's own import: every process of the tests has that, and reads the whole package with it."""
+    """Imports of each module. A function: at import time every test process would parse the whole package."""
     return {module: tuple(imported(file)) for module, file in MODULES.items()}
 
 
 def folder_of(module: str) -> str:
-    """Modules at the top of the package are what users import (`workbench.commands`)."""
+    """Folder of a module. Modules at the top of the package are the public ones (`workbench.commands`)."""
     return module.split("/")[0] if "/" in module else ""
 
 
-def test_each_folder_imports_only_those_before_it() -> None:
+def test_each_folder_imports_only_folders_before_it() -> None:
     assert {folder_of(module) for module in MODULES} == {"", *ORDER}
     wrong = [
         f"{module}:{line} imports {name}"
@@ -97,15 +97,17 @@ def test_each_folder_imports_only_those_before_it() -> None:
     assert wrong == []
 
 
-def test_no_module_imports_one_that_imports_it() -> None:
-    """Not for types alone either."""
+def test_there_are_no_circular_imports() -> None:
+    """Not even for types only."""
     done: set[str] = set()
 
-    def reach(module: str, way: tuple[str, ...]) -> None:
-        assert module not in way, f"a circle: {' imports '.join((*way[way.index(module) :], module))}"
+    def reach(module: str, path: tuple[str, ...]) -> None:
+        assert module not in path, (
+            f"circular import: {' imports '.join((*path[path.index(module) :], module))}"
+        )
         if module not in done:
             for _, name in imports()[module]:
-                reach(name, (*way, module))
+                reach(name, (*path, module))
             done.add(module)
 
     for module in MODULES:
@@ -122,8 +124,8 @@ def reached_from(*modules: str) -> set[str]:
     return reached
 
 
-def test_state_jobs_and_workers_do_without_the_page() -> None:
-    """So they run where viser cannot, and a test of them needs no page."""
+def test_state_jobs_and_workers_do_not_import_the_page() -> None:
+    """So they run where viser cannot, and their tests need no page."""
     with_viser = {
         module
         for module, file in MODULES.items()
@@ -139,8 +141,8 @@ def test_state_jobs_and_workers_do_without_the_page() -> None:
     )
 
 
-def test_what_is_imported_is_a_dependency_of_ours_and_not_only_of_one() -> None:
-    """ManiSkill brought scipy along, until it was an extra."""
+def test_every_imported_package_is_a_direct_dependency() -> None:
+    """A package that only another dependency installs may be missing, as scipy without ManiSkill."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
     ours = {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
     ours |= {
@@ -149,7 +151,7 @@ def test_what_is_imported_is_a_dependency_of_ours_and_not_only_of_one() -> None:
         "debugpy",
         "ray",
         "maniskill-workbench",
-    }  # by extras, and ourselves
+    }  # from extras, and the workbench itself
     brought_by = packages_distributions()
     names = {
         name.split(".")[0]
@@ -158,7 +160,7 @@ def test_what_is_imported_is_a_dependency_of_ours_and_not_only_of_one() -> None:
         for name in [getattr(node, "module", None), *(alias.name for alias in node.names)]
         if name and (isinstance(node, ast.Import) or name == node.module)
     }
-    # pydevd is within debugpy; rerun before 0.41 lies in a folder that no metadata tells.
+    # pydevd is part of debugpy; rerun before 0.41 is in a folder that its metadata does not list.
     names -= {*sys.stdlib_module_names, "pydevd", "workbench", "rerun", "rerun_cli"}
     assert "scipy" in names
     wanting = {name for name in names if not ours & set(map(canonicalize_name, brought_by.get(name, ())))}
@@ -167,7 +169,7 @@ def test_what_is_imported_is_a_dependency_of_ours_and_not_only_of_one() -> None:
 
 @pytest.mark.thorough
 def test_nothing_is_imported_from_a_test() -> None:
-    """Whoever changes a test would change others, and the file would be run for a helper of a line."""
+    """A change of one test could affect others, and importing a helper would run the whole test file."""
     names = {file.stem for file in TESTS.rglob("*.py") if file.name.startswith("test_")}
     assert "test_imports" in names
     wrong = [
@@ -180,7 +182,7 @@ def test_nothing_is_imported_from_a_test() -> None:
     assert wrong == []
 
 
-def test_nothing_that_a_run_wrote_lies_at_the_top(child_process: None) -> None:
+def test_no_output_of_a_run_is_at_the_top_level(child_process: None) -> None:
     top = PACKAGE.parent
     if not (top / ".git").exists():
         pytest.skip("not a checkout")

@@ -1,4 +1,4 @@
-"""What the workbench puts in the place of a function of ManiSkill's or SAPIEN's takes what that takes."""
+"""Each replacement of a ManiSkill or SAPIEN function accepts the original's parameters."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _VAR = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
 
 @pytest.fixture(scope="module")
 def replaced() -> Iterator[dict[str, tuple[Callable[..., Any], Callable[..., Any]]]]:
-    """Ours and theirs, by name, while all that is ever replaced is."""
+    """Our and the original function, by name, with every replacement active."""
     env: Any = batched(PUSH_CUBE, 2)
     mark_camera_configs()
     with ExitStack() as stack:
@@ -57,13 +57,13 @@ def _replaced() -> Iterator[tuple[str, tuple[Callable[..., Any], Callable[..., A
 
 
 def _functions(member: Any) -> dict[str, Any]:
-    """By what stands behind the name where it is used."""
+    """The functions behind a member, such as a property's getter and setter, by name suffix."""
     if isinstance(member, property):
         return {"": member.fget, " = ...": member.fset}
     return {"()": getattr(member, "__func__", member)}
 
 
-def test_what_is_replaced_takes_what_the_original_takes(replaced: Any) -> None:
+def test_each_replacement_accepts_the_originals_parameters(replaced: Any) -> None:
     known = {"Articulation.merge()", "Actor.pose = ...", "Entity.set_pose()", "download_asset.download()"}
     assert known <= replaced.keys() and len(replaced) > 60, "the search finds too little"
     called = {name: both for name, both in replaced.items() if name.endswith("()")}
@@ -72,7 +72,7 @@ def test_what_is_replaced_takes_what_the_original_takes(replaced: Any) -> None:
 
 
 @pytest.mark.parametrize("base", [ManiSkillScene, BaseEnv], ids=lambda base: base.__name__)
-def test_what_overrides_a_method_of_maniskill_takes_what_that_takes(base: type) -> None:
+def test_each_override_of_a_maniskill_method_accepts_its_parameters(base: type) -> None:
     env: Any = batched(PUSH_CUBE, 1)
     cls = type(env.scene) if base is ManiSkillScene else type(env)
     assert issubclass(cls, base) and (base is BaseEnv or cls is BatchedCpuScene)
@@ -93,7 +93,7 @@ def _parameters(function: Callable[..., Any]) -> Parameters:
 
 
 def _refuses(ours: Callable[..., Any], theirs: Callable[..., Any]) -> str:
-    """What `theirs` takes and `ours` does not; empty if nothing, or if SAPIEN does not say what it takes."""
+    """What `theirs` accepts and `ours` does not; empty if nothing, or if SAPIEN has no signature."""
     try:
         theirs_of = _parameters(theirs)
     except ValueError:

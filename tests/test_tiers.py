@@ -1,4 +1,4 @@
-"""``pytest --fast`` leaves out what needs a process, a renderer or a browser, and fails what does not say so."""
+"""``pytest --fast`` deselects tests that need a process, a renderer or a browser, and fails those without the fixture."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def test_that_takes_long(): pass
 
 
 @pytest.mark.slow
-def test_only_what_needs_nothing_is_fast_and_the_rest_is_named_its_fixture(
+def test_a_test_without_the_fixture_for_what_it_uses_fails_and_names_it(
     child_process: None, tmp_path: Path
 ) -> None:
     (tmp_path / "conftest.py").write_text('pytest_plugins = ["tests.drive.tiers"]\n')
     (tmp_path / "test_all.py").write_text(TESTS)
     markers = "browser process render slow".split()
     (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n  " + "\n  ".join(markers))
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, "-m", "pytest", "--fast", "-rA", "-p", "no:cacheprovider", str(tmp_path)],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -62,11 +62,17 @@ def test_only_what_needs_nothing_is_fast_and_the_rest_is_named_its_fixture(
         timeout=120,
     ).stdout
     outcomes = {
-        name: outcome for outcome, name in re.findall(r"^(PASSED|FAILED) \S+::(\w+)", said, re.MULTILINE)
+        name: outcome for outcome, name in re.findall(r"^(PASSED|FAILED) \S+::(\w+)", output, re.MULTILINE)
     }
     in_threads = ("test_in_a_thread", "test_waits_for_it")
-    unsaid = ("test_says_nothing", "test_forks", *in_threads, "test_swallowed", "test_renders_unsaid")
-    assert outcomes == {"test_plain": "PASSED", **dict.fromkeys(unsaid, "FAILED")}, said
-    assert " 5 deselected" in said and "fixture `renderer`" in said, said
-    assert said.count("ask for the fixture `child_process`") >= 5, said
-    assert "did not come within" not in said, said
+    without_fixture = (
+        "test_says_nothing",
+        "test_forks",
+        *in_threads,
+        "test_swallowed",
+        "test_renders_unsaid",
+    )
+    assert outcomes == {"test_plain": "PASSED", **dict.fromkeys(without_fixture, "FAILED")}, output
+    assert " 5 deselected" in output and "fixture `renderer`" in output, output
+    assert output.count("ask for the fixture `child_process`") >= 5, output
+    assert "did not come within" not in output, output

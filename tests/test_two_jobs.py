@@ -1,4 +1,4 @@
-"""Two jobs at once of which one is killed: the other comes to its result, the end is told, the next of its kind works."""
+"""Of two concurrent jobs one is killed: the other finishes, the death is reported, and the next of its kind works."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from workbench.share.make import MakeRequest, Making
 from workbench.trust.clearance import Clearances
 
 pytestmark = pytest.mark.usefixtures("child_process")
-PATIENCE = 200.0
-ROWS_ARE_KEPT = 1.0
-"""Seconds: README says that nothing but the last one is lost."""
+EXIT_TIMEOUT_SECONDS = 200.0
+FLUSH_SECONDS = 1.0
+"""README promises that at most the last second is lost."""
 POLICY = """
 import time
 from pathlib import Path
@@ -54,7 +54,7 @@ def act(obs):
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """A golden recording with a camera, and beside it the task that it names."""
+    """A golden recording with a camera, and next to it the task that it names."""
     for name in ("tasks", "v1/cameras"):
         shutil.copytree(GOLDEN / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     return tmp_path
@@ -76,7 +76,7 @@ class Rescoring:
     def ended(self) -> bool:
         return self._rescorer.view.state in ("done", "failed")
 
-    def told(self) -> str:
+    def problem(self) -> str:
         return self._rescorer.view.why
 
     def assert_right(self) -> None:
@@ -103,7 +103,7 @@ class Filming:
     def ended(self) -> bool:
         return not self._making.view().running
 
-    def told(self) -> str:
+    def problem(self) -> str:
         return self._making.view().problem
 
     def assert_right(self) -> None:
@@ -116,14 +116,14 @@ class Filming:
 
 
 def running(module: str) -> list[int]:
-    """Of what this process has started by a keeper; a page's server of other tests has workers further down."""
+    """Pids of this process's kept children that run `module`; workers of other tests' servers are further down the tree."""
     found = []
     for child in psutil.Process().children():
         try:
             found += [process for process in (child, *child.children()) if module in process.cmdline()]
         except psutil.NoSuchProcess:
             continue
-    # Each has a keeper above it of the same name, which is there before it.
+    # Each is the child of a keeper with the same command line, which starts first.
     keepers = {process.pid for process in found}
     return [process.pid for process in found if process.ppid() in keepers]
 
@@ -138,26 +138,28 @@ def jobs(place: Path) -> Iterator[list[Rescoring | Filming]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", [0, 1], ids=["rescoring", "filming"])
-def test_of_two_processes_of_a_page_one_is_killed(jobs: list[Rescoring | Filming], which: int) -> None:
+def test_killing_one_of_two_processes_of_a_page_leaves_the_other(
+    jobs: list[Rescoring | Filming], which: int
+) -> None:
     killed, other = jobs[which], jobs[1 - which]
     held: dict[int, int] = {}
     for number, job in enumerate(jobs):
         job.start()
-        (held[number],) = until(lambda job=job: job.pids(), "the process", seen=job.told)
-        # It stands still, so that both are under way when one is killed.
+        (held[number],) = until(lambda job=job: job.pids(), "the process", seen=job.problem)
+        # Stopped, so that both are in progress when one is killed.
         os.kill(held[number], signal.SIGSTOP)
     assert not killed.ended() and not other.ended()
     os.kill(held[which], signal.SIGKILL)
     until(killed.ended, "the end of the killed one")
-    assert killed.told().lower().startswith(f"{killed.process} was killed by sigkill")
+    assert killed.problem().lower().startswith(f"{killed.process} was killed by sigkill")
     assert not other.ended()
     os.kill(held[1 - which], signal.SIGCONT)
     until(other.ended, "the end of the other")
-    assert other.told() == ""
+    assert other.problem() == ""
     other.assert_right()
     killed.start()
     until(killed.ended, "the end of the next")
-    assert killed.told() == ""
+    assert killed.problem() == ""
     killed.assert_right()
 
 
@@ -166,7 +168,7 @@ def test_of_two_processes_of_a_page_one_is_killed(jobs: list[Rescoring | Filming
 
 @contextmanager
 def recording(folder: Path, name: str, seed: int) -> Iterator[subprocess.Popen[str]]:
-    """``workbench record`` with a policy that waits before its fourth step until it may go on; killed if it has not ended."""
+    """``workbench record`` with a policy that waits for a go-ahead before its fourth step; killed if still running at the end."""
     (folder / f"{name}.py").write_text(POLICY.replace("NAME", name))
     command = [
         sys.executable,
@@ -192,7 +194,7 @@ def recording(folder: Path, name: str, seed: int) -> Iterator[subprocess.Popen[s
 
 
 @pytest.mark.slow
-def test_of_two_that_record_into_one_folder_one_is_killed(tmp_path: Path) -> None:
+def test_killing_one_of_two_recorders_into_one_folder_leaves_the_other(tmp_path: Path) -> None:
     folder = tmp_path / "author"
     shutil.copytree(GOLDEN / "tasks" / "push", folder, ignore=shutil.ignore_patterns("__pycache__"))
     journals = folder / "out" / ".writing"
@@ -200,21 +202,21 @@ def test_of_two_that_record_into_one_folder_one_is_killed(tmp_path: Path) -> Non
         one, other = (ending.enter_context(recording(folder, *which)) for which in (("one", 9), ("other", 7)))
         until(lambda: (folder / "one.waits").exists() and (folder / "other.waits").exists(), "both")
         until(lambda: len(list(journals.glob("*.arrow"))) == 2, "both journals")
-        time.sleep(ROWS_ARE_KEPT)
+        time.sleep(FLUSH_SECONDS)
         one.kill()
         assert one.wait() == -signal.SIGKILL and other.poll() is None
         (folder / "other.may").touch()
-        said, _ = other.communicate(timeout=PATIENCE)
-        assert other.returncode == 0, said
+        output, _ = other.communicate(timeout=EXIT_TIMEOUT_SECONDS)
+        assert other.returncode == 0, output
         (path,) = (folder / "out").glob("*.json")
         assert_recorded(read_episode(path), "tagged", 8)
-        assert len(list(journals.glob("*.arrow"))) == 1, "what the killed one left is for the next"
+        assert len(list(journals.glob("*.arrow"))) == 1, "the killed recorder's journal is left for the next"
 
         (folder / "next.may").touch()
         third = ending.enter_context(recording(folder, "next", 6))
-        said, _ = third.communicate(timeout=PATIENCE)
+        output, _ = third.communicate(timeout=EXIT_TIMEOUT_SECONDS)
         assert third.returncode == 0 and re.search(
-            "1 episode that an earlier recording left .* recovered", said
+            "1 episode that an earlier recording left .* recovered", output
         )
     episodes = {episode.info.seed: episode for episode in map(read_episode, (folder / "out").glob("*.json"))}
     assert sorted(episodes) == [6, 7, 9] and not journals.exists()
@@ -223,7 +225,7 @@ def test_of_two_that_record_into_one_folder_one_is_killed(tmp_path: Path) -> Non
 
 
 def assert_recorded(episode: Episode, kind: str, length: int) -> None:
-    """It is the golden one of this kind, which has the same seed and actions, or its beginning."""
+    """Check that the episode equals the golden one of this kind (same seed and actions), or its beginning."""
     (path,) = (GOLDEN / "v1" / kind).glob("*.json")
     golden = read_episode(path)
     assert episode.length == length

@@ -1,4 +1,4 @@
-"""The tested versions, the ranges and the table of versions agree."""
+"""The tested versions, the version ranges and the table of versions agree."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ PINNED = {canonicalize_name(name): version for name, version in pins().items()}
 @pytest.mark.parametrize(
     "line", [*PROJECT["dependencies"], *(line for extra in EXTRAS.values() for line in extra)]
 )
-def test_each_range_takes_the_tested_version(line: str) -> None:
+def test_each_range_includes_the_tested_version(line: str) -> None:
     requirement = Requirement(line)
     assert requirement.specifier.contains(PINNED[canonicalize_name(requirement.name)], prereleases=True)
 
 
 @pytest.mark.parametrize("name", TESTED)
-def test_what_the_program_takes_for_tested_is_pinned_or_in_the_table(name: str) -> None:
-    """The first is the pinned one: it is what a person is told to install."""
+def test_versions_that_the_program_calls_tested_are_pinned_or_in_the_table(name: str) -> None:
+    """The first is the pinned version, which messages tell the user to install."""
     assert TESTED[name][0] == PINNED[canonicalize_name(name)]
     header = [line for line in PAGE.read_text().splitlines() if line.startswith("| set |")][0]
     columns = [cell.strip() for cell in header.strip("|").split("|")]
@@ -37,7 +37,7 @@ def test_what_the_program_takes_for_tested_is_pinned_or_in_the_table(name: str) 
     assert set(TESTED[name][1:]) <= shown
 
 
-def test_each_row_of_the_table_is_of_a_set_that_the_script_knows() -> None:
+def test_each_row_of_the_table_is_of_a_known_set() -> None:
     for row in rows(PAGE.read_text()):
         assert len(row) == 6 + len(SHOWN) and row[0] in SETS and row[-3] in TESTS
         assert ", 0 failed, " in row[-2]

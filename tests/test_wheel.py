@@ -1,7 +1,7 @@
-"""The wheel is the program too: it carries its data and works where there is no clone.
+"""The wheel contains its data files and works without a clone.
 
-Its dependencies are not downloaded again: the clean environment sees this one's site-packages through a
-``.pth`` line. Editable installs do not come along, since Python reads ``.pth`` files only in a site
+Its dependencies are not downloaded again: the clean environment uses this one's site-packages through a
+``.pth`` line. Editable installs are not visible there, because Python reads ``.pth`` files only in a site
 folder, not in a folder that such a line adds.
 """
 
@@ -42,7 +42,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The ``bin`` folder of an environment that holds the wheel and nothing of this clone."""
+    """The ``bin`` folder of an environment with the wheel and without this clone."""
     venv = tmp_path_factory.mktemp("installed") / "venv"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], check=True)
     pip = [sys.executable, "-m", "pip", "--python", str(venv / "bin" / "python")]
@@ -53,7 +53,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_web_assets_and_tasks_travel_in_the_wheel(wheel: Path) -> None:
+def test_the_wheel_contains_web_assets_and_tasks(wheel: Path) -> None:
     carried = set(ZipFile(wheel).namelist())
     wanted = {
         f"workbench/{name}/{path.relative_to(ROOT / folder).as_posix()}"
@@ -70,9 +70,9 @@ def test_web_assets_and_tasks_travel_in_the_wheel(wheel: Path) -> None:
 def test_the_installed_command_is_not_the_clone(installed: Path, tmp_path: Path) -> None:
     where = "import workbench; print(workbench.__file__)"
     assert str(installed.parent) in _run([str(installed / "python"), "-c", where], tmp_path)
-    said = _run([str(installed / "workbench"), "--help"], tmp_path)
-    assert all(command in said for command in ("open", "record", "doctor"))
-    # README is no part of the package in a clone.
+    output = _run([str(installed / "workbench"), "--help"], tmp_path)
+    assert all(command in output for command in ("open", "record", "doctor"))
+    # In a clone README is not part of the package.
     assert "The first ten minutes" in _run([str(installed / "workbench"), "help", "overview"], tmp_path)
 
 
@@ -84,11 +84,11 @@ def test_a_file_elsewhere_opens_is_served_and_ends_with_ctrl_c(installed: Path, 
 
 
 @pytest.mark.slow
-def test_beside_a_laboratory_s_packages_no_version_changes_and_its_task_opens(
+def test_installed_into_a_labs_environment_no_version_changes_and_its_task_opens(
     wheel: Path, tmp_path: Path
 ) -> None:
-    """They pin the ManiSkill that they were written for. Without an index pip could not bring another version of anything, and
-    would say so."""
+    """The lab's packages pin their ManiSkill version. Without an index pip cannot install another version of anything and
+    would report that."""
     ((name, version),) = installed_maniskills().items()
     lab = tmp_path / "lab"
     (lab / "lab_tasks").mkdir(parents=True)
@@ -111,17 +111,17 @@ def test_beside_a_laboratory_s_packages_no_version_changes_and_its_task_opens(
 
 
 @pytest.mark.slow
-def test_without_maniskill_it_says_what_to_type(wheel: Path, tmp_path: Path) -> None:
-    """In an environment with all that this one has, but for ManiSkill."""
+def test_without_maniskill_it_prints_what_to_type(wheel: Path, tmp_path: Path) -> None:
+    """In an environment with all packages of this one except ManiSkill."""
     binaries = _environment(tmp_path, but=("maniskill_workbench", "mani_skill"))
     _run([str(binaries / "python"), "-m", "pip", "install", "-q", "--no-index", str(wheel)], tmp_path)
     workbench = str(binaries / "workbench")
-    said = _run([workbench, "open", "PickCube-v1"], tmp_path, code=2)
-    first, second = said.splitlines()
+    output = _run([workbench, "open", "PickCube-v1"], tmp_path, code=2)
+    first, second = output.splitlines()
     assert first.startswith("workbench open needs ManiSkill") and str(binaries.parent) in first
     assert second.startswith(f"Type: {binaries}/python -m pip install 'mani_skill")
-    said = _run([str(binaries / "python"), "-c", "import workbench; workbench.make"], tmp_path, code=1)
-    assert "workbench.make needs ManiSkill" in said and "gym_env" not in said
+    output = _run([str(binaries / "python"), "-c", "import workbench; workbench.make"], tmp_path, code=1)
+    assert "workbench.make needs ManiSkill" in output and "gym_env" not in output
 
 
 LAB_PROJECT = """
@@ -146,7 +146,7 @@ class LabPush(PushCubeEnv):
 
 
 def _environment(folder: Path, but: tuple[str, ...]) -> Path:
-    """The ``bin`` folder of a new environment in which pip finds all that this one has, `but` what begins with such a name."""
+    """The ``bin`` folder of a new environment with this one's packages, except (`but`) those whose names start with these."""
     venv, packages = folder / "venv", folder / "packages"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], check=True)
     packages.mkdir()
@@ -159,13 +159,13 @@ def _environment(folder: Path, but: tuple[str, ...]) -> Path:
 
 
 def _versions(pip: list[str], folder: Path) -> dict[str, str]:
-    """Name to version of all that pip finds."""
+    """Version of each package that pip finds, by name."""
     lines = _run([*pip, "list", "--format=freeze"], folder).splitlines()
     return {canonicalize_name(line.split("==")[0]): line.split("==")[1] for line in lines}
 
 
 def _opens(binaries: Path, task: str, folder: Path) -> None:
-    """The task is opened in this folder, its page answers, and Ctrl-C ends all of it."""
+    """Check that the task opens in this folder, its page answers, and Ctrl-C ends all processes."""
     log = folder / "log.txt"
     with log.open("w") as output:
         process = subprocess.Popen(
@@ -184,7 +184,7 @@ def _opens(binaries: Path, task: str, folder: Path) -> None:
             return re.search(pattern, log.read_text())
 
         address = until(lambda: printed(r"http://\S+"), "the address", 60, seen=log.read_text)[0]
-        # The token of the first address becomes a cookie, so the client must keep cookies as a browser does.
+        # The token in the first address becomes a cookie, so the client must store cookies as a browser does.
         client = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(http.cookiejar.CookieJar()))
         with client.open(address, timeout=20) as answer:
             assert answer.status == 200
@@ -204,7 +204,7 @@ def _opens(binaries: Path, task: str, folder: Path) -> None:
 
 
 def _run(command: list[str], folder: Path, code: int = 0) -> str:
-    """What it prints: of a command that fails, as it should, what it says of that."""
+    """Output of the command: stdout, or stderr if it is expected to fail with `code`."""
     done = subprocess.run(
         command, cwd=folder, env=_clean_environment(), capture_output=True, text=True, timeout=60
     )

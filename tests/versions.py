@@ -1,13 +1,13 @@
-"""Runs the tests with other versions of what the workbench stands on, and writes the table of web_assets/docs/reference/versions.md.
+"""Runs the tests with other versions of the dependencies, and writes the table in web_assets/docs/reference/versions.md.
 
     python -m tests.versions tested nightly                 # ManiSkill's release and nightly build, by constraints.txt
-    python -m tests.versions oldest newest --tests fast     # the ends of pyproject.toml's ranges; uv has to be on PATH
+    python -m tests.versions oldest newest --tests fast     # the ends of pyproject.toml's ranges; needs uv on PATH
     python -m tests.versions newest --python 3.12 --write   # also into the table
 
 Sets: ``tested`` is constraints.txt with ManiSkill's release, ``nightly`` the same with its nightly build, ``oldest`` and
-``newest`` the ends of the ranges, ``nightly-newest`` the nightly build with the newest of all else. ``fast`` takes 3 minutes
-on two cores, ``all`` (the default) 17. Each set gets an environment of its own (3 to 8 GB) below ``--folder``, where it stays:
-the next run is quick. torch stays at the version of constraints.txt, unless ``--torch`` says another: releases are CUDA
+``newest`` the ends of the ranges, ``nightly-newest`` the nightly build with the newest of everything else. ``fast`` takes 3
+minutes on two cores, ``all`` (the default) 17. Each set gets its own environment (3 to 8 GB) under ``--folder``, which is
+kept for the next run. torch stays at the version of constraints.txt unless ``--torch`` gives another: releases are CUDA
 builds of gigabytes.
 """
 
@@ -73,7 +73,7 @@ class Result:
     date: str
     maniskill: str
     versions: tuple[str, ...]
-    """Of `SHOWN`."""
+    """Versions of the packages in `SHOWN`."""
     passed: int
     failed: int
     skipped: int
@@ -116,7 +116,7 @@ def pins() -> dict[str, str]:
 
 
 def requirements(chosen: VersionSet, torch: str) -> list[str]:
-    """What is installed: ranges of pyproject.toml, test tools and torch at one version."""
+    """Requirements to install: ranges of pyproject.toml, test tools, and torch at one version."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     wanted = [
@@ -128,7 +128,7 @@ def requirements(chosen: VersionSet, torch: str) -> list[str]:
 
 
 def install(name: str, version: str, torch: str, folder: Path) -> Path:
-    """The interpreter of an environment with this set, made or brought up to date."""
+    """Create or update the environment of this set; return its interpreter."""
     uv, chosen = shutil.which("uv"), SETS[name]
     venv = folder / f"{name}-{version}"
     python = venv / "bin" / "python"
@@ -198,7 +198,7 @@ print(json.dumps({{"python": platform.python_version(), **{{name: version(name) 
 
 
 def environment(python: Path) -> dict[str, str]:
-    """This one, with the software Vulkan driver that `make test` uses too."""
+    """The current environment variables, with the software Vulkan driver that `make test` also uses."""
     lines = subprocess.run(
         [str(python), "-m", "workbench.machine.software_vulkan", "--export"],
         check=True,
@@ -221,7 +221,7 @@ def rows(text: str) -> list[list[str]]:
 
 
 def with_row(text: str, result: Result) -> str:
-    """The page with this row, in place of an earlier one of the same set, Python and tests."""
+    """The page with this row, which replaces one of the same set, Python and tests."""
     key = (result.name, result.python, result.tests)
     lines: list[str] = []
     place = None
@@ -230,7 +230,7 @@ def with_row(text: str, result: Result) -> str:
         if cells is not None and (cells[0], cells[1], cells[-3]) == key:
             continue
         lines.append(line)
-        # Behind the last row: further tables follow.
+        # After the last row: other tables follow.
         if line.startswith("| set |") or (place == len(lines) - 1 and line.startswith("|")):
             place = len(lines)
     if place is None:

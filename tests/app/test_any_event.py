@@ -1,4 +1,4 @@
-"""Whatever happens in any order: the checks, the profile, the seeds and the plans follow from it alone."""
+"""Any events in any order: the checks, the profile, the seeds and the plans depend only on them."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ PROFILE = StepProfile(2, 20, 1.0, (HookTime("evaluate", 1.0, 1.0),), ())
 
 flags, numbers, why = st.booleans(), st.integers(0, 3), st.sampled_from(["", "it died"])
 problems = st.sampled_from([None, problem()])
-wishes = st.builds(PlanWanted, numbers, st.just((0,)), why_not=why)
+plan_requests = st.builds(PlanWanted, numbers, st.just((0,)), why_not=why)
 EVENTS = st.one_of(
     st.sampled_from([CheckNow(), StopChecks(), TimeStep(), StopProfile(), SolveSeeds(), StopSolving()]).map(
         Asked
@@ -66,7 +66,7 @@ EVENTS = st.one_of(
     st.builds(ChooseSeeds, seeds=st.integers(1, 256)).map(Asked),
     st.just(VersionLoaded(Loaded(description(GEOMETRY), step_of(POSES), {}), True)),
     st.sampled_from([LoadDone(), FileSaved(), WorkerDied(DEATH, ""), PlanDropped()]),
-    wishes,
+    plan_requests,
     st.builds(
         moment,
         numbers.map(lambda step: np.full(ENVS, step, np.int32)),
@@ -86,11 +86,11 @@ EVENTS = st.one_of(
     st.builds(solve_seeds.SeedsFailed, why, problems),
     st.just(solver.RolloutsStart()),
     st.builds(solver.PlanActivity, why),
-    st.builds(solver.PlanMade, wishes, st.just((PLAN,)), st.floats(1, 99)),
+    st.builds(solver.PlanMade, plan_requests, st.just((PLAN,)), st.floats(1, 99)),
     st.builds(solver.PlanFailed, why, problems),
 )
 SEQUENCES = st.lists(st.tuples(EVENTS, st.sampled_from(RUNS)), max_size=40)
-"""Each event with the run after it."""
+"""(event, run after the event) pairs."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,11 @@ class Feature:
     begins: type
     """The effect that begins its job."""
     ends: tuple[type, ...]
-    """The effect that ends the job, and what the job tells last."""
+    """The effect that ends the job, and the job's last event."""
 
 
 def without_before(apply: Callable[[Any, object, Run], Any]) -> Callable[[Any, object, Run, Run], Any]:
-    """This `apply`, which asks for the run after the event only, called with the run before it too."""
+    """Adapt an `apply` that only takes the run after the event to one that also gets the run before it."""
     return lambda value, event, before, run: apply(value, event, run)
 
 
@@ -147,7 +147,7 @@ FEATURES = {
 }
 
 
-def test_the_check_of_a_load_begins_last_so_that_it_comes_before_the_rescoring() -> None:
+def test_the_check_of_a_load_is_started_last_and_so_runs_before_rescoring() -> None:
     loaded = VersionLoaded(Loaded(description(GEOMETRY), step_of(POSES), {}), True)
     value, effects = checks.apply(checks.Checks(), loaded, NOTHING, PUSH)
     assert effects == []
@@ -159,7 +159,7 @@ features = pytest.mark.parametrize("feature", FEATURES.values(), ids=FEATURES)
 
 
 def values_after(feature: Feature, happened: list[tuple[object, Run]]) -> list[tuple[Any, list[Any]]]:
-    """The value after each event, and what has to be done."""
+    """The value after each event, and its effects."""
     values: list[tuple[Any, list[Any]]] = [(feature.first, [])]
     before = NOTHING
     for event, run in happened:
@@ -183,9 +183,7 @@ def test_the_same_events_give_the_same_value(feature: Feature, happened: list[tu
 
 @features
 @given(happened=SEQUENCES)
-def test_no_job_runs_on_when_the_page_says_that_none_does(
-    feature: Feature, happened: list[tuple[object, Run]]
-) -> None:
+def test_no_job_runs_when_the_page_shows_none(feature: Feature, happened: list[tuple[object, Run]]) -> None:
     runs = False
     for (event, _), (value, effects) in zip(happened, values_after(feature, happened)[1:], strict=True):
         runs = runs and not isinstance(event, feature.ends)

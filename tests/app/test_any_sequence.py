@@ -1,4 +1,4 @@
-"""Whatever is asked and whatever a worker says, in any order: the state can be drawn, and is the same for who comes late."""
+"""Any commands and worker events in any order: the state can be drawn, and a page that opens later shows the same."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from tests.drive.live import Live
 from tests.drive.panels import Clock
-from tests.drive.session import BASE, Told, seek_by, told_session
+from tests.drive.session import BASE, FakeWorkerSession, fake_worker_session, seek_by
 from workbench.cameras.commands import UndoCamera
 from workbench.cameras.events import CameraPlaced
 from workbench.cameras.view import StudioView
@@ -33,7 +33,7 @@ from workbench.record.state import RecordingStatus
 from workbench.task.problem import Problem
 
 PROBLEM = Problem("step", "KeyError: 'goal'", "push.py", 7, None, "Traceback")
-Act = Callable[[Told], object]
+Act = Callable[[FakeWorkerSession], object]
 
 
 def act(name: str, do: Act) -> st.SearchStrategy[tuple[str, Act]]:
@@ -41,91 +41,91 @@ def act(name: str, do: Act) -> st.SearchStrategy[tuple[str, Act]]:
 
 
 def fails(kept: bool, at_run: bool) -> Act:
-    return lambda told: told.tell(TaskFailed(PROBLEM, kept=kept, at_run=at_run))
+    return lambda fake: fake.tell(TaskFailed(PROBLEM, kept=kept, at_run=at_run))
 
 
-def places(told: Told) -> None:
-    """A camera somewhere else, if there is one that can be placed."""
-    camera = told.view.of(StudioView).camera(BASE)
+def places(fake: FakeWorkerSession) -> None:
+    """Move a camera, if there is one that can be moved."""
+    camera = fake.view.of(StudioView).camera(BASE)
     if camera is not None and camera.now is not None:
         x, y, z = camera.now.position
-        told.session.happen(CameraPlaced(BASE, replace(camera.now, position=(x + 0.1, y, z))))
+        fake.session.happen(CameraPlaced(BASE, replace(camera.now, position=(x + 0.1, y, z))))
 
 
-def undoes(told: Told) -> None:
+def undoes(fake: FakeWorkerSession) -> None:
     with suppress(Refused):
-        told.session.do(UndoCamera())
+        fake.session.do(UndoCamera())
 
 
 EVENTS = st.one_of(
     st.sampled_from(["same", "patched", "cameras", "rebuilt", "restarted"]).map(
-        lambda level: (f"loaded {level}", lambda told: told.load(level))
+        lambda level: (f"loaded {level}", lambda fake: fake.load(level))
     ),
-    st.integers(1, 4).map(lambda count: (f"{count} steps", lambda told: told.step(count))),
+    st.integers(1, 4).map(lambda count: (f"{count} steps", lambda fake: fake.step(count))),
     st.lists(st.integers(0, 2), unique=True, min_size=1).map(
-        lambda envs: (f"reset of {envs}", lambda told: told.reset(envs))
+        lambda envs: (f"reset of {envs}", lambda fake: fake.reset(envs))
     ),
-    act("plays", lambda told: told.tell(Status(True, 20.0, 1.0))),
-    act("is paused", lambda told: told.tell(Status(False, 0.0, 0.0))),
-    act("is loading", lambda told: told.tell(Loading("importing"))),
+    act("plays", lambda fake: fake.tell(Status(True, 20.0, 1.0))),
+    act("is paused", lambda fake: fake.tell(Status(False, 0.0, 0.0))),
+    act("is loading", lambda fake: fake.tell(Loading("importing"))),
     act("does not load", fails(True, False)),
     act("fails while it runs", fails(True, True)),
-    act("dies", lambda told: told.die()),
+    act("dies", lambda fake: fake.die()),
 )
 COMMANDS = st.one_of(
-    act("play", lambda told: told.session.do(PlayRun())),
-    act("pause", lambda told: told.session.do(PauseRun())),
-    act("step", lambda told: told.session.do(Step())),
-    act("undo", lambda told: told.session.do(UndoReset())),
-    act("go on from here", lambda told: told.session.do(ContinueFromHere(scope="all"))),
-    st.integers(-20, 20).map(lambda by: (f"{by} along", lambda told: seek_by(told.session, by))),
-    st.integers(-2, 40).map(lambda at: (f"seek {at}", lambda told: told.session.happen(MomentShown(at)))),
-    st.integers(-1, 5).map(lambda env: (f"select {env}", lambda told: told.session.change(selected_env=env))),
+    act("play", lambda fake: fake.session.do(PlayRun())),
+    act("pause", lambda fake: fake.session.do(PauseRun())),
+    act("step", lambda fake: fake.session.do(Step())),
+    act("undo", lambda fake: fake.session.do(UndoReset())),
+    act("go on from here", lambda fake: fake.session.do(ContinueFromHere(scope="all"))),
+    st.integers(-20, 20).map(lambda by: (f"{by} along", lambda fake: seek_by(fake.session, by))),
+    st.integers(-2, 40).map(lambda at: (f"seek {at}", lambda fake: fake.session.happen(MomentShown(at)))),
+    st.integers(-1, 5).map(lambda env: (f"select {env}", lambda fake: fake.session.change(selected_env=env))),
     act(
         "watch a camera",
-        lambda told: told.session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),)),
+        lambda fake: fake.session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),)),
     ),
     act("place a camera", places),
     act("undo a placement", undoes),
-    st.integers(0, 9).map(lambda seed: (f"seed {seed}", lambda told: told.session.do(SetSeed(seed=seed)))),
-    act("reload", lambda told: told.session.do(ReloadFile())),
+    st.integers(0, 9).map(lambda seed: (f"seed {seed}", lambda fake: fake.session.do(SetSeed(seed=seed)))),
+    act("reload", lambda fake: fake.session.do(ReloadFile())),
 )
 SEQUENCES = st.lists(st.one_of(EVENTS, COMMANDS), min_size=1, max_size=25)
 
 
 @contextmanager
-def told_first() -> Iterator[Told]:
+def told_first() -> Iterator[FakeWorkerSession]:
     with (
         tempfile.TemporaryDirectory() as folder,
-        told_session(Path(folder), task=f"{folder}/push.py") as told,
+        fake_worker_session(Path(folder), task=f"{folder}/push.py") as fake,
     ):
-        told.load()
-        told.reset()
-        yield told
+        fake.load()
+        fake.reset()
+        yield fake
 
 
 @contextmanager
 def page() -> Iterator[Live]:
     live = Live(viser.ViserServer(host="127.0.0.1", port=0, verbose=False), Clock())
-    live.page.do(TellUnfolded(panel=TABLE), live.visitor)  # folded, it is drawn for each task alone
+    live.page.do(TellUnfolded(panel=TABLE), live.visitor)  # folded, it is only drawn for a new task
     try:
         yield live
     finally:
         live.server.stop()
 
 
-def draw(live: Live, told: Told) -> None:
-    live.session.answers["look"] = told.session.look
-    live.show(told.view, told.session.env_rows())
+def draw(live: Live, fake: FakeWorkerSession) -> None:
+    live.session.answers["look"] = fake.session.look
+    live.show(fake.view, fake.session.env_rows())
 
 
 def panels_of(live: Live) -> dict[str, object]:
-    """All but the 3-D view, where the first moment that is drawn decides how far apart the envs stand."""
+    """Everything but the 3-D view, where the first drawn moment decides the spacing of the envs."""
     return {name: value for name, value in live.all_drawn().items() if not name.startswith("in the view")}
 
 
 def plain(value: object) -> Any:
-    """What can be compared, without times of the day and what is not of the state."""
+    """The comparable part of a value, without clock times and anything outside the state."""
     if isinstance(value, np.ndarray):
         return value.shape, value.astype(object).ravel().tolist().__repr__()
     if is_dataclass(value) and not isinstance(value, type):
@@ -156,7 +156,7 @@ def test_the_same_sequence_gives_the_same_state(sequence: list[tuple[str, Act]])
     parts, again_parts = ({**view.pop("features"), **view} for view in (first, again))
     assert parts.keys() == again_parts.keys()
     for name, value in parts.items():
-        # The task's file is in another folder each time.
+        # Each run has the task's file in another folder.
         if name not in ("task", str(RecordingStatus), "refused", "problem", "loads", str(StudioView)):
             assert value == again_parts[name], name
 
@@ -164,7 +164,7 @@ def test_the_same_sequence_gives_the_same_state(sequence: list[tuple[str, Act]])
 @pytest.mark.thorough
 @settings(max_examples=12)
 @given(SEQUENCES)
-def test_a_page_that_comes_in_the_middle_shows_what_one_shows_that_was_there_from_the_start(
+def test_a_page_that_opens_midway_shows_the_same_as_one_open_from_the_start(
     sequence: list[tuple[str, Act]],
 ) -> None:
     with told_first() as told, page() as there, page() as late:

@@ -1,4 +1,4 @@
-"""A file without content that is opened: the page offers to write the minimal task into it, and then runs that."""
+"""Opening an empty file: the page offers to write the minimal task into it, and then runs that task."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from workbench.task.description import TaskOptions
 
 
 @pytest.mark.slow
-def test_an_empty_file_becomes_a_running_task_by_a_press(child_process: None, tmp_path: Path) -> None:
+def test_a_press_turns_an_empty_file_into_a_running_task(child_process: None, tmp_path: Path) -> None:
     file = tmp_path / "stack_two.py"
     file.write_text("# to be written\n")
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)

@@ -1,4 +1,4 @@
-"""Every command, with whatever a page can send, on the start page, the live page and the review."""
+"""Every command, with any values that a page can send, on the start page, the live page and the review."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def app(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     make_session = functools.partial(Session, recordings=folder, make_worker=scripted(2))
     session = make_session(str(folder / "push.py"), TaskOptions(num_envs=2))
     app = App(gated_server, folder, make_session, TaskOptions(), session)
-    # Else a process would list ManiSkill's tasks.
+    # Otherwise a process would list ManiSkill's tasks.
     app.open_task.catalogue.registered.close()
     app.shared.pages.start("live")
     wait_until(session, lambda view: view.task is not None, "the task")
@@ -55,7 +55,7 @@ def app(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 def with_values(kind: type[Command], seed: int) -> Iterator[Command]:
-    """This command with values of each type that it takes, among those of `NASTY`."""
+    """Instances of this command with values from `NASTY` for each field type."""
     choose = random.Random(seed)
     taken: dict[str, list[Any]] = {}
     for field in msgspec.structs.fields(kind):
@@ -75,9 +75,9 @@ def with_values(kind: type[Command], seed: int) -> Iterator[Command]:
 
 
 @pytest.mark.parametrize("which", ["start", "live", "review"])
-def test_no_command_fails_otherwise_than_by_a_sentence(app: App, which: Any) -> None:
+def test_a_command_succeeds_or_is_refused_with_a_reason(app: App, which: Any) -> None:
     app.shared.pages.show(which).result(60)
-    assert inputs_of(app.shared.server.gui) == [], "viser's own have no order beside commands"
+    assert inputs_of(app.shared.server.gui) == [], "viser's own inputs are not ordered relative to commands"
     (visitor,), done = app.shared.visitors.all(), 0
     for kind in COMMANDS:
         if kind in LEAVES:

@@ -1,4 +1,4 @@
-"""When a page is drawn next."""
+"""The schedule of page frames."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 
 from workbench.app.pages import FRAME_SECONDS, next_frame
 
-CLOSE = 1e-9
+TOLERANCE_SECONDS = 1e-9
 
 
 def draw_times(late: list[float], due: float = 0.0) -> list[float]:
-    """When frames are drawn that come so much after they are due."""
+    """Times of frames that are each drawn this late, in seconds."""
     drawn = []
     for delay in late:
         drawn.append(due + delay)
@@ -19,12 +19,12 @@ def draw_times(late: list[float], due: float = 0.0) -> list[float]:
     return drawn
 
 
-def test_a_frame_that_came_late_takes_nothing_from_the_rate() -> None:
+def test_a_late_frame_does_not_lower_the_rate() -> None:
     drawn = draw_times([0.0, 0.3 * FRAME_SECONDS, 0.1 * FRAME_SECONDS, 0.4 * FRAME_SECONDS, 0.0])
-    assert abs(drawn[-1] - 4 * FRAME_SECONDS) < CLOSE
+    assert abs(drawn[-1] - 4 * FRAME_SECONDS) < TOLERANCE_SECONDS
 
 
 @given(st.lists(st.floats(0.0, 5.0), min_size=2, max_size=30))
-def test_frames_never_follow_closer_than_half_of_their_time_however_late_they_are(late: list[float]) -> None:
+def test_late_frames_are_never_closer_than_half_a_frame_time(late: list[float]) -> None:
     drawn = draw_times(late)
-    assert all(b - a > FRAME_SECONDS / 2 - CLOSE for a, b in zip(drawn, drawn[1:], strict=False))
+    assert all(b - a > FRAME_SECONDS / 2 - TOLERANCE_SECONDS for a, b in zip(drawn, drawn[1:], strict=False))

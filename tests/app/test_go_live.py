@@ -30,8 +30,8 @@ from workbench.task.reference import TaskName
 from workbench.trust.clearance import Clearances, CodeToRun, NotCleared
 
 
-class Person(Clearances):
-    """Says yes when it is told to, and is asked no more by who does not wait."""
+class Consenter(Clearances):
+    """Consents once `says_yes` is set; counts questions, and those that were abandoned."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -43,19 +43,19 @@ class Person(Clearances):
         until(lambda: self.says_yes.is_set() or stopped(), "an answer")
         if stopped():
             self.left += 1
-            raise NotCleared("nobody waits any more")
+            raise NotCleared("no one waits for the answer")
         return wanted.info.task
 
 
 class Desk:
-    """A review with an episode of the task that is open, 0, and one of another, 1."""
+    """A review with an episode of the open task (0) and one of another task (1)."""
 
     def __init__(self, app: App, live: Session, other: Session, panels: Panels) -> None:
         self.app, self.live, self.other, self.panels = app, live, other, panels
-        self.person = Person()
+        self.person = Consenter()
         self.opened: list[TaskName] = []
         self.shown: list[str] = []
-        """Pages that were asked for; none is built."""
+        """Requested pages; none is built."""
         app.shared.pages.show = self._show
         self.go_live = GoLive(app.shared, self._make, self.person, TaskOptions())
         self.part = GoLivePart(app.shared.server, self.go_live)
@@ -74,15 +74,15 @@ class Desk:
         opened = self.app.shared.recordings.review.view().opened[which]
         do(lambda: self.go_live.go(opened.id, state))
 
-    def is_led_to_the_live_page(self) -> None:
-        """Though nobody looks: nothing draws the review here."""
+    def wait_for_the_live_page(self) -> None:
+        """Wait for the switch to the live page; here nothing draws the review."""
         until(lambda: self.shown == ["live"], "the live page", seen=self.go_live.going)
         assert self.go_live.going() == ""
 
 
 @pytest.fixture
 def server(gated_server: GatedServer) -> viser.ViserServer:
-    """Of the review."""
+    """The review's server."""
     return gated_server.server
 
 
@@ -100,7 +100,7 @@ def desk(
     live, other = scripted_session(2), scripted_session(1)
 
     def no_other(task: TaskName, options: TaskOptions) -> Session:
-        raise AssertionError("this test opens it itself")
+        raise AssertionError("the test opens the other session itself")
 
     app = App(gated_server, folder, no_other, TaskOptions(), session=live)
     library, review = app.shared.recordings.library, app.shared.recordings.review
@@ -113,27 +113,27 @@ def desk(
     app.close()
 
 
-def test_into_the_task_that_is_open_one_goes_at_once_and_the_page_follows_also_if_nobody_looks(
+def test_going_live_in_the_open_task_is_immediate_and_switches_the_page_even_if_not_drawn(
     desk: Desk,
 ) -> None:
     desk.go(0, state=3)
     assert desk.person.asked == 0 and desk.opened == [] and desk.app.shared.session is desk.live
     until(lambda: desk.live.view().timeline.entered, "the recorded state")
-    desk.is_led_to_the_live_page()
+    desk.wait_for_the_live_page()
     assert not desk.go_live.can_go_home()
 
 
-def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason_to(desk: Desk) -> None:
+def test_a_failure_while_going_live_shows_the_live_page_but_an_earlier_failure_does_not(desk: Desk) -> None:
     desk.live._take(TaskFailed(problem(), kept=True))
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
-    time.sleep(0.2)  # so long a page would be led there for a failure
+    time.sleep(0.2)  # time in which a failure would switch the page
     assert desk.go_live.going() == "restoring Push-v1 at step 2 …" and desk.shown == []
     desk.live._take(TaskFailed(problem(), kept=True))
-    desk.is_led_to_the_live_page()
+    desk.wait_for_the_live_page()
 
 
-def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_yes(desk: Desk) -> None:
+def test_another_task_is_opened_next_to_the_open_one_after_consent(desk: Desk) -> None:
     desk.live.do(PlayRun())
     until(lambda: desk.live.view().playing, "the play")
     desk.go(1)
@@ -143,9 +143,9 @@ def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_y
     desk.person.says_yes.set()
     until(lambda: desk.app.shared.session is desk.other, "the other session")
     assert desk.opened == ["Pull-v1"] and desk.go_live.can_go_home()
-    until(lambda: not desk.live.view().playing, "the pause of the task that nobody sees")
+    until(lambda: not desk.live.view().playing, "the pause of the hidden task")
     until(lambda: desk.other.view().timeline.entered, "the recorded state")
-    desk.is_led_to_the_live_page()
+    desk.wait_for_the_live_page()
     desk.part.draw(desk.app.shared.recordings.review.view())
     desk.panels.press("Back to the first task")
     assert desk.app.shared.session is desk.live and not desk.go_live.can_go_home()
@@ -153,7 +153,7 @@ def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_y
     assert not desk.panels.shows("Back to the first task")
 
 
-def test_which_code_and_which_envs_are_kept_for_the_next_review(desk: Desk) -> None:
+def test_the_choice_of_code_and_envs_is_kept_for_the_next_review(desk: Desk) -> None:
     desk.part.draw(desk.app.shared.recordings.review.view())
     assert desk.panels.field("Code").value == "today's"
     desk.panels.set("Code", "as recorded")
@@ -167,18 +167,18 @@ def test_which_code_and_which_envs_are_kept_for_the_next_review(desk: Desk) -> N
     assert desk.panels.client.notices == ["No other task is open."]
 
 
-def test_who_presses_again_stays_and_nobody_is_asked_any_more(desk: Desk) -> None:
+def test_a_second_press_cancels_going_live_and_its_question(desk: Desk) -> None:
     desk.go(1)
     until(lambda: desk.person.asked, "the question")
     desk.go(1)
     assert desk.go_live.going() == ""
-    until(lambda: desk.person.left, "that nobody waits for the answer")
+    until(lambda: desk.person.left, "the abandoned question")
     assert desk.opened == [] and desk.app.shared.session is desk.live
 
 
-def test_a_review_that_is_shown_anew_waits_for_nothing_that_is_under_way(desk: Desk) -> None:
+def test_reopening_the_review_cancels_going_live(desk: Desk) -> None:
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
-    until(lambda: desk.go_live.going().startswith("restoring"), "the way")
+    until(lambda: desk.go_live.going().startswith("restoring"), "the restore")
     GoLivePart(desk.app.shared.server, desk.go_live)
     assert desk.go_live.going() == ""

@@ -1,4 +1,4 @@
-"""The whole page on a real session and a real server, drawn without a browser."""
+"""The whole page on a real session and a real server, without a browser."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ import pathlib, time
 while not pathlib.Path(__file__).with_name("drawn").exists():
     time.sleep(0.01)
 """
-"""A worker that was forked has loaded the task before a busy page is drawn for the first time."""
+"""Delays the load: a forked worker would load the task before a busy page is drawn for the first time."""
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @dataclass
 class Opened:
-    """A page, its session and what it shows."""
+    """A page, its session and its contents."""
 
     page: Page
     session: Session
@@ -76,8 +76,8 @@ def opened(
     server.stop()
 
 
-def test_says_what_it_waits_for_and_then_shows_the_scene(opened: Opened) -> None:
-    # The fixture drew it before there was a task.
+def test_the_page_names_what_it_waits_for_and_then_shows_the_scene(opened: Opened) -> None:
+    # The fixture drew the page before the task was loaded.
     run = opened.panels.part("Run")
     transport = opened.panels.part("Timeline")
     assert transport.button("Play").command is None and not run.presses(ResetAll())
@@ -112,10 +112,10 @@ def test_a_step_moves_the_robots_and_fills_the_numbers(opened: Opened) -> None:
     assert "of 3" in opened.panels.part("Reward").html()
 
 
-def test_while_steps_go_on_a_press_is_shown_at_once_and_the_robots_move_with_every_frame(
+def test_while_playing_a_press_is_shown_at_once_and_the_robots_move_every_frame(
     opened: Opened,
 ) -> None:
-    # No time passes on the page, in which the panels are drawn less often.
+    # The page's clock stands still, so the panels are not due.
     opened.load()
     hand, session = opened.panels.bodies("panda_hand")[0], opened.session
     session.change(action_source="random")
@@ -137,10 +137,10 @@ def test_while_steps_go_on_a_press_is_shown_at_once_and_the_robots_move_with_eve
     wait_until(session, lambda view: view.state == "paused", "the pause")
 
 
-def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
+def test_panel_changes_of_a_press_are_sent_separately_from_the_view(
     opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A browser applies a batch with anything of the view in it at its next frame of the view, which may take long.
+    # A browser applies a batch with any view message at the view's next frame, which may take long.
     opened.load()
     monkeypatch.setattr("workbench.app.pages.PANELS_TIMEOUT_SECONDS", 10.0)
     opened.session.change(selected_env=0)
@@ -164,7 +164,7 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
     assert "GuiUpdateMessage" not in view
 
 
-def test_one_env_alone_is_one_instance_of_each_shape(opened: Opened) -> None:
+def test_a_single_env_has_one_instance_of_each_mesh(opened: Opened) -> None:
     opened.load()
     opened.panels.do(ToggleOnlySelected())
     opened.draw()
@@ -176,7 +176,7 @@ def test_one_env_alone_is_one_instance_of_each_shape(opened: Opened) -> None:
     assert all(len(h.batched_positions) == 3 for h in opened.panels.bodies("panda_hand"))
 
 
-def test_broken_file_is_said_and_the_scene_stays(opened: Opened, task_file: Path) -> None:
+def test_a_broken_file_is_reported_and_the_scene_stays(opened: Opened, task_file: Path) -> None:
     good = task_file.read_text(encoding="utf-8")
     opened.load()
     shown = opened.panels.bodies("")
@@ -195,5 +195,5 @@ def test_broken_file_is_said_and_the_scene_stays(opened: Opened, task_file: Path
     )
     opened.draw()
     assert not opened.banner()
-    # The same shapes are not sent again.
+    # The same meshes are not sent again.
     assert all(new is old for new, old in zip(opened.panels.bodies(""), shown, strict=True))

@@ -1,4 +1,4 @@
-"""Tabs that come, go and fall asleep, on the real page, door and session; the browsers are `tests.drive.tabs`."""
+"""Tabs that open, close and stop reading, on the real page, door and session; the browsers are `tests.drive.tabs`."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ class House:
     session: Session
     stage: View3D
     tabs: Tabs
-    told: list[int]
-    """How many pages are open, each time that the session was told."""
+    counts: list[int]
+    """Each number of open pages that the session received."""
 
     def clients(self) -> int:
         return len(self.gated_server.server.get_clients())
 
 
-class Told(Session):
-    """Notes how many pages it is told of."""
+class CountingSession(Session):
+    """Records the page counts that it receives."""
 
-    def __init__(self, told: list[int], folder: Path) -> None:
-        self._told = told
+    def __init__(self, counts: list[int], folder: Path) -> None:
+        self._counts = counts
         options = TaskOptions(num_envs=2)
         super().__init__(
             str(folder / "push.py"), options, recordings=folder / "recordings", make_worker=scripted(2)
@@ -58,21 +58,21 @@ class Told(Session):
 
     def happen(self, event: RunEvent) -> None:
         if isinstance(event, PagesCounted):
-            self._told.append(event.count)
+            self._counts.append(event.count)
         super().happen(event)
 
 
 @pytest.fixture(scope="module")
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    gated_server, told = open_server(ServerOptions(port=0)), [0]
-    session, stage = Told(told, tmp_path_factory.mktemp("author")), View3D(gated_server.server)
+    gated_server, counts = open_server(ServerOptions(port=0)), [0]
+    session, stage = CountingSession(counts, tmp_path_factory.mktemp("author")), View3D(gated_server.server)
     page = Page(gated_server.server, Visitors(gated_server.server, COMMANDS), session, stage=stage)
     pages = Pages(gated_server.server, stage, lambda which, dark: page)
     pages.start("live")
     try:
         with tabs_of(gated_server.url) as tabs:
             wait_until(session, lambda view: view.task is not None, "the first load")
-            yield House(gated_server, session, stage, tabs, told)
+            yield House(gated_server, session, stage, tabs, counts)
     finally:
         pages.stop()
         session.close()
@@ -80,17 +80,17 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
 
 
 def test_the_session_knows_whether_any_tab_is_open(house: House) -> None:
-    """Without one it renders nothing: `tests/live/test_session.py`."""
+    """Without a tab it renders nothing: `tests/live/test_session.py`."""
     first, second = house.tabs.open(), house.tabs.open()
-    until(lambda: house.told[-1] == 2, "both tabs")
+    until(lambda: house.counts[-1] == 2, "both tabs")
     house.tabs.close(first)
-    until(lambda: house.told[-1] == 1, "the end of one")
+    until(lambda: house.counts[-1] == 1, "the end of one")
     house.tabs.close(second)
-    until(lambda: house.told[-1] == 0, "the end of the other")
+    until(lambda: house.counts[-1] == 0, "the end of the other")
 
 
 @pytest.mark.slow
-def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
+def test_a_tab_that_reads_nothing_is_disconnected_and_blocks_no_one(
     house: House, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(strangers, "READ_TIMEOUT_SECONDS", 3.0)
@@ -113,7 +113,7 @@ def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
 
 
 @pytest.mark.slow
-def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
+def test_a_tab_that_opens_and_closes_leaves_nothing_behind(house: House) -> None:
     server = house.gated_server.server
 
     def come_and_go() -> None:
@@ -147,5 +147,5 @@ def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
     def grown() -> dict[str, tuple[int, int]]:
         return {name: (before[name], now) for name, now in held().items() if now > before[name]}
 
-    # The kernel, and a thread of viser's, may take a socket's end later than the page does.
+    # The kernel and a viser thread may notice a closed socket later than the page.
     until(lambda: not grown(), "as few as before", 20, seen=grown)

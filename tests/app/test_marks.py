@@ -30,8 +30,8 @@ def marks(panels: Panels, rows: EnvRows) -> Marks:
     return Marks(panels.server, cast(Any, OneTable(rows)), OpenTabs(panels.visitors))
 
 
-def test_flagged_envs_are_in_sight_and_a_press_leads_to_the_first(panels: Panels) -> None:
-    """A reward that was NaN in most envs left a green "running"."""
+def test_flagged_envs_are_shown_and_a_press_selects_the_first(panels: Panels) -> None:
+    """Without the mark, a NaN reward in most envs would show only a green "running"."""
     lost = Outlier(OutlierKind.REWARD_NOT_FINITE, 3, "the reward is <b>NaN</b>")
     row = marks(panels, rows_of(outliers={4: (lost,), 2: (lost,)}))
     row.draw(running(6))
@@ -42,11 +42,11 @@ def test_flagged_envs_are_in_sight_and_a_press_leads_to_the_first(panels: Panels
         and "In env 2, step 3: reward-finite: the reward" in content
     )
     row.draw(running(6, steps_per_second=21.0))
-    assert standing.content is content, "it stays under the finger that presses"
+    assert standing.content is content, "the mark is not redrawn under a press"
     assert panels.presses(ShowFirstFlagged())
 
 
-def test_what_is_saved_of_the_past_is_in_sight_until_it_is_saved(panels: Panels) -> None:
+def test_saving_of_the_past_is_shown_until_it_is_done(panels: Panels) -> None:
     row, view = marks(panels, rows_of(outliers={})), running(6)
     saves = SaveStatus(progress=JobProgress("replaying", 3, 20))
     saving = changed(view, recording=replace(view.of(RecordingStatus), saving=saves))

@@ -1,4 +1,4 @@
-"""A listed task in place of the open one, with scripted workers and without a browser."""
+"""Opening a listed task instead of the open one, with scripted workers and without a browser."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "min
 
 
 class Desk:
-    """A workbench that was started in ``work``, with a task file there, and one elsewhere that was opened before."""
+    """A workbench started in ``work``, with a task file there and a recently opened one elsewhere."""
 
     def __init__(self, app: App, opened: list[tuple[TaskName, TaskOptions]], folder: Path) -> None:
         self.app, self.opened, self.folder = app, opened, folder
@@ -58,7 +58,7 @@ class Desk:
         do(lambda: self.app.open_task.choose(number))
 
     def session_of(self, name: str) -> Session:
-        """The open session, once it is that of this file."""
+        """Wait until the open session is that of this file; return it."""
         until(
             lambda: self.app.shared.home is not None and str(self.app.shared.home.reference).endswith(name),
             f"the session of {name}",
@@ -80,7 +80,9 @@ def desk(tmp_path: Path, gated_server: GatedServer, monkeypatch: pytest.MonkeyPa
         (tmp_path / name).write_text(TASK)
     monkeypatch.chdir(tmp_path / "work")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    monkeypatch.setattr(RegisteredTasks, "start", lambda self: None)  # else a process lists ManiSkill's
+    monkeypatch.setattr(
+        RegisteredTasks, "start", lambda self: None
+    )  # otherwise a process lists ManiSkill's tasks
     recents = RecentTasks(lambda: tmp_path / "state")
     recents.add(str(tmp_path / "elsewhere/other.py"), TaskOptions(3, env_kwargs={"size": 2}))
     recents.add(str(tmp_path / "elsewhere/gone.py"), TaskOptions())
@@ -103,18 +105,18 @@ def desk(tmp_path: Path, gated_server: GatedServer, monkeypatch: pytest.MonkeyPa
     app.close()
 
 
-def test_a_file_of_the_folder_opens_unasked_with_the_options_of_the_run(desk: Desk) -> None:
+def test_a_file_of_the_folder_opens_without_a_question_with_the_options_of_the_run(desk: Desk) -> None:
     desk.choose("push.py")
     session = desk.session_of("push.py")
     assert desk.opened == [(str(desk.folder / "work/push.py"), TaskOptions(5))]
     until(lambda: desk.app.shared.pages.shown == "live", "the page")
     desk.choose("push.py")
     desk.idle()
-    assert desk.app.shared.home is session, "what is open is not opened again"
+    assert desk.app.shared.home is session, "an open task is not opened again"
 
 
 @pytest.mark.thorough
-def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
+def test_a_reopened_task_has_its_selections_and_camera_edits(desk: Desk) -> None:
     desk.choose("push.py")
     first = desk.session_of("push.py")
     until(lambda: desk.app.shared.pages.shown == "live", "the page")
@@ -137,11 +139,11 @@ def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
     view = again.view()
     assert (view.selected_env, view.settings.speed, view.of(StudioView).selected) == (1, 2.0, CAMERA)
     again.do(UndoCamera())
-    assert not moved(again.view()), "the way back is kept too"
+    assert not moved(again.view()), "the undo history is kept too"
 
 
 @pytest.mark.thorough
-def test_a_file_from_elsewhere_asks_once_and_a_no_leaves_all_as_it_is(desk: Desk) -> None:
+def test_a_file_from_elsewhere_asks_once_and_a_refusal_changes_nothing(desk: Desk) -> None:
     desk.choose("push.py")
     first = desk.session_of("push.py")
     until(lambda: desk.app.shared.pages.shown == "live", "the page")
@@ -155,7 +157,7 @@ def test_a_file_from_elsewhere_asks_once_and_a_no_leaves_all_as_it_is(desk: Desk
     until(lambda: desk.panels.shows(ONCE), "the question again")
     desk.panels.press(ONCE)
     desk.session_of("other.py")
-    assert desk.opened[-1][1] == TaskOptions(3, env_kwargs={"size": 2}), "as it was opened last"
+    assert desk.opened[-1][1] == TaskOptions(3, env_kwargs={"size": 2}), "with the options of the last time"
     assert desk.app.open_task.is_open(desk.row("other.py"))
     assert not desk.app.open_task.is_open(desk.row("push.py"))
     desk.choose("push.py")
@@ -164,7 +166,7 @@ def test_a_file_from_elsewhere_asks_once_and_a_no_leaves_all_as_it_is(desk: Desk
     desk.session_of("other.py")
 
 
-def test_another_choice_withdraws_the_question_and_the_last_of_several_counts(desk: Desk) -> None:
+def test_another_choice_withdraws_the_question_and_the_last_choice_wins(desk: Desk) -> None:
     desk.choose("other.py")
     until(lambda: desk.panels.shows(ALWAYS), "the question")
     desk.choose("push.py")
@@ -174,7 +176,7 @@ def test_another_choice_withdraws_the_question_and_the_last_of_several_counts(de
     assert [str(task) for task, _ in desk.opened if str(task).endswith("other.py")] == []
 
 
-def test_what_is_gone_is_said_and_nothing_is_opened(desk: Desk) -> None:
+def test_a_missing_file_is_reported_and_nothing_is_opened(desk: Desk) -> None:
     assert desk.row("gone.py").gone
     desk.choose("gone.py")
     file = desk.folder / "work/push.py"
@@ -186,7 +188,7 @@ def test_what_is_gone_is_said_and_nothing_is_opened(desk: Desk) -> None:
     assert desk.opened == [] and desk.app.shared.session is None
 
 
-def test_the_recordings_are_a_row_and_a_task_is_opened_from_there_too(
+def test_the_recordings_have_a_row_and_a_task_can_be_opened_from_there(
     child_process: None, desk: Desk
 ) -> None:
     (recordings,) = desk.rows(Section.RECORDINGS)
@@ -197,7 +199,7 @@ def test_the_recordings_are_a_row_and_a_task_is_opened_from_there_too(
     until(lambda: desk.app.shared.pages.shown == "live", "the page")
 
 
-def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
+def test_the_machine_is_idle_for_thumbnails_only_while_no_task_is_working(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shared, "MIN_FREE_BYTES", 0)
@@ -213,7 +215,7 @@ def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
     assert not desk.app.shared.is_idle()
 
 
-def test_a_new_task_is_written_where_the_workbench_was_started_and_opened(desk: Desk) -> None:
+def test_a_new_task_is_written_to_the_start_folder_and_opened(desk: Desk) -> None:
     for name in ("push", "../elsewhere/mine", "class"):
         with pytest.raises(ValueError):
             result_of(desk.app.open_task.create(name, "minimal"))

@@ -1,4 +1,4 @@
-"""The live page and the review on one server, swapped over and over; nothing is left behind."""
+"""The live page and the review on one server, swapped repeatedly; nothing is left behind."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ SWAPS = 20
 
 @pytest.fixture
 def server(gated_server: GatedServer) -> viser.ViserServer:
-    """Of the pages that are swapped."""
+    """The server of both pages."""
     return gated_server.server
 
 
 def no_session(task: object, options: object) -> Session:
-    raise AssertionError("nobody goes live from a recording")
+    raise AssertionError("no test here goes live from a recording")
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def app(
 
 
 @pytest.mark.slow
-def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
+def test_twenty_swaps_leave_nothing_behind_and_the_session_keeps_running(
     app: App, gated_server: GatedServer, server: viser.ViserServer, panels: Panels
 ) -> None:
     session = app.shared.session
@@ -69,16 +69,16 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
         threads.append(threading.active_count())
     for found in seen.values():
         for name, count in found[-1].items():
-            # A busy machine can rest for as long as `drawn_whole` waits, and then an early count lacks some parts.
+            # A busy machine can pause for as long as `drawn_whole` waits; then an early count lacks some parts.
             early = max(counts[name] for counts in found[:2])
             assert count <= early + (40 if name == "messages" else 0), (name, found)
     assert max(threads[4:]) <= max(threads[:4])
     before = session.view().step_serial
-    wait_until(session, lambda view: view.step_serial > before, "a step of the env that plays on")
+    wait_until(session, lambda view: view.step_serial > before, "a step of the playing env")
 
 
 def drawn_whole(server: viser.ViserServer) -> dict[str, int]:
-    """What it holds once nothing more comes: some parts are drawn moments after the page."""
+    """What the server holds once it stops changing: some parts are drawn shortly after the page."""
     looks: list[dict[str, int]] = []
 
     def unchanged() -> bool:
@@ -90,7 +90,7 @@ def drawn_whole(server: viser.ViserServer) -> dict[str, int]:
     return looks[-1]
 
 
-def test_an_episode_whose_writer_was_killed_is_mended_and_said(
+def test_an_episode_whose_writer_was_killed_is_recovered_and_reported(
     child_process: None, tmp_path: Path, gated_server: GatedServer
 ) -> None:
     begin(tmp_path, made(5, seed=8))
@@ -99,14 +99,14 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
     try:
         until(
             lambda: "is back in the library" in " ".join(app.shared.recordings.review.view().problems),
-            "the word for it",
+            "the report",
         )
         until(lambda: [row.seed for row in app.shared.recordings.library.view().rows] == [8], "its row")
     finally:
         app.close()
 
 
-def test_what_is_pressed_while_another_page_is_built_is_refused_and_nothing_fails(
+def test_a_press_while_another_page_is_built_is_refused(
     app: App, panels: Panels, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     panels.come_to(app.shared.visitors)
@@ -134,16 +134,16 @@ def test_what_is_pressed_while_another_page_is_built_is_refused_and_nothing_fail
 
 @pytest.mark.slow
 def test_serving_the_pages_needs_no_simulator(child_process: None) -> None:
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, "-c", "import sys, workbench.cli.page; print(*sys.modules)"],
         check=True,
         capture_output=True,
         text=True,
     ).stdout.split()
-    assert not {"torch", "sapien", "mani_skill"} & set(said)
+    assert not {"torch", "sapien", "mani_skill"} & set(output)
 
 
-def test_a_recording_that_is_wanted_is_opened_also_if_it_is_not_the_newest(
+def test_a_requested_recording_is_opened_even_if_it_is_not_the_newest(
     app: App, gated_server: GatedServer, tmp_path: Path
 ) -> None:
     (older,) = tmp_path.glob("*.rrd")

@@ -1,4 +1,4 @@
-"""What several people do at once on the pages of one server, and what fails once: each counts, and costs nothing else."""
+"""Concurrent presses on the pages of one server all count, and a single failure affects nothing else."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from websockets.sync.connection import Connection
 from tests.drive.panels import Panels
 from tests.drive.session import wait_until
 from tests.drive.tabs import handshake, tabs_of
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from workbench.app.live_page import Page
 from workbench.app.server import App
 from workbench.app.session import Session
@@ -34,11 +34,11 @@ def server(gated_server: GatedServer) -> Any:
 
 
 def no_session(task: object, options: object) -> Session:
-    raise AssertionError("nobody goes live from a recording")
+    raise AssertionError("no test here goes live from a recording")
 
 
 class Pressing:
-    """A page that sends commands without waiting, and has the replies."""
+    """A page that sends commands without waiting and reads the replies later."""
 
     def __init__(self, channel: Connection) -> None:
         self._channel, self._sent = channel, 0
@@ -50,7 +50,7 @@ class Pressing:
             self._channel.send(json.dumps({"n": self._sent, "do": [name, fields]}))
 
     def hears(self, count: int = 1) -> list[dict[str, Any]]:
-        return [json.loads(self._channel.recv(PATIENCE)) for _ in range(count)]
+        return [json.loads(self._channel.recv(TIMEOUT_SECONDS)) for _ in range(count)]
 
 
 class Two:
@@ -66,7 +66,7 @@ class Two:
 
 @pytest.fixture
 def fails(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
-    """Set it before the drawing that is to fail."""
+    """An event that makes the next redraw fail when set."""
     fails, redraw = threading.Event(), Page.redraw
 
     def redraw_or_fail(self: Page) -> None:
@@ -100,9 +100,9 @@ def two(
     app.close()
 
 
-def test_two_pages_that_press_at_once_count_once_each_and_in_their_order(two: Two) -> None:
+def test_concurrent_presses_on_two_pages_each_count_once_and_in_order(two: Two) -> None:
     before, count = two.steps, 20
-    # A page that selects an env and then one that there is not: told so each time, so that its order is seen.
+    # One page alternately selects an env and a missing env: the refusals show the order of its commands.
     in_turns: list[Command] = [SelectEnv(env=0), SelectEnv(env=7)] * (count // 2)
     pages = [(two.one, [Step()] * count), (two.other, [Step(), *in_turns])]
     threads = [threading.Thread(target=page.press, args=presses) for page, presses in pages]
@@ -111,17 +111,17 @@ def test_two_pages_that_press_at_once_count_once_each_and_in_their_order(two: Tw
     for thread in threads:
         thread.join()
     assert two.one.hears(count) == [{"n": number} for number in range(1, count + 1)]
-    heard = two.other.hears(count + 1)
-    assert [reply["n"] for reply in heard] == list(range(1, count + 2))
-    assert ["refused" in reply for reply in heard] == [False, *[False, True] * (count // 2)]
+    replies = two.other.hears(count + 1)
+    assert [reply["n"] for reply in replies] == list(range(1, count + 2))
+    assert ["refused" in reply for reply in replies] == [False, *[False, True] * (count // 2)]
     wait_until(two.session, lambda view: view.timeline.last >= before + count + 1, "all steps")
     two.one.press(SelectEnv(env=1))
     two.one.hears()
     view = wait_until(two.session, lambda view: view.selected_env == 1, "the last press")
-    assert view.timeline.last == before + count + 1, "none counted twice"
+    assert view.timeline.last == before + count + 1, "no press counts twice"
 
 
-def test_a_slider_that_one_person_drags_swallows_no_key_of_another(two: Two) -> None:
+def test_a_slider_dragged_by_one_user_does_not_swallow_keys_of_another(two: Two) -> None:
     two.one.press(*[Step()] * 5)
     two.one.hears(5)
     wait_until(two.session, lambda view: view.timeline.last == 5, "some past")
@@ -133,7 +133,7 @@ def test_a_slider_that_one_person_drags_swallows_no_key_of_another(two: Two) -> 
         wait_until(two.session, lambda view, last=5 + count: view.timeline.last == last, "the step")
 
 
-def test_a_drawing_that_fails_once_is_told_and_the_page_is_drawn_again(
+def test_a_failed_redraw_is_reported_and_the_page_is_drawn_again(
     fails: threading.Event, two: Two, panels: Panels, caplog: pytest.LogCaptureFixture
 ) -> None:
     fails.set()
@@ -148,7 +148,7 @@ def test_a_drawing_that_fails_once_is_told_and_the_page_is_drawn_again(
         seen=lambda: panels.html("wb-status"),
     )
     two.other.press(PauseRun())
-    assert two.other.hears() == [{"n": 1}], "what the other page asks for is done"
+    assert two.other.hears() == [{"n": 1}], "the other page's command is executed"
     until(
         lambda: "paused" in panels.html("wb-status"),
         "the page that is drawn",

@@ -1,4 +1,4 @@
-"""What could not be recorded is told on whichever page is open, and in the terminal."""
+"""Recording problems are shown on the open page, whichever it is, and in the terminal."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from workbench.task.description import TaskOptions
 
 @pytest.mark.usefixtures("child_process")
 @pytest.mark.parametrize("page", ["live", "review"])
-def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServer) -> None:
+def test_each_page_shows_a_recording_problem(page: Which, tmp_path: Path, gated_server: GatedServer) -> None:
     folder = tmp_path / "no folder"
     folder.write_text("a file")
-    told: list[str] = []
+    notices: list[str] = []
     session = Session(
         str(tmp_path / "push.py"), TaskOptions(num_envs=2), recordings=folder, make_worker=scripted(2)
     )
@@ -36,7 +36,7 @@ def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServ
     def no_other(*_: object) -> Session:
         raise AssertionError("no other task is opened")
 
-    app = App(gated_server, folder, no_other, TaskOptions(), session, on_notice=told.append)
+    app = App(gated_server, folder, no_other, TaskOptions(), session, on_notice=notices.append)
     app.open_task.catalogue.registered.close()
     app.shared.pages.start(page)
     address, how = handshake(gated_server.url)
@@ -52,12 +52,12 @@ def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServ
                 for message in messages_in(frame)
                 if message["type"] == "NotificationShowMessage"
             ]
-            return any(str(folder) in text for text in texts) and len(told) == number
+            return any(str(folder) in text for text in texts) and len(notices) == number
 
         for number in (1, 2):
             session.happen(RecordingWanted())
             until(lambda number=number: tells(number), "the notice")
-        # What is refused at a moment is told too, and not kept for the moments after it.
+        # A momentary refusal is shown too, and not kept afterwards.
         begun = session.view().timeline.moments
         session.happen(EnvsReset())
         wait_until(session, lambda view: view.timeline.moments > begun, "the reset")
@@ -65,6 +65,6 @@ def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServ
         assert session.view().of(RecordingStatus).saving.failed
         session.do(Step())
         wait_until(session, lambda view: not view.of(RecordingStatus).saving.message, "the message's end")
-    assert len(told) == 2
+    assert len(notices) == 2
     app.close()
     session.close()

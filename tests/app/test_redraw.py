@@ -1,5 +1,5 @@
-"""Whatever changes in the view is seen, and nothing of it is left when it has changed back: no redraw key lacks an input, and no
-place stays where it was."""
+"""Every change of the view is shown, and nothing of it remains once it is reverted: no redraw key lacks an input, and nothing
+keeps an old place."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def curves(env: int = 0, steps: int = 40, scale: float = 1.0) -> Any:
 
 def episode(env: int, largest: float = 0.25) -> Verdict[PastRun]:
     run = PastRun(env, 0, 10 * env + np.arange(50))
-    told = {"first_difference": 5, "look_at": 5, "differing": ("reward",), "largest": largest}
-    return replace(Verdict(run, length=49, returns=(1.0, 2.0), metres=0.0, has=("reward",)), **told)
+    details = {"first_difference": 5, "look_at": 5, "differing": ("reward",), "largest": largest}
+    return replace(Verdict(run, length=49, returns=(1.0, 2.0), metres=0.0, has=("reward",)), **details)
 
 
 def studio(now: CameraSettings = LENS, mount: np.ndarray | None = None, **changes: Any) -> StudioView:
@@ -82,7 +82,7 @@ def picture(grey: int, env: int = 0) -> dict[Any, Picture]:
 
 
 def base() -> SessionView:
-    """Everything has something to show; it is paused, so that each view is drawn."""
+    """A view in which every part has content; paused, so that each view is drawn."""
     view = running(ENVS, playing=False, state="paused", steps_per_second=0.0)
     assert view.task is not None
     task = replace(
@@ -95,7 +95,7 @@ def base() -> SessionView:
         options=TaskOptions(ENVS),
         curves=curves(),
         timeline=PAST,
-        told=np.zeros((ENVS, 2), np.float32),
+        details=np.zeros((ENVS, 2), np.float32),
         loads=(load, load),
         reload=ReloadReport("patched", "only evaluate changed"),
         printed=Printed(1, (PrintedLine("stdout", "one"),), 0),
@@ -220,17 +220,17 @@ def live() -> Iterator[Live]:
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_change_is_seen_and_gone_when_it_is_taken_back(live: Live, change: str) -> None:
+def test_a_change_is_shown_and_disappears_when_reverted(live: Live, change: str) -> None:
     view = base()
     live.show(view, rows())
-    live.show(view, rows())  # pictures that follow each other are sent whole a moment later
+    live.show(view, rows())  # pictures in quick succession are sent in full quality with a delay
     before = live.everything()
     after = changed(view, **CHANGES[change](view))
     live.show(after, rows())
     live.again()  # a new version is announced for some seconds
     shown = live.everything()
-    assert difference(before, shown), "it is not seen"
-    assert difference(shown, live.all_drawn()) == "", "a part was not drawn that shows it"
+    assert difference(before, shown), "the change is not shown"
+    assert difference(shown, live.all_drawn()) == "", "a part that shows the change was not redrawn"
     live.show(view, rows())
     live.again()
     assert difference(before, live.everything()) == ""
@@ -244,7 +244,7 @@ def test_a_step_is_in_the_table_of_envs(live: Live) -> None:
     assert live.html("wb-env-table") != before
 
 
-def test_a_page_that_has_shown_much_shows_what_a_new_one_shows(live: Live) -> None:
+def test_a_page_after_many_changes_shows_the_same_as_a_new_one(live: Live) -> None:
     view = base()
     for change in CHANGES.values():
         live.show(changed(view, **change(view)), rows())

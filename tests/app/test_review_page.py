@@ -1,4 +1,4 @@
-"""The review's page on a real server and real files, drawn without a browser."""
+"""The review page on a real server and real files, without a browser."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ SLIDER = "step of the timeline"
 
 
 @pytest.mark.slow
-def test_the_results_of_a_sweep_have_a_tab_also_if_they_come_later(
+def test_the_results_of_a_sweep_have_a_tab_even_if_they_arrive_later(
     child_process: None, gated_server: GatedServer, tmp_path: Path
 ) -> None:
     write(tmp_path, made(4, seed=1))
@@ -77,7 +77,7 @@ CHANGES: dict[str, tuple[Command, Command]] = {
 }
 
 
-def test_what_is_changed_is_seen_and_gone_when_it_is_taken_back(shown: Reviewed) -> None:
+def test_a_change_is_shown_and_disappears_when_reverted(shown: Reviewed) -> None:
     shown.open(1, 2)
     shown.review.do(AlignRecordings(at="start"))
     for what, (change, back) in CHANGES.items():
@@ -91,8 +91,8 @@ def test_what_is_changed_is_seen_and_gone_when_it_is_taken_back(shown: Reviewed)
         shown.review.do(change)
         shown.draw()
         changed = shown.everything()
-        assert difference(before, changed), f"{what} is not seen"
-        assert difference(changed, shown.all_drawn()) == "", f"a part was not drawn that shows {what}"
+        assert difference(before, changed), f"{what} is not shown"
+        assert difference(changed, shown.all_drawn()) == "", f"a part that shows {what} was not redrawn"
         shown.review.do(back)
         shown.review.do(Seek(step=8))
         for _ in range(3):
@@ -100,7 +100,7 @@ def test_what_is_changed_is_seen_and_gone_when_it_is_taken_back(shown: Reviewed)
         assert difference(before, shown.everything()) == "", what
 
 
-def test_what_was_open_leaves_nothing_in_what_is_open_then(shown: Reviewed) -> None:
+def test_a_closed_recording_leaves_nothing_in_the_next_one(shown: Reviewed) -> None:
     shown.open(2)
     for _ in range(3):
         shown.draw()
@@ -121,7 +121,7 @@ def test_an_opened_recording_fills_every_part(shown: Reviewed) -> None:
     cube = shown.bodies("cube")[0]
     assert np.allclose(cube.batched_positions[:, 0], 0.0)
     shown.seek(7)
-    shown.draw()  # the Cameras tab has asked for its pictures meanwhile
+    shown.draw()  # the Cameras tab has requested its pictures by now
     assert np.allclose(cube.batched_positions[:, 0], 0.07)
     assert shown.field(SLIDER).bounds == (0, 10) and shown.field(SLIDER).value == 7
     assert "step 7 / 10" in shown.html("wb-timeline") and "success" in shown.html("wb-timeline")
@@ -148,7 +148,7 @@ def test_two_recordings_are_compared_and_aligned(shown: Reviewed, monkeypatch: p
     assert len(cubes.batched_positions) == 2 and sorted(shown.labels()) == ["A, seed 1", "B"]
     (name,) = shown.nodes("/names")
     away = np.linalg.norm(cubes.batched_positions - name.position, axis=1)
-    assert away[1] < away[0], "at its own place"
+    assert away[1] < away[0], "at its own offset"
     shown.select(1)
     shown.draw()
     assert sorted(shown.labels()) == ["A", "B, seed 2"]
@@ -160,7 +160,7 @@ def test_two_recordings_are_compared_and_aligned(shown: Reviewed, monkeypatch: p
     assert bounds is not None and bounds[0] == -7
 
 
-def test_what_a_person_chooses_for_several_is_shown_and_done(shown: Reviewed) -> None:
+def test_choices_for_several_recordings_are_shown_and_applied(shown: Reviewed) -> None:
     shown.open(1, 2)
     chosen = {"Speed": "2 ×", "Loop": True, "Layout": GRID, "Align at": "first success", "Tolerance": "1 cm"}
     for label, value in chosen.items():
@@ -181,7 +181,7 @@ def test_what_a_person_chooses_for_several_is_shown_and_done(shown: Reviewed) ->
     assert len(shown.client.notices) == 4
 
 
-def test_what_could_not_be_read_is_tried_again_with_a_press(shown: Reviewed, folder: Path) -> None:
+def test_a_press_retries_an_unreadable_recording(shown: Reviewed, folder: Path) -> None:
     write(folder, made(4, seed=3))
     shown.library.refresh()
     (row,) = (row for row in shown.library.view().rows if row.seed == 3)
@@ -189,7 +189,7 @@ def test_what_could_not_be_read_is_tried_again_with_a_press(shown: Reviewed, fol
     for path in files:
         path.write_bytes(b"cut off")
     shown.review.open([row.id])
-    until(lambda: not shown.review.view().loading, "that it cannot be read")
+    until(lambda: not shown.review.view().loading, "the failed read")
     shown.draw()
     assert "was not opened" in shown.part("Review").html() and shown.shows(TRY_AGAIN)
     for path, content in files.items():
@@ -209,7 +209,7 @@ def test_what_could_not_be_read_is_tried_again_with_a_press(shown: Reviewed, fol
 
 
 def strip_of(shown: Reviewed) -> dict[str, list[tuple[str, ...]]]:
-    """What the strip draws: extents of recordings, marks, and upright lines, with their places in per cent."""
+    """What the strip draws: extents of recordings, marks and vertical lines, with positions in per cent."""
     html = shown.html("wb-timeline")
     extent = r'wb-length" style="left:([-\d.]+)%;width:([-\d.]+)%;background:(#\w+)"'
     mark = r'wb-mark wb-mark-(\w+)" style="left:([-\d.]+)%" data-do="[^"]*" title="([^"]*)"'
@@ -222,7 +222,7 @@ def strip_of(shown: Reviewed) -> dict[str, list[tuple[str, ...]]]:
     }
 
 
-def test_the_strip_has_each_recording_where_it_is_aligned(shown: Reviewed) -> None:
+def test_the_strip_shows_each_recording_at_its_alignment(shown: Reviewed) -> None:
     shown.open(1)
     shown.seek(7)
     strip = strip_of(shown)
@@ -257,13 +257,13 @@ def test_the_strip_has_each_recording_where_it_is_aligned(shown: Reviewed) -> No
     assert "background:#f08c00" in status and ">B</span>" in status and "no success" in status
 
 
-def test_the_timeline_has_its_buttons_and_is_not_drawn_again_where_nothing_moved(shown: Reviewed) -> None:
+def test_the_timeline_has_its_buttons_and_is_not_redrawn_without_a_change(shown: Reviewed) -> None:
     shown.open(1)
     assert shown.shows("Play") and shown.presses(TogglePlay())
     (strip,) = (html for html in shown.htmls() if "wb-timeline" in html.content)
     points = re.findall(r'<polyline points="([^"]*)"', strip.content)
     places = [float(point.partition(",")[0]) for line in points for point in line.split()]
-    assert (min(places), max(places)) == (10.0, 100.0), "a reward of each step, the first with the first"
+    assert (min(places), max(places)) == (10.0, 100.0), "one reward per step, starting at the first step"
     before = strip.content
     shown.draw()
     assert strip.content is before
@@ -275,7 +275,7 @@ def test_the_timeline_has_its_buttons_and_is_not_drawn_again_where_nothing_moved
     shown.review.do(TogglePlay())
 
 
-def test_pressing_a_row_of_the_comparison_goes_there(shown: Reviewed) -> None:
+def test_pressing_a_row_of_the_comparison_seeks_its_step(shown: Reviewed) -> None:
     shown.open(1, 2)
     shown.review.do(Seek(step=9))
     shown.part("Compare").ask(Seek(step=1))
@@ -287,11 +287,11 @@ def test_a_name_with_markup_in_it_is_text(shown: Reviewed, folder: Path, tmp_pat
     write(folder, evil)
     shown.library.refresh()
     shown.open(9)
-    said = shown.html()
-    assert "<script>alert" not in said and said.count("&lt;script&gt;alert") >= 2
+    shown_html = shown.html()
+    assert "<script>alert" not in shown_html and shown_html.count("&lt;script&gt;alert") >= 2
 
 
-def test_what_is_not_per_env_is_shown_marked_and_drawn(shown: Reviewed, folder: Path) -> None:
+def test_a_value_that_is_not_per_env_is_shown_marked_and_drawn(shown: Reviewed, folder: Path) -> None:
     for seed in (11, 12):
         odd = made(4, seed=seed)
         odd.batch = {"progress: all": np.linspace(0, 1, 5), "goal": np.ones((5, 2)) * seed}
@@ -334,7 +334,7 @@ HOSTILE: tuple[dict[str, Any], ...] = (
 )  # fmt: skip
 
 
-def test_a_foreign_recording_of_any_values_is_shown_or_named(
+def test_a_foreign_recording_with_any_values_is_shown_or_reported(
     child_process: None, gated_server: GatedServer, tmp_path: Path
 ) -> None:
     path = write(tmp_path, made(6, success_from=3))

@@ -1,11 +1,11 @@
-"""Episodes a second on a Ray cluster beside local processes, and what each part costs: python tests/benchmarks/cluster.py
+"""Episodes per second on a Ray cluster and on local processes, and the cost of each part: python tests/benchmarks/cluster.py
 
-Both sides record the same episodes with as many workers as cores, in turns. Told apart are the start (until the first
-episode is over) and the rate from there to the last; a cluster's own start is told by itself. Then with one worker. Then
-the parts that do not grow with the number of machines: a message through the broker, a result at the process that deals,
-one in the job file, the files that travel.
+Both sides record the same episodes with one worker per core, alternately. The start (until the end of the first episode),
+the rate from there to the last episode, and the start of the cluster itself are reported separately. Then one worker is
+measured, and the parts that do not scale with the number of machines: a message through the broker, a result at the
+scheduler and in the job file, and the packed files.
 
-    python tests/benchmarks/cluster.py --write    # also a row of the table of benchmarks
+    python tests/benchmarks/cluster.py --write    # also writes a row of the table of benchmarks
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from workbench.task.description import TaskOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 CORES = len(os.sched_getaffinity(0))
-MANY = 1000
-"""Cores for which `on_paper` computes."""
+PROJECTED_CORES = 1000
+"""Number of cores for which `projection` computes the limits."""
 
 
 @dataclass(frozen=True)
@@ -50,19 +50,19 @@ class Options:
     num_envs: int = 16
     turns: int = 3
     write: bool = False
-    """Keep a row in the table of benchmarks."""
+    """Write a row of the table of benchmarks."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One recording."""
+    """Timing of one recording job."""
 
     start: float
-    """Seconds until the first episode was over."""
+    """Seconds until the end of the first episode."""
     rate: float
-    """Episodes a second from there on."""
+    """Episodes per second from there on."""
     whole: float
-    """Episodes a second, start included."""
+    """Episodes per second, start included."""
 
 
 def recorded(options: Options, executor: Executor, episodes: int) -> tuple[Run, Recorded]:
@@ -86,8 +86,8 @@ def recorded(options: Options, executor: Executor, episodes: int) -> tuple[Run, 
     return Run(over[0] - began, (episodes - 1) / (over[-1] - over[0]), episodes / (ended - began)), done
 
 
-def post_costs(ray: Any) -> tuple[float, float]:
-    """Seconds of a request for a chunk and its answer, and messages a second that one post takes."""
+def broker_costs(ray: Any) -> tuple[float, float]:
+    """Seconds of a request for a chunk with its answer, and messages per second through one broker."""
     broker = ray.remote(num_cpus=0)(MessageBroker).remote()
     ray.get(broker.put.remote(0, []))
     trips: list[float] = []
@@ -112,7 +112,7 @@ def post_costs(ray: Any) -> tuple[float, float]:
 
 
 def result_cost(one: Written) -> tuple[int, float, float]:
-    """Bytes of a result, and seconds that it takes at the process that deals, and in the job file."""
+    """Bytes of a result, and its seconds at the scheduler and in the job file."""
     count = 2000
     packed = [pack_message(ItemResult(number, pack(one))) for number in range(count)]
     scheduler: Scheduler[Written | None, None] = Scheduler(
@@ -150,7 +150,7 @@ def text(options: Options, kept_rows: list[Row]) -> Iterator[str]:
                 sides[name].append(run)
                 one = done.written[0]
                 print(name, run, flush=True)
-        trip, messages = post_costs(ray)
+        trip, messages = broker_costs(ray)
     assert one is not None
     middle = {
         name: Run(
@@ -167,10 +167,10 @@ def text(options: Options, kept_rows: list[Row]) -> Iterator[str]:
     kept_rows.append(Row(what, cluster.rate, local.rate, "episodes/s", "more", "cluster.py"))
     yield (
         f"Measured on {date.today():%B %-d, %Y}: {CORES} cores, {options.task}, {options.episodes} episodes of 50 steps "
-        f"without pictures, {options.num_envs} envs a worker, medians of {options.turns} runs (`tests/benchmarks/cluster.py`)."
+        f"without pictures, {options.num_envs} envs per worker, medians of {options.turns} runs (`tests/benchmarks/cluster.py`)."
     )
     yield ""
-    yield "| | episodes a second | first episode after | with the start |"
+    yield "| | episodes per second | first episode after | with the start |"
     yield "| --- | ---: | ---: | ---: |"
     for name, run in (
         (f"{CORES} local processes", local),
@@ -187,33 +187,33 @@ def text(options: Options, kept_rows: list[Row]) -> Iterator[str]:
     print(
         f"{local.rate / alone.rate:.2f} times the rate of one core on {CORES}\n"
         f"{1000 * trip:.1f} ms: a request for a chunk through the broker, and its answer\n"
-        f"{messages:,.0f} messages a second that the broker takes, from two senders on these cores\n"
-        f"{1e6 * taken:.0f} µs: a result ({size} bytes) at the process that deals\n"
+        f"{messages:,.0f} messages per second through the broker, from two senders on these cores\n"
+        f"{1e6 * taken:.0f} µs: a result ({size} bytes) at the scheduler\n"
         f"{1000 * kept:.1f} ms: a result in the job file, on disk\n"
-        f"{1000 * packed:.0f} ms: the files that travel ({len(worker_files.data) / 1e6:.1f} MB, the examples in `tasks/`), packed"
+        f"{1000 * packed:.0f} ms: packing the files to send ({len(worker_files.data) / 1e6:.1f} MB, the examples in `tasks/`)"
     )
-    yield from on_paper(cluster.rate / CORES, messages, taken, kept, options.num_envs)
+    yield from projection(cluster.rate / CORES, messages, taken, kept, options.num_envs)
 
 
-def on_paper(rate: float, messages: float, taken: float, kept: float, envs: int) -> Iterator[str]:
-    """What many cores would do.
+def projection(rate: float, messages: float, taken: float, kept: float, envs: int) -> Iterator[str]:
+    """Project the limits of the shared parts to many cores.
 
     Args:
-        rate: episodes a second of a core.
+        rate: episodes per second and core.
     """
-    results = MANY * rate
+    results = PROJECTED_CORES * rate
     parts = {
-        # Each worker says once a second what it has made.
+        # Each worker reports its results once a second.
         "the broker": messages * rate,
-        "the process that deals": 1 / taken,
+        "the scheduler": 1 / taken,
         "the job file": 1 / kept,
     }
     name, most = min(parts.items(), key=lambda pair: pair[1])
     yield (
-        f"Computed for {MANY:,} cores: {results:,.0f} such episodes a second. The post carries {parts['the broker']:,.0f}, the "
-        f"process that deals takes {parts['the process that deals']:,.0f}, the job file keeps {parts['the job file']:,.0f}. "
-        f"The first limit is {name}, from {most / rate:,.0f} cores on. Beyond it use `--shard`, one driver for each part, and "
-        f"`merge`. Give each worker ten chunks of {envs} envs or more: the last chunk ends alone."
+        f"Computed for {PROJECTED_CORES:,} cores: {results:,.0f} such episodes per second. The broker carries {parts['the broker']:,.0f}, the "
+        f"scheduler takes {parts['the scheduler']:,.0f}, the job file keeps {parts['the job file']:,.0f}. "
+        f"The first limit is {name}, from {most / rate:,.0f} cores on. Beyond it use `--shard` with one driver per part, and "
+        f"`merge`. Give each worker at least ten chunks of {envs} envs, because workers idle during the last chunk."
     )
 
 

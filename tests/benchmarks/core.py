@@ -1,11 +1,11 @@
-"""The batched CPU core in figures: speed, its shares, pictures, snapshots and memory, as markdown.
+"""Benchmarks the batched CPU core: speed, its shares, pictures, snapshots and memory, as markdown.
 
     python tests/benchmarks/core.py                       # everything, about 15 minutes on two cores
-    python tests/benchmarks/core.py --parts speed shares  # some of it
-    python tests/benchmarks/core.py --write               # also rows of the table of benchmarks, part by part
+    python tests/benchmarks/core.py --parts speed shares  # some parts
+    python tests/benchmarks/core.py --write               # also writes rows of the table of benchmarks, part by part
 
-Both sides of every comparison run in this one call, in turns, each turn in a process of its own. Take the
-ratios; the absolute numbers are those of the machine. Run it on a machine that does nothing else.
+Both sides of every comparison run in one call, alternately, each turn in its own process. Compare the ratios; the
+absolute numbers depend on the machine. Run it on an idle machine.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class Options:
     env_ids: tuple[str, ...] = ("PickCube-v1", "PushCube-v1", "StackCube-v1")
     num_envs: int = 64
     seconds: float = 5.0
-    """Of stepping, a turn."""
+    """Stepping time per turn."""
     turns: int = 3
     most_envs: int = 960
-    """The scaling table doubles from 1 to this; a process has room for a little more (`envs/cpu_scene.py`)."""
+    """The scaling table doubles from 1 to this number; a process can hold slightly more (`envs/cpu_scene.py`)."""
     resets: int = 1000
     rebuilds: int = 100
     write: bool = False
-    """Keep rows in the table of benchmarks instead of only printing tables."""
+    """Also write rows of the table of benchmarks."""
 
 
 def _answer(function: Callable[..., Any], args: tuple[Any, ...], results: Any) -> None:
@@ -55,7 +55,7 @@ def _answer(function: Callable[..., Any], args: tuple[Any, ...], results: Any) -
 
 
 def in_own_process(function: Callable[..., Any], *args: Any) -> Any:
-    """A fresh process, so that no side inherits threads, caches or memory."""
+    """Call the function in a new process, so that no side inherits threads, caches or memory."""
     context = multiprocessing.get_context("spawn")
     results = context.Queue()
     process = context.Process(target=_answer, args=(function, args, results))
@@ -196,7 +196,7 @@ def snapshots(options: Options, kept: list[Row]) -> Iterator[str]:
         kept.append(Row(what, 1e3 * took[ours], 1e3 * took[other], "ms", "less", "core.py"))
     yield f"## Snapshots of {envs}"
     yield ""
-    yield "The exact restore gives every env a PhysX scene without a past, so that it goes on in the same way to the"
+    yield "The exact restore gives every env a new PhysX scene, so that it goes on in the same way to the"
     yield "last bit each time. The quick one keeps the scene: contacts may then be solved in another order, and what"
     yield "is in contact differs, from the last bit on, after the first step."
     yield ""
@@ -244,7 +244,7 @@ def main(options: Options) -> None:
         for line in makers[part](options, kept):
             print(line, flush=True)
         if options.write:
-            # After each part: a call that is broken off keeps what it measured.
+            # After each part, so that an interrupted call keeps its measurements.
             keep(kept)
 
 

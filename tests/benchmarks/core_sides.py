@@ -1,7 +1,7 @@
-"""The sides that ``core.py`` compares, one function each, run in a fresh process each.
+"""The sides that ``core.py`` compares: one function each, run in a new process.
 
-Every function takes plain arguments and returns plain numbers. One torch thread everywhere: for tensors of
-this size it is up to 2.8 times faster than torch's default, on both sides.
+Every function takes plain arguments and returns plain numbers. All use one torch thread, which for tensors of this
+size is up to 2.8 times faster than torch's default, on both sides.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def make_stock(env_id: str, **kwargs: Any) -> Any:
 
 
 def random_stepper(env: Any, episode: int = 50) -> Callable[[], None]:
-    """Uniform random actions, which keep every body awake, and a reset of all envs every `episode` steps."""
+    """A function that steps with uniform random actions, which keep every body awake, and resets every `episode` steps."""
     import torch
 
     low, high = env.single_action_space.low, env.single_action_space.high
@@ -80,11 +80,11 @@ def batched_rate(env_id: str, num_envs: int, threads: int | None, seconds: float
 
 
 def physics_share(env_id: str, num_envs: int, control_steps: int = 100) -> dict[str, float]:
-    """How much of a control step is PhysX's own ``step()``.
+    """The share of PhysX's own ``step()`` in a control step.
 
     Returns:
-        wall: share of the wall time in which at least one env was inside ``step()``.
-        cores: share of what all threads together could have done in that time.
+        wall: share of the wall time during which at least one env was inside ``step()``.
+        cores: share of the total time of all threads that was spent inside ``step()``.
     """
     env = make_batched(env_id, num_envs)
     stepper = env.scene.px.stepper
@@ -123,7 +123,7 @@ def stock_rate(env_id: str, seconds: float) -> float:
 def async_rate(env_id: str, num_envs: int, seconds: float) -> float:
     """Env-steps per second of gymnasium's AsyncVectorEnv over ManiSkill's CPUGymWrapper.
 
-    Its processes are forked, gymnasium's default on Linux: to spawn 64 takes minutes of imports on two cores.
+    Its processes are forked, gymnasium's default on Linux: spawning 64 takes minutes of imports on two cores.
     """
     import gymnasium as gym
     import mani_skill.envs  # noqa: F401  once, before the fork
@@ -145,9 +145,9 @@ def async_rate(env_id: str, num_envs: int, seconds: float) -> float:
 
 
 def picture_seconds(env_id: str, num_envs: int, seconds: float) -> dict[str, float]:
-    """Seconds a 128 x 128 rgb picture takes: batched, stock, and SAPIEN's bare calls; taken in turns.
+    """Seconds per 128 x 128 rgb picture: batched, stock, and SAPIEN's bare calls, measured alternately.
 
-    The scene is drawn as after a step: poses are handed to the renderer, then each env's camera draws.
+    The scene is rendered as after a step: poses are passed to the renderer, then each env's camera renders.
     """
     small = {"sensor_configs": {"width": 128, "height": 128}, "obs_mode": "rgb"}
     batched = make_batched(env_id, num_envs, render=True, **small)
@@ -188,7 +188,7 @@ def picture_seconds(env_id: str, num_envs: int, seconds: float) -> dict[str, flo
 
 
 def snapshot_seconds(env_id: str, num_envs: int, rounds: int = 60) -> dict[str, float]:
-    """Median seconds of a control step, of a snapshot of all envs after it, and of its two restores."""
+    """Median seconds of a control step, of a snapshot of all envs after it, and of its two kinds of restore."""
     from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
 
     env = make_batched(env_id, num_envs)
@@ -221,7 +221,7 @@ def resident_bytes() -> int:
 
 
 def memory_of(env_id: str, num_envs: int) -> int:
-    """Bytes that this process holds with so many envs, after a reset and some steps."""
+    """Resident bytes of this process with `num_envs` envs, after a reset and some steps."""
     step = random_stepper(make_batched(env_id, num_envs))
     for _ in range(60):
         step()
@@ -229,7 +229,7 @@ def memory_of(env_id: str, num_envs: int) -> int:
 
 
 def memory_over_resets(env_id: str, num_envs: int, resets: int) -> list[int]:
-    """Bytes held after each tenth of `resets` full resets, each followed by a step."""
+    """Resident bytes after each tenth of `resets` full resets, each followed by a step."""
     env = make_batched(env_id, num_envs)
     step = random_stepper(env)
     held = []
@@ -242,7 +242,7 @@ def memory_over_resets(env_id: str, num_envs: int, resets: int) -> list[int]:
 
 
 def memory_over_rebuilds(env_id: str, num_envs: int, rebuilds: int) -> list[int]:
-    """Bytes held after each tenth of `rebuilds` times an env was made, reset, stepped and closed."""
+    """Resident bytes after each tenth of `rebuilds` cycles of making, resetting, stepping and closing an env."""
     import gc
 
     held = []

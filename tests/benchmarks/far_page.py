@@ -1,11 +1,10 @@
-"""How a page at the end of a slow line answers: python tests/benchmarks/far_page.py [--num-envs 16 64] [--against CHECKOUT]
+"""Response time of a page behind a slow connection: python tests/benchmarks/far_page.py [--num-envs 16 64] [--against CHECKOUT]
 
-The live page of the example task, on its real server, plays in this process behind a relay of 2 Mbit/s and a
-round trip of 80 ms, with room for 2 MB on the way (as ``ssh -L`` has). A client without a browser answers pings
-as a browser does. It presses Play or Pause, and waits until the button's new label has arrived; the most bytes
-that wait in the relay are told in seconds of the line.
+The live page of the example task plays on its real server in this process, behind a relay with 2 Mbit/s, a round trip
+of 80 ms and a buffer of 2 MB (like ``ssh -L``). A client without a browser answers pings as a browser does, presses Play
+or Pause, and waits for the button's new label. The largest backlog of the relay is printed in seconds of transmission.
 
-``--against`` measures another checkout (an older version) first, in the same run.
+``--against`` first measures another checkout (an older version), in the same run.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ import viser._messages
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
-# Last: the checkout that is measured may be another one.
+# Appended last, because the measured checkout may be another one.
 sys.path.append(str(Path(__file__).parents[2]))
 from tests.benchmarks.page_bytes import Played, Player, play
 from tests.drive.far_line import FarLine, line_to
@@ -48,7 +47,7 @@ from workbench.page.scene.viewpoint import FOV_RADIANS, View3D
 from workbench.page.widgets.visitors import Visitors
 from workbench.task.description import TaskOptions
 
-BITS, DELAY = 2e6, 0.04
+BITS_PER_SECOND, DELAY_SECONDS = 2e6, 0.04
 COMMAND = "Play or pause"
 
 
@@ -58,11 +57,11 @@ class Options:
     against: Path | None = None
     presses: int = 12
     side: str = "now"
-    """How the rows are called."""
+    """Label of the rows."""
 
 
 class Playing(Player):
-    """Plays its steps, again and again."""
+    """A worker that plays its steps in a loop."""
 
     shown = 0
 
@@ -83,7 +82,7 @@ class Client:
         self.loop = asyncio.get_running_loop()
         async with connect(address, **options) as self.connection:
             await self.connection.send(greeting)
-            # Ends when the server closes, also without a handshake.
+            # The loop ends when the server closes, even without a closing handshake.
             with contextlib.suppress(ConnectionClosed):
                 await self._take_all(self.connection)
 
@@ -100,19 +99,19 @@ class Client:
                     self.counts["poses"] += 1
 
     def press(self, expected: str) -> float:
-        """Seconds until the button has that label."""
+        """Press the button; returns the seconds until it has the expected label."""
         message = viser._messages.CommandTriggerMessage(self.commands[COMMAND])
         began = time.perf_counter()
         assert self.connection is not None and self.loop is not None
-        said = self.connection.send(msgspec.msgpack.encode(message.as_serializable_dict()))
-        asyncio.run_coroutine_threadsafe(said, self.loop)
+        sending = self.connection.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+        asyncio.run_coroutine_threadsafe(sending, self.loop)
         while self.labels.get(timeout=60.0) != expected:
             pass
         return time.perf_counter() - began
 
 
 def watched(line: FarLine, seconds: float) -> int:
-    """The most bytes that waited in the line in these seconds."""
+    """The largest number of bytes that waited in the line during these seconds."""
     most, end = 0, time.monotonic() + seconds
     while time.monotonic() < end:
         most = max(most, line.waiting)
@@ -137,7 +136,7 @@ def measure(played: Played, options: Options) -> str:
         wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
         page.redraw()
         pages.start("live")
-        with line_to(gated.url, BITS, DELAY) as line:
+        with line_to(gated.url, BITS_PER_SECOND, DELAY_SECONDS) as line:
             address, how = handshake(line.address(gated.url))
             how["compression"] = "deflate"
             greeting = camera_message(
@@ -157,7 +156,7 @@ def measure(played: Played, options: Options) -> str:
                 times.append(client.press("Play"))
                 most = max(most, watched(line, 0.3))
                 times.append(client.press("Pause"))
-            # Two messages an update, of positions and of rotations.
+            # Each update has two messages: positions and rotations.
             rate = (client.counts["poses"] - poses) / 2 / (time.monotonic() - began)
             pages.stop()
             session.close()
@@ -165,13 +164,13 @@ def measure(played: Played, options: Options) -> str:
             thread.join(20.0)
     return (
         f"| {played.task.num_envs} | {options.side} | {1000 * statistics.median(times):.0f} "
-        f"| {1000 * max(times):.0f} | {8 * most / BITS:.2f} | {rate:.1f} |"
+        f"| {1000 * max(times):.0f} | {8 * most / BITS_PER_SECOND:.2f} | {rate:.1f} |"
     )
 
 
 def _measure_other(checkout: Path, num_envs: int, presses: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        # Not its tests: this script needs those that belong to it.
+        # Without its tests: this script needs the tests of its own checkout.
         for name in ("workbench", "web_assets"):
             (Path(folder) / name).symlink_to(checkout / name)
         arguments = ["--num-envs", str(num_envs), "--side", "before", "--presses", str(presses)]
@@ -184,7 +183,7 @@ def main(options: Options) -> None:
     torch.set_num_threads(1)
     if options.side == "now":
         print(
-            "| envs | | Play or Pause, ms: median | worst | most that waits, s of the line | updates a second |"
+            "| envs | | Play or Pause, ms: median | worst | largest backlog, s of the line | updates per second |"
         )
         print("|---|---|---|---|---|---|", flush=True)
     for num_envs in options.num_envs:

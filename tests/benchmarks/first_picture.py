@@ -1,11 +1,11 @@
-"""How long a person waits for the first picture: of a session that starts, and of a worker that is started again.
+"""Time to the first picture of a new session and of a restarted worker.
 
     python tests/benchmarks/first_picture.py [--num-envs 4] [--rounds 3] [--no-parts] [--write]
 
-A real session on the example task with both its cameras looked through, as `workbench open` has it, without a browser. The
-machine's disk caches are warm after the first round, which is left out. Once with workers that are forks of a process that has
-done the imports, once with workers that import for themselves. Then what a worker does until then, one after the
-other in one process: seconds of the wall, and of the processor, which count also on a busy machine.
+A real session on the example task shows both cameras, as in `workbench open`, without a browser. The first round, which
+warms the disk caches, is not counted. Workers are either forked from a process with all imports done, or import everything
+themselves. Then the steps of a worker's start are run one by one in one process; their wall time and CPU time are printed
+(CPU time is meaningful even on a busy machine).
 """
 
 from __future__ import annotations
@@ -47,30 +47,30 @@ class Options:
     num_envs: int = 4
     rounds: int = 3
     parts: bool = True
-    """Also what a worker does, one after the other."""
+    """Also measure the steps of a worker's start one by one."""
     write: bool = False
-    """Keep a row in the table of benchmarks."""
+    """Write a row of the table of benchmarks."""
 
 
-def wait(session: Session, reached: Callable[[SessionView], bool], patience: float = 300.0) -> float:
-    """Seconds until then."""
+def wait(session: Session, reached: Callable[[SessionView], bool], timeout: float = 300.0) -> float:
+    """Wait until `reached`; returns the seconds."""
     began, seen = time.monotonic(), -1
-    while time.monotonic() < began + patience:
+    while time.monotonic() < began + timeout:
         if reached(session.view()):
             return time.monotonic() - began
         seen = session.wait(seen, 0.5)
-    raise SystemExit(f"it did not come within {patience:.0f} s")
+    raise SystemExit(f"the awaited state was not reached within {timeout:.0f} s")
 
 
-WAYS = {"forked": worker_forks.start, "anew": start_anew}
-"""Workers as forks of a process that has done the imports, and workers that import for themselves."""
+STARTS = {"forked": worker_forks.start, "anew": start_anew}
+"""Two ways to start a worker: forked from a process with all imports done, or a new process that imports everything."""
 
 
 def waits(options: Options) -> dict[str, dict[str, list[float]]]:
-    """What each round found, of each way to start a worker, one after the other in turn."""
-    found: dict[str, dict[str, list[float]]] = {way: {} for way in WAYS}
+    """Measurements of all rounds for each way to start a worker, taken alternately."""
+    found: dict[str, dict[str, list[float]]] = {way: {} for way in STARTS}
     for _ in range(options.rounds + 1):
-        for way, start in WAYS.items():
+        for way, start in STARTS.items():
             worker_forks.end()
             setattr(worker_process, "worker_forks", SimpleNamespace(start=start))  # noqa: B010
             for what, number in opened_and_restarted(options.num_envs):
@@ -115,18 +115,18 @@ def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
 
 
 def is_exact(view: SessionView) -> bool:
-    """Until then a page that stands still gets a fast one, and a worker that draws an exact one answers nothing."""
+    """Whether all pictures are exact. A paused page first gets a fast one, and a worker answers nothing while it renders."""
     return bool(view.pictures) and all(picture.degree == "exact" for picture in view.pictures.values())
 
 
 def processor() -> float:
-    """Seconds of all that this process started and that still runs."""
+    """CPU seconds of all running child processes."""
     times = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
     return sum(time.user + time.system for time in times)
 
 
 def memory() -> float:
-    """Of the same, megabytes; what they share counts once."""
+    """Memory of the same processes in MB; shared memory counts once."""
     return proportional_memory(child.pid for child in psutil.Process().children(recursive=True)) / 2**20
 
 
@@ -177,14 +177,14 @@ def parts(num_envs: int) -> None:
 def main(options: Options) -> None:
     found = waits(options)
     for what in found["forked"]:
-        for way in WAYS:
+        for way in STARTS:
             numbers = found[way][what][1:]
             each = ", ".join(f"{one:.2f}" for one in numbers)
             print(f"{what:52s} {way:7s} {statistics.median(numbers):8.2f} ({each})", flush=True)
     if options.write:
         what = f"Worker that is restarted without a spare: until its first picture, {options.num_envs} envs, forked, "
         what += "against one that imports for itself"
-        forked, anew = (statistics.median(found[way][WITHOUT_SPARE][1:]) for way in WAYS)
+        forked, anew = (statistics.median(found[way][WITHOUT_SPARE][1:]) for way in STARTS)
         keep([Row(what, forked, anew, "s", "less", "first_picture.py")])
     if options.parts:
         print(f"parts of a worker's start: {'':27s}   wall    processor, s", flush=True)

@@ -1,8 +1,8 @@
-"""What keeping every step costs: python tests/benchmarks/history_cost.py [--task PushCube-v1] [--processor]
+"""The cost of keeping every step in the history: python tests/benchmarks/history_cost.py [--task PushCube-v1] [--processor]
 
-Plays a task in this process as the worker does, packs a snapshot of every step, sends it through a pickle as
-the pipe would, and keeps it in a `History` as the server does. Prints medians: milliseconds of the step, of the
-snapshot, of cutting it in parts, of the message; bytes of the message and bytes that the history holds a step.
+Plays a task in this process as the worker does, packs a snapshot of every step, pickles it as the pipe would, and stores it
+in a `History` as the server does. Prints medians: milliseconds of the step, the snapshot, its division into parts and the
+message; bytes of the message, and bytes that the history holds per step.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from workbench.live.history.moments import History
 from workbench.task.description import Stepped
 
 TASKS = {"PickCube-v1": PickCubeEnv, "PushCube-v1": PushCubeEnv}
-"""The first asks which bodies touch, the second does not."""
+"""PickCube queries contacts, PushCube does not."""
 
 
 @dataclass
 class Options:
     num_envs: tuple[int, ...] = (16, 64)
     steps: int = 150
-    """Control steps that are played; every episode is 50."""
+    """Control steps to play; every episode has 50."""
     task: Literal["PickCube-v1", "PushCube-v1"] = "PickCube-v1"
     processor: bool = False
-    """Take the processor's time of all threads in place of the wall's: on a machine that others use, only that says something."""
+    """Measure the CPU time of all threads instead of the wall time, which is meaningless on a busy machine."""
 
 
 def measure(num_envs: int, options: Options) -> str:
@@ -70,7 +70,7 @@ def measure(num_envs: int, options: Options) -> str:
         message = pickle.dumps(event)
         times.append(clock())
         if number % 2:
-            tracemalloc.start()  # the odd steps tell the bytes, the even ones the time
+            tracemalloc.start()  # odd steps measure bytes, even steps time
         history.add(pickle.loads(message))
         times.append(clock())
         if number % 2:
@@ -89,7 +89,7 @@ def measure(num_envs: int, options: Options) -> str:
     shown = ", ".join(f"{lap} {statistics.median(values):.2f}" for lap, values in laps.items())
     return (
         f"{options.task}, {num_envs} envs: ms {shown}; message {statistics.median(sizes) / 1000:.1f} KB; "
-        f"history counts {counted / 1000:.1f} KB a step and takes {2 * held / (steps - 21) / 1000:.1f}"
+        f"history counts {counted / 1000:.1f} KB per step and takes {2 * held / (steps - 21) / 1000:.1f}"
     )
 
 

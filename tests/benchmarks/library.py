@@ -1,11 +1,11 @@
-"""How long a library takes to its first screen: python tests/benchmarks/library.py
+"""Time to the first screen of a library: python tests/benchmarks/library.py
 
-Makes a folder of real recordings (one that `EpisodeWriter` wrote, with a camera; the others are copies with ids, seeds,
-dates and versions of their own, whose .h5 and .rrd are links to the first one's) and opens it as the review does: a
-`Library` that is watched and its panel on a viser server, drawn thirty times a second. Each opening is in a process of
-its own. Printed: milliseconds from making the `Library` to the first full page of rows in the table, to a picture in each
-of them, and until everything is read, without an index and with one; then of a second look, and of the first screen in
-Chromium (from the address to the rows, viser's own page included).
+Makes a folder of real recordings (one written by `EpisodeWriter` with a camera; the others are copies with their own ids,
+seeds, dates and versions, whose .h5 and .rrd are hard links to those of the first) and opens it as the review does: a watched
+`Library` with its panel on a viser server, drawn thirty times per second. Each opening runs in its own process. Printed:
+milliseconds from creating the `Library` to the first full page of rows, to a thumbnail in each of them, and until everything
+is read, without and with an index; then of a second scan, and of the first screen in Chromium (from the address to the rows,
+viser's own page included).
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class Options:
     browser: bool = False
     """Measure the page in Chromium too."""
     folder: Path | None = None
-    """Keep what is made there for the next time."""
+    """Keep the recordings in this folder for the next run."""
     one: bool = False
-    """Open `folder` once, print what it took as JSON, and end: for the program itself."""
+    """Internal: open `folder` once, print the times as JSON, and exit."""
 
 
 def write_one(folder: Path) -> Path:
-    """A recording of 50 steps of a scene of two bodies with one camera; returns its ``.json``."""
+    """Write a recording of 50 steps of a scene with two bodies and one camera; returns its ``.json``."""
     from tests.drive.rows import EpisodeRow, append
     from workbench.envs.camera_data import CameraInfo, Picture
     from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
@@ -105,7 +105,7 @@ def make(folder: Path, count: int) -> None:
 def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
     from workbench.episodes.reader.reading import start_reading
 
-    # As the command does, before it imports what a page needs.
+    # The command also starts the reader before it imports the page's modules.
     start_reading()
     import viser
 
@@ -119,32 +119,32 @@ def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
     library = Library(folder)
     library.watch()
     panel, panels = LibraryPanel(server, library, lambda ids: None), Panels(server)
-    said: dict[str, float] = {}
+    times: dict[str, float] = {}
     draws: list[float] = []
     wanted = min(ROWS_PER_PAGE, count)
-    while not {"all", "pictures"} <= said.keys():
+    while not {"all", "pictures"} <= times.keys():
         at = time.perf_counter()
         panel.draw()
         draws.append(time.perf_counter() - at)
         view = library.view()
-        if "first" not in said and panels.html("wb-library").count("<tbody") == wanted:
-            said["first"] = 1e3 * (time.perf_counter() - began)
-        if "pictures" not in said and panels.html("wb-library").count("<img") == wanted:
-            said["pictures"] = 1e3 * (time.perf_counter() - began)
-        if "all" not in said and view.reading is None and len(view.rows) == count:
-            said["all"] = 1e3 * (time.perf_counter() - began)
+        if "first" not in times and panels.html("wb-library").count("<tbody") == wanted:
+            times["first"] = 1e3 * (time.perf_counter() - began)
+        if "pictures" not in times and panels.html("wb-library").count("<img") == wanted:
+            times["pictures"] = 1e3 * (time.perf_counter() - began)
+        if "all" not in times and view.reading is None and len(view.rows) == count:
+            times["all"] = 1e3 * (time.perf_counter() - began)
             panel.draw()
         time.sleep(1 / 30)
-    said["page KB"] = len(panels.html("wb-library")) / 1e3
-    said["longest draw"] = 1e3 * max(draws)
+    times["page KB"] = len(panels.html("wb-library")) / 1e3
+    times["longest draw"] = 1e3 * max(draws)
     at = time.perf_counter()
     library.refresh()
-    said["look again"] = 1e3 * (time.perf_counter() - at)
+    times["look again"] = 1e3 * (time.perf_counter() - at)
     if browser:
-        said["Chromium"] = in_chromium(server.get_port())
+        times["Chromium"] = in_chromium(server.get_port())
     library.close()
     server.stop()
-    return said
+    return times
 
 
 def in_chromium(port: int) -> float:

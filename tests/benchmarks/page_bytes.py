@@ -1,14 +1,13 @@
-"""Bytes of an update of the page while the task plays: python tests/benchmarks/page_bytes.py [--num-envs 16 64 256] [--write]
+"""Bytes per update of the page while the task plays: python tests/benchmarks/page_bytes.py [--num-envs 16 64 256] [--write]
 
-The whole live page of the example task, on its real server, in this process: the envs make random steps, and
-at 30 Hz and four times real time an update shows each 2.67th of them. The page's clock moves a thirtieth of a
-second an update, so the figures do not depend on how fast this machine is; a client without a browser reads
-what is sent, behind a relay that counts it.
+The whole live page of the example task runs on its real server in this process. The envs make random steps; at 30 Hz and
+four times real time an update shows every 2.67th step. The page's clock advances by 1/30 s per update, so the numbers do
+not depend on the machine's speed. A client without a browser reads the data behind a relay that counts the bytes.
 
-Both sides play the same steps. *Exact*: a client with so narrow a lens that it sees every motion, and that takes no compression: every pose as it is, which was all that there was before. *As sent*: a view of
-1280 x 720, far away. Prints the kilobytes of an update, the panels' and the poses' part of it before
-compression, what that is a second at 30 Hz, and the processor's time that the server takes for an update: to draw panels
-and poses, and in viser's thread, which encodes, compresses and sends.
+Both sides play the same steps. *Exact*: a client without compression, whose field of view is so narrow that it sees every
+motion and gets every pose in full. *As sent*: a view of 1280 x 720 over a slow connection. Prints the kilobytes per update,
+the panels' and poses' part of them before compression, the rate per second at 30 Hz, and the server's CPU time per update:
+for drawing panels and poses, and in viser's thread, which encodes, compresses and sends.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ from workbench.task.open import open_task
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 HERTZ, SPEED, EPISODE = 30, 4.0, 50
-FAR = 0.01
-"""Seconds one way."""
+DELAY_SECONDS = 0.01
+"""One-way delay of the connection."""
 KEPT_ENVS = 64
 
 
@@ -60,9 +59,9 @@ class Options:
     num_envs: tuple[int, ...] = (16, 64, 256)
     updates: int = 90
     settle: int = 15
-    """Updates before those that count: the page's charts fill."""
+    """Updates before the measured ones, during which the page's charts fill."""
     write: bool = False
-    """Keep a row in the table of benchmarks, of `KEPT_ENVS`."""
+    """Write a row of the table of benchmarks, for `KEPT_ENVS` envs."""
 
 
 @dataclass
@@ -70,7 +69,7 @@ class Played:
     task: TaskDescription
     first: StepResult
     steps: list[tuple[StepResult, bool]]
-    """And whether it is a reset of all."""
+    """Each step, and whether it is a reset of all envs."""
 
 
 def play(num_envs: int, count: int) -> Played:
@@ -87,7 +86,7 @@ def play(num_envs: int, count: int) -> Played:
 
 
 class Player(ScriptedWorker):
-    """A worker that shows the next of these steps when it is told to."""
+    """A worker that sends one of the played steps on each call of `show`."""
 
     def __init__(self, played: Played, made: list[Player], *arguments: Any, **named: Any) -> None:
         super().__init__(played.task, played.first.poses, no_success, *arguments, **named)
@@ -119,10 +118,10 @@ class Client:
     """A page without a browser."""
 
     metadata: int = 0
-    """Bytes, as packed by viser."""
+    """Bytes of message metadata as packed by viser."""
     arrays: int = 0
     has: queue.Queue[str] = field(default_factory=queue.Queue)
-    """The marks that it has had."""
+    """The marks received so far."""
 
     async def read(self, address: str, options: dict[str, Any], greeting: bytes) -> None:
         async with connect(address, **options) as connection:
@@ -141,17 +140,17 @@ class Client:
 
 @dataclass(frozen=True)
 class Update:
-    """Means of the updates, in bytes."""
+    """Means per update, in bytes unless noted."""
 
     wire: float
     metadata: float
     arrays: float
     rest: float
-    """The same with nothing new to show."""
+    """Bytes on the wire with nothing new to show."""
     draw: float
-    """Seconds of processor to draw panels and poses."""
+    """CPU seconds to draw panels and poses."""
     send: float
-    """The same of viser's thread."""
+    """CPU seconds of viser's thread."""
 
 
 def measure(played: Played, options: Options, exact: bool) -> Update:
@@ -171,7 +170,7 @@ def measure(played: Played, options: Options, exact: bool) -> Update:
         mark = gated.server.gui.add_text("mark", "")
         wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
         page.redraw()
-        with line_to(gated.url, delay=0.0 if exact else FAR) as line:
+        with line_to(gated.url, delay=0.0 if exact else DELAY_SECONDS) as line:
             address, how = handshake(line.address(gated.url))
             how["compression"] = None if exact else "deflate"
             eye = gated.server.initial_camera.position
@@ -242,7 +241,7 @@ def _updates(
 
 
 def processor_of(thread: threading.Thread) -> float:
-    """Seconds that it took so far."""
+    """CPU seconds of the thread so far."""
     assert thread.ident is not None
     return time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
 
@@ -250,8 +249,8 @@ def processor_of(thread: threading.Thread) -> float:
 def main(options: Options) -> None:
     torch.set_num_threads(1)
     print(
-        "| envs | | kB an update | panels, kB | poses, kB | at 30 Hz, MB a second | paused, kB an update "
-        "| processor, ms an update: drawing | viser's thread |"
+        "| envs | | kB per update | panels, kB | poses, kB | at 30 Hz, MB per second | paused, kB per update "
+        "| CPU ms per update: drawing | viser's thread |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     count = int((options.updates + options.settle) * SPEED / HERTZ / 0.05) + 2

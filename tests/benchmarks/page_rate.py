@@ -1,30 +1,27 @@
-"""How often the page is really updated while the task plays, what that takes of the processor, and how soon a control has its
-effect.
+"""Update rate of the page while the task plays, its CPU time, and the latency of controls.
 
     python tests/benchmarks/page_rate.py [--num-envs 16] [--speed "4 ×"] [--draw page] [--cameras] [--solve] [--orbit]
 
-``workbench open`` on the example task with a real Chromium before it. *Applied updates* are counted in
-the page: animation frames on which the robot's hand has poses that the frame before did not have. *Click
-to effect* is the time from a key or a click to the change that the person asked for in the page's text:
-``Play`` becoming ``Pause``, and the S key (one control step, through the session and the worker)
-changing the number of elapsed steps.
+Runs ``workbench open`` on the example task in a real Chromium. *Applied updates* are counted in the page: animation
+frames in which the poses of the robot's hands differ from the previous frame. *Click to effect* is the time from a
+key or click to the resulting change of the page's text: ``Play`` becoming ``Pause``, and the S key (one control step,
+through the session and the worker) changing the number of elapsed steps.
 
-The processor's time is told apart by process: the worker (control steps and their snapshots), the server (panels,
-poses, viser's encoding, the socket), the browser's page (viser's client) and its drawing. The workbench, the browser and
-the rest of the machine share the cores: *others* is what the rest took, without what runs in the idle class.
+CPU time is printed per process: the worker (control steps and their snapshots), the server (panels, poses, viser's
+encoding, the socket), the browser's page (viser's client) and its drawing. The workbench, the browser and other
+processes share the cores: *others* is the CPU time of all other processes, except those in the idle class.
 
-``--draw none``, the default, is a stand-in for a browser with a graphics card: WebGL's draw calls are replaced by
-nothing, and the page is transparent, so that Chromium does not put it together in software. All else is done. ``--draw page`` replaces the draw calls alone; with ``--draw all`` Chromium rasterises
-everything on the processor, which then is the limit on a machine without a card; ``--draw as-with-a-card`` does so too, and tells
-the page that it has one, which is then sent the shapes as they are. Without ``--cameras`` the pictures
-are unticked: on such a machine the renderer, the physics and the browser share the cores.
+``--draw none``, the default, simulates a browser with a GPU: WebGL's draw calls do nothing, and the page is transparent,
+so that Chromium does not composite it in software. ``--draw page`` only disables the draw calls. With ``--draw all``
+Chromium rasterises everything on the CPU, which is then the limit on a machine without a GPU. ``--draw as-with-a-card``
+does so too, but reports a GPU to the page, which then gets full shapes. Without ``--cameras`` the pictures are turned
+off: without a GPU the renderer, the physics and the browser share the cores.
 
-``--orbit`` measures a second time, paused, while the mouse turns the camera: what a person does who looks for a mistake.
-*Drawn* are the frames of the 3-D view.
+``--orbit`` measures again, paused, while the mouse turns the camera, as a person does to find a mistake. *Drawn* are the
+frames of the 3-D view.
 
-``--solve`` measures a second time, in the same page, while actions are planned by rollouts in a process beside. The envs
-then wait for their plans, so there is a new step, and an update, less often. The task is one that never succeeds, or the
-planner would be done after some steps.
+``--solve`` measures again, in the same page, while another process plans actions by rollouts. The envs then wait for
+their plans, so steps and updates are rarer. The task never succeeds, because the planner would stop at a success.
 """
 
 from __future__ import annotations
@@ -54,7 +51,7 @@ NO_DRAWING = """
 for (const name of ['drawElements', 'drawArrays', 'drawElementsInstanced', 'drawArraysInstanced'])
     WebGL2RenderingContext.prototype[name] = function () {};
 """
-A_CARD = """
+PRETEND_GPU = """
 const ask = WebGL2RenderingContext.prototype.getParameter, UNMASKED_RENDERER = 0x9246;
 WebGL2RenderingContext.prototype.getParameter = function (what) {
     return what === UNMASKED_RENDERER ? 'NVIDIA GeForce RTX 3060' : ask.call(this, what);
@@ -68,7 +65,7 @@ WebGL2RenderingContext.prototype.clear = function (mask) {
     return clear.call(this, mask);
 };
 """
-"""A frame of the view begins with it."""
+"""Each frame of the view begins with ``clear``."""
 TRANSPARENT = "() => { document.documentElement.style.opacity = 0; }"
 COUNT = """async (seconds) => {
     const nodes = () => window.__viserSceneTree.getState();
@@ -97,8 +94,8 @@ PACE = r"""() => {
     const found = document.body.innerText.match(/([0-9.]+) steps\/s/);
     return found ? found[1] : '';
 }"""
-FREE_OF_PANELS = 400, 420
-"""Pixels: a place in the view."""
+FREE_PIXEL = 400, 420
+"""A pixel (x, y) of the view that no panel covers."""
 PROCESSES = ("worker", "server", "planner", "browser's page", "browser's drawing", "browser's rest")
 
 
@@ -107,24 +104,24 @@ class Options:
     num_envs: int = 16
     speed: str = "4 ×"
     seconds: float = 6.0
-    """Of one window."""
+    """Length of one window."""
     windows: int = 3
     clicks: int = 15
     draw: Literal["none", "page", "all", "as-with-a-card"] = "none"
-    """What Chromium draws, on the processor: nothing, all but the 3-D view's triangles, or all."""
+    """What Chromium draws on the CPU: nothing, all but the 3-D view's triangles, or everything."""
     cameras: bool = False
-    """Leave the default pictures on."""
+    """Keep the default pictures on."""
     solve: bool = False
     """Measure again while actions are planned."""
     orbit: bool = False
-    """Measure again while the camera turns around what stands still."""
+    """Measure again while the camera turns around the paused scene."""
 
 
 def prepare(page: Page, options: Options, url: str) -> None:
     if options.draw in ("none", "page"):
         page.add_init_script(NO_DRAWING)
     if options.draw == "as-with-a-card":
-        page.add_init_script(A_CARD)
+        page.add_init_script(PRETEND_GPU)
     page.add_init_script(COUNT_DRAWN)
     page.goto(url)
     expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
@@ -142,7 +139,7 @@ def prepare(page: Page, options: Options, url: str) -> None:
 
 
 def play_to_pause(page: Page, clicks: int) -> list[float]:
-    """Seconds from clicking Play to the button that says Pause."""
+    """Seconds from each click on Play until the button says Pause."""
     times = []
     for _ in range(clicks):
         times.append(timed_click(page, "Play", "Pause"))
@@ -153,8 +150,8 @@ def play_to_pause(page: Page, clicks: int) -> list[float]:
 
 
 def timed_click(page: Page, label: str, effect: str) -> float:
-    """Seconds from a click on this button to the button that it becomes."""
-    # Timed inside the page, so that the way between this script and Chromium does not count.
+    """Seconds from a click on the button `label` until there is a button `effect`."""
+    # Timed inside the page, so that the latency between this script and Chromium does not count.
     return page.evaluate(
         """([label, effect]) => new Promise((done) => {
             const find = (text) => [...document.querySelectorAll('button, [role=button]')].find((b) => b.textContent.trim() === text);
@@ -168,7 +165,7 @@ def timed_click(page: Page, label: str, effect: str) -> float:
 
 
 def key_to_step(page: Page, presses: int) -> list[float]:
-    """Seconds from the S key to another number of elapsed steps: through server, worker and back."""
+    """Seconds from each press of S until the number of elapsed steps changes, through server, worker and back."""
     page.get_by_role("tab", name="Reward").click()
     page.mouse.click(5, 690)
     times = []
@@ -184,20 +181,20 @@ def key_to_step(page: Page, presses: int) -> list[float]:
 
 @dataclass(frozen=True)
 class Window:
-    """What one window of seconds saw, each a second."""
+    """Rates measured in one window, per second."""
 
     applied: float
     frames: float
     drawn: float
     processor: dict[str, float]
-    """Cores that each of `PROCESSES` took."""
+    """Cores used by each of `PROCESSES`."""
     others: float
     pace: str
-    """Control steps a second, as the page says."""
+    """Control steps per second, as shown on the page."""
 
 
 def used(server: int) -> tuple[dict[int, tuple[str, float]], dict[int, float]]:
-    """Seconds of processor so far: of the workbench and the browser, with what they are, and of all else but the idle class."""
+    """CPU seconds so far: of the workbench's and browser's processes by kind, and of all others except the idle class."""
     mine, rest = {}, {}
     family = {process.pid for process in psutil.Process().children(recursive=True)}
     for process in psutil.process_iter():
@@ -218,7 +215,7 @@ def name_of(is_server: bool, command: str, niceness: int) -> str:
     if is_server:
         return "server"
     if "session.worker." in command:
-        # What works beside the worker that plays gives way to it.
+        # Background processes have a lower priority than the playing worker.
         return "planner" if niceness else "worker"
     drawing = "browser's drawing" if "--type=gpu-process" in command else "browser's rest"
     return "browser's page" if "--type=renderer" in command else drawing
@@ -239,27 +236,27 @@ def watch(page: Page, server: int, seconds: float, orbit: bool = False) -> Windo
 
 
 def turn_camera(page: Page, seconds: float) -> None:
-    page.mouse.move(*FREE_OF_PANELS)
+    page.mouse.move(*FREE_PIXEL)
     page.mouse.down()
     end = time.perf_counter() + seconds
     while (left := end - time.perf_counter()) > 0:
-        page.mouse.move(FREE_OF_PANELS[0] + 60 * np.sin(2 * left), FREE_OF_PANELS[1] + 10 * np.cos(2 * left))
+        page.mouse.move(FREE_PIXEL[0] + 60 * np.sin(2 * left), FREE_PIXEL[1] + 10 * np.cos(2 * left))
         time.sleep(1 / 60)
     page.mouse.up()
 
 
-def told_of_view(windows: list[Window]) -> str:
-    """The window with the most frames of the view, and what one of them takes."""
+def view_report(windows: list[Window]) -> str:
+    """Describe the window with the most frames of the view, and the cost per frame."""
     best = max(windows, key=lambda window: window.drawn)
     counts = ", ".join(f"{window.drawn:.1f}" for window in windows)
     drawing = ", ".join(
         f"{1000 * w.processor.get(PROCESSES[4], 0.0) / max(w.drawn, 1e-9):.0f}" for w in windows
     )
-    return f"drawn frames a second: {best.drawn:.1f} (of windows: {counts}); processor, ms of drawing a frame: {drawing}"
+    return f"drawn frames per second: {best.drawn:.1f} (of windows: {counts}); CPU ms of drawing per frame: {drawing}"
 
 
-def told(windows: list[Window]) -> str:
-    """The window with the most updates, in words, and all of their counts."""
+def update_report(windows: list[Window]) -> str:
+    """Describe the window with the most updates, with the counts of all windows."""
     best = max(windows, key=lambda window: window.applied)
     counts = ", ".join(f"{window.applied:.1f}" for window in windows)
     pace = f", {best.pace} control steps" if best.pace else ""
@@ -271,9 +268,9 @@ def told(windows: list[Window]) -> str:
         if name in best.processor
     )
     return (
-        f"applied updates a second: {best.applied:.1f} (of windows: {counts}; animation frames {best.frames:.1f}{pace})\n"
+        f"applied updates per second: {best.applied:.1f} (of windows: {counts}; animation frames {best.frames:.1f}{pace})\n"
         f"cores: {cores}; others {best.others:.2f}\n"
-        f"processor, ms an update: {stages}"
+        f"CPU ms per update: {stages}"
     )
 
 
@@ -281,7 +278,7 @@ def without_success(file: Path) -> None:
     text = file.read_text()
     test = "(distance < GOAL_RADIUS)"
     if test not in text:
-        sys.exit(f"{TASK} has no {test} any more: change `without_success`.")
+        sys.exit(f"{TASK} has no {test}: change `without_success`.")
     file.write_text(text.replace(test, "(distance < 0)"))
 
 
@@ -296,9 +293,9 @@ def main(options: Options) -> None:
         sys.exit(how_to_get_chromium())
     drawing = {
         "none": "nothing is drawn",
-        "page": "draw calls replaced by nothing",
+        "page": "draw calls do nothing",
         "all": "Chromium draws in software",
-        "as-with-a-card": "Chromium draws in software, and the page is as with a card",
+        "as-with-a-card": "Chromium draws in software, and the page is sent as with a GPU",
     }[options.draw]
     cameras = "on" if options.cameras else "off"
     print(f"push_cube.py, {options.num_envs} envs, speed {options.speed}, cameras {cameras}; {drawing}")
@@ -319,36 +316,37 @@ def main(options: Options) -> None:
             time.sleep(2.0)
             server = opened.process.pid
             windows = [watch(page, server, options.seconds) for _ in range(options.windows)]
-            print(f"{told(windows)}\n{told_of_view(windows)}", flush=True)
-            say_clicks(clicks, steps)
+            print(f"{update_report(windows)}\n{view_report(windows)}", flush=True)
+            print_clicks(clicks, steps)
             if options.orbit:
                 timed_click(page, "Pause", "Play")
                 time.sleep(2.0)
                 windows = [watch(page, server, options.seconds, orbit=True) for _ in range(options.windows)]
-                print(f"paused, while the camera turns: {told_of_view(windows)}", flush=True)
+                print(f"paused, while the camera turns: {view_report(windows)}", flush=True)
                 timed_click(page, "Play", "Pause")
             if options.solve:
                 choose_source(page, "solve")
-                # The envs of the rollouts are made, and the first plan.
+                # Wait for the rollout envs and the first plan.
                 page.wait_for_function(
                     f"() => ({PACE})() === '' && /plan/.test(document.body.innerText)", timeout=60_000
                 )
                 time.sleep(10.0)
                 print("while actions are planned (solve):")
                 print(
-                    told([watch(page, server, options.seconds) for _ in range(options.windows)]), flush=True
+                    update_report([watch(page, server, options.seconds) for _ in range(options.windows)]),
+                    flush=True,
                 )
-                say_clicks(pauses(page, options.clicks), [])
+                print_clicks(pauses(page, options.clicks), [])
 
 
 def pauses(page: Page, clicks: int) -> list[float]:
-    """As `play_to_pause`, of a page that plays."""
+    """Like `play_to_pause`, for a page that is playing."""
     timed_click(page, "Pause", "Play")
     time.sleep(0.2)
     return play_to_pause(page, clicks)
 
 
-def say_clicks(clicks: list[float], steps: list[float]) -> None:
+def print_clicks(clicks: list[float], steps: list[float]) -> None:
     for what, times in (("Play to Pause", clicks), ("S key to the step's numbers", steps)):
         if times:
             median, worst = 1000 * statistics.median(times), 1000 * max(times)

@@ -1,12 +1,12 @@
-"""Fast pictures against exact ones and bare SAPIEN: pictures a second, and how much they differ; as markdown.
+"""Fast pictures against exact ones and bare SAPIEN: CPU time and differences, as markdown.
 
-    python tests/benchmarks/pictures.py                                   # all, some 15 minutes on two cores
-    python tests/benchmarks/pictures.py --tasks PickCube-v1 --sizes 128   # some of it
+    python tests/benchmarks/pictures.py                                   # everything, about 15 minutes on two cores
+    python tests/benchmarks/pictures.py --tasks PickCube-v1 --sizes 128   # some parts
     python tests/benchmarks/pictures.py --parts steps
-    python tests/benchmarks/pictures.py --write                           # also rows of the table of benchmarks
+    python tests/benchmarks/pictures.py --write                           # also writes rows of the table of benchmarks
 
-All sides of a task run in one process, in turns. Milliseconds are the processor's, of all threads, which count also on a busy
-machine, of the best turn. `bare` are SAPIEN's own calls for the same cameras, `fast` includes ManiSkill's conversions.
+All sides of a task run alternately in one process. Milliseconds are CPU time of all threads, which is meaningful even on a
+busy machine, of the best turn. `bare` are SAPIEN's own calls for the same cameras; `fast` includes ManiSkill's conversions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from core import in_own_process, table
 from core_sides import make_batched, random_stepper
 from numpy.typing import NDArray
 
-from tests.benchmarks.table import Row, keep  # `core` has put the repository on the path
+from tests.benchmarks.table import Row, keep  # `core` puts the repository on the path
 from tests.drive.render_device import RENDER_BACKEND
 
 Part = Literal["pictures", "steps"]
@@ -34,10 +34,10 @@ TABLETOP = (
     "PickCube-v1", "PushCube-v1", "PullCube-v1", "StackCube-v1", "StackPyramid-v1", "LiftPegUpright-v1", "PokeCube-v1",
     "RollBall-v1", "PlaceSphere-v1", "PegInsertionSide-v1", "PlugCharger-v1", "PushT-v1", "TwoRobotPickCube-v1",
 )  # fmt: skip
-OFF = 10
-"""Of 255, and millimetres: a pixel that differs by more in a colour, or in depth, counts as off."""
-KEPT_SIZE = 128
-"""Pixels a side, of the rows in the table of benchmarks."""
+OFF_BY = 10
+"""A pixel that differs by more than this in a colour (of 255), or in depth (millimetres), counts as off."""
+KEPT_SIZE_PIXELS = 128
+"""Width and height in pixels for the rows in the table of benchmarks."""
 
 
 @dataclass(frozen=True)
@@ -47,18 +47,18 @@ class Options:
     sizes: tuple[int, ...] = (128, 512)
     num_envs: int = 2
     steps: int = 6
-    """Random ones, before pictures are compared."""
+    """Random steps before pictures are compared."""
     turns: int = 3
     step_envs: int = 16
-    """Of the part on steps."""
+    """Number of envs in the part on steps."""
     seconds: float = 10.0
-    """A side, of the part on steps."""
+    """Time per side in the part on steps."""
     write: bool = False
-    """Keep rows in the table of benchmarks."""
+    """Write rows of the table of benchmarks."""
 
 
 def compare(task: str, size: int, num_envs: int, steps: int, turns: int) -> dict[str, float]:
-    """Milliseconds a picture of each side (wall and processor), and the differences."""
+    """Milliseconds per picture of each side (wall and CPU time), and the differences."""
     env = make_batched(
         task,
         num_envs,
@@ -69,10 +69,10 @@ def compare(task: str, size: int, num_envs: int, steps: int, turns: int) -> dict
     if hasattr(env.single_action_space, "low"):
         step = random_stepper(env, episode=10**6)
     else:
-        # Several robots stand still.
+        # In a task with several robots, they stand still.
         env.reset(seed=0)
         step = partial(env.step, None)
-    env.scene.pictures = "fast"  # or the steps would draw exact ones
+    env.scene.pictures = "fast"  # otherwise the steps would render exact pictures
     for _ in range(steps):
         step()
     env.scene.forget_fast_shapes()
@@ -139,9 +139,9 @@ def compare(task: str, size: int, num_envs: int, steps: int, turns: int) -> dict
 
 
 def differences(exact: dict[str, Any], fast: dict[str, Any]) -> dict[str, float]:
-    """Over all pictures of all cameras: of colours in parts of 255, of depth in millimetres, of pixels in percent.
+    """Mean and worst differences over all pictures: colours in parts of 255, depth in millimetres, pixels in percent.
 
-    Inside are pixels that have no other body within a pixel.
+    *Inside* are pixels without another body within one pixel.
     """
     each: dict[str, list[float]] = {}
     for name, of_camera in exact.items():
@@ -152,10 +152,10 @@ def differences(exact: dict[str, Any], fast: dict[str, Any]) -> dict[str, float]
         another, inside = ids != other["segmentation"].numpy()[..., 0], ~_at_silhouettes(ids)
         of_pictures = {
             "error": colours.mean(axis=(1, 2, 3)),
-            "off": 100 * (colours.max(axis=-1) > OFF).mean(axis=(1, 2)),
+            "off": 100 * (colours.max(axis=-1) > OFF_BY).mean(axis=(1, 2)),
             "depth": millimetres.mean(axis=(1, 2)),
-            "depth off": 100 * (millimetres > OFF).mean(axis=(1, 2)),
-            "depth off inside": 100 * ((millimetres > OFF) & inside).mean(axis=(1, 2)),
+            "depth off": 100 * (millimetres > OFF_BY).mean(axis=(1, 2)),
+            "depth off inside": 100 * ((millimetres > OFF_BY) & inside).mean(axis=(1, 2)),
             "segmentation": 100 * another.mean(axis=(1, 2)),
             "segmentation inside": 100 * (another & inside).mean(axis=(1, 2)),
         }
@@ -166,7 +166,7 @@ def differences(exact: dict[str, Any], fast: dict[str, Any]) -> dict[str, float]
 
 
 def _at_silhouettes(ids: NDArray) -> NDArray[np.bool_]:
-    """(N, H, W) whether one of the eight pixels around shows another body."""
+    """(N, H, W): whether one of the eight neighbour pixels shows another body."""
     around = np.pad(ids, ((0, 0), (1, 1), (1, 1)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(around, (3, 3), axis=(1, 2))
     return (windows != ids[..., None, None]).any(axis=(-1, -2))
@@ -191,7 +191,7 @@ def pictures(options: Options, kept: list[Row]) -> Iterator[str]:
         mean = {what: statistics.fmean(got[what] for got in every) for what in every[0]}
         mean |= {what: max(got[what] for got in every) for what in mean if what.startswith("worst")}
         rows.append(_row("mean (worst of all)", mean))
-        if size == KEPT_SIZE:
+        if size == KEPT_SIZE_PIXELS:
             kept.extend(_kept(mean, len(every)))
         yield f"### {size} x {size}"
         yield ""
@@ -210,7 +210,7 @@ def pictures(options: Options, kept: list[Row]) -> Iterator[str]:
 
 
 def _kept(mean: dict[str, float], tasks: int) -> list[Row]:
-    what = f'Pictures, `pictures="fast"`, {KEPT_SIZE} x {KEPT_SIZE}'
+    what = f'Pictures, `pictures="fast"`, {KEPT_SIZE_PIXELS} x {KEPT_SIZE_PIXELS}'
     fast, bare = mean["fast processor"], mean["bare processor"]
     return [
         Row(
@@ -222,7 +222,7 @@ def _kept(mean: dict[str, float], tasks: int) -> list[Row]:
             "pictures.py",
         ),
         Row(
-            f"{what}: pixels that differ from exact ones by more than {OFF} of 255, mean of {tasks} tabletop tasks",
+            f"{what}: pixels that differ from exact ones by more than {OFF_BY} of 255, mean of {tasks} tabletop tasks",
             mean["off"],
             None,
             "%",
@@ -246,11 +246,11 @@ def _row(task: str, got: dict[str, float]) -> list[str]:
     ]
 
 
-# --- what a learner gets ------------------------------------------------------------------------------
+# --- speed of env-steps -------------------------------------------------------------------------------
 
 
 def rate(step: Callable[[], object], num_envs: int, seconds: float) -> tuple[float, float]:
-    """Env-steps a second, and the processor's milliseconds of each in all processes."""
+    """Env-steps per second, and CPU milliseconds per env-step over all processes."""
     step()
     count, start, before = 0, time.perf_counter(), _processor()
     while time.perf_counter() - start < seconds or count < 3:
@@ -261,7 +261,7 @@ def rate(step: Callable[[], object], num_envs: int, seconds: float) -> tuple[flo
 
 
 def _processor() -> float:
-    """Seconds of this process and those that it started."""
+    """CPU seconds of this process and its children."""
     this = psutil.Process()
     every = (process.cpu_times() for process in (this, *this.children(recursive=True)))
     return sum(times.user + times.system for times in every)
@@ -313,7 +313,7 @@ def steps(options: Options, kept: list[Row]) -> Iterator[str]:
         [name, f"{a_second:.0f}", f"{took:.1f}", f"{stock[1] / took:.1f}"]
         for name, (a_second, took) in sides.items()
     ]
-    yield from table(["", "env-steps a second", "processor, ms an env-step", "stock / this"], rows)
+    yield from table(["", "env-steps per second", "CPU ms per env-step", "stock / this"], rows)
 
 
 def main(options: Options) -> None:

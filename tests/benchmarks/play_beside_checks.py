@@ -1,8 +1,8 @@
-"""What playing loses while the Checks tab checks: python tests/benchmarks/play_beside_checks.py [--num-envs 16]
+"""Slowdown of playing while the Checks tab runs its checks: python tests/benchmarks/play_beside_checks.py [--num-envs 16]
 
-A session with a worker on the example task plays, without a page, at unlimited speed or (--speed 1) in real time. Windows without checks and windows in
-which the background process checks all rules come in turns, in one run. Prints the control steps a second of both (median
-of the windows), their ratio, how long a whole check took beside the play, and how long alone.
+A session with a worker on the example task plays without a page, at unlimited speed or (--speed 1) in real time. Windows
+with and without a check of all rules in the background process alternate in one run. Prints the control steps per second
+of both (median of the windows), their ratio, and the duration of a whole check while playing and while paused.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from workbench.live.commands import PlayRun
 class Options:
     num_envs: int = 16
     seconds: float = 4.0
-    """Of one window."""
+    """Length of one window."""
     windows: int = 5
-    """Of each kind."""
+    """Number of windows of each kind."""
     speed: float = math.inf
-    """Times real time."""
+    """Speed relative to real time."""
     task: str = str(TASKS / "push_cube.py")
 
 
 def steps_a_second(session: Session, seconds: float, checking: bool) -> float:
-    """Of all envs together as one step; while rules are checked, until the last is."""
+    """Control steps per second, where a step of all envs counts as one; with `checking` it ends with the last rule."""
     first, begun = session.view().timeline.last, time.perf_counter()
     while time.perf_counter() - begun < seconds:
         if checking and session.view().of(ChecksView).state != "checking":
@@ -49,11 +49,11 @@ def steps_a_second(session: Session, seconds: float, checking: bool) -> float:
 
 def begin_check(session: Session) -> None:
     session.do(CheckNow())
-    wait_until(session, lambda view: view.of(ChecksView).state != "loading", "the begin of the checks")
+    wait_until(session, lambda view: view.of(ChecksView).state != "loading", "the start of the checks")
 
 
 def whole_check(session: Session) -> float:
-    """Seconds of all rules, once the version is loaded there."""
+    """Seconds of a check of all rules, after the version was loaded in the background process."""
     begin_check(session)
     wait_until(session, lambda view: view.of(ChecksView).state not in RUNNING, "the end of the checks")
     return session.view().of(ChecksView).seconds
@@ -65,7 +65,7 @@ def main(options: Options) -> None:
         live_session(options.task, Path(folder), options.num_envs, draw=True) as session,
     ):
         session.change(speed=options.speed)
-        whole_check(session)  # shaders are compiled
+        whole_check(session)  # compiles the shaders
         alone = whole_check(session)
         session.do(PlayRun())
         without, beside = [], []
@@ -81,9 +81,9 @@ def main(options: Options) -> None:
         f"{Path(options.task).name}, {options.num_envs} envs, speed {options.speed:g}, {options.windows} windows of each kind"
     )
     print(
-        f"control steps a second: {one:.1f} without checks, {other:.1f} beside them: {other / one:.2f} of it"
+        f"control steps per second: {one:.1f} without checks, {other:.1f} during checks, ratio {other / one:.2f}"
     )
-    print(f"{rules} rules: {took:.1f} s beside the play, {alone:.1f} s while it is paused")
+    print(f"{rules} rules: {took:.1f} s while playing, {alone:.1f} s while paused")
 
 
 if __name__ == "__main__":

@@ -1,17 +1,18 @@
-"""What recording costs, beside ManiSkill's own RecordEpisode: python tests/benchmarks/recording.py [--write]
+"""The cost of recording, compared with ManiSkill's own RecordEpisode: python tests/benchmarks/recording.py [--write]
 
-The same env, the same seed, the same actions: inside RecordEpisode, inside `workbench.Recorder`, in turn, several rounds. Both
-recorders keep actions, rewards, flags, state observations and env states. With a camera, both keep the base camera's colour, depth and
-segmentation, which the env observes. Ours keeps more: every pose, what ``evaluate`` returned, the meshes, all in a second file, the
-.rrd, which RecordEpisode does not have, and which holds our pictures. So there are two verdicts on bytes and on the processor: of the same
-content, which is all but the .rrd without a camera and everything with one, and of everything.
+The same env with the same seed and actions runs inside RecordEpisode and inside `workbench.Recorder`, alternately, for several
+rounds. Both recorders store actions, rewards, flags, state observations and env states. With a camera, both store the base
+camera's colour, depth and segmentation, which the env observes. Ours also stores every pose, the results of ``evaluate`` and the
+meshes in a second file, the .rrd, which RecordEpisode does not have and which holds our pictures. So bytes and CPU time are
+compared twice: for the same content (without a camera all but the .rrd, with one everything), and for everything.
 
-What a recorder takes is what a step takes beyond the env's own, which is measured within the same step: on a machine that others use
-too, two runs differ by more than a recorder takes. Stepping is that. The whole run is some episodes, one after the other, until the files
-of the last are there, without what the env took of it. RecordEpisode makes the files of an episode when the next one begins, ours while it
-happens, in a process where there are many envs, else on another thread; what that takes of the processor, the process's start with it,
-is a row of its own, as the env may have wanted it, and so is the whole run with the env, which shows what it waited. Where there is
-a process, a run without one is beside it, which also gives the processor time of the same content. Times are medians of the rounds. Bytes a step are a difference of two lengths, so that neither side's fixed parts (the scene's meshes, the sources' texts) count.
+*Stepping* is the time of a step beyond the env's own time, which is measured within the same step, because on a busy machine two
+runs differ by more than the recorder's cost. *The whole run* is several episodes in sequence, until the files of the last one
+exist, without the env's own time. RecordEpisode writes the files of an episode when the next one begins; ours are written during
+the next episode, in a subprocess if there are many envs, else on another thread. Their CPU time, with the start of the subprocess,
+is a separate row, and so is the whole run with the env, which shows how long the env waited. With a subprocess, a run without one
+is shown too; it gives the CPU time of the same content. Times are medians of the rounds. Bytes per step are the difference of two
+lengths, so the fixed parts (the scene's meshes, the source texts) do not count.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from workbench.record import recorder as recorder_module
 
 SIDES = ("RecordEpisode", "Recorder")
 THREAD = "on a thread"
-"""`Recorder` without its process."""
+"""`Recorder` without its subprocess."""
 
 
 @dataclass
@@ -52,22 +53,22 @@ class Options:
     task: str = "PickCube-v1"
     num_envs: tuple[int, ...] = (1, 16)
     steps: int = 200
-    """Of an episode."""
+    """Steps per episode."""
     episodes: int = 3
-    """Of a run."""
+    """Episodes per run."""
     rounds: int = 5
-    """Without a camera; 0 leaves it out."""
+    """Rounds without a camera; 0 skips them."""
     camera_steps: tuple[int, ...] = (50, 16)
-    """With a camera, for each of `num_envs`: drawing them takes a second a step. PickCube's own episode has 50. RecordEpisode copies
-    all that it has at every step, so its steps grow slower with the episode."""
+    """Steps with a camera, for each of `num_envs`: rendering takes a second per step. PickCube's own episode has 50. RecordEpisode
+    copies all of its data at every step, so its steps become slower during the episode."""
     camera_rounds: tuple[int, ...] = (3, 1)
-    """With a camera, for each of `num_envs`; 0 leaves it out."""
+    """Rounds with a camera, for each of `num_envs`; 0 skips them."""
     write: bool = False
-    """Keep rows in the table of benchmarks, of the most envs without a camera."""
+    """Write rows of the table of benchmarks, for the largest number of envs without a camera."""
 
 
 class Timed(gym.Wrapper):
-    """Sums up what its env takes."""
+    """Sums up the time of its env."""
 
     steps = resets = processor = 0.0
 
@@ -87,7 +88,7 @@ class Timed(gym.Wrapper):
 
 
 class RecordersThread(threading.Thread):
-    """Every thread of this process: those of the recorder leave what they had of the processor."""
+    """Replaces `threading.Thread`; threads of the recorder add their CPU time to `ended` when they end."""
 
     ended = 0.0
 
@@ -103,34 +104,34 @@ threading.Thread = RecordersThread  # type: ignore[misc]
 
 
 def on_threads() -> float:
-    """Seconds of the processor that the recorder's own threads have had; those of the env would hide them in its step."""
+    """CPU seconds of the recorder's own threads; the process's total would include the threads of the env."""
     ours = [t for t in threading.enumerate() if t.name.startswith("episode-") and t.ident is not None]
     alive = sum(time.clock_gettime(time.pthread_getcpuclockid(t.ident)) for t in ours if t.ident)
     return alive + RecordersThread.ended
 
 
 def in_processes() -> float:
-    """The same, of processes that have ended."""
+    """CPU seconds of child processes that have ended."""
     ended = resource.getrusage(resource.RUSAGE_CHILDREN)
     return ended.ru_utime + ended.ru_stime
 
 
 @dataclass(frozen=True)
 class Run:
-    """Seconds of all its episodes."""
+    """Seconds of all episodes of a run."""
 
     bare: float
-    """Of the env's own steps."""
+    """The env's own steps."""
     stepping: float
-    """That the recorder took while stepping."""
+    """The recorder's time while stepping."""
     whole: float
-    """That it took until the files were there."""
+    """The recorder's time until the files existed."""
     env_and_all: float
-    """All that the run took: the env's own steps are slower where another thread wants the interpreter meanwhile."""
+    """The whole run with the env: its own steps are slower while another thread holds the interpreter."""
     processor: float
-    """The whole, of the processor, all threads of the recorder, and its process."""
+    """CPU time of the whole run: all threads of the recorder, and its subprocess."""
     rrd: float
-    """Of `processor`, what the .rrd took; not where a process made it."""
+    """The part of `processor` for the .rrd; 0 if a subprocess wrote it."""
     size: dict[str, int]
     """Bytes by suffix."""
 
@@ -140,7 +141,7 @@ class Run:
 
 
 class _Rrd:
-    """Sums up what the .rrd files take; they are made one after the other."""
+    """Sums up the CPU time of writing .rrd files, which are written one by one."""
 
     taken = 0.0
 
@@ -198,7 +199,7 @@ def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes
 
 
 def finish(side: str, wrapped: Any) -> None:
-    """Close the files, and not the env, which the next run goes on with."""
+    """Close the files but not the env, which the next run uses."""
     if side == "RecordEpisode":
         wrapped.flush_trajectory()
         wrapped._h5_file.close()
@@ -241,16 +242,16 @@ def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: i
     whole = (".h5", ".json", ".rrd")
     same, processor = (whole, "processor") if camera else (whole[:2], "without_rrd")
     rows = [
-        ("ms a step: stepping", lambda side: took(side, "stepping")),
-        ("ms a step: the whole run", lambda side: took(side, "whole")),
-        ("ms a step: the whole run, with the env", lambda side: took(side, "env_and_all")),
+        ("ms per step: stepping", lambda side: took(side, "stepping")),
+        ("ms per step: the whole run", lambda side: took(side, "whole")),
+        ("ms per step: the whole run, with the env", lambda side: took(side, "env_and_all")),
         (
-            "ms a step: processor, same content",
+            "ms per step: CPU, same content",
             lambda side: took(sides[-1] if side == "Recorder" else side, processor),
         ),
-        ("ms a step: processor, everything", lambda side: took(side, "processor")),
-        ("bytes a step and env: same content", lambda side: weighs(side, *same)),
-        ("bytes a step and env: everything", lambda side: weighs(side, *whole)),
+        ("ms per step: CPU, everything", lambda side: took(side, "processor")),
+        ("bytes per step and env: same content", lambda side: weighs(side, *same)),
+        ("bytes per step and env: everything", lambda side: weighs(side, *whole)),
     ]
     print(
         f"  {'':38s} {'Recorder':>14s} {'RecordEpisode':>14s} {'ratio':>6s}"

@@ -1,17 +1,17 @@
-"""From saving a task's file to new numbers on the screen, by reload level, against a cold restart.
+"""Time from saving a task file to new numbers on the screen, by reload level, against a cold restart.
 
     python tests/benchmarks/reload.py [--num-envs 16] [--saves 7] [--restarts 3] [--write]
 
-``workbench open`` with the cameras on, and a real Chromium before it. Of every level the same file is saved again and
-again with another edit, and the clock runs from the end of the write until the page shows what it changed:
+Runs ``workbench open`` with the cameras on in a real Chromium. For each level the same file is saved repeatedly with
+another edit, and the time runs from the end of the write until the page shows the change:
 
     patched     another name of an entry of ``evaluate``       the entry is in the table
-    cameras     another width of the sensor camera             a picture of that width
-    rebuilt     another colour of the cube, another entry      the entry and a new picture, of all envs built anew
+    cameras     another width of the sensor camera             there is a picture of that width
+    rebuilt     another colour of the cube, another entry      the entry and a new picture, with all envs rebuilt
 
-The moment is the same before and after; the last column is what the worker says it took. The other side is what an
-author does without a workbench: python started anew on the same file, stock ``gym.make`` of one env, reset, first
-picture. Bars: 300 ms, 600 ms and 2 s at 16 envs.
+The episode's state is the same before and after; the last column is the duration that the worker reports. The other side
+is the work without a workbench: a new Python process on the same file, stock ``gym.make`` of one env, reset, first
+picture. The limits are 300 ms, 600 ms and 2 s at 16 envs.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from tests.benchmarks.table import Row, keep
 from tests.drive.page import TASK, browser_at, page_on
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
-WIDTH = 100
-BARS = {"patched": 0.3, "cameras": 0.6, "rebuilt": 2.0}
+WIDTH_PIXELS = 100
+LIMIT_SECONDS = {"patched": 0.3, "cameras": 0.6, "rebuilt": 2.0}
 
 COLD = """
 import runpy, sys
@@ -54,7 +54,7 @@ class Options:
     saves: int = 7
     restarts: int = 3
     write: bool = False
-    """Keep rows in the table of benchmarks."""
+    """Write rows of the table of benchmarks."""
 
 
 def cold_restart(file: Path) -> float:
@@ -75,19 +75,19 @@ def version(number: int) -> str:
 
 
 def edited(level: str, number: int) -> tuple[str, str | None, bool]:
-    """A version of the task, the entry that it brings to the table, and whether its picture is another."""
+    """A version of the task, the new entry of the table, and whether the picture changes."""
     good = TASK.read_text()
     if level == "patched":
         return good.replace('"cube_to_goal"', f'"patch_{number}"'), f"patch_{number}", False
     if level == "cameras":
         size = "width=128, height=128"
         assert good.count(size) == 1
-        return good.replace(size, f"width={WIDTH + number}, height=128"), None, True
+        return good.replace(size, f"width={WIDTH_PIXELS + number}, height=128"), None, True
     return version(number), f"seen_{number}", True
 
 
 def save_to_seen(page: Page, file: Path, level: str, number: int) -> tuple[float, float]:
-    """Seconds from the saved file to what is new on the page, and the milliseconds that the page tells."""
+    """Seconds from the save until the page shows the change, and the milliseconds that the page reports."""
     text, entry, picture = edited(level, number)
     before = page.locator('img[src^="blob:"]').first.get_attribute("src")
     file.write_text(text)
@@ -99,16 +99,16 @@ def save_to_seen(page: Page, file: Path, level: str, number: int) -> tuple[float
                 && (!picture || (image && image.src && image.src !== before))
                 && (!width || (image && image.naturalWidth === width));
         }""",
-        arg=[entry, picture, before, WIDTH + number if level == "cameras" else 0],
+        arg=[entry, picture, before, WIDTH_PIXELS + number if level == "cameras" else 0],
         polling=10,
     )
     seconds = time.perf_counter() - start
-    # In the Run tab, which is hidden and there.
-    told = page.locator(".wb-note", has_text=re.compile(rf"^\s*{level} in")).first.text_content() or ""
-    found = re.search(rf"{level} in ([\d.]+) (m?s)", told)
-    assert found is not None, told
+    # The note is on the Run tab, which is hidden but in the document.
+    note = page.locator(".wb-note", has_text=re.compile(rf"^\s*{level} in")).first.text_content() or ""
+    found = re.search(rf"{level} in ([\d.]+) (m?s)", note)
+    assert found is not None, note
     milliseconds = float(found[1]) * (1 if found[2] == "ms" else 1000)
-    time.sleep(1.0)  # an author looks at what came; and what follows a reload must not slow the next
+    time.sleep(1.0)  # like an author's pause; later work of a reload must not slow down the next one
     return seconds, milliseconds
 
 
@@ -122,12 +122,12 @@ def workbench_side(options: Options, folder: Path, chromium: str) -> dict[str, l
             _,
         ),
     ):
-        # Tabs that were opened once keep their content, so both the picture and the table are there.
+        # Tabs keep their content once opened, so both the picture and the table are in the document.
         page.get_by_role("tab", name="Cameras").click()
         expect(page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
         page.get_by_role("tab", name="Reward").click()
         seen: dict[str, list[tuple[float, float]]] = {}
-        for level in BARS:
+        for level in LIMIT_SECONDS:
             file.write_text(TASK.read_text())
             time.sleep(4.0)
             seen[level] = [save_to_seen(page, file, level, number) for number in range(options.saves)]
@@ -143,13 +143,13 @@ def main(options: Options) -> None:
         seen = workbench_side(options, folder, chromium)
         cold = [cold_restart(folder / "push_cube.py") for _ in range(options.restarts)]
     print(f"push_cube.py, {options.num_envs} envs, cameras on")
-    print("| save to seen | median s | lowest | highest | bar | worker, median ms |")
+    print("| save to seen | median s | lowest | highest | limit | worker, median ms |")
     print("|---|---|---|---|---|---|")
     for level, values in seen.items():
         seconds = [value[0] for value in values]
-        told = statistics.median(value[1] for value in values)
-        spread = f"{min(seconds):.2f} | {max(seconds):.2f} | {BARS[level]}"
-        print(f"| {level} | {statistics.median(seconds):.2f} | {spread} | {told:.0f} |")
+        reported = statistics.median(value[1] for value in values)
+        spread = f"{min(seconds):.2f} | {max(seconds):.2f} | {LIMIT_SECONDS[level]}"
+        print(f"| {level} | {statistics.median(seconds):.2f} | {spread} | {reported:.0f} |")
     if cold:
         spread = f"{min(cold):.2f} | {max(cold):.2f} | | |"
         print(f"| cold restart, stock, 1 env | {statistics.median(cold):.2f} | {spread}")

@@ -1,20 +1,20 @@
-"""How far a run goes from itself after a restore, by kind of task: python tests/benchmarks/restore_distance.py
+"""Deviation of a run after a restore, by kind of task: python tests/benchmarks/restore_distance.py
 
-One run of each task is made and kept; then it is gone back to, at moments of it, in several ways, and goes on with
-the very actions of the run. Printed is the largest difference of any env at any of the moments from the run that was
-not interrupted: of any number of the state (velocities included), and of any joint (rad; m of sliding ones).
+One run of each task is recorded. Then some of its moments are restored in several ways, and the run continues with its
+recorded actions. Printed is the largest difference from the uninterrupted run over all envs and moments: of any number of
+the state (velocities included), and of any joint (rad; m for prismatic joints).
 
-    put there       `TaskEnv.restore`: a PhysX scene without a past, and the state of the moment
+    put there       `TaskEnv.restore`: a new PhysX scene, and the state of the moment
     quick           the same with ``fresh_physics=False``
-    warmed          put there some steps earlier, the steps made again, then put at the moment quickly
-    lived through   the run's first moment put there, and every action up to the moment made again
+    warmed          an earlier moment put there, the steps from it repeated, then a quick restore of the moment
+    lived through   the run's first moment put there, and every action up to the moment repeated
 
-The run begins as a live page's does: a reset that is an exact point (`envs.snapshots.snapshot.begin_anew`). A page goes back in the
-last way (`live.worker.go_back`), and in the first where that does not come out to the last byte, takes too long, or begins
-before what is kept.
+The run begins like a live page's: with a reset that can be restored exactly (`envs.snapshots.snapshot.begin_anew`). A page goes
+back in the last way (`live.worker.go_back`), and in the first way if that is not exact to the byte, takes too long, or begins
+before the kept history.
 """
 
-# ManiSkill annotates an env's members as the widest thing they may be in any task.
+# ManiSkill annotates an env's members with the widest types of all tasks.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ from workbench.envs import action_vector as actions
 from workbench.envs.snapshots.snapshot import Snapshot, begin_anew
 from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
 
-AFTER = (1, 5, 20)
+AFTER_STEPS = (1, 5, 20)
 """Control steps after which the runs are compared."""
-WARMING = 4
-"""Control steps of the way "warmed"."""
+WARMING_STEPS = 4
+"""Control steps that the way "warmed" repeats."""
 Put = Callable[[TaskEnv], None]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of task: one of ManiSkill's, and what its robot does."""
+    """A kind of task: a ManiSkill task and its robot's motion."""
 
     name: str
     env_id: str
     held: str | None = None
-    """The actor that is put into the gripper, which stays closed; else all joints move at random."""
+    """The actor placed in the gripper, which stays closed; without one all joints move at random."""
 
 
 KINDS = (
@@ -75,15 +75,15 @@ KINDS = (
 @dataclass(frozen=True)
 class Options:
     kinds: tuple[str, ...] = ()
-    """Of the names in `KINDS`; all if none are named."""
+    """Names from `KINDS`; all if empty."""
     num_envs: int = 4
     moments: tuple[int, ...] = (8, 16, 24, 32)
-    """Control steps of the run that are gone back to."""
+    """Control steps of the run to restore."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What was lived through, moment by moment; moment 0 is the reset."""
+    """A recorded run by moment; moment 0 is the reset."""
 
     snapshots: list[Snapshot]
     actions: list[NDArray[np.float32]]
@@ -132,7 +132,7 @@ def ways(run: Run, moment: int) -> Iterator[tuple[str, Put]]:
         task.restore(run.snapshots[moment], fresh_physics=False)
 
     def warmed(task: TaskEnv) -> None:
-        begin = max(0, moment - WARMING)
+        begin = max(0, moment - WARMING_STEPS)
         task.restore(run.snapshots[begin])
         for action in run.actions[begin:moment]:
             task.step(action)
@@ -154,7 +154,7 @@ def measure(kind: Kind, options: Options) -> Iterator[str]:
     spec = REGISTERED_ENVS[kind.env_id]
     made = EnvOptions(options.num_envs, "cpu", render=kind.env_id == "PushT-v1", rules="off")
     task = TaskEnv(make_env(spec.cls, made, asset_ids=spec.asset_download_ids or ()))
-    run = make_run(task, kind, max(options.moments) + max(AFTER))
+    run = make_run(task, kind, max(options.moments) + max(AFTER_STEPS))
     found: dict[str, dict[int, tuple[float, float]]] = {}
     seconds: dict[str, float] = {}
     for moment in options.moments:
@@ -162,9 +162,9 @@ def measure(kind: Kind, options: Options) -> Iterator[str]:
             began = time.perf_counter()
             put(task)
             seconds[way] = max(seconds.get(way, 0.0), time.perf_counter() - began)
-            for done in range(1, max(AFTER) + 1):
+            for done in range(1, max(AFTER_STEPS) + 1):
                 task.step(run.actions[moment + done - 1])
-                if done in AFTER:
+                if done in AFTER_STEPS:
                     state = worst(state_of(task), run.states[moment + done])
                     qpos = worst(qpos_of(task), run.qpos[moment + done])
                     before = found.setdefault(way, {}).get(done, (0.0, 0.0))
@@ -184,13 +184,13 @@ def worst(a: NDArray[Any], b: NDArray[Any]) -> float:
 def main(options: Options) -> None:
     warnings.filterwarnings("ignore")
     chosen = [kind for kind in KINDS if not options.kinds or kind.name in options.kinds]
-    print("| kind | task | way | " + " | ".join(f"after {n}: state / qpos" for n in AFTER) + " | ms |")
-    print("|" + "---|" * (4 + len(AFTER)))
+    print("| kind | task | way | " + " | ".join(f"after {n}: state / qpos" for n in AFTER_STEPS) + " | ms |")
+    print("|" + "---|" * (4 + len(AFTER_STEPS)))
     for kind in chosen:
         try:
             for line in measure(kind, options):
                 print(line, flush=True)
-        except Exception as error:  # a download that is not there, say
+        except Exception as error:  # for example a missing download
             print(f"| {kind.name} | {kind.env_id} | {type(error).__name__}: {error} |", flush=True)
 
 

@@ -1,13 +1,12 @@
-"""How many positions a second a person sees who drags the time slider: over recordings, and over a live env's past.
+"""Positions per second shown while the time slider is dragged: over recordings, and over a live session's past.
 
     python tests/benchmarks/review_scrub.py [--envs 64] [--seconds 8] [--software]
 
-A recording holds one env, so a review of 64 envs is 64 recordings that are open side by side, made here by
-``workbench record``. Beside it the live page over the history of as many envs, through the same kind of slider, in
-the same run: what counts is the ratio. The slider is dragged back and forth by real mouse events in a real Chromium;
-counted are animation frames on which the robots' hands have poses that the frame before did not have. Drawing is
-replaced by nothing, as a stand-in for a browser with a graphics card (``--software`` lets Chromium rasterise on the
-processor).
+A recording holds one env, so a review of 64 envs is 64 recordings opened side by side, made here by ``workbench record``.
+It is compared with the live page over the history of as many envs, through the same kind of slider in the same run: compare
+the ratio. Real mouse events drag the slider back and forth in a real Chromium; animation frames are counted in which the
+poses of the robots' hands differ from the previous frame. Draw calls do nothing, to simulate a browser with a GPU
+(``--software`` lets Chromium rasterise on the CPU).
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ class Options:
 
 @contextmanager
 def command(*arguments: str) -> Iterator[str]:
-    """A running command of the workbench with a page; its address."""
+    """Run a workbench command that opens a page; yields its address."""
     process = subprocess.Popen(
         [sys.executable, "-m", "workbench.cli.main", *arguments, "--port", "0"],
         stdout=subprocess.PIPE,
@@ -75,7 +74,7 @@ def command(*arguments: str) -> Iterator[str]:
         if re.search(r"page +http", line):
             break
     else:
-        raise SystemExit("it ended before it had a page")
+        raise SystemExit("the command ended before it opened a page")
     try:
         yield line.split()[-1]
     finally:
@@ -84,7 +83,7 @@ def command(*arguments: str) -> Iterator[str]:
 
 
 def scrub(page: Page, seconds: float) -> tuple[float, float]:
-    """Positions and animation frames a second while the slider is dragged back and forth."""
+    """Positions and animation frames per second while the slider is dragged back and forth."""
     box = page.locator("input[type=range]:visible").last.bounding_box()
     assert box is not None
     y, low, high = box["y"] + box["height"] / 2, box["x"] + 4, box["x"] + box["width"] - 4
@@ -93,7 +92,7 @@ def scrub(page: Page, seconds: float) -> tuple[float, float]:
     page.evaluate(WATCH)
     began, n = time.monotonic(), 0
     while time.monotonic() - began < seconds:
-        # From end to end in 1.5 s, at whatever rate the browser takes the events.
+        # One pass takes 1.5 s, at whatever rate the browser accepts the events.
         phase = (time.monotonic() - began) / 1.5
         page.mouse.move(low + (high - low) * (1 - abs(1 - phase % 2)), y)
         n += 1
@@ -141,7 +140,7 @@ def opened_page(browser: Browser, url: str, options: Options) -> Page:
 
 
 def untick(page: Page) -> None:
-    """No pictures: on a machine without a graphics card they are what takes the time."""
+    """Turn the pictures off: without a GPU they would take most of the time."""
     page.get_by_role("tab", name="Cameras").click()
     for box in page.get_by_role("checkbox").all():
         if box.is_checked():
@@ -160,7 +159,7 @@ def measured(page: Page, options: Options) -> list[tuple[float, float]]:
     return found
 
 
-def say(what: str, found: list[tuple[float, float]]) -> float:
+def print_rates(what: str, found: list[tuple[float, float]]) -> float:
     rates = [rate for rate, _ in found]
     frames = statistics.median(frames for _, frames in found)
     median = statistics.median(rates)
@@ -182,8 +181,8 @@ def main(options: Options) -> None:
         )  # fmt: skip
         browser = launch(playwright, chromium)
         print(f"{envs} envs, {'software drawing' if options.software else 'no drawing'}")
-        of_review = say("review     ", review(browser, folder, options))
-        of_live = say("live's past", live(browser, options))
+        of_review = print_rates("review     ", review(browser, folder, options))
+        of_live = print_rates("live's past", live(browser, options))
         print(f"  review / live {of_review / of_live:.2f}")
         browser.close()
 

@@ -1,19 +1,19 @@
-"""What planning costs beside the steps that it is made of: python tests/benchmarks/solve.py
+"""The cost of planning, compared with its bare steps: python tests/benchmarks/solve.py
 
-For each task, in turns in one process: *quick* and *exact*, one plan of K rollouts of H steps for a live env in the middle
-of an episode, with each of the two ways to restore; *bare*, the same actions from the same state in K envs as
-`workbench.make` gives them, which are restored before the clock starts. Printed are the medians and their ratios.
+For each task, alternately in one process: *quick* and *exact*, one plan of K rollouts of H steps for a live env in the
+middle of an episode, with each of the two kinds of restore; *bare*, the same actions from the same state in K envs of
+`workbench.make`, restored before the timing starts. Printed are the medians and their ratios.
 
-    python tests/benchmarks/solve.py --write    # also a row of the table of benchmarks
+    python tests/benchmarks/solve.py --write    # also writes a row of the table of benchmarks
     python tests/benchmarks/solve.py --demonstrations 20 --packages numpy1
 
-With ``--demonstrations``, in place of that: successes an hour of ``workbench record --actions solve --successes`` and of
-ManiSkill's motion-planning scripts (`mani_skill.examples.motionplanning.panda.run`), each one run with as many processes as
-cores, start included. The scripts need mplib; 0.1.1, the one that ManiSkill pins, ends in a segmentation fault with numpy 2, so
-theirs is run with another numpy: ``pip install --no-deps --target numpy1 numpy==1.26.4``.
+``--demonstrations`` instead measures successes per hour of ``workbench record --actions solve --successes`` and of ManiSkill's
+motion-planning scripts (`mani_skill.examples.motionplanning.panda.run`), each in one run with one process per core, start
+included. The scripts need mplib; version 0.1.1, which ManiSkill pins, crashes with a segmentation fault with numpy 2, so the
+scripts run with another numpy: ``pip install --no-deps --target numpy1 numpy==1.26.4``.
 """
 
-# ManiSkill annotates an env's members as the widest thing they may be in any task.
+# ManiSkill annotates an env's members with the widest types of all tasks.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
@@ -43,27 +43,27 @@ from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import RolloutPlanner, make_rollout_env
 
 ROOT = Path(__file__).resolve().parents[2]
-_LONGEST = 3600.0
+_TIMEOUT_SECONDS = 3600.0
 KEPT_TASK = "PickCube-v1"
-"""The task of the rows in the table of benchmarks."""
+"""The task whose rows are in the table of benchmarks."""
 
 
 @dataclass(frozen=True)
 class Options:
     env_ids: tuple[str, ...] = ("PushCube-v1", "PickCube-v1", "StackCube-v1")
     turns: int = 9
-    """Of each side; a turn is one plan, or as many bare steps."""
+    """Turns of each side; a turn is one plan, or as many bare steps."""
     steps: int = 5
-    """Control steps of the live env before it is planned for, each by a plan."""
+    """Planned control steps of the live env before the measurement."""
     plan: PlanOptions = field(default_factory=PlanOptions)
     processor: bool = False
-    """Take the processor's time of all threads in place of the wall's: on a machine that others use, only that says something."""
+    """Measure the CPU time of all threads instead of the wall time, which is meaningless on a busy machine."""
     demonstrations: int = 0
-    """Successes of each side, in place of the table of plans."""
+    """Measure demonstrations instead of plans, with this number of successes per side."""
     packages: Path | None = None
-    """A folder whose packages the motion-planning scripts import before others."""
+    """A folder with packages that the motion-planning scripts import first."""
     write: bool = False
-    """Keep a row of `KEPT_TASK` in the table of benchmarks."""
+    """Write a row of the table of benchmarks, for `KEPT_TASK`."""
 
 
 def seconds(action: Callable[[], Any], clock: Callable[[], float]) -> float:
@@ -99,7 +99,7 @@ def measure(env_id: str, options: Options) -> dict[str, float]:
 
     def plan_with(side: str) -> Callable[[], None]:
         def plan() -> None:
-            # An episode's first plan each time, so that all sides make the same steps.
+            # Always the first plan of an episode, so that all sides make the same steps.
             planners[side].begin(0, 0)
             planners[side].plan(workbench.take_snapshot(live), 0)
 
@@ -142,10 +142,10 @@ def table(options: Options, kept: list[Row]) -> Iterator[str]:
         )
 
 
-# --- a factory of demonstrations -------------------------------------------------------------------------
+# --- demonstrations --------------------------------------------------------------------------------------
 
 
-def factories(env_id: str, count: int, folder: Path) -> dict[str, list[str]]:
+def demonstration_commands(env_id: str, count: int, folder: Path) -> dict[str, list[str]]:
     """The command of each side."""
     cores = str(len(os.sched_getaffinity(0)))
     ours = ["workbench.cli.main", "record", env_id, "--actions", "solve", "--successes", str(count)]
@@ -157,13 +157,13 @@ def factories(env_id: str, count: int, folder: Path) -> dict[str, list[str]]:
     return {"solve": ours, "motion planning": theirs}
 
 
-def factory_table(options: Options, kept: list[Row]) -> Iterator[str]:
-    yield "| task | side | successes | wall, s | successes an hour | processor's seconds a success |"
+def demonstration_table(options: Options, kept: list[Row]) -> Iterator[str]:
+    yield "| task | side | successes | wall, s | successes per hour | CPU seconds per success |"
     yield "|---|---|---|---|---|---|"
     for env_id in options.env_ids:
         rates: dict[str, float] = {}
         with tempfile.TemporaryDirectory() as folder:
-            for side, command in factories(env_id, options.demonstrations, Path(folder)).items():
+            for side, command in demonstration_commands(env_id, options.demonstrations, Path(folder)).items():
                 used, began = _children_seconds(), time.perf_counter()
                 environment = dict(os.environ)
                 if side != "solve" and options.packages is not None:
@@ -174,7 +174,7 @@ def factory_table(options: Options, kept: list[Row]) -> Iterator[str]:
                     cwd=ROOT,
                     env=environment,
                     stdout=subprocess.DEVNULL,
-                    timeout=_LONGEST,  # a process of theirs that crashes is waited for without end
+                    timeout=_TIMEOUT_SECONDS,  # their script waits forever for a crashed process
                 )
                 wall, processor = time.perf_counter() - began, _children_seconds() - used
                 count = sum(map(_successes, Path(folder).rglob("*.json")))
@@ -201,7 +201,7 @@ def _children_seconds() -> float:
 def main(options: Options) -> None:
     torch.set_num_threads(1)
     kept: list[Row] = []
-    for line in (factory_table if options.demonstrations else table)(options, kept):
+    for line in (demonstration_table if options.demonstrations else table)(options, kept):
         print(line, flush=True)
     if options.write:
         keep(kept)

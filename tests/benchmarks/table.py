@@ -2,8 +2,7 @@
 
     python -m tests.benchmarks.table          # writes the page from results.json
 
-A script of this folder that has rows in the table replaces them with ``--write``. ``test_generated.py`` fails where the page is not
-what is written here.
+A script in this folder replaces its rows with ``--write``. ``test_generated.py`` fails if the page does not match.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ RESULTS = Path(__file__).with_name("results.json")
 PAGE = ROOT / "web_assets" / "docs" / "reference" / "benchmarks.md"
 MAX_ROWS = 25
 _TIMES = ("s", "ms", "µs")
-"""Units of time, the first word of a unit."""
+"""First words of the units of time."""
 _HEAD = """\
 # How fast it is
 

@@ -1,16 +1,16 @@
-"""Every way to hang or kill the worker under an open page: does the page answer, and when is the task back?
+"""Every way to hang or kill the worker under an open page: latency of the page, and time until the task is back.
 
     python tests/benchmarks/unkillable.py [--num-envs 4] [--ways loop segfault ...] [--screenshot FILE] [--write]
 
-``workbench open`` on a task that misbehaves on demand (`tests/live/hazards.py`), a real Chromium before it, the
-spare worker warm. For each way the task is put into it by a single step; until it is back, a control of the page
-is used again and again (*next env*) and the time until the page shows the next env is taken, inside
-the page. What cannot be left by *Interrupt* is ended by *Restart*. *Back* is the time from the death of the
-process (or the click) until the page says that the last good version is back, or that it was interrupted.
+Runs ``workbench open`` on a task that misbehaves on demand (`tests/live/hazards.py`), in a real Chromium, with a warm
+spare worker. A single step triggers each way. Until the task is back, a control of the page (*next env*) is used
+repeatedly, and the time until the page shows the next env is measured inside the page. A worker that ignores *Interrupt*
+is ended by *Restart*. *Back* is the time from the death of the process (or the click) until the page says that the last
+good version is back, or that the task was interrupted.
 
-A round trip has two parts. The *answer* is the time from the message that leaves by the page's websocket until the
-changed value arrives there: the server, and the way to it. What remains is the browser's own: here it has no
-graphics card, and shares the cores with the server, the worker and this script.
+A round trip has two parts. The *answer* is the time from the message on the page's websocket until the changed value
+arrives there: server and network. The rest is the browser's own time; here it has no GPU, and shares the cores with the
+server, the worker and this script.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ HANGS = {"loop": "Interrupt", "slow": "Interrupt", "catch": "Restart", "native":
 DEATHS = ("exit", "segfault", "abort", "kill", "children", "memory")
 OTHERS = ("flood", "read")
 SOCKET_TIMES = """
-// viser's page has its websocket in a worker that it makes of a text: this is put before that text.
+// viser's page creates its websocket in a worker from source text; this code is prepended to that text.
 const inWorker = () => {
     const told = new BroadcastChannel('socket times'), now = () => performance.timeOrigin + performance.now();
     const Socket = self.WebSocket, post = self.postMessage.bind(self);
@@ -75,7 +75,7 @@ NEXT_ENV = """async () => {
     const end = performance.now();
     const sent = () => window.socketTimes.find((time) => time.sent > origin + start)?.sent;
     const arrived = () => window.socketTimes.find((time) => time.arrived > sent())?.arrived;
-    // They are told by a way of their own, which may be the longer one.
+    // The times arrive on a separate channel, which may be slower.
     while (!arrived() && performance.now() - end < 1000) await wait();
     return [end - start, arrived() ? arrived() - sent() : null];
 }"""
@@ -86,18 +86,18 @@ class Options:
     num_envs: int = 4
     ways: tuple[str, ...] = (*HANGS, *DEATHS, *OTHERS)
     screenshot: Path | None = None
-    """Where to leave a picture of the banner of the first way that hangs."""
+    """File for a screenshot of the banner of the first way that hangs."""
     write: bool = False
-    """Keep a row in the table of benchmarks."""
+    """Write a row of the table of benchmarks."""
 
 
 @dataclass(frozen=True)
 class Trip:
-    """One press, in ms."""
+    """Times of one press, in ms."""
 
     whole: float
     answer: float | None
-    """The part between the page's websocket and the server; None where it was not seen."""
+    """The part between the page's websocket and the server; None if it was not observed."""
 
 
 @dataclass
@@ -116,11 +116,11 @@ class Desk:
     def click(self, name: str) -> None:
         self.page.get_by_role("button", name=name, exact=True).click()
 
-    def poke_until(self, reached: Callable[[], bool], trips: list[Trip], patience: float = 90.0) -> float:
-        """Use the control until `reached`; the seconds that it took."""
+    def poke_until(self, reached: Callable[[], bool], trips: list[Trip], timeout: float = 90.0) -> float:
+        """Use the control until `reached`; returns the seconds."""
         start = time.perf_counter()
         while not reached():
-            if time.perf_counter() - start > patience:
+            if time.perf_counter() - start > timeout:
                 raise TimeoutError(page_text(self.page)[:1000])
             trips.append(Trip(*self.page.evaluate(NEXT_ENV)))
             time.sleep(0.05)
@@ -128,44 +128,44 @@ class Desk:
 
 
 def page_text(page: Page) -> str:
-    """What can be seen; `Desk.says` also finds what stands on the other tabs."""
+    """The visible text; `Desk.says` also searches the other tabs."""
     return page.inner_text("body")
 
 
 def one_way(desk: Desk, way: str) -> tuple[str, float]:
-    """Provoke it and see it through; returns the line to print, and the seconds until the task was back."""
+    """Trigger one way and wait for the task; returns the line to print, and the seconds until the task was back."""
     desk.poke_until(lambda: desk.says("the spare worker") and not desk.says("being warmed up"), [], 180.0)
     worker, trips = desk.workers()[0], []
     usage = desk.server.cpu_times()
     provoke(desk.file, "evaluate", way)
     desk.click("Step")
-    said = ""
+    outcome = ""
     if way in HANGS:
         busy = desk.poke_until(lambda: desk.says("has been in evaluate for"), trips)
-        said = f"busy banner after {busy:.1f} s; "
+        outcome = f"busy banner after {busy:.1f} s; "
         if desk.options.screenshot is not None and way == "loop":
             time.sleep(3.0)
             desk.page.screenshot(path=desk.options.screenshot, type="jpeg", quality=82)
         desk.click("Interrupt")
         if HANGS[way] == "Restart":
             deaf = desk.poke_until(lambda: desk.says("was interrupted and continues"), trips)
-            said += f"deaf after {deaf:.1f} s; "
+            outcome += f"deaf after {deaf:.1f} s; "
             calm(desk.file)
             desk.click("Restart")
             back = desk.poke_until(lambda: desk.says("is restored where it was"), trips)
         else:
             back = desk.poke_until(lambda: desk.says("was interrupted in evaluate"), trips)
-        said += f"{HANGS[way]}"
+        outcome += f"{HANGS[way]}"
     elif way in DEATHS:
         dying = desk.poke_until(lambda: not worker.is_running() or worker.status() == "zombie", trips)
-        said = f"dead after {dying:.1f} s"
+        outcome = f"dead after {dying:.1f} s"
         calm(desk.file)
         back = desk.poke_until(lambda: desk.says("is restored where it was"), trips)
     else:
         word = "EOFError" if way == "read" else "came too fast to be kept"
         back = desk.poke_until(lambda: desk.says(word) and "busy" not in page_text(desk.page), trips)
         if way == "flood":
-            # It takes its provocation away when it ends, and would take the next one's.
+            # The task removes the provocation file when it ends, and would remove that of the next way.
             desk.poke_until(lambda: not provocation(desk.file).exists(), trips)
     calm(desk.file)
     now = desk.server.cpu_times()
@@ -174,7 +174,7 @@ def one_way(desk: Desk, way: str) -> tuple[str, float]:
     desk.click("Step")
     time.sleep(1.0)
     line = (
-        f"| {way} | {said} | {back:.2f} | {median_and_worst([trip.whole for trip in trips])} "
+        f"| {way} | {outcome} | {back:.2f} | {median_and_worst([trip.whole for trip in trips])} "
         f"| {median_and_worst([trip.answer for trip in trips if trip.answer is not None])} "
         f"| {len(trips)} | {cpu:.1f} | {memory:.0f} |"
     )

@@ -1,4 +1,4 @@
-"""The example task, opened once for several files: a server, a worker and its first picture take a core for twenty seconds."""
+"""The example task, opened once for several files: server, worker and first picture take a core for twenty seconds."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ def _desk(opened: Opened, file: Path, browser: Browser, width: int, height: int)
         desk = Desk(page, errors, file, opened)
         desk.select_the_first_env()
         yield desk
-    # The next file begins with what this one began with.
+    # Restore the initial state for the next file.
     file.write_text(TASK.read_text())
 
 
 @pytest.fixture(scope="session")
 def example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[At]:
-    """A page of its own on the one server of a task with two envs; give it a browser and a size."""
+    """A function that opens a page, for a browser and a size, on the shared server of a task with two envs."""
     yield from _opened(tmp_path_factory, "--num-envs", "2")
 
 
 @pytest.fixture(scope="session")
 def example_without_pictures(tmp_path_factory: pytest.TempPathFactory) -> Iterator[At]:
-    """As `example`, with three envs and nothing that draws them."""
+    """As `example`, with three envs and without a renderer."""
     yield from _opened(tmp_path_factory, "--num-envs", "3", "--env", "render_backend=none")

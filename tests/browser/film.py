@@ -1,4 +1,4 @@
-"""The moving picture of README: what a person does in front of the page, in twenty seconds."""
+"""The animation of README: a user at work on the page, in twenty seconds."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from tests.browser.take_screenshots import Desk
 
 SIZE = (960, 540)
-"""Of the page in the film, which it is taken at 1280 x 720 for."""
+"""Size of the page in the film, in pixels; it is taken at 1280 x 720."""
 STRIP = 64
-"""Pixels below it, for what happens."""
-MOST_BYTES = 3_000_000
+"""Height in pixels of the caption strip below the page."""
+MAX_BYTES = 3_000_000
 QUALITIES = (80, 70, 60, 50, 40)
 REWARD = ("reach = 1 - torch.tanh(5 * distance)", "reach = 1 - torch.tanh(3 * distance)")
 
@@ -39,7 +39,7 @@ class Film:
         then: Callable[[int], None] = lambda frame: None,
         code: tuple[str, str] | None = None,
     ) -> None:
-        """Take some frames, shown over these seconds; `then` is done after each, with its number."""
+        """Take `frames` frames that are shown for `seconds` in all; call `then` with the number of each."""
         for number in range(frames):
             shot = Image.open(BytesIO(self.desk.page.screenshot())).convert("RGB")
             self.frames.append(with_caption(shot.resize(SIZE, Image.Resampling.LANCZOS), says, code))
@@ -47,13 +47,13 @@ class Film:
             then(number)
 
     def save(self, path: Path) -> None:
-        """As an animated WebP, as good as fits."""
+        """Save an animated WebP of the best quality below `MAX_BYTES`."""
         for quality in QUALITIES:
             self.frames[0].save(
                 path, save_all=True, append_images=self.frames[1:], duration=self.milliseconds, loop=0, quality=quality, method=5,
             )  # fmt: skip
             size = path.stat().st_size
-            if size < MOST_BYTES:
+            if size < MAX_BYTES:
                 seconds = sum(self.milliseconds) / 1000
                 print(
                     f"{path}: {len(self.frames)} frames, {seconds:.1f} s, {size / 1e6:.2f} MB, quality {quality}"
@@ -75,7 +75,7 @@ def with_caption(picture: Image.Image, says: str, code: tuple[str, str] | None) 
 
 
 def take_film(desk: Desk, path: Path) -> None:
-    """The page plays with a policy that is careless in every fifth env."""
+    """The page plays a policy that overshoots in every fifth env."""
     film, page = Film(desk), desk.page
     desk.tab("Reward")
     desk.press("Space")

@@ -1,7 +1,7 @@
-"""Takes the pictures of the gallery, one of each example: .venv/bin/python tests/browser/gallery_pictures.py [NAME ...]
+"""Takes the gallery's pictures, one per example: .venv/bin/python tests/browser/gallery_pictures.py [NAME ...]
 
 Not a test. It opens each example on the real page and writes ``web_assets/screenshots/dark/gallery_NAME.webp`` and
-``light/``. Names choose among `VIEWS`; without one, all are taken, in some fifteen minutes.
+``light/``. Names select from `VIEWS`; without any, all are taken, in about fifteen minutes.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.take_screenshots import POLICY, Desk, as_a_new_person, picture_of
+from tests.browser.take_screenshots import POLICY, Desk, picture_of, with_empty_settings
 from tests.drive.page import browser_at, close_notice, new_page, open_workbench
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 ROOT = Path(__file__).parents[2]
 SOLVERS = ROOT / "tests" / "tasks" / "solvers.py"
 SIZE = (1120, 780)
-"""Of the page, whose timeline is cut off; help pages show the picture a little smaller."""
+"""Size of the page in pixels; its timeline is cut off. Help pages show the picture a little smaller."""
 MIDDLE = (390, 250)
-"""Of the view above the timeline, in pixels."""
+"""Middle of the view above the timeline, in pixels."""
 QUALITY = 70
 HAND = ("--env", "control_mode=pd_ee_delta_pos")
 
@@ -41,22 +41,22 @@ class View:
     envs: int = 16
     steps: int = 20
     policy: str = ""
-    """A function of `SOLVERS` or `POLICY`, as the page lists it; random actions without one."""
+    """A function in `SOLVERS` or `POLICY`, as the page lists it; empty for random actions."""
     arguments: tuple[str, ...] = ()
     keys: tuple[str, ...] = ()
-    """Pressed at the end."""
+    """Keys to press at the end."""
     turned: tuple[int, int] = (0, 0)
-    """Pixels that the view is dragged by, to be seen from another side."""
+    """Pixels by which the view is dragged, to rotate it."""
     nearer: int = 0
     """Notches of the mouse wheel."""
     show: str = ""
-    """What the Inspect tab shows."""
+    """The Inspect tab's choice."""
     all_cameras: bool = False
-    """Whether each is drawn, on the Cameras tab and in the view."""
+    """Draw every camera, on the Cameras tab and in the view."""
 
 
 ONE = ("o", "f")
-"""Shows one env, and frames it."""
+"""Keys that show one env and frame it."""
 VIEWS: dict[str, View] = {
     "minimal": View("Run"),
     "push_cube": View("Reward", 4, 13, "pusher.py:act", HAND, ONE, (-220, 0), 3),
@@ -111,7 +111,7 @@ def take(browser: Browser, name: str, view: View) -> None:
 
 
 def turn(page: Page, view: View) -> None:
-    """Drag the view, and turn the wheel over it."""
+    """Rotate the view by a drag and zoom it with the wheel."""
     x, y = MIDDLE
     page.mouse.move(x, y)
     if view.turned != (0, 0):
@@ -146,7 +146,7 @@ def main(names: list[str]) -> None:
     unknown = set(names) - VIEWS.keys()
     if unknown:
         sys.exit(f"no such picture: {', '.join(sorted(unknown))}; there are {', '.join(VIEWS)}")
-    as_a_new_person()
+    with_empty_settings()
     for name, view in VIEWS.items():
         if not names or name in names:
             with browser_at(chromium) as browser:

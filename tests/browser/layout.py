@@ -1,4 +1,4 @@
-"""Finds what a person would call badly laid out: text that is cut or covered, buttons that touch."""
+"""Finds layout defects: text that is cut off or covered, buttons that touch."""
 
 FAULTS = r"""() => {
     const faults = new Set();
@@ -99,4 +99,4 @@ FAULTS = r"""() => {
     });
     return [...faults].sort();
 }"""
-"""JavaScript: a line for each fault that is seen on the page now."""
+"""JavaScript that returns a line for each layout defect on the page."""

@@ -1,4 +1,4 @@
-"""A policy for screenshots: pushes push_cube's cube to its goal, and in every fifth env past it.
+"""A policy for screenshots: pushes push_cube's cube to its goal, in every fifth env past it.
 
 For ``obs_mode="state"`` and ``control_mode="pd_ee_delta_pos"``, where one unit of an action is 0.1 m.
 """

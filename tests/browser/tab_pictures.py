@@ -1,14 +1,14 @@
-"""Takes pictures of every tab of both pages, and compares those of two versions.
+"""Takes pictures of every tab of both pages and compares those of two versions.
 
     git worktree add /tmp/old COMMIT
     PYTHONPATH=/tmp/old .venv/bin/python /tmp/old/tests/browser/tab_pictures.py take /tmp/before
     .venv/bin/python tests/browser/tab_pictures.py take /tmp/after
     .venv/bin/python tests/browser/tab_pictures.py compare /tmp/before /tmp/after --out /tmp/differences
 
-One after the other: both show the golden task and the golden recordings (tests/golden), in the same place, with the same seed and steps; beside
-each picture is the text of the page. Numbers that no two runs share (times, rates, memory) are written over with dots before a picture is
-taken. The comparison prints the share of pixels that are another colour and the lines of text that came and went, leaves in --out a picture of
-both and of where they differ, and exits with 1 where a picture differs by more than --share, or is in one folder alone.
+Run them one after the other: both show the golden task and recordings (tests/golden), in the same folder, with the same seed and steps. The
+page's text is saved with each picture. Numbers that differ between runs (times, rates, memory) are replaced by dots first. The comparison prints
+the share of pixels of another colour and the lines of text that were added or removed, writes pictures of both and of the differences to --out,
+and exits with 1 if a picture differs by more than --share or is in one folder only.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ LIVE_TABS = ("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Check
 REVIEW_TABS = ("Review", "Cameras", "Curves", "Compare", "Rescore", "Share")
 STEPS = 6
 WIDTH, HEIGHT = 1280, 1000
-PATIENCE = 60.0
-ANOTHER_COLOUR = 24
-"""Of 255, in any channel: less is the smoothing of a letter's edge."""
-MOST = 0.002
-"""Share of a picture's pixels; two runs of one version differ by less."""
+SETTLE_TIMEOUT_SECONDS = 60.0
+MIN_COLOUR_DIFFERENCE = 24
+"""Out of 255, in any channel; smaller differences are antialiasing."""
+MAX_SHARE = 0.002
+"""Fraction of a picture's pixels; two runs of one version differ by less."""
 DOTS = r"""() => {
     const own = /\d+(\.\d+)?(?= ?(ms|s|MB|GB|steps? a second|Hz|fps)\b)|\d\d:\d\d(:\d\d)?/g;
     const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
@@ -94,7 +94,7 @@ def take_live(page: Page, folder: Path) -> None:
 
 def take_review(page: Page, folder: Path) -> None:
     rows = page.locator(".wb-library").get_by_text(re.compile("/Golden"))
-    # The newest one is opened, and the library folded for it where the width of the page is known by then.
+    # The newest recording opens, and folds the library if the width of the page is known by then.
     expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
     close_notice(page)
     page.wait_for_timeout(3000)
@@ -119,10 +119,10 @@ def tab(page: Page, name: str) -> None:
 
 
 def shoot(page: Page, folder: Path, name: str) -> None:
-    """As soon as two pictures running are the same: a browser that draws in software needs some seconds for a frame."""
-    page.mouse.move(2, HEIGHT - 2)  # over nothing that answers
+    """Save a picture once two in a row are equal: a software-rendering browser needs seconds for a frame."""
+    page.mouse.move(2, HEIGHT - 2)  # away from anything that reacts
     before = b""
-    for _ in until_late():
+    for _ in until_timeout():
         page.evaluate(DOTS)
         picture = page.screenshot(animations="disabled", caret="hide")
         if picture == before:
@@ -130,14 +130,14 @@ def shoot(page: Page, folder: Path, name: str) -> None:
         before = picture
         page.wait_for_timeout(1000)
     else:
-        print(f"{name} does not come to rest")
+        print(f"{name} keeps changing")
     Image.open(BytesIO(before)).convert("RGB").save(folder / f"{name}.png", optimize=True)
     (folder / f"{name}.txt").write_text(page.locator("body").inner_text() + "\n")
     print(folder / f"{name}.png", flush=True)
 
 
-def until_late() -> Iterator[None]:
-    end = time.monotonic() + PATIENCE
+def until_timeout() -> Iterator[None]:
+    end = time.monotonic() + SETTLE_TIMEOUT_SECONDS
     while time.monotonic() < end:
         yield
 
@@ -153,7 +153,7 @@ def compare(old: Path, new: Path, out: Path | None, share: float) -> int:
             failed = True
             continue
         before, after = (read_picture(folder / name) for folder in (old, new))
-        differs = where_another(before, after)
+        differs = differing_pixels(before, after)
         found = float(differs.mean())
         failed |= found > share
         print(f"{name:28} {found:8.3%}" + (f"  more than {share:.3%}" if found > share else ""))
@@ -170,13 +170,13 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
         return np.asarray(picture.convert("RGB"))
 
 
-def where_another(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(H, W) of the larger one; what only one of them has is another."""
+def differing_pixels(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(H, W) mask of differing pixels, of the larger size; pixels that only one picture has differ."""
     height, width = (max(before.shape[axis], after.shape[axis]) for axis in (0, 1))
     differs = np.ones((height, width), bool)
     h, w = (min(before.shape[axis], after.shape[axis]) for axis in (0, 1))
     apart = np.abs(before[:h, :w].astype(int) - after[:h, :w].astype(int)).max(axis=2)
-    differs[:h, :w] = apart > ANOTHER_COLOUR
+    differs[:h, :w] = apart > MIN_COLOUR_DIFFERENCE
     return differs
 
 
@@ -207,14 +207,16 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     taking = commands.add_parser("take", help="pictures and texts of every tab, into a folder")
     taking.add_argument(
-        "folder", type=Path, help="is made where it is not there; what is in it is written over"
+        "folder", type=Path, help="output folder; created if missing, existing pictures are overwritten"
     )
     comparing = commands.add_parser("compare", help="two such folders")
-    comparing.add_argument("old", type=Path, help="folder of the one version")
-    comparing.add_argument("new", type=Path, help="folder of the other")
-    comparing.add_argument("--out", type=Path, help="folder for pictures of both and of where they differ")
+    comparing.add_argument("old", type=Path, help="folder of the old version")
+    comparing.add_argument("new", type=Path, help="folder of the new version")
     comparing.add_argument(
-        "--share", type=float, default=MOST, help=f"of the pixels that may differ ({MOST})"
+        "--out", type=Path, help="folder for pictures of both versions and their differences"
+    )
+    comparing.add_argument(
+        "--share", type=float, default=MAX_SHARE, help=f"fraction of pixels that may differ ({MAX_SHARE})"
     )
     asked = parser.parse_args()
     if asked.command == "take":

@@ -1,7 +1,7 @@
 """Takes the pictures of README and the docs: .venv/bin/python tests/browser/take_screenshots.py [NAME ...]
 
 Not a test. It opens the real pages and writes ``web_assets/screenshots/dark/NAME.jpg`` and ``light/NAME.jpg``, all of one size,
-and ``demo.webp``, which moves (`film.py`). Names choose among `SHOTS`; without one, all are taken, in some ten minutes.
+and the animated ``demo.webp`` (`film.py`). Names select from `SHOTS`; without any, all are taken, in about ten minutes.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ OUT = ROOT / "web_assets" / "screenshots"
 TASK = ROOT / "tasks" / "push_cube.py"
 POLICY = Path(__file__).parent / "pusher.py"
 CONTROL = ("--env", "control_mode=pd_ee_delta_pos")
-"""What the policy is written for."""
+"""The control mode that the policy needs."""
 THEMES = ("dark", "light")
-MOST_EFFORT = {"jpg": {"optimize": True}, "webp": {"method": 6}}
-FRAME = 4.0
-"""Seconds that a browser that draws in software may need for a frame of the 3-D view."""
+BEST_COMPRESSION = {"jpg": {"optimize": True}, "webp": {"method": 6}}
+FRAME_SECONDS = 4.0
+"""Time that a software-rendering browser may need for a frame of the 3-D view."""
 
 
 @dataclass
 class Desk:
     page: Page
     file: Path
-    """The task: a copy of the example."""
+    """The task file, a copy of the example."""
     theme: Literal["dark", "light"] = "dark"
 
     def tab(self, name: str) -> None:
@@ -57,7 +57,7 @@ class Desk:
         self.page.get_by_role("button", name=name, exact=True).click()
 
     def press(self, *keys: str) -> None:
-        # An input that has the focus would take them.
+        # A focused input would take the keys.
         self.page.evaluate("document.activeElement?.blur()")
         for key in keys:
             self.page.keyboard.press(key)
@@ -67,13 +67,13 @@ class Desk:
         self.page.get_by_label(label, exact=True).locator("visible=true").first.select_option(label=option)
 
     def edit(self, old: str, new: str) -> None:
-        """Save the example with this change."""
+        """Save the example with `old` replaced by `new`."""
         text = TASK.read_text()
         assert old in text
         self.file.write_text(text.replace(old, new, 1))
 
     def step(self, steps: int) -> None:
-        """As many steps as this also on a busy machine; returns when the page shows the last."""
+        """Make exactly this many steps, also on a busy machine; return when the page shows the last."""
         self.press(*steps * ["s"])
         timeline = self.page.locator(".wb-timeline")
         shown = ""
@@ -93,16 +93,16 @@ class Desk:
         kind: Literal["jpg", "webp"] = "jpg",
         quality: int = 82,
     ) -> None:
-        """Write the picture of this name, dark and light."""
+        """Write the picture with this name, dark and light."""
         for theme in THEMES:
             self.wear(theme)
-            # Away from what would show a tooltip.
+            # Away from anything with a tooltip.
             self.page.mouse.move(400, 10)
-            time.sleep(FRAME)
+            time.sleep(FRAME_SECONDS)
             image = picture_of(self.page) if take is None else take(self.page)
             path = OUT / theme / f"{name}.{kind}"
             path.parent.mkdir(parents=True, exist_ok=True)
-            image.convert("RGB").save(path, quality=quality, **MOST_EFFORT[kind])
+            image.convert("RGB").save(path, quality=quality, **BEST_COMPRESSION[kind])
             print(path, flush=True)
         self.wear("dark")
 
@@ -115,7 +115,7 @@ def picture_of(page: Page) -> Image.Image:
 def live_page(
     browser: Browser, *arguments: str, task: str = "", name: str = TASK.name, checks: bool = False
 ) -> Iterator[Desk]:
-    """The page of a copy of the example, paused; `task` is another text, `name` another name of the file."""
+    """The page of a copy of the example, paused; `task` replaces the text and `name` the file name."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / name
         file.write_text(task or TASK.read_text())
@@ -133,7 +133,7 @@ def live_page(
 
 
 def take_policy(desk: Desk) -> None:
-    """The policy acts, which is careless in every fifth env."""
+    """Choose the policy, which overshoots in every fifth env."""
     desk.choose("Source", "policy")
     desk.choose("Known", f"{POLICY.name}:act")
     time.sleep(3)
@@ -143,7 +143,7 @@ def take_policy(desk: Desk) -> None:
 
 
 def shoot_page(browser: Browser) -> None:
-    """While it plays, the Run tab, the cameras, and a name that does not exist."""
+    """While the task plays: the Run tab, the cameras, and a misspelt name in the file."""
     with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
         desk.tab("Cameras")
         expect(desk.page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
@@ -167,7 +167,7 @@ def shoot_page(browser: Browser) -> None:
 
 
 def shoot_reload(browser: Browser) -> None:
-    """What the Run tab says of a patched and of a rebuilt version, side by side."""
+    """The Run tab after a patched and after a rebuilt version, side by side."""
     edits = {
         "patched in": ("return reward\n", "return reward + 1\n"),
         "rebuilt in": ('name="goal")', 'name="target")'),
@@ -181,12 +181,12 @@ def shoot_reload(browser: Browser) -> None:
             desk.page.get_by_role("button", name="Rebuild the scene", exact=True).scroll_into_view_if_needed()
             for theme in THEMES:
                 desk.wear(theme)
-                time.sleep(FRAME)
+                time.sleep(FRAME_SECONDS)
                 whole = picture_of(desk.page)
                 left = (desk.page.locator(".wb-status").bounding_box() or {"x": 0.0})["x"] - 10
                 taken[theme].append(whole.crop((int(left), 0, whole.width, whole.height)))
             desk.wear("dark")
-        # Beside the view as it is now, so that all pictures have one size.
+        # Next to the current view, so that all pictures have the same size.
         both = {
             theme: beside(whole_of, taken[theme])
             for theme, whole_of in ((t, picture_in(desk, t)) for t in THEMES)
@@ -196,7 +196,7 @@ def shoot_reload(browser: Browser) -> None:
 
 def picture_in(desk: Desk, theme: Literal["dark", "light"]) -> Image.Image:
     desk.wear(theme)
-    time.sleep(FRAME)
+    time.sleep(FRAME_SECONDS)
     return picture_of(desk.page)
 
 
@@ -211,7 +211,7 @@ def beside(whole: Image.Image, panels: list[Image.Image]) -> Image.Image:
 
 
 def shoot_envs(browser: Browser) -> None:
-    """The table of envs: a policy that is careless in every fifth env, and one env that loses a number."""
+    """The table of envs: a policy that overshoots in every fifth env, and one env with a NaN."""
     good, lost = '"cube_height": height', "(self.elapsed_steps >= 20) & (torch.arange(len(height)) == 11)"
     text = TASK.read_text()
     assert good in text
@@ -225,7 +225,7 @@ def shoot_envs(browser: Browser) -> None:
 
 
 def shoot_studio(browser: Browser) -> None:
-    """A camera is chosen, moved with keys, and the change is shown; then it is measured over its envs."""
+    """A camera is chosen and moved with keys, and the change is shown; then it is measured over the envs."""
     with live_page(browser, "--num-envs", "4") as desk:
         desk.tab("Studio")
         desk.choose("Camera", "base_camera · sensor")
@@ -238,7 +238,7 @@ def shoot_studio(browser: Browser) -> None:
 
 
 def shoot_measured_camera(browser: Browser) -> None:
-    """What a camera sees of all envs: the table, the depths, and the pictures."""
+    """A camera measured over all envs: the table, the depths, and the pictures."""
     with live_page(browser, "--num-envs", "16") as desk:
         desk.step(20)
         desk.tab("Studio")
@@ -256,7 +256,7 @@ def shoot_measured_camera(browser: Browser) -> None:
 
 
 def shoot_branch(browser: Browser) -> None:
-    """The selected env goes back some steps and on from there; then a moment of that branch is looked at."""
+    """The selected env goes back some steps and continues; then a moment of that branch is shown."""
     with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
         take_policy(desk)
         desk.step(40)
@@ -269,7 +269,7 @@ def shoot_branch(browser: Browser) -> None:
 
 
 def shoot_rescored(browser: Browser) -> None:
-    """A reward that asks for less is saved: what it says of the episodes so far, and one moment of them."""
+    """A more lenient reward is saved: how it changes past episodes, and one moment of them."""
     with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
         take_policy(desk)
         desk.step(70)
@@ -280,13 +280,13 @@ def shoot_rescored(browser: Browser) -> None:
         rows.nth(1).click()
         expect(rows.nth(1)).to_have_class("wb-selected")
         time.sleep(2.0)
-        # By script: it is drawn anew while it is scrolled to.
+        # By script: the element is redrawn while Playwright scrolls to it.
         desk.page.locator(".wb-again-more").evaluate("more => more.scrollIntoView({ block: 'nearest' })")
         desk.shoot("rescored")
 
 
 def shoot_checks(browser: Browser) -> None:
-    """A goal that is reached at the reset: the finding, why it matters, and how to mend it."""
+    """A goal that is reached at reset: the finding, why it matters, and how to fix it."""
     text, good = TASK.read_text(), "(distance < GOAL_RADIUS)"
     assert good in text
     text = text.replace(good, "(distance < 3 * GOAL_RADIUS)")
@@ -298,7 +298,7 @@ def shoot_checks(browser: Browser) -> None:
 
 
 def shoot_solve(browser: Browser) -> None:
-    """Some steps of a plan, paused: the rollouts, and what they earned."""
+    """Some steps of a plan, paused: the rollouts and their returns."""
     with live_page(browser, "--num-envs", "1", "--env", "control_mode=pd_ee_delta_pose") as desk:
         desk.choose("Source", "solve")
         for step in range(1, 4):
@@ -314,7 +314,7 @@ def shoot_solve(browser: Browser) -> None:
 
 
 def shoot_busy(browser: Browser) -> None:
-    """A loop that does not end, in the reward of a new version."""
+    """An infinite loop in the reward of a new version."""
     lines = TASK.read_text().splitlines()
     place = next(i for i, line in enumerate(lines) if line.strip().startswith("def compute_dense_reward"))
     while not lines[place].rstrip().endswith(":"):
@@ -332,7 +332,7 @@ def shoot_busy(browser: Browser) -> None:
 
 
 def record(file: Path, folder: Path, *arguments: str) -> None:
-    """Episodes of the policy, whose name a recording keeps as it is given here."""
+    """Record episodes of the policy; recordings store its name as given here."""
     shutil.copy(POLICY, file.parent)
     command = [sys.executable, "-m", "workbench.cli.main", "record", file.name]
     command += ["--actions", f"{POLICY.name}:act", "--out", str(folder), *CONTROL, *arguments]
@@ -354,8 +354,8 @@ def shoot_review(browser: Browser) -> None:
             expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
             close_notice(page)
             desk = Desk(page, file)
-            # The newest one has been opened, and the library folded where there is little room.
-            time.sleep(FRAME)
+            # The newest recording is open, and in a narrow page the library is folded.
+            time.sleep(FRAME_SECONDS)
             if not rows.first.is_visible():
                 desk.press("b")
             expect(rows).to_have_count(2)
@@ -399,18 +399,18 @@ def shoot_sweep(browser: Browser) -> None:
             expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
             close_notice(page)
             desk = Desk(page, file)
-            time.sleep(FRAME)
+            time.sleep(FRAME_SECONDS)
             desk.tab("Sweep")
             page.locator(".wb-sweep-scroll tr[data-do]").first.click()
             page.locator(".wb-sweep-episodes tr[data-do]").first.click()
-            time.sleep(FRAME)
+            time.sleep(FRAME_SECONDS)
             desk.press(*5 * ["ArrowRight"])
             desk.shoot("sweep")
             page.close()
 
 
 def shoot_tutorial(browser: Browser) -> None:
-    """What the reader of the tutorial sees: the live page after each step, then the recorded success."""
+    """The pictures of the tutorial: the live page after each step, then the recorded success."""
     with live_page(browser, "--num-envs", "8", task=text_after(1), name=FILE, checks=True) as desk:
         take_steps(desk)
     with tempfile.TemporaryDirectory() as place:
@@ -425,7 +425,7 @@ def shoot_tutorial(browser: Browser) -> None:
             expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
             close_notice(page)
             desk = Desk(page, folder / FILE)
-            time.sleep(FRAME)
+            time.sleep(FRAME_SECONDS)
             desk.press(*10 * ["ArrowRight"])
             desk.tab("Cameras")
             desk.shoot("tutorial_recorded", kind="webp")
@@ -447,11 +447,11 @@ SHOTS: dict[str, Callable[[Browser], None]] = {
     "sweep": shoot_sweep,
     "tutorial": shoot_tutorial,
 }
-"""``page`` takes run, cameras and banner too, ``review`` library and compare, ``tutorial`` all of its own."""
+"""``page`` also takes run, cameras and banner, ``review`` also library and compare, ``tutorial`` all of the tutorial."""
 
 
-def as_a_new_person() -> None:
-    """Neither is what this person trusts and has opened in the pictures, nor is it changed by what is pressed here."""
+def with_empty_settings() -> None:
+    """Use empty settings: the user's trusted files and recent tasks are neither shown nor changed."""
     for folder in ("XDG_CONFIG_HOME", "XDG_STATE_HOME"):
         os.environ[folder] = tempfile.mkdtemp(prefix="workbench-pictures-")
 
@@ -463,7 +463,7 @@ def main(names: list[str]) -> None:
     unknown = set(names) - {*SHOTS, "demo"}
     if unknown:
         sys.exit(f"no such picture: {', '.join(sorted(unknown))}; there are {', '.join(SHOTS)} and demo")
-    as_a_new_person()
+    with_empty_settings()
     for name, shot in SHOTS.items():
         if not names or name in names:
             with browser_at(chromium) as browser:

@@ -1,4 +1,4 @@
-"""Folds and the palette, by the keyboard alone."""
+"""Folds and the palette, operated with the keyboard only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
 def choose(page: Page, words: str) -> None:
-    """Type words into the palette and press Enter, once its first command has them all."""
+    """Type words into the palette and press Enter once its first command contains them all."""
     page.keyboard.press("Control+k")
     expect(page.get_by_placeholder("Search commands...")).to_be_focused()
     page.keyboard.type(words)
@@ -24,7 +24,7 @@ def choose(page: Page, words: str) -> None:
     expect(page.locator(".mantine-Spotlight-content")).to_be_hidden()
 
 
-def test_every_fold_is_reached_by_tab_and_opened_by_enter_and_space(example: At, browser: Browser) -> None:
+def test_every_fold_is_reached_by_tab_and_toggled_by_enter_and_space(example: At, browser: Browser) -> None:
     with example(browser) as desk:
         page = desk.page
         for tab in ("Run", "Checks"):
@@ -46,7 +46,7 @@ def test_every_fold_is_reached_by_tab_and_opened_by_enter_and_space(example: At,
                 expect(heading).to_have_attribute("aria-expanded", "false")
                 expect(heading).to_be_focused()
         expect(page.get_by_text("paused", exact=True)).to_be_visible()
-        # The page is drawn anew with it open: the focus stays where it was.
+        # The page is redrawn with the fold open: the focus stays.
         choose(page, "how the envs are made")
         heading = page.get_by_role("button", name="How the envs are made")
         expect(heading).to_be_focused()
@@ -77,7 +77,7 @@ def test_the_palette_finds_places_envs_cameras_and_control_modes(example: At, br
         expect(status).to_contain_text("pd_ee_delta_pose")
         choose(page, "pd_joint_delta_pos")
         expect(status).to_contain_text("pd_joint_delta_pos")
-        # Keys have the names that people use, also where they are looked for.
+        # The search also finds keys by their usual names.
         page.keyboard.press("Control+k")
         expect(page.get_by_placeholder("Search commands...")).to_be_focused()
         page.keyboard.type("left arrow")

@@ -1,4 +1,4 @@
-"""A camera judged, compared, searched and exported in a real Chromium, over real envs."""
+"""A camera measured, compared, searched and exported in a real Chromium, over real envs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FOLDERS = {
     "Suggest a placement": "Search",
     "Matrices and files": "Download",
 }
-"""And a button in each."""
+"""Report folders, and a button in each."""
 
 PLACES_OF_A_PILL = """
 window.places = [];
@@ -37,17 +37,17 @@ const look = () => {
 };
 look();
 """
-"""Frame by frame, from when there is one."""
+"""Records the button's place in every frame, from its first appearance."""
 
 
 @pytest.fixture(scope="module")
 def opened(example: At, browser: Browser) -> Iterator[Page]:
-    """The Studio tab on base_camera, with every folder that judges open."""
+    """The Studio tab on base_camera, with every report folder open."""
     with example(browser, height=900) as desk:
         page = desk.page
         desk.tab("Studio")
         page.get_by_label("Camera", exact=True).select_option(label=f"{CAMERA} · sensor")
-        # The first picture pushes the folders down: a click that is under way then falls beside its folder.
+        # The first picture moves the folders down, and a click in progress would miss its folder.
         expect(page.locator(PICTURE).first).to_be_visible(timeout=180_000)
         for folder, inside in FOLDERS.items():
             page.get_by_text(folder, exact=True).click()
@@ -64,18 +64,15 @@ def page(opened: Page) -> Page:
 
 
 def back_to_the_file(page: Page) -> None:
-    said = page.get_by_text(re.compile("^As in push_cube.py"))
+    status = page.get_by_text(re.compile("^As in push_cube.py"))
 
     def back() -> bool:
-        # What has just come is brought into sight: a press that is under way then falls beside its pill.
+        # A new part is scrolled into view, and a press in progress would miss its button.
         if "wb-off" not in tool(page, "Reset to file")["classes"]:
             press_tool(page, "Reset to file")
-        return said.is_visible()
+        return status.is_visible()
 
-    until(back, "the camera as the file has it")
-
-
-"""By how many pixels each scrollbar lies over the boxes that it scrolls."""
+    until(back, "the camera at the file's pose")
 
 
 def press(page: Page, name: str) -> None:
@@ -93,7 +90,7 @@ def shown_matrix(page: Page) -> np.ndarray:
     )
 
 
-def test_a_press_on_the_picture_tells_body_depth_and_point(page: Page) -> None:
+def test_a_press_on_the_picture_shows_body_depth_and_point(page: Page) -> None:
     pane = page.locator(".wb-pane")
     until(lambda: lies_over(pane, page.locator(PICTURE).first), "a pane as large as the picture")
     box = pane.bounding_box()
@@ -103,14 +100,14 @@ def test_a_press_on_the_picture_tells_body_depth_and_point(page: Page) -> None:
     text = page.locator(".wb-found").inner_text()
     point = np.array(re.findall(r"-?\d\.\d{4}", text), float)[1:]
     depth = float(re.findall(r"\d\.\d{4}", text)[0])
-    # The table's top is the env's z = 0, and this corner is at the lower left of what the camera sees.
+    # The table top is at the env's z = 0, and this corner is at the lower left of the picture.
     assert abs(point[2]) < 0.005
     x, y, z, one = shown_matrix(page) @ [*point, 1]
     assert one == 1 and abs(z - depth) < 1e-3 and x < 0 and y > 0
-    assert abs(x + y) < 0.02  # a square picture: as far to the left as down
+    assert abs(x + y) < 0.02  # a square picture: equally far left and down
 
 
-def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of_another(page: Page) -> None:
+def test_a_report_suggests_planes_and_is_outdated_once_they_are_used(page: Page) -> None:
     press(page, "Measure this camera")
     expect(page.get_by_text(f"{ENVS} envs now")).to_be_visible()
     row = page.locator(".wb-seen-table tbody tr").filter(has_text="cube")
@@ -128,7 +125,7 @@ def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of
     expect(page.get_by_text("measure again")).to_have_count(0)
 
 
-def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:
+def test_a_downloaded_calibration_places_the_camera_again(page: Page) -> None:
     with page.expect_download() as event:
         press(page, "Download")
     assert event.value.suggested_filename == f"{CAMERA}.json"
@@ -137,7 +134,7 @@ def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:
     json.loads(text)
     before = shown_matrix(page)
     moved = before.copy()
-    moved[2, 3] += 0.1  # world to camera, OpenCV: what is seen goes a decimetre away
+    moved[2, 3] += 0.1  # world to camera, OpenCV: the scene moves 0.1 m away
     field = page.get_by_label("Calibration")
     field.fill("\n".join(" ".join(map(str, row)) for row in moved))
     press(page, "Apply to the camera")
@@ -152,7 +149,7 @@ def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:
     until(lambda: bool(np.allclose(shown_matrix(page), before, atol=1e-5)), "our own file's pose")
 
 
-def test_placements_are_suggested_with_pictures_and_taken(page: Page) -> None:
+def test_placements_are_suggested_with_pictures_and_can_be_used(page: Page) -> None:
     before = shown_matrix(page)
     page.get_by_role("textbox", name="Resets").fill("1")
     page.keyboard.press("Enter")
@@ -162,9 +159,12 @@ def test_placements_are_suggested_with_pictures_and_taken(page: Page) -> None:
     expect(take.first).to_be_visible(timeout=180_000)
     page.wait_for_function("() => places.length >= 40")
     places = page.evaluate("places.slice(3)")
-    assert len(set(places)) == 1, "it is where it was first seen: a press under way does not miss it"
+    assert len(set(places)) == 1, "the button does not move, so a press in progress does not miss it"
     assert page.locator(".wb-offer img").count() == page.locator(".wb-offer").count() <= 5
     expect(page.locator(".wb-offer").first).to_contain_text(re.compile(r"cube: in (\d) of \1 envs"))
     take.first.click()
     expect(page.locator(".wb-offer").first).to_contain_text("in use")
-    until(lambda: not np.allclose(shown_matrix(page), before, atol=1e-3), "the camera where it was suggested")
+    until(
+        lambda: not np.allclose(shown_matrix(page), before, atol=1e-3),
+        "the camera at the suggested placement",
+    )

@@ -1,4 +1,4 @@
-"""The curves as a browser draws them: read from the pixels of the canvas."""
+"""The curves as a browser draws them, read from the canvas pixels."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def widest_gap(columns: NDArray[np.float64]) -> float:
 
 
 def whole(page: Page) -> bool:
-    """Whether the curve goes without a gap over the chart, but for the axis at its left."""
+    """Whether the curve spans the chart, except for the axis at the left, without a gap."""
     columns = drawn(page)
     return len(columns) > 1 and columns[0] < 0.3 and columns[-1] > 0.9 and widest_gap(columns) < 0.05
 
@@ -54,7 +54,7 @@ def whole(page: Page) -> bool:
 def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
     server: viser.ViserServer, browser: Browser
 ) -> None:
-    """It went blank, and stayed so: each new range or line moved the x axis, until none of the steps was on it."""
+    """The chart must not go blank because new ranges or lines move the x axis off all steps."""
     clock = Clock()
     panel = CurvesPanel(server)
     with page_at(browser, f"http://127.0.0.1:{server.get_port()}") as (page, errors):
@@ -63,7 +63,7 @@ def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
         def draw(curves: Curves, env: int = 0) -> None:
             clock.passes()
             panel.draw(running(ENVS, curves=curves, selected_env=env))
-            page.wait_for_timeout(1000 * CurvesPanel.every / 4)  # as fast as steps come while it plays
+            page.wait_for_timeout(1000 * CurvesPanel.every / 4)  # as fast as steps arrive while playing
 
         for last in range(40, 200, 20):
             draw(past(last))

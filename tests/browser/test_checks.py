@@ -1,4 +1,4 @@
-"""The checks in a real Chromium: a broken save is found with file and line, and mending it clears the list."""
+"""The checks in a real Chromium: a broken save is found with file and line, and a fix clears the list."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator
         yield Desk(page, errors, file, opened)
 
 
-def test_a_broken_save_is_found_with_its_line_and_mending_it_clears_the_list(desk: Desk) -> None:
+def test_a_broken_save_is_found_with_its_line_and_a_fix_clears_the_list(desk: Desk) -> None:
     page, text = desk.page, TASK.read_text()
     line = text[: text.index(GOOD)].count("\n") + 1
     page.get_by_role("tab", name="Run").click()
@@ -44,7 +44,7 @@ def test_a_broken_save_is_found_with_its_line_and_mending_it_clears_the_list(des
     expect(link).to_have_attribute("href", re.compile(rf"push_cube\.py:{line}$"))
     card.get_by_text("Why, mend").click()
     expect(card.locator(".wb-check-page")).to_contain_text("Why")
-    # The fold stays while results come.
+    # The fold stays open while results arrive.
     expect(page.get_by_text(re.compile(r"^\d+ rules checked in "))).to_be_visible(timeout=180_000)
     expect(card.locator(".wb-check-page")).to_be_visible()
     desk.file.write_text(text)
@@ -76,8 +76,8 @@ def test_rules_whose_checks_fail_are_shown_and_all_others_are_checked(
     arguments = ("--num-envs", "2", "--env", "render_backend=none", "--import", "breaks")
     with page_on(file, *arguments, browser=browser, checks=True) as (page, errors, _):
         page.get_by_role("tab", name=re.compile("^Checks")).click()
-        told = page.get_by_text(re.compile(r"^\d+ rules checked in "))
-        expect(told).to_be_visible(timeout=240_000)
+        summary = page.get_by_text(re.compile(r"^\d+ rules checked in "))
+        expect(summary).to_be_visible(timeout=240_000)
         for rule, why in (("versioned-id", "our own mistake"), ("entry-name", "SIGKILL")):
             card = page.locator(f"[data-rule={rule}]")
             expect(card).to_contain_text(why)

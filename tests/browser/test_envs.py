@@ -1,4 +1,4 @@
-"""The table of envs and the inspectors in a real Chromium, used as a person uses them."""
+"""The table of envs and the inspectors in a real Chromium, used as by a user."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ ENVS = 6
 
 @pytest.fixture(scope="module")
 def page(task_file: Path, browser: Browser) -> Iterator[Page]:
-    # Env 4 says from its fifth step on that it knows no height; nothing else of the task asks for it.
+    # From its fifth step env 4 reports NaN for `height`, which nothing else in the task uses.
     good, lost = '"cube_height": height', "(self.elapsed_steps >= 5) & (torch.arange(len(height)) == 4)"
     text = task_file.read_text()
     assert text.count(good) == 1
     task_file.write_text(text.replace(good, f"{good}.masked_fill({lost}, torch.nan)"))
-    # Without pictures there are no shaders to wait for.
+    # Without pictures there are no shaders to compile.
     arguments = ("--num-envs", str(ENVS), "--env", "render_backend=none")
     with page_on(task_file, *arguments, browser=browser) as (page, errors, _):
         assert envs(page) == []
@@ -37,7 +37,7 @@ def page(task_file: Path, browser: Browser) -> Iterator[Page]:
 
 
 def press(page: Page, selector: str) -> None:
-    """With the mouse, where it is now: while envs play, the rows are replaced as one looks."""
+    """Click at the element's current place: while envs play, the rows are replaced all the time."""
     at = page.evaluate(
         """s => {
             const element = document.querySelector(s);
@@ -76,7 +76,7 @@ def play_until_step(page: Page, steps: int) -> None:
     expect(page.get_by_text("paused", exact=True)).to_be_visible()
 
 
-def test_a_row_is_pressed_and_its_env_selected_also_while_the_envs_play(page: Page) -> None:
+def test_a_press_on_a_row_selects_its_env_also_while_playing(page: Page) -> None:
     open_tab(page, "Run")
     page.get_by_role("button", name="Play", exact=True).click()
     for env in (3, 1, 5):
@@ -86,7 +86,7 @@ def test_a_row_is_pressed_and_its_env_selected_also_while_the_envs_play(page: Pa
     page.get_by_role("button", name="Pause", exact=True).click()
 
 
-def test_an_odd_env_is_flagged_with_its_reason_and_found_by_the_filter(page: Page) -> None:
+def test_an_outlier_env_is_flagged_with_its_reason_and_found_by_the_filter(page: Page) -> None:
     until(lambda: "flagged 1" in page.locator(".wb-envs .wb-pills").first.inner_text(), "the flag")
     press(page, ".wb-envs .wb-pills span:nth-child(4)")
     until(lambda: envs(page) == [4], "the filter")
@@ -117,7 +117,7 @@ def test_a_pose_is_copied(page: Page) -> None:
 
 
 def columns(page: Page) -> list[str]:
-    """Those that are seen."""
+    """The visible columns."""
     return page.evaluate(
         "() => [...document.querySelector('.wb-env-table').tHead.rows[0].cells].filter(c => c.offsetWidth).map(c => c.textContent.trim())"
     )
@@ -130,7 +130,7 @@ def overhang(page: Page) -> float:
     )
 
 
-def test_the_view_keeps_half_of_the_page_and_columns_that_find_no_room_are_named(page: Page) -> None:
+def test_the_view_keeps_half_of_the_page_and_omitted_columns_are_named(page: Page) -> None:
     view = page.evaluate("() => document.querySelector('canvas[data-engine]').getBoundingClientRect().width")
     assert view >= 1280 / 2 - 10
     assert overhang(page) < 1

@@ -1,4 +1,4 @@
-"""Whatever on the page says that it can be pressed does something when it is pressed."""
+"""Every part of the page that looks pressable does something when pressed."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ WebSocket.prototype.send = function (text) {
 };
 """
 LEAVES = "show_recordings", "show_live", "continue_live", "toggle_timeline", "open_task_list"
-"""What shows another page or a dialog, or folds what is to be pressed, is not pressed."""
+"""Commands that show another page or a dialog, or fold the timeline; their parts are not pressed."""
 PRESSED = "[data-do]" + "".join(f":not([data-do*={name}])" for name in LEAVES) + ", [data-copy]"
-MOST = 150
+MAX_PRESSES = 150
 TRIES = 5
 LIVE = ("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Checks", "Log")
 REVIEW = ("Review", "Cameras", "Share")
@@ -43,7 +43,7 @@ class Board:
     pressed: set[str]
 
     def unfold_all(self) -> None:
-        """Folds are opened by their headings."""
+        """Open every fold by its heading."""
         for name in (
             "How the envs are made",
             "Keys",
@@ -57,8 +57,8 @@ class Board:
                 heading.first.click()
                 self.page.wait_for_timeout(300)
 
-    def next_one(self) -> tuple[str, Locator] | None:
-        """A part that is seen and was not pressed yet."""
+    def next_part(self) -> tuple[str, Locator] | None:
+        """A visible part that was not pressed yet."""
         for part in self.page.locator(PRESSED).all():
             if not part.is_visible():
                 continue
@@ -77,10 +77,10 @@ class Board:
             expect(dialog).to_have_count(0)
 
     def press(self, part: Locator) -> bool:
-        """Whether the server was asked for something, or a text was copied."""
+        """Press the part; return whether a command was sent or a text copied."""
         self.close_dialog()
         before = self.page.evaluate("asked")
-        # Playwright's own would wait for a picture to be stable, which is drawn anew while it waits.
+        # Playwright's own click would wait for the picture to be stable, and it is redrawn all the time.
         part.evaluate("p => p.scrollIntoView({block: 'center'})")
         box = part.bounding_box()
         if box is None:
@@ -93,19 +93,19 @@ class Board:
         return False
 
     def press_all(self, where: str) -> list[str]:
-        """What was pressed and did nothing, as text."""
+        """Press every part; return the texts of those that did nothing."""
         dead: list[str] = []
-        for _ in range(MOST):
-            found = self.next_one()
+        for _ in range(MAX_PRESSES):
+            found = self.next_part()
             if found is None:
                 return dead
             key, part = found
             what = part.inner_text()[:40]
-            # Again: what is drawn anew at that moment moves away from under the mouse.
+            # Try again: a part that is redrawn at that moment moves away from under the mouse.
             if not any(self.press(part) or not part.is_visible() for _ in range(TRIES)):
                 dead.append(f"{where}: {what!r} ({key[:60]})")
             self.close_dialog()
-        raise AssertionError(f"{where} has no end of parts to press")
+        raise AssertionError(f"{where} there are always more parts to press")
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def board(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterato
         page.close()
 
 
-def test_the_envs_are_made_again_as_the_task_makes_them(board: Board) -> None:
+def test_the_envs_are_rebuilt_with_the_tasks_own_options(board: Board) -> None:
     page = board.page
     status = page.locator(".wb-status")
     expect(status).to_contain_text("pd_joint_pos")

@@ -19,7 +19,7 @@ from tests.drive.waiting import until
 
 pytestmark = pytest.mark.slow
 PICTURES = Path(__file__).parents[2] / "test-results" / "firefox"
-"""A picture of each tab, to be looked at."""
+"""A picture of each tab, for visual inspection."""
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_it_plays(page: Firefox) -> None:
 
 
 @pytest.mark.parametrize("tab", LIVE_TABS)
-def test_each_tab_is_opened_and_nothing_is_cut_or_covered(page: Firefox, tab: str) -> None:
+def test_each_tab_opens_and_nothing_is_cut_off_or_covered(page: Firefox, tab: str) -> None:
     page.click("[role=tab]", tab)
     active = (
         "document.querySelector('[data-dock-region=right] [role=tab][aria-selected=true]').innerText.trim()"
@@ -85,7 +85,7 @@ def test_each_tab_is_opened_and_nothing_is_cut_or_covered(page: Firefox, tab: st
     assert view.std() > 10 and panel.std() > 4, "the view and the tab are drawn"
 
 
-def test_inputs_are_written_as_their_labels(page: Firefox) -> None:
+def test_inputs_use_the_font_of_their_labels(page: Firefox) -> None:
     page.click("[role=tab]", "Run")
     fonts = page.evaluate(
         "[...document.querySelectorAll('[data-dock-region=right] .wb-field > :is(span, input[type=text], select)')]"
@@ -94,9 +94,9 @@ def test_inputs_are_written_as_their_labels(page: Firefox) -> None:
     assert len(fonts) > 8 and len(set(fonts)) == 1, set(fonts)
 
 
-def test_the_console_tells_of_nothing_but_the_eval_that_is_forbidden(page: Firefox) -> None:
+def test_the_console_shows_only_the_blocked_eval(page: Firefox) -> None:
     page.text()
-    # viser's sorter of splats makes functions from text when the page is loaded (browser.js); Firefox tells of it even so.
+    # viser's splat sorter creates functions from text on page load (browser.js); Firefox reports it anyway.
     assert [
         said for said in page.errors if not re.search("blocked a JavaScript eval|blocked by CSP", said)
     ] == []

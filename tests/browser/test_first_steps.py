@@ -1,4 +1,4 @@
-"""What a newcomer meets in a real Chromium: hints, keys, curves that can be clicked, tabs that show something."""
+"""A new user's first steps in a real Chromium: hints, keys, clickable curves, tabs with content."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def opened(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
 
 @pytest.fixture
 def desk(opened: Desk) -> Desk:
-    """On the Run tab, at the first step of an episode."""
+    """The desk on the Run tab, at the first step of an episode."""
     opened.leave_inputs()
     opened.tab("Run")
     opened.press("End", "Shift+R")
@@ -36,11 +36,11 @@ def desk(opened: Desk) -> Desk:
 
 
 def charts(desk: Desk) -> Locator:
-    """Where curves are drawn, the reward's first."""
+    """The charts, the reward's first."""
     return desk.page.locator(".u-over:visible")
 
 
-def test_a_question_mark_lists_the_keys_which_rest_meanwhile(desk: Desk) -> None:
+def test_a_question_mark_lists_the_keys_and_disables_them_meanwhile(desk: Desk) -> None:
     listed = desk.page.get_by_role("dialog", name="Keys")
     desk.press("?")
     expect(listed.get_by_text("Play or pause")).to_be_visible()
@@ -60,7 +60,7 @@ def test_the_tooltip_of_a_button_names_its_key(desk: Desk) -> None:
     expect(desk.button("Play")).to_have_attribute("title", re.compile(re.escape("(Space)")))
 
 
-def test_a_field_gives_the_keys_back_and_so_does_a_click_on_the_view(desk: Desk) -> None:
+def test_keys_work_again_after_leaving_a_field_or_clicking_the_view(desk: Desk) -> None:
     def selected() -> str:
         found = re.search(r"env \d", desk.page.locator(".wb-timeline").inner_text())
         return "" if found is None else found[0]
@@ -70,7 +70,7 @@ def test_a_field_gives_the_keys_back_and_so_does_a_click_on_the_view(desk: Desk)
     seed.click()
     desk.press("Enter", "s")
     desk.timeline_says("step 1 /")
-    # Where another env lies, as clicks without a field show.
+    # Find a place where a click selects another env.
     places = [(view["x"] + view["width"] * x / 8, view["y"] + view["height"] * 0.35) for x in range(1, 8)]
     desk.page.keyboard.press("f")
     for place in places:

@@ -1,4 +1,4 @@
-"""From a recording into the live env, and recordings judged again, in a real Chromium."""
+"""From a recording into the live env, and rescoring of recordings, in a real Chromium."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from workbench.record.job_worker import RecordOptions
 from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.browser
-PATIENT = 120_000
+TIMEOUT_MS = 120_000
 
 
 @pytest.fixture(scope="module")
 def author(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A task file with an episode of it, whose reward was edited since."""
+    """A task file with a recorded episode, and an edit of its reward since."""
     folder = tmp_path_factory.mktemp("author")
     file = Path(shutil.copy(TASK, folder))
     options = TaskOptions(1, "cpu", 5, {"render_backend": "none"})
@@ -38,7 +38,7 @@ def author(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def address(author: Path) -> Iterator[str]:
-    """Of ``workbench review``, which ends with Ctrl-C's signal and leaves no folder of recorded text."""
+    """The address of ``workbench review``; it must exit on SIGINT and leave no folder of recorded code."""
     with open_workbench("recordings", cwd=author, what="review", env={"TMPDIR": str(author)}) as opened:
         yield opened.url
     assert opened.process.returncode == 0, "\n".join(opened.lines)
@@ -58,37 +58,37 @@ def timeline_width(page: Page) -> float:
 
 
 @pytest.mark.slow
-def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
+def test_a_recording_is_rescored_and_entered_with_todays_and_with_its_own_code(
     address: str, author: Path, browser: Browser
 ) -> None:
     with page_at(browser, address) as (page, errors):
         live = page.get_by_role("button", name="Continue live from here")
-        expect(live).to_be_visible(timeout=PATIENT)  # the newest recording is opened by itself
+        expect(live).to_be_visible(timeout=TIMEOUT_MS)  # the newest recording opens automatically
 
         page.get_by_role("tab", name="Rescore").click()
         expect(page.get_by_text(f"With {author / 'push_cube.py'} as it is now.")).to_be_visible()
         page.get_by_role("button", name="Rescore the open recordings").click()
-        expect(page.get_by_text("1 of 1 episode differs")).to_be_visible(timeout=PATIENT)
+        expect(page.get_by_text("1 of 1 episode differs")).to_be_visible(timeout=TIMEOUT_MS)
         page.get_by_text("reward by up to").click()
         expect(page.get_by_text("step 1 / 15").first).to_be_visible()
 
         page.get_by_role("tab", name="Review").click()
         page.keyboard.press("ArrowRight")
         expect(page.get_by_text("step 2 / 15").first).to_be_visible()
-        # The library is open beside it: there is little room for the timeline.
+        # The open library leaves little room for the timeline.
         until(lambda: timeline_width(page) < 500, "the narrow timeline")
         page.evaluate(COUNT_BODIES)
         live.click()
         expect(page.get_by_text("loading WorkbenchPushCube-v1 at step 2")).to_be_visible()
         expect(page.get_by_role("button", name="Stay here")).to_be_visible()
         changed = "changed since: compute_normalized_dense_reward"
-        told = page.get_by_text(
+        status = page.get_by_text(
             f"WorkbenchPushCube-v1, seed 5, step 2 ({changed}): its actions were replayed"
         )
-        expect(told).to_be_visible(timeout=PATIENT)
+        expect(status).to_be_visible(timeout=TIMEOUT_MS)
         assert page.evaluate("window.fewest") > 5, "the view was empty for a while"
         until(lambda: timeline_width(page) > 700, "the wide timeline")
-        expect(told).to_contain_text("to the last bit")
+        expect(status).to_contain_text("to the last bit")
         expect(page.get_by_role("button", name="undo going live")).to_be_visible()
 
         page.get_by_role("tab", name="Episodes").click()
@@ -96,7 +96,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         page.get_by_text("Continue live", exact=True).click()
         page.get_by_label("Code", exact=True).locator("visible=true").select_option(label="as recorded")
         live.click()
-        told = page.get_by_text("seed 5 as it was recorded, step 2: its actions were replayed")
-        expect(told).to_be_visible(timeout=PATIENT)
+        status = page.get_by_text("seed 5 as it was recorded, step 2: its actions were replayed")
+        expect(status).to_be_visible(timeout=TIMEOUT_MS)
         assert list(author.glob("workbench-recorded-*/push_cube.py"))
         assert not [error for error in errors if "non-existent component" not in error]

@@ -1,4 +1,4 @@
-"""The documents in the browser: every page with its pictures, and the ways to them from the pages of the workbench."""
+"""The docs in the browser: every page with its pictures, and the links to them from the workbench."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def served(child_process: None) -> Iterator[GatedServer]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("theme", ["dark", "light"])
-def test_every_page_of_the_documents_opens_with_its_pictures(
+def test_every_page_of_the_docs_opens_with_its_pictures(
     served: GatedServer, browser: Browser, theme: str
 ) -> None:
     address = served.addresses("/help/")[0]
     with page_at(browser, address) as (page, errors):
-        address = address.partition("?")[0]  # the token is a cookie by now
+        address = address.partition("?")[0]  # the token is now a cookie
         page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
         listed = [topic for topic in help_pages.topics() if topic.group != help_pages.RULE_PAGES]
         entries = page.locator("nav li a")
@@ -57,7 +57,7 @@ def test_every_page_of_the_documents_opens_with_its_pictures(
 
 
 @pytest.mark.slow
-def test_a_link_to_a_part_of_a_page_shows_that_part(served: GatedServer, browser: Browser) -> None:
+def test_a_link_to_a_section_shows_that_section(served: GatedServer, browser: Browser) -> None:
     with page_at(browser, served.addresses("/help/tasks")[0]) as (page, errors):
         page.get_by_role("link", name="rules", exact=True).click()
         page.wait_for_url("**/help/batched_env#what-goes-wrong-on-a-gpu-goes-wrong-here")
@@ -68,7 +68,7 @@ def test_a_link_to_a_part_of_a_page_shows_that_part(served: GatedServer, browser
 
 
 @pytest.mark.slow
-def test_help_opens_the_documents_from_both_pages(example_without_pictures: At, browser: Browser) -> None:
+def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, browser: Browser) -> None:
     with example_without_pictures(browser) as desk:
 
         def leads_to_help(press: str) -> None:

@@ -1,4 +1,4 @@
-"""The page's input: presses, keys and fields become commands, each once and in the order in which they were done."""
+"""The page's input: presses, keys and fields become commands, each once and in order."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from workbench.page.widgets.visitors import PATH, Visitor, Visitors
 
 pytestmark = pytest.mark.browser
 ROWS = 12
-DELAY = 0.2
-"""Seconds each way, over the far line."""
-MOST_SEED = 99
+DELAY_SECONDS = 0.2
+"""One-way delay of the far line, in seconds."""
+MAX_SEED = 99
 
 
 def part(command: Command, text: str, **more: str) -> str:
-    """Something that can be pressed."""
+    """HTML of a pressable part."""
     data = "".join(f" data-{name}='{value}'" for name, value in more.items())
     return f"<div data-do='{asks(command)}'{data} tabindex='0' role='button' style='height:24px'>{text}</div>"
 
 
 @dataclass
-class Small:
-    """A small page: rows that are redrawn all the time, a seed, a strip, a picture; and what it asked for."""
+class SmallPage:
+    """A small page with constantly redrawn rows, a seed, a strip and a picture; and the commands that it sent."""
 
     gated_server: GatedServer
     page: Page
@@ -52,16 +52,16 @@ class Small:
     came: list[Command] = field(default_factory=list)
     seed: int = 7
     swapped: bool = False
-    """The rows stand in another order."""
+    """Whether the rows are in another order."""
     still: bool = False
-    """They are not redrawn."""
+    """Whether the rows are not redrawn."""
     drawn_pause: bool = False
-    """What the page is told of the tick *Pause*."""
+    """The value that the page gets for the *Pause* checkbox."""
 
     def do(self, command: Command, visitor: Visitor) -> None:
         if isinstance(command, SetSeed):
-            if command.seed > MOST_SEED:
-                raise Refused(f"The seed goes up to {MOST_SEED}.")
+            if command.seed > MAX_SEED:
+                raise Refused(f"The seed goes up to {MAX_SEED}.")
             self.seed = command.seed
         self.came.append(command)
 
@@ -74,7 +74,7 @@ class Small:
 
 
 @pytest.fixture(scope="module")
-def opened(browser: Browser) -> Iterator[Small]:
+def opened(browser: Browser) -> Iterator[SmallPage]:
     gated_server = open_server(ServerOptions(port=0))
     server, visitors = gated_server.server, Visitors(gated_server.server, COMMANDS)
     gated_server.add_channel(PATH, visitors.serve)
@@ -87,8 +87,11 @@ def opened(browser: Browser) -> Iterator[Small]:
     rows = server.gui.add_html("")
     register(server, visitors, {Step, ResetAll, TogglePlay, FrameScene}, "live page")
     ending = threading.Event()
-    with line_to(gated_server.url, delay=DELAY) as far, page_at(browser, gated_server.url) as (page, errors):
-        small = Small(gated_server, page, far)
+    with (
+        line_to(gated_server.url, delay=DELAY_SECONDS) as far,
+        page_at(browser, gated_server.url) as (page, errors),
+    ):
+        small = SmallPage(gated_server, page, far)
         visitors.do = small.do
 
         def draw() -> None:
@@ -115,7 +118,7 @@ def opened(browser: Browser) -> Iterator[Small]:
 
 
 @pytest.fixture
-def small(opened: Small) -> Small:
+def small(opened: SmallPage) -> SmallPage:
     opened.seed, opened.swapped, opened.still, opened.drawn_pause = 7, False, False, False
     expect(opened.page.get_by_label("Seed")).to_have_value("7")
     opened.page.evaluate("document.activeElement.blur()")
@@ -126,7 +129,7 @@ def small(opened: Small) -> Small:
 def press_for_a_while(page: Page, x: float, y: float) -> None:
     page.mouse.move(x, y)
     page.mouse.down()
-    page.wait_for_timeout(50)  # a finger's press, in which the row is drawn anew three times
+    page.wait_for_timeout(50)  # duration of a press, during which the row is redrawn three times
     page.mouse.up()
 
 
@@ -135,14 +138,14 @@ def middle_of(page: Page, selector: str) -> tuple[float, float]:
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
-def test_presses_on_rows_that_are_redrawn_count_once_each(small: Small) -> None:
+def test_presses_on_redrawn_rows_count_once_each(small: SmallPage) -> None:
     wanted = [(7 * k) % ROWS for k in range(20)]
     for env in wanted:
         press_for_a_while(small.page, *middle_of(small.page, small.row(env)))
     small.has(*(SelectEnv(env=env) for env in wanted))
 
 
-def test_a_press_means_what_was_under_the_pointer_as_it_went_down(small: Small) -> None:
+def test_a_press_acts_on_the_part_under_the_pointer_at_mouse_down(small: SmallPage) -> None:
     small.page.mouse.move(*middle_of(small.page, small.row(2)))
     small.page.mouse.down()
     small.swapped = True
@@ -154,7 +157,7 @@ def test_a_press_means_what_was_under_the_pointer_as_it_went_down(small: Small) 
     small.has(SelectEnv(env=2))
 
 
-def test_a_press_that_is_drawn_off_its_part_does_nothing(small: Small) -> None:
+def test_a_press_that_is_dragged_off_its_part_does_nothing(small: SmallPage) -> None:
     x, y = middle_of(small.page, small.row(3))
     small.page.mouse.move(x, y)
     small.page.mouse.down()
@@ -164,12 +167,12 @@ def test_a_press_that_is_drawn_off_its_part_does_nothing(small: Small) -> None:
     small.has(Step())
 
 
-def test_what_is_typed_is_done_before_the_command_that_follows_it(browser: Browser, small: Small) -> None:
-    """Over a line that takes 200 ms each way."""
+def test_typed_input_is_committed_before_the_following_command(browser: Browser, small: SmallPage) -> None:
+    """Over a line with 200 ms delay each way."""
     small.came.clear()
     with page_at(browser, small.far.address(small.gated_server.url)) as (page, errors):
         page.set_default_timeout(120_000)
-        page.wait_for_selector("[data-page]", state="attached")  # until then viser may draw the panel anew
+        page.wait_for_selector("[data-page]", state="attached")  # until then viser may redraw the panel
         field = page.get_by_label("Seed")
         expect(field).to_have_value("7")
         for seed in (12, 34, 5):
@@ -182,15 +185,13 @@ def test_what_is_typed_is_done_before_the_command_that_follows_it(browser: Brows
         x, y = middle_of(page, small.row(1))
         press_for_a_while(page, x, y)
         until(lambda: len(small.came) == 8, "the press", seen=lambda: small.came)
-        assert small.came[6:] == [SetSeed(seed=8), SelectEnv(env=1)], (
-            "the press takes the focus from the field first"
-        )
+        assert small.came[6:] == [SetSeed(seed=8), SelectEnv(env=1)], "the press blurs the field first"
         assert not errors
 
 
 @pytest.mark.parametrize("typed", ["5000000000", "1.5", "NaN", "-1", "abc", "100", ""])
-def test_a_seed_that_is_none_is_refused_in_words_and_the_field_shows_what_holds(
-    small: Small, typed: str
+def test_an_invalid_seed_is_refused_with_a_reason_and_the_field_restored(
+    small: SmallPage, typed: str
 ) -> None:
     field = small.page.get_by_label("Seed")
     field.fill(typed)
@@ -201,17 +202,17 @@ def test_a_seed_that_is_none_is_refused_in_words_and_the_field_shows_what_holds(
     small.has(Step())
 
 
-def test_a_refusal_that_comes_late_leaves_what_is_typed_meanwhile(browser: Browser, small: Small) -> None:
+def test_a_late_refusal_keeps_what_was_typed_meanwhile(browser: Browser, small: SmallPage) -> None:
     small.came.clear()
     with page_at(browser, small.far.address(small.gated_server.url)) as (page, errors):
         page.set_default_timeout(120_000)
         page.wait_for_selector("[data-page]", state="attached")
         field = page.get_by_label("Seed")
-        field.fill(str(MOST_SEED + 1))
+        field.fill(str(MAX_SEED + 1))
         page.keyboard.press("Enter")
         field.fill("55")
         expect(page.locator(".mantine-Notification-root").filter(has_text="seed").last).to_be_visible()
-        page.wait_for_timeout(500)  # the reply comes beside the notification
+        page.wait_for_timeout(500)  # the reply arrives separately from the notification
         expect(field).to_have_value("55")
         page.keyboard.press("Enter")
         small.has(SetSeed(seed=55))
@@ -219,20 +220,20 @@ def test_a_refusal_that_comes_late_leaves_what_is_typed_meanwhile(browser: Brows
 
 
 @pytest.mark.parametrize("taken", [True, False])
-def test_what_was_entered_stays_until_it_is_drawn_and_goes_if_it_is_not(small: Small, taken: bool) -> None:
+def test_an_entered_value_stays_until_redrawn_and_reverts_if_it_is_not(small: SmallPage, taken: bool) -> None:
     box = small.page.get_by_label("Pause")
     expect(box).not_to_be_checked()
     box.click()
     small.has(PauseLog(on=True))
     for _ in range(8):
-        small.page.wait_for_timeout(50)  # the drawing may come that much later than the reply
+        small.page.wait_for_timeout(50)  # the redraw may be this much later than the reply
         assert box.is_checked()
     small.drawn_pause = taken
     small.page.wait_for_timeout(1500)
     assert box.is_checked() == taken
 
 
-def test_what_another_command_makes_of_an_entered_value_is_shown_as_soon_as_it_is_drawn(small: Small) -> None:
+def test_a_value_changed_by_another_command_is_shown_as_soon_as_it_is_drawn(small: SmallPage) -> None:
     field = small.page.get_by_label("Seed")
     drawn = small.page.locator("[data-shows*='seed']")
     field.fill("55")
@@ -243,7 +244,7 @@ def test_what_another_command_makes_of_an_entered_value_is_shown_as_soon_as_it_i
     assert field.input_value() == "66"
 
 
-def test_escape_leaves_a_field_as_it_was(small: Small) -> None:
+def test_escape_restores_a_field(small: SmallPage) -> None:
     field = small.page.get_by_label("Seed")
     field.fill("55")
     small.page.keyboard.press("Escape")
@@ -252,9 +253,9 @@ def test_escape_leaves_a_field_as_it_was(small: Small) -> None:
     small.has(FrameScene())
 
 
-def test_a_key_that_is_held_repeats_where_that_makes_sense(small: Small) -> None:
+def test_a_held_key_repeats_where_that_makes_sense(small: SmallPage) -> None:
     for key in ("s", "s", "s", "f", "f"):
-        small.page.keyboard.down(key)  # again without up: the browser says that it repeats
+        small.page.keyboard.down(key)  # again without up: the browser marks it as a repeat
     small.page.keyboard.up("s")
     small.page.keyboard.up("f")
     small.has(Step(), Step(), Step(), FrameScene())
@@ -272,9 +273,7 @@ def test_a_key_that_is_held_repeats_where_that_makes_sense(small: Small) -> None
         ("{key: 's', code: 'KeyS', ctrlKey: true}", []),
     ],
 )
-def test_a_key_is_the_letter_that_is_on_it_in_any_layout(
-    small: Small, event: str, commands: list[Command]
-) -> None:
+def test_a_key_is_its_letter_in_any_layout(small: SmallPage, event: str, commands: list[Command]) -> None:
     small.page.evaluate(
         f"document.body.dispatchEvent(new KeyboardEvent('keydown', {{bubbles: true, ...{event}}}))"
     )
@@ -282,7 +281,7 @@ def test_a_key_is_the_letter_that_is_on_it_in_any_layout(
     small.has(*commands, FrameScene())
 
 
-def test_letters_right_after_the_palettes_key_do_nothing_on_the_page(small: Small) -> None:
+def test_letters_right_after_the_palette_key_do_not_act_on_the_page(small: SmallPage) -> None:
     small.page.evaluate(
         """() => {
             const press = (what) =>
@@ -301,25 +300,25 @@ def test_letters_right_after_the_palettes_key_do_nothing_on_the_page(small: Smal
     small.has(FrameScene())
 
 
-def test_without_a_pointer_a_part_is_pressed_too_and_keeps_the_focus_when_it_is_redrawn(small: Small) -> None:
+def test_a_part_can_be_pressed_by_key_and_keeps_the_focus_when_redrawn(small: SmallPage) -> None:
     small.page.evaluate(f"document.querySelector(`{small.row(4)}`).click()")
     small.has(SelectEnv(env=4))
     small.page.keyboard.press("Tab")
     small.page.evaluate(f"document.querySelector(`{small.row(5)}`).focus()")
-    small.page.wait_for_timeout(300)  # it is drawn anew some twenty times
+    small.page.wait_for_timeout(300)  # it is redrawn about twenty times
     small.page.keyboard.press("Enter")
     small.has(SelectEnv(env=4), SelectEnv(env=5))
     small.page.keyboard.press("Space")
     small.has(SelectEnv(env=4), SelectEnv(env=5), SelectEnv(env=5))
 
 
-def test_a_click_gives_the_focus_back_so_that_space_plays(small: Small) -> None:
+def test_a_click_releases_the_focus_so_that_space_plays(small: SmallPage) -> None:
     press_for_a_while(small.page, *middle_of(small.page, small.row(0)))
     small.page.keyboard.press("Space")
     small.has(SelectEnv(env=0), TogglePlay())
 
 
-def test_a_drag_along_a_strip_ends_where_the_pointer_does(small: Small) -> None:
+def test_a_drag_along_a_strip_ends_at_the_pointer(small: SmallPage) -> None:
     box = until(lambda: small.page.get_by_text("strip", exact=True).bounding_box(), "the strip")
     y = box["y"] + 5
     small.page.mouse.move(box["x"] + box["width"] / 20, y)
@@ -332,7 +331,7 @@ def test_a_drag_along_a_strip_ends_where_the_pointer_does(small: Small) -> None:
     assert steps == sorted(steps) and len(steps) == len(small.came) <= 11
 
 
-def test_a_picture_says_where_it_was_pressed(small: Small) -> None:
+def test_a_press_on_a_picture_sends_its_position(small: SmallPage) -> None:
     box = until(lambda: small.page.get_by_text("picture", exact=True).bounding_box(), "the picture")
     small.page.mouse.click(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2)
     until(lambda: small.came, "the place")
@@ -341,11 +340,11 @@ def test_a_picture_says_where_it_was_pressed(small: Small) -> None:
     assert picked.y == pytest.approx(0.5, abs=0.05)
 
 
-def test_a_row_hears_of_shift_and_ctrl_and_is_opened_by_a_second_press(small: Small) -> None:
+def test_a_row_gets_shift_and_ctrl_and_is_opened_by_a_double_press(small: SmallPage) -> None:
     row = small.page.get_by_text("recording", exact=True)
     row.click(modifiers=["Shift"])
     row.click(modifiers=["Control"])
-    small.page.wait_for_timeout(600)  # two presses after that are no double press with it
+    small.page.wait_for_timeout(600)  # later presses are not part of this double press
     row.click()
     row.click()
     small.has(
@@ -353,7 +352,7 @@ def test_a_row_hears_of_shift_and_ctrl_and_is_opened_by_a_second_press(small: Sm
     )
 
 
-def test_a_channel_that_is_lost_alone_comes_back_and_nothing_is_asked_twice(small: Small) -> None:
+def test_a_lost_command_channel_reconnects_and_sends_nothing_twice(small: SmallPage) -> None:
     small.page.evaluate(
         """() => new Promise((done) => {
             const send = WebSocket.prototype.send;
@@ -370,11 +369,11 @@ def test_a_channel_that_is_lost_alone_comes_back_and_nothing_is_asked_twice(smal
     deadline = time.monotonic() + 60
     while not small.came and time.monotonic() < deadline:
         small.page.keyboard.press("s")
-        small.page.wait_for_timeout(200)  # the channel takes a moment to come back
-    assert set(small.came) == {Step()}, "what was lost is told, and not sent again"
+        small.page.wait_for_timeout(200)  # the channel takes a moment to reconnect
+    assert set(small.came) == {Step()}, "a lost command is reported, and not sent again"
 
 
-def test_a_page_whose_viser_reconnects_alone_is_heard(small: Small) -> None:
+def test_commands_work_after_only_viser_reconnects(small: SmallPage) -> None:
     page = small.page
     name = page.locator("[data-page]").get_attribute("data-page")
     drop_viser(small.gated_server)
@@ -382,7 +381,7 @@ def test_a_page_whose_viser_reconnects_alone_is_heard(small: Small) -> None:
     deadline = time.monotonic() + 60
     while not small.came and time.monotonic() < deadline:
         page.keyboard.press("s")
-        page.wait_for_timeout(200)  # the channel takes a moment to come back
+        page.wait_for_timeout(200)  # the channel takes a moment to reconnect
     small.came.clear()
     page.keyboard.press("f")
     small.has(FrameScene())

@@ -1,4 +1,4 @@
-"""Every tab in the sizes and themes that people use: nothing is cut, covered or too close, and the view keeps its room."""
+"""Every tab in common sizes and themes: nothing is cut off, covered or too close, and the view keeps its space."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def opened(example: At, browser: Browser) -> Iterator[Desk]:
         desk.comes_to(2)
         yield desk
         assert not desk.errors
-        # As the next file begins.
+        # Restore the initial state for the next file.
         desk.tab("Reward")
         desk.press("Shift+R")
         desk.comes_to(0)
@@ -56,7 +56,7 @@ def desk(opened: Desk) -> Desk:
 
 
 def faults(page: Page) -> list[str]:
-    """What is still there after some seconds: panels open and fold within some frames."""
+    """Layout defects that remain after some seconds: panels take some frames to open and fold."""
     for _ in range(15):
         if not (found := page.evaluate(FAULTS)):
             break
@@ -68,7 +68,7 @@ def width_of(page: Page, what: str) -> float:
     return page.evaluate("s => document.querySelector(s).parentElement.getBoundingClientRect().width", what)
 
 
-def look_at_all(page: Page, tabs: tuple[str, ...], table: str) -> dict[str, list[str]]:
+def faults_of_all_tabs(page: Page, tabs: tuple[str, ...], table: str) -> dict[str, list[str]]:
     found = {}
     for tab in tabs:
         page.get_by_role("tab", name=tab, exact=True).click()
@@ -90,17 +90,17 @@ def choose_camera(desk: Desk) -> None:
 def test_every_tab_of_the_live_page_in_both_themes(desk: Desk, size: tuple[int, int]) -> None:
     choose_camera(desk)
     desk.page.set_viewport_size({"width": size[0], "height": size[1]})
-    found = look_at_all(desk.page, LIVE_TABS, "Envs")
+    found = faults_of_all_tabs(desk.page, LIVE_TABS, "Envs")
     desk.press("d")
     expect(desk.page.locator("html")).to_have_attribute("data-mantine-color-scheme", "light")
-    in_light = look_at_all(desk.page, LIVE_TABS, "Envs")
+    in_light = faults_of_all_tabs(desk.page, LIVE_TABS, "Envs")
     desk.press("d")
-    # A tab that is drawn anew between a click's press and its release takes no click.
+    # A tab that is redrawn between mouse down and up gets no click.
     expect(desk.page.locator("html")).to_have_attribute("data-mantine-color-scheme", "dark")
     assert (found, in_light) == ({}, {})
 
 
-def test_what_is_wrong_is_found(desk: Desk) -> None:
+def test_each_layout_defect_is_found(desk: Desk) -> None:
     desk.tab("Run")
     for kind, css in DEFECTS.items():
         sheet = desk.page.evaluate_handle(
@@ -112,7 +112,7 @@ def test_what_is_wrong_is_found(desk: Desk) -> None:
     assert faults(desk.page) == []
 
 
-def test_all_tabs_are_in_one_row_and_inputs_are_written_as_their_labels(desk: Desk) -> None:
+def test_all_tabs_are_in_one_row_and_inputs_use_the_font_of_their_labels(desk: Desk) -> None:
     for name in LIVE_TABS:
         desk.tab(name)
         rows = desk.page.evaluate(
@@ -127,7 +127,7 @@ def test_all_tabs_are_in_one_row_and_inputs_are_written_as_their_labels(desk: De
     assert len(fonts) > 8 and len(set(fonts)) == 1, set(fonts)
 
 
-def test_nothing_lies_over_what_is_looked_at_through_a_camera(desk: Desk) -> None:
+def test_nothing_covers_the_view_through_a_camera(desk: Desk) -> None:
     choose_camera(desk)
     press(desk.page, "Look through")
     view = desk.page.evaluate("s => document.querySelector(s).getBoundingClientRect().toJSON()", VIEW)
@@ -157,7 +157,7 @@ def test_every_tab_of_the_review_in_all_sizes_and_both_themes(tmp_path: Path, br
         page_at(browser, opened.url) as (page, errors),
     ):
         rows = page.locator(".wb-library").get_by_text(re.compile("/Golden"))
-        # The newest one is opened, and the library folded for it where the width of the page is known by then.
+        # The newest recording opens, and folds the library if the width of the page is known by then.
         expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
         close_notice(page)
         page.wait_for_timeout(3000)
@@ -171,13 +171,13 @@ def test_every_tab_of_the_review_in_all_sizes_and_both_themes(tmp_path: Path, br
         for width, height in ((1280, 720), (1440, 900), (1920, 1080)):
             page.set_viewport_size({"width": width, "height": height})
             for theme in ("dark", "light"):
-                seen = look_at_all(page, REVIEW_TABS, "Library folded or not")
+                seen = faults_of_all_tabs(page, REVIEW_TABS, "Library folded or not")
                 found |= {f"{width}, {theme}, {tab}": said for tab, said in seen.items()}
                 page.keyboard.press("d")
         assert ({tab: said for tab, said in found.items() if said}, errors) == ({}, [])
 
 
-def test_a_browser_without_webgl_says_what_is_missing_and_what_to_do(
+def test_a_browser_without_webgl_shows_what_is_missing_and_what_to_do(
     example: At, browser: Browser, chromium_path: str
 ) -> None:
     without = browser.browser_type.launch(
@@ -186,9 +186,9 @@ def test_a_browser_without_webgl_says_what_is_missing_and_what_to_do(
     with example(browser) as desk:
         page = without.new_page()
         page.goto(desk.opened.url)
-        told = page.get_by_role("alert").filter(has_text="This browser has no WebGL 2")
-        expect(told).to_be_visible()
-        expect(told).to_contain_text("Use graphics acceleration when available")
+        alert = page.get_by_role("alert").filter(has_text="This browser has no WebGL 2")
+        expect(alert).to_be_visible()
+        expect(alert).to_contain_text("Use graphics acceleration when available")
         assert page.evaluate(
             "() => { const r = document.querySelector('.wb-needs-webgl').getBoundingClientRect(); return r.width >= innerWidth && r.height >= innerHeight }"
         )

@@ -1,4 +1,4 @@
-"""The table of recordings in a real Chromium, used as a person uses it."""
+"""The table of recordings in a real Chromium, used as by a user."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Shown:
         return self.page.locator(".wb-library tbody[data-row]").nth(place)
 
     def seeds(self) -> list[int]:
-        """Of the rows that are listed, as the page has them."""
+        """Seeds of the listed rows, in the order of the page."""
         script = "() => [...document.querySelectorAll('.wb-library tbody')].map(b => +b.rows[0].cells[4].innerText)"
         return self.page.evaluate(script)
 
@@ -93,7 +93,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterat
 
 @pytest.fixture
 def shown(opened: Shown) -> Shown:
-    """All recordings, the newest first, none selected."""
+    """The page with all recordings, newest first, none selected."""
     opened.page.keyboard.press("Escape")
     while opened.seeds()[0] != COUNT - 1 or len(opened.seeds()) != 50:
         before = opened.seeds()
@@ -114,7 +114,7 @@ def test_rows_are_selected_by_mouse_and_keys_and_opened(shown: Shown) -> None:
     shown.selects(58, 57, 56, 54)
     shown.row(2).click(modifiers=["Control"])
     shown.selects(58, 56, 54)
-    # Marked without the table being sent again: the same element is there, and coloured.
+    # The table is not sent again: the same element is there, now coloured.
     expect(shown.row(5)).to_have_css("background-color", "rgba(34, 139, 230, 0.22)")
     expect(shown.row(4)).not_to_have_css("background-color", "rgba(34, 139, 230, 0.22)")
     shown.page.keyboard.press("Enter")
@@ -123,7 +123,7 @@ def test_rows_are_selected_by_mouse_and_keys_and_opened(shown: Shown) -> None:
     until(lambda: shown.opened[1:] == [("id59",)], "opened by pressing twice", seen=lambda: shown.opened)
 
 
-def test_a_key_right_after_a_press_is_about_what_was_pressed(shown: Shown) -> None:
+def test_a_key_right_after_a_press_acts_on_the_pressed_row(shown: Shown) -> None:
     for k in range(6):
         shown.row(k + 1).click()
         shown.row(k).click()
@@ -132,7 +132,7 @@ def test_a_key_right_after_a_press_is_about_what_was_pressed(shown: Shown) -> No
     until(lambda: shown.opened == wanted, "opened", seen=lambda: shown.opened)
 
 
-def test_keys_walk_down_and_the_page_scrolls_along(shown: Shown) -> None:
+def test_keys_move_down_and_the_page_scrolls_along(shown: Shown) -> None:
     shown.row(0).click()
     shown.selects(59)
     for seed in range(58, 39, -1):
@@ -146,10 +146,10 @@ def test_keys_walk_down_and_the_page_scrolls_along(shown: Shown) -> None:
     until(lambda: shown.seeds()[0] == 59, "the first page")
 
 
-def test_words_are_looked_for_as_they_are_typed(shown: Shown) -> None:
+def test_the_search_updates_while_typing(shown: Shown) -> None:
     field = shown.page.get_by_role("textbox").first
     field.fill("even r1")
-    until(lambda: shown.seeds() == [18, 16, 14, 12, 10], "what has those words")
+    until(lambda: shown.seeds() == [18, 16, 14, 12, 10], "the rows with those words")
     field.fill("zebra")
     expect(shown.page.get_by_text("No recording has “zebra”.")).to_be_visible()
     shown.page.get_by_text("Clear the filter").click()
@@ -175,7 +175,7 @@ def test_words_are_looked_for_as_they_are_typed(shown: Shown) -> None:
 
 
 @pytest.mark.slow
-def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
+def test_a_recording_is_tagged_deleted_and_restored(shown: Shown) -> None:
     page = shown.page
     page.locator("[data-do]", has_text="seed").first.click()
     until(lambda: shown.seeds()[0] == 0, "sorted by seed")
@@ -184,7 +184,7 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     page.keyboard.press("t")
     save = page.get_by_role("button", name="Save", exact=True)
     expect(save).to_be_visible()
-    # Letters and Enter as fast as they can be pressed: all of them count.
+    # Letters and Enter in quick succession: all of them count.
     page.get_by_role("dialog").get_by_role("textbox").focus()
     page.keyboard.type("wobbly, good")
     page.keyboard.press("Enter")
@@ -197,7 +197,7 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     expect(save).to_be_hidden()
     page.keyboard.press("Delete")
     expect(page.get_by_text("Delete 1 recording (3 files")).to_be_visible()
-    # While it is asked, Enter is the button's that has the focus, and opens no recording.
+    # While the question is open, Enter goes to its focused button and opens no recording.
     opened = len(shown.opened)
     page.get_by_role("button", name="Cancel").focus()
     page.keyboard.press("Enter")
@@ -215,7 +215,7 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
 
 
 @pytest.mark.slow
-def test_a_new_recording_appears_by_itself_with_all_of_its_seed(shown: Shown) -> None:
+def test_a_new_recording_appears_automatically_with_all_of_its_seed(shown: Shown) -> None:
     largest = 2**31 - 1
     describe(shown.library.folder, "new", id="new", seed=largest, written_at="2026-11-21T12:00:00")
     until(lambda: shown.seeds()[0] == largest, "the new row")

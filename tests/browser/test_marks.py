@@ -1,4 +1,4 @@
-"""What is recorded, and a camera that stands elsewhere than in the file, is in sight on every tab; letters alone change neither."""
+"""A running recording and a moved camera are visible on every tab; plain letters change neither."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def desk(example: At, browser: Browser) -> Iterator[Desk]:
         assert not desk.errors
 
 
-def in_sight_on_every_tab(desk: Desk, mark: Locator) -> None:
-    """Also where the panel is scrolled to its end."""
-    desk.tab("Run")  # before the Studio was ever opened
+def expect_on_every_tab(desk: Desk, mark: Locator) -> None:
+    """Expect the mark on every tab, also with the panel scrolled to its end."""
+    desk.tab("Run")  # before the Studio tab was opened for the first time
     desk.page.mouse.move(WIDTH - 150, HEIGHT - 100)
     desk.page.mouse.wheel(0, 3000)
     expect(desk.page.get_by_text("Theme", exact=True)).to_be_in_viewport()
@@ -40,7 +40,7 @@ def in_sight_on_every_tab(desk: Desk, mark: Locator) -> None:
 
 
 @pytest.mark.slow
-def test_letters_typed_beside_a_field_reset_and_record_nothing(desk: Desk) -> None:
+def test_letters_typed_outside_a_field_reset_and_record_nothing(desk: Desk) -> None:
     desk.tab("Reward")
     desk.press("Shift+R", "s", "s")
     desk.comes_to(2)
@@ -52,7 +52,7 @@ def test_letters_typed_beside_a_field_reset_and_record_nothing(desk: Desk) -> No
 
 
 @pytest.mark.slow
-def test_recording_is_in_sight_on_every_tab_and_in_the_title(desk: Desk) -> None:
+def test_recording_is_shown_on_every_tab_and_in_the_title(desk: Desk) -> None:
     mark = desk.page.locator(".wb-sight-rec")
     desk.tab("Reward")
     desk.press("Shift+C")
@@ -61,7 +61,7 @@ def test_recording_is_in_sight_on_every_tab_and_in_the_title(desk: Desk) -> None
     desk.press("n")
     expect(desk.page.get_by_role("columnheader", name="env 1")).to_be_visible()
     expect(mark).to_have_attribute("title", re.compile("Env 1, which is selected, is not recorded"))
-    in_sight_on_every_tab(desk, mark)
+    expect_on_every_tab(desk, mark)
     desk.press("p", "s", "s", "Shift+R")
     expect(mark).to_contain_text("1 episode ")
     mark.get_by_text("stop").click()
@@ -70,13 +70,13 @@ def test_recording_is_in_sight_on_every_tab_and_in_the_title(desk: Desk) -> None
 
 
 @pytest.mark.slow
-def test_a_moved_camera_is_in_sight_until_it_is_put_back(desk: Desk) -> None:
+def test_a_moved_camera_is_shown_until_it_is_reset(desk: Desk) -> None:
     mark = desk.page.locator(".wb-sight-moved")
     desk.tab("Studio")
     until(lambda: end_of_the_left_arrow(desk.page) is not None, "the handles")
     x, y = end_of_the_left_arrow(desk.page) or (0.0, 0.0)
     expect(mark).to_have_count(0)
-    # On another tab there is no handle: what is dragged there is the view.
+    # On another tab there is no handle: a drag there moves the view.
     desk.tab("Run")
     until(lambda: end_of_the_left_arrow(desk.page) is None, "a view without handles")
     desk.page.mouse.move(x, y)
@@ -89,8 +89,8 @@ def test_a_moved_camera_is_in_sight_until_it_is_put_back(desk: Desk) -> None:
     desk.leave_inputs()
     desk.press("Alt+ArrowUp")
     expect(mark).to_contain_text("camera moved: base_camera")
-    in_sight_on_every_tab(desk, mark)
-    # Nor after the review, to which and from which all of the page is made anew.
+    expect_on_every_tab(desk, mark)
+    # Nor after the review: both switches rebuild the whole page.
     desk.press("v")
     expect(desk.page.get_by_text("Library", exact=True).first).to_be_visible()
     desk.press("v")
@@ -107,7 +107,7 @@ def test_a_moved_camera_is_in_sight_until_it_is_put_back(desk: Desk) -> None:
 
 
 @pytest.mark.slow
-def test_a_recording_of_a_moved_camera_says_so_in_the_review(desk: Desk) -> None:
+def test_the_review_shows_that_a_camera_was_moved(desk: Desk) -> None:
     page = desk.page
     desk.tab("Studio")
     until(lambda: numbers(page, "Position") == [0.45, 0, 0.6], "the camera")

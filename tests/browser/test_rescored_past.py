@@ -1,4 +1,4 @@
-"""The past judged again in a real Chromium: an edit is saved, and the Reward tab says what it would have changed."""
+"""Rescoring the past in a real Chromium: after an edit the Reward tab shows what it would have changed."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ STEPS = 60
 
 @pytest.fixture(scope="module")
 def desk(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
-    """Three envs that have made some sixty steps, paused, on the Reward tab."""
+    """Three envs after some sixty steps, paused, on the Reward tab."""
     with example_without_pictures(browser, height=1000) as desk:
         page = desk.page
-        # The server is shared: an edit of another file's tests may have been rescored, and its past be kept.
+        # The server is shared: it may still have the rescored past of an edit by another file's tests.
         page.get_by_role("button", name="Rebuild the scene", exact=True).click()
         until(lambda: desk.moments_kept() <= 2, "a new past")
         page.get_by_role("button", name="Play", exact=True).click()
@@ -31,7 +31,7 @@ def desk(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
         expect(page.get_by_text("paused", exact=True)).to_be_visible()
         page.get_by_role("button", name="Reset all", exact=True).click()
         page.get_by_role("tab", name="Reward").click()
-        # Before there is something to say.
+        # Before there is a result.
         expect(page.locator(".wb-again")).to_have_count(0)
         expect(page.get_by_role("button", name="Stop rescoring")).to_have_count(0)
         yield desk
@@ -45,7 +45,7 @@ def rows(desk: Desk) -> Locator:
     return desk.page.locator(".wb-again-table tbody tr")
 
 
-def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_listed(desk: Desk) -> None:
+def test_an_edited_reward_is_drawn_over_the_recorded_one_and_differences_are_listed(desk: Desk) -> None:
     desk.edit(REWARD, f"{REWARD} * 2")
     says(desk, r"(\d+) of \1 episodes differ\.")
     says(desk, "mean return: .* → ")
@@ -63,7 +63,7 @@ def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_lis
     desk.page.set_viewport_size({"width": 1280, "height": 1000})
 
 
-def test_a_row_shows_its_env_at_its_moment_and_a_key_goes_to_the_next(desk: Desk) -> None:
+def test_a_row_shows_its_env_and_moment_and_a_key_goes_to_the_next(desk: Desk) -> None:
     desk.edit(REWARD, f"{REWARD} * 2")
     until(lambda: rows(desk).count() >= 6, "the list")
     expect(desk.page.get_by_role("button", name="Stop rescoring")).to_have_count(0)

@@ -1,4 +1,4 @@
-"""The review in a real Chromium: open from the library, play, step, compare; and over to it from the live page."""
+"""The review in a real Chromium: open from the library, play, step, compare; and switch to it from the live page."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tests.drive.page import close_notice, open_workbench, page_at
 from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
-LATE = "Tried to update non-existent component"
-"""What viser's page says in its console when a thing goes that was written to in the same moment."""
+LATE_UPDATE_ERROR = "Tried to update non-existent component"
+"""Console error of viser's page when a component is removed while an update to it is in flight."""
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def address(folder: Path) -> Iterator[str]:
-    """Of ``workbench review``, which ends with Ctrl-C's signal."""
+    """The address of ``workbench review``, which must exit on SIGINT."""
     with open_workbench(str(folder), what="review") as opened:
         yield opened.url
     assert opened.process.returncode == 0, "\n".join(opened.lines)
@@ -39,7 +39,7 @@ def address(folder: Path) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def desk(address: str, browser: Browser) -> Iterator[tuple[Page, list[str]]]:
     with page_at(browser, address) as (page, errors):
-        # The newest, and the library beside it: one that folds itself when the newest is open takes a click with it.
+        # The newest recording, with the library open: a library that folds after opening would swallow a click.
         expect(page.locator(".wb-status")).to_contain_text("paused")
         expect(page.locator(".wb-status")).to_contain_text("seed0002")
         says(page, "step 0 / 12")
@@ -58,10 +58,10 @@ def unfold_library(page: Page) -> None:
 
 
 def open_both(page: Page) -> None:
-    """Both are selected too, and the library is folded."""
+    """Open and select both recordings, with the library folded."""
     page.get_by_role("tab", name="Review").click()
-    # The library folds itself when something else is opened, also when only the order of the two is another. A key
-    # pressed beside that would unfold it again.
+    # The library folds itself when another selection is opened, also if only the order differs. An extra key press
+    # would unfold it again.
     opened = page.locator(".wb-opened-list tr", has=page.locator(".wb-letter"))
     seeds = [text.split("\t") for text in opened.all_inner_texts()]
     was_open = ["1" in cells for cells in seeds] == [True, False] and "2" in seeds[1]
@@ -95,7 +95,7 @@ def cubes(page: Page) -> list[float]:
     )
 
 
-def test_opens_from_the_library_and_walks_with_the_keys(desk: tuple[Page, list[str]]) -> None:
+def test_a_recording_opens_from_the_library_and_keys_step_through_it(desk: tuple[Page, list[str]]) -> None:
     page, errors = desk
     page.get_by_role("tab", name="Review").click()
     unfold_library(page)
@@ -120,17 +120,17 @@ def test_opens_from_the_library_and_walks_with_the_keys(desk: tuple[Page, list[s
             return both;
         }"""
     )
-    assert remark[0] == pytest.approx(remark[1], abs=0.1), "the size of other remarks"
+    assert remark[0] == pytest.approx(remark[1], abs=0.1), "the font size of other remarks"
     page.keyboard.press("Home")
     says(page, "step 0 / 20")
     page.keyboard.press("Space")
     says(page, "step 20 / 20")
     page.get_by_role("tab", name="Cameras").click()
     expect(page.locator('img[src^="blob:"]').first).to_be_visible()
-    assert [e for e in errors if LATE not in e] == []
+    assert [e for e in errors if LATE_UPDATE_ERROR not in e] == []
 
 
-def test_compares_two_and_says_where_they_part(desk: tuple[Page, list[str]]) -> None:
+def test_two_recordings_are_compared_and_their_first_difference_shown(desk: tuple[Page, list[str]]) -> None:
     page, errors = desk
     open_both(page)
     page.get_by_role("tab", name="Compare").click()
@@ -140,12 +140,12 @@ def test_compares_two_and_says_where_they_part(desk: tuple[Page, list[str]]) -> 
     page.get_by_role("button", name="Swap A and B").click()
     page.get_by_role("tab", name="Review").click()
     rows = page.locator(".wb-opened-list tr", has=page.locator(".wb-letter"))
-    expect(rows.last).to_contain_text("210.00")  # the older one, which was A: the sum of 1 to 20
-    assert [e for e in errors if LATE not in e] == []
+    expect(rows.last).to_contain_text("210.00")  # the older recording, which was A: the sum of 1 to 20
+    assert [e for e in errors if LATE_UPDATE_ERROR not in e] == []
 
 
 @pytest.mark.slow
-def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) -> None:
+def test_a_shared_file_is_named_made_and_downloaded(desk: tuple[Page, list[str]]) -> None:
     page, errors = desk
     open_both(page)
     page.get_by_role("tab", name="Share").click()
@@ -160,20 +160,20 @@ def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) 
         sheet = Image.open(io.BytesIO(page.request.get(address).body()))
         assert sheet.format == "PNG" and sheet.width > 100
         assert address.endswith(str(link.get_attribute("title"))) and ".sheet.png" in address
-    assert [e for e in errors if LATE not in e] == []
+    assert [e for e in errors if LATE_UPDATE_ERROR not in e] == []
 
 
 @pytest.mark.slow
-def test_of_rerun_and_the_library_the_one_unfolded_last_folds_the_other_where_there_is_no_room_for_both(
+def test_without_room_for_both_unfolding_rerun_or_the_library_folds_the_other(
     desk: tuple[Page, list[str]],
 ) -> None:
     page, errors = desk
     before = len(errors)
     open_both(page)
-    # Its width is a share of the view's, of which the server hears a moment after the library was folded.
+    # Its width is a fraction of the view's, which the server learns shortly after the library was folded.
     until(lambda: page.locator("canvas[data-engine]").evaluate("c => c.clientWidth") > 800, "the wide view")
     page.get_by_role("tab", name="Share").click()
-    # It is loaded anew at each of its returns, a core for some seconds; what it shows is tests/share/test_rerun_view.py's.
+    # rerun reloads each time, which takes a core for some seconds; tests/share/test_rerun_view.py checks its content.
     page.route("**/rerun/viewer-*/*.wasm", lambda route: route.abort())
     library, rerun = page.locator(".wb-library"), page.locator("iframe.wb-rerun")
     unfold = page.get_by_role("button", name="Expand column").first
@@ -183,7 +183,7 @@ def test_of_rerun_and_the_library_the_one_unfolded_last_folds_the_other_where_th
     until(lambda: page.locator("canvas[data-engine]").evaluate("c => c.clientWidth") < 400, "the narrow view")
     tops = [page.get_by_role("button", name=name, exact=True) for name in ("first", "play", "last")]
     until(lambda: len({top.evaluate("b => b.offsetTop") for top in tops}) == 1, "the buttons in one row")
-    unfold.click()  # viser's own button, of which the server is not told
+    unfold.click()  # viser's own button, which does not notify the server
     expect(library).to_be_visible()
     expect(rerun).to_have_count(0)
     unfold.click()
@@ -196,14 +196,14 @@ def test_of_rerun_and_the_library_the_one_unfolded_last_folds_the_other_where_th
     expect(library).to_have_count(0)
     page.get_by_role("button", name="Close rerun").click()
     expect(rerun).to_have_count(0)
-    del errors[before:]  # what rerun says of this
+    del errors[before:]  # rerun's errors about this
 
 
 @pytest.mark.slow
-def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Browser) -> None:
-    """The env is there as it was."""
+def test_switching_to_the_recordings_and_back_keeps_the_env(folder: Path, browser: Browser) -> None:
+    """The env is unchanged after the switch."""
     task = Path(__file__).parents[2] / "tasks" / "minimal.py"
-    # Without pictures there are no shaders to wait for.
+    # Without pictures there are no shaders to compile.
     quick = ("--num-envs", "1", "--no-spare", "--env", "render_backend=none")
     with (
         open_workbench(str(task), *quick, "--recordings", str(folder)) as opened,
@@ -218,9 +218,9 @@ def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Br
         expect(page.get_by_role("tab", name="Run")).to_be_visible()
 
         def steps() -> bool:
-            # Keys come with the last part of the page.
+            # The last part of the page brings the keys.
             page.keyboard.press("s")
             return page.locator(".wb-status").get_by_text(re.compile(r"step [1-9]")).count() > 0
 
         until(steps, "a step")
-        assert [e for e in errors if LATE not in e] == []
+        assert [e for e in errors if LATE_UPDATE_ERROR not in e] == []

@@ -1,4 +1,4 @@
-"""A page that lost its server says so, with what to do."""
+"""A page that lost its server shows a notice with what to do."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from workbench.page.widgets.visitors import PATH, Visitors
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
-def test_a_server_that_is_gone_is_said_with_its_address(browser: Browser, tmp_path: Path) -> None:
+def test_a_lost_server_is_reported_with_its_address(browser: Browser, tmp_path: Path) -> None:
     with open_workbench(str(tmp_path), cwd=tmp_path, what="review") as opened:
-        page, _ = new_page(browser, drawn=False)  # it complains of the refused connection
+        page, _ = new_page(browser, drawn=False)  # the console has errors about the refused connection
         page.goto(opened.url)
         expect(page.get_by_text("Library", exact=True).first).to_be_visible()
         expect(page.get_by_role("alert").filter(has_text="127.0.0.1")).to_have_count(0)
@@ -30,7 +30,7 @@ def test_a_server_that_is_gone_is_said_with_its_address(browser: Browser, tmp_pa
         page.close()
 
 
-def test_the_notice_goes_when_the_server_can_be_reached_again(browser: Browser) -> None:
+def test_the_notice_disappears_when_the_server_is_reachable_again(browser: Browser) -> None:
     gated_server = open_server(ServerOptions(port=0))
     gated_server.add_channel(PATH, Visitors(gated_server.server, COMMANDS).serve)
     try:
@@ -40,18 +40,18 @@ def test_the_notice_goes_when_the_server_can_be_reached_again(browser: Browser) 
             page.wait_for_selector("[data-page]", state="attached")
         gone = page.get_by_role("alert").filter(has_text=str(line.port))
         expect(gone).to_be_in_viewport()
-        page.wait_for_timeout(3000)  # it tries again meanwhile
+        page.wait_for_timeout(3000)  # time for retries
         expect(gone).to_have_count(1)
         with line_to(gated_server.url, port=line.port):
             expect(gone).to_have_count(0)
-            page.wait_for_timeout(2000)  # in which it would come again
+            page.wait_for_timeout(2000)  # time in which the notice would reappear
             expect(gone).to_have_count(0)
             page.close()
     finally:
         gated_server.close()
 
 
-def test_a_page_that_comes_back_has_its_tab_and_its_env_and_is_heard(
+def test_a_reconnected_page_keeps_its_tab_and_env_and_its_commands_work(
     browser: Browser, tmp_path: Path
 ) -> None:
     task = shutil.copy(TASK, tmp_path)
@@ -59,7 +59,7 @@ def test_a_page_that_comes_back_has_its_tab_and_its_env_and_is_heard(
     with open_workbench(*arguments, cwd=tmp_path) as opened:
         page, _ = new_page(browser, drawn=False)
 
-        def is_as_it_was() -> None:
+        def expect_unchanged() -> None:
             expect(page.get_by_role("tab", name="Inspect")).to_have_attribute("aria-selected", "true")
             expect(page.get_by_text("live env 1").first).to_be_visible()
 
@@ -68,14 +68,14 @@ def test_a_page_that_comes_back_has_its_tab_and_its_env_and_is_heard(
             expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
             page.keyboard.press("n")
             open_tab(page, "Inspect")
-            is_as_it_was()
+            expect_unchanged()
         expect(page.get_by_role("alert").filter(has_text=str(line.port))).to_be_in_viewport()
         with line_to(opened.url, port=line.port):
             expect(page.get_by_role("alert").filter(has_text=str(line.port))).to_have_count(0)
-            is_as_it_was()
+            expect_unchanged()
             page.keyboard.press("Space")
             expect(page.get_by_text("running", exact=True).first).to_be_visible()
             page.keyboard.press("Space")
             expect(page.get_by_text("paused", exact=True)).to_be_visible()
-            is_as_it_was()
+            expect_unchanged()
             page.close()

@@ -1,4 +1,4 @@
-"""A task is solved on the page, its episode is saved, and becomes a file of demonstrations for ManiSkill's baselines."""
+"""Solving a task on the page, saving the episode, and exporting it as demonstrations for ManiSkill's baselines."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def choose(desk: Desk, label: str, option: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_task_is_solved_saved_and_exported_with_the_mouse_alone(desk: Desk) -> None:
+def test_a_task_is_solved_saved_and_exported_with_the_mouse_only(desk: Desk) -> None:
     page = desk.page
     desk.tab("Run")
     choose(desk, "Source", "solve")
@@ -54,18 +54,18 @@ def test_a_task_is_solved_saved_and_exported_with_the_mouse_alone(desk: Desk) ->
     desk.button("Make").click()
     datasets = desk.file.parent / "recordings" / "datasets"
     (file,) = until(lambda: list(datasets.glob("demonstrations_*.h5")), "the demonstrations")
-    told = json.loads(file.with_suffix(".json").read_text())
-    assert [episode["success"] for episode in told["episodes"]] == [True]
+    metadata = json.loads(file.with_suffix(".json").read_text())
+    assert [episode["success"] for episode in metadata["episodes"]] == [True]
     with h5py.File(file) as demonstrations:
         steps = np.asarray(demonstrations["traj_0/actions"]).shape[0]
-    assert steps == told["episodes"][0]["elapsed_steps"] > 0
+    assert steps == metadata["episodes"][0]["elapsed_steps"] > 0
     expect(page.get_by_text(re.compile(f"^1 episode, {steps} steps"))).to_be_visible()
     assert desk.errors == []
 
 
 @pytest.mark.slow
-def test_a_pressed_seed_is_watched_in_the_review_and_the_way_back_leads_to_its_row(desk: Desk) -> None:
-    """The review was left at its Share tab, with another episode."""
+def test_a_pressed_seed_opens_in_the_review_and_back_returns_to_its_row(desk: Desk) -> None:
+    """The review last showed its Share tab, with another episode."""
     page = desk.page
     desk.button("Back to the live env").click()
     page.get_by_role("tab", name=re.compile("^Checks")).click()

@@ -1,4 +1,4 @@
-"""The start page and *Open...* in a real Chromium, as a person uses them: one server for all."""
+"""The start page and *Open...* in a real Chromium, used as by a user: one server for all tests."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from workbench.start.registered import LIST_FILE
 from workbench.task.new_task import TEMPLATES
 from workbench.trust.consent_dialog import DO_NOT, ONCE
 
-# The first begins at the start page, which is gone once a task is open.
+# The first test needs the start page, which is gone once a task is open.
 pytestmark = [pytest.mark.browser, pytest.mark.random_order(disabled=True)]
-PATIENT = 120_000
+TIMEOUT_MS = 120_000
 NOT_FOUND = "NoSuchTask-v1"
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A working folder with two tasks, another folder with one, and a cache in which nothing is left to draw."""
+    """A working folder with two tasks, another folder with one, and a complete thumbnail cache."""
     folder = tmp_path_factory.mktemp("start")
     for name in ("work/push.py", "work/sub/small.py", "elsewhere/other.py"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -63,26 +63,26 @@ def row(page: Page, name: str) -> Locator:
 
 
 def marked(page: Page) -> Locator:
-    """What Enter opens."""
+    """The row that Enter opens."""
     return page.locator(".wb-task:focus, .wb-tasks:not(:focus-within) [data-best]")
 
 
 def runs(page: Page, title: str, envs: str = "2 envs") -> None:
     status = page.locator(".wb-status")
-    expect(status).to_have_attribute("data-title", re.compile(title), timeout=PATIENT)
-    # In this order: "building 2 envs" is said while it loads.
-    expect(status).to_contain_text(f"{envs} on cpu", timeout=PATIENT)
-    expect(status).to_contain_text("paused", timeout=PATIENT)
+    expect(status).to_have_attribute("data-title", re.compile(title), timeout=TIMEOUT_MS)
+    # In this order: "building 2 envs" is shown while the task loads.
+    expect(status).to_contain_text(f"{envs} on cpu", timeout=TIMEOUT_MS)
+    expect(status).to_contain_text("paused", timeout=TIMEOUT_MS)
 
 
 def view_of(page: Page) -> NDArray[np.uint8]:
-    """The middle of the 3-D view."""
+    """Pixels in the middle of the 3-D view."""
     return picture_of_view(page, {"x": 150, "y": 250, "width": 500, "height": 250})
 
 
 def open_list(page: Page) -> None:
-    """The dialog; where no task is open yet, the list is there already."""
-    expect(page.locator(".wb-status, .wb-start").first).to_be_visible(timeout=PATIENT)
+    """Open the dialog; while no task is open, the list is already there."""
+    expect(page.locator(".wb-status, .wb-start").first).to_be_visible(timeout=TIMEOUT_MS)
     if page.locator(".wb-status").count():
         page.wait_for_selector("[data-keys]", state="attached")
         page.keyboard.press("Control+o")
@@ -90,11 +90,11 @@ def open_list(page: Page) -> None:
 
 
 @pytest.mark.slow
-def test_the_list_follows_its_folder_and_takes_a_path(
+def test_the_list_follows_its_folder_and_accepts_a_path(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
     with page_at(browser, started.url) as (page, errors):
-        expect(row(page, "push.py")).to_be_visible(timeout=PATIENT)
+        expect(row(page, "push.py")).to_be_visible(timeout=TIMEOUT_MS)
         close_notice(page)
         shutil.copy(TASK, folder / "work/a_new_one.py")
         (folder / "work/broken.py").write_text("class Task(BaseEnv):\n    def evaluate(self)\n")
@@ -106,7 +106,7 @@ def test_the_list_follows_its_folder_and_takes_a_path(
         for name in ("renamed.py", "broken.py"):
             (folder / "work" / name).unlink()
             expect(row(page, name)).to_have_count(0)
-        # A path that is wrong, and one as a terminal gives it.
+        # A wrong path, and one in terminal notation.
         search = page.get_by_role("textbox").first
         search.fill(f"{folder}/elsewhere/othr.py")
         expect(page.locator(".wb-tasks")).to_contain_text("did you mean other.py")
@@ -114,24 +114,24 @@ def test_the_list_follows_its_folder_and_takes_a_path(
         expect(row(page, f"{folder}/elsewhere/other.py")).to_be_visible()
         expect(marked(page)).to_contain_text("elsewhere/other.py")
         page.keyboard.press("Enter")
-        # It is outside of the folder: nothing runs unasked.
+        # The file is outside the folder: nothing runs without a question.
         question = page.get_by_role("dialog", name="Run this code?")
-        expect(question).to_contain_text(f"{folder}/elsewhere/other.py", timeout=PATIENT)
+        expect(question).to_contain_text(f"{folder}/elsewhere/other.py", timeout=TIMEOUT_MS)
         question.get_by_role("button", name=DO_NOT).click()
         expect(question).to_be_hidden()
-        # The search is the same for all browsers.
+        # All browsers share the search.
         search.fill("")
         expect(row(page, "push.py")).to_be_visible()
         assert errors == []
 
 
 @pytest.mark.slow
-def test_from_the_start_page_to_a_task_to_another_and_back(
+def test_switching_from_the_start_page_to_a_task_to_another_and_back(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
     with page_at(browser, started.url) as (page, errors), page_at(browser, started.url) as (other, _):
-        # The list is there, the search has the focus, and the first row is marked.
-        expect(row(page, "push.py")).to_be_visible(timeout=PATIENT)
+        # The list is shown, the search has the focus, and the first row is marked.
+        expect(row(page, "push.py")).to_be_visible(timeout=TIMEOUT_MS)
         for name in ("sub/small.py", "minimal.py", "PickCube-v1", "recordings/", "other.py"):
             expect(row(page, name)).to_be_attached()
         expect(page.get_by_role("textbox").first).to_be_focused()
@@ -140,7 +140,7 @@ def test_from_the_start_page_to_a_task_to_another_and_back(
         expect(marked(page)).to_contain_text("push.py")
         page.keyboard.press("ArrowUp")
         expect(marked(page)).to_contain_text("other.py")
-        # Words and Enter, pressed at once: Enter waits for the list of these words.
+        # Words and Enter in quick succession: Enter waits for the list of these words.
         page.keyboard.type("push.py", delay=0)
         page.keyboard.press("Enter")
         runs(page, "WorkbenchPushCube-v1")
@@ -148,7 +148,7 @@ def test_from_the_start_page_to_a_task_to_another_and_back(
         expect(page.locator(".wb-status")).to_contain_text("panda")
         expect(page.locator(".wb-status")).to_contain_text("8 actions")
 
-        # Another task in place of it, from another tab of the page, with the other browser following.
+        # Another task replaces it, opened from another tab; the other browser follows.
         page.get_by_role("tab", name="Reward").click()
         page.keyboard.press("n")
         expect(page.locator(".wb-timeline")).to_contain_text("env 1")
@@ -159,7 +159,7 @@ def test_from_the_start_page_to_a_task_to_another_and_back(
         expect(page.locator(".wb-timeline")).to_contain_text("env 0")
         expect(page.get_by_role("tab", name="Run")).to_have_attribute("aria-selected", "true")
 
-        # And back: the tab and the selected env are as they were.
+        # And back: the tab and the selected env are unchanged.
         open_list(page)
         page.keyboard.type("push")
         page.keyboard.press("Enter")
@@ -167,16 +167,16 @@ def test_from_the_start_page_to_a_task_to_another_and_back(
         expect(page.locator(".wb-timeline")).to_contain_text("env 1")
         expect(page.get_by_role("tab", name="Reward")).to_have_attribute("aria-selected", "true")
 
-        # A task that cannot be made: the page says so, and the way back is the same list.
+        # A task that cannot be built: the page reports it, and the same list leads back.
         open_list(page)
         row(page, NOT_FOUND).click()
         banner = page.locator(".wb-banner")
-        expect(banner).to_contain_text(NOT_FOUND, timeout=PATIENT)
+        expect(banner).to_contain_text(NOT_FOUND, timeout=TIMEOUT_MS)
         # A file from elsewhere asks first.
         open_list(page)
         row(page, "other.py").click()
         question = page.get_by_role("dialog", name="Run this code?")
-        expect(question).to_contain_text("outside of the folder", timeout=PATIENT)
+        expect(question).to_contain_text("outside of the folder", timeout=TIMEOUT_MS)
         expect(question).to_contain_text(str(folder / "elsewhere/other.py"))
         question.get_by_role("button", name=ONCE).click()
         runs(page, "WorkbenchPushCube-v1", "3 envs")
@@ -213,12 +213,12 @@ def test_a_new_task_is_created_with_the_mouse_and_opens(
 
 
 def colours(page: Page) -> int:
-    """How many the 3-D view has."""
+    """Number of colours in the 3-D view."""
     return len(np.unique(view_of(page).reshape(-1, 3), axis=0))
 
 
 @pytest.mark.slow
-def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_once_mended(
+def test_a_file_with_a_syntax_error_shows_no_other_task_and_opens_once_fixed(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
     file = folder / "work/torn.py"
@@ -235,7 +235,7 @@ def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_o
         expect(row(page, "torn.py")).to_contain_text("line 4")
         page.keyboard.press("Enter")
         banner = page.locator(".wb-banner")
-        expect(banner).to_contain_text("torn.py:4", timeout=PATIENT)
+        expect(banner).to_contain_text("torn.py:4", timeout=TIMEOUT_MS)
         expect(page.get_by_text("torn.py", exact=True)).to_be_visible()
         until(lambda: colours(page) < 100, "an empty view")
         started.wait_for_line(r"torn\.py:4")

@@ -1,4 +1,4 @@
-"""The view where the browser draws in software: of simpler shapes and one resolution; viser's own affair where it does not."""
+"""The view with software rendering has simplified meshes and a fixed resolution; with a GPU viser's defaults apply."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from workbench.page.scene.software_rendering import InSoftware
 from workbench.page.widgets.visitors import PATH, Visitors
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-A_CARD = """
+GPU_JS = """
 const ask = WebGL2RenderingContext.prototype.getParameter, UNMASKED_RENDERER = 0x9246;
 WebGL2RenderingContext.prototype.getParameter = function (what) {
     return what === UNMASKED_RENDERER ? 'NVIDIA GeForce RTX 3060' : ask.call(this, what);
 };
 """
-SLOW_FRAMES = """
+SLOW_FRAMES_JS = """
 const soon = window.requestAnimationFrame.bind(window);
 let last = 0;
 window.framesSeen = 0;
@@ -38,8 +38,8 @@ window.requestAnimationFrame = (draw) => soon(() => setTimeout(() => {
     draw(now);
 }, 60));
 """
-ENOUGH_FRAMES = 60
-"""viser decides after ten quarters of a second in which frames follow each other."""
+MIN_FRAMES = 60
+"""viser decides after 2.5 s of continuous frames."""
 CANVAS = "document.querySelector('canvas[data-engine]')"
 Show = Callable[..., Page]
 
@@ -53,15 +53,15 @@ def gated_server() -> Iterator[GatedServer]:
 
 @pytest.fixture(scope="module")
 def show(gated_server: GatedServer, browser: Browser) -> Iterator[Show]:
-    """Opens the page on a screen of twice the usual resolution, and waits for its view."""
+    """A function that opens the page on a screen with device pixel ratio 2 and waits for its view."""
 
-    def opened(*scripts: str, wish: str = "") -> Page:
+    def opened(*scripts: str, choice: str = "") -> Page:
         page = browser.new_page(viewport={"width": 640, "height": 400}, device_scale_factor=2)
         for script in scripts:
             page.add_init_script(script)
-        page.goto(gated_server.url + wish)
-        # A function: of an expression every look but the first is an eval, which the page's policy forbids.
-        # Made with 300 x 150, as every canvas; the view's size comes some frames later.
+        page.goto(gated_server.url + choice)
+        # A function: an expression would be polled with eval, which the page's policy forbids.
+        # A canvas starts with 300 x 150; it gets the view's size some frames later.
         page.wait_for_function(
             f"() => {CANVAS}?.clientWidth === 640 && {CANVAS}.width !== 300", timeout=60_000
         )
@@ -71,7 +71,7 @@ def show(gated_server: GatedServer, browser: Browser) -> Iterator[Show]:
 
 
 def draw_until(gated_server: GatedServer, page: Page, reached: str) -> None:
-    """Something moves in the view until this is true in the page."""
+    """Move a body in the view until the expression `reached` is true in the page."""
     node = gated_server.server.scene.add_frame("/moved")
 
     def seen() -> bool:
@@ -85,25 +85,25 @@ def width(page: Page) -> int:
     return page.evaluate(f"{CANVAS}.width")
 
 
-def test_a_page_drawn_in_software_keeps_its_resolution_while_frames_come_slowly(
+def test_a_software_rendered_page_keeps_its_resolution_with_slow_frames(
     gated_server: GatedServer, show: Show
 ) -> None:
-    page = show(SLOW_FRAMES)
+    page = show(SLOW_FRAMES_JS)
     assert width(page) == 2 * 640
-    draw_until(gated_server, page, f"framesSeen > {ENOUGH_FRAMES}")
+    draw_until(gated_server, page, f"framesSeen > {MIN_FRAMES}")
     assert width(page) == 2 * 640
     assert page.url == gated_server.url.partition("?")[0]
     page.close()
 
 
 def test_a_page_with_a_graphics_card_is_sharp_and_still_adapts(gated_server: GatedServer, show: Show) -> None:
-    page = show(A_CARD, SLOW_FRAMES)
+    page = show(GPU_JS, SLOW_FRAMES_JS)
     assert width(page) == 2 * 640
     draw_until(gated_server, page, f"{CANVAS}.width < {2 * 640}")
     page.close()
 
 
-def test_the_notice_of_it_goes_by_itself_and_is_not_shown_again(
+def test_the_software_rendering_notice_closes_itself_and_is_not_shown_again(
     gated_server: GatedServer, browser: Browser
 ) -> None:
     context = browser.new_context()
@@ -119,7 +119,7 @@ def test_the_notice_of_it_goes_by_itself_and_is_not_shown_again(
     context.close()
 
 
-def test_shapes_are_simpler_only_while_every_page_draws_in_software(
+def test_meshes_are_simplified_only_while_every_page_uses_software_rendering(
     gated_server: GatedServer, show: Show
 ) -> None:
     in_software = InSoftware(gated_server.server)
@@ -130,7 +130,7 @@ def test_shapes_are_simpler_only_while_every_page_draws_in_software(
     until(lambda: len(gated_server.server.get_clients()) == 1, "the page")
     assert not in_software.all_pages
     in_software.ask()
-    until(lambda: in_software.all_pages, "the page says so")
+    until(lambda: in_software.all_pages, "the page's report")
     geometry, poses = table_scene(100)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32))
@@ -139,11 +139,11 @@ def test_shapes_are_simpler_only_while_every_page_draws_in_software(
     until(lambda: in_software.looks(DrawStyle(), geometry, layout, alone=False).error > 0, "simpler shapes")
     assert in_software.looks(DrawStyle(), geometry, layout, alone=True) == DrawStyle()
     assert in_software.looks(DrawStyle(1_000_000), geometry, layout, alone=False).error == 0
-    other = show(A_CARD)
+    other = show(GPU_JS)
     until(lambda: len(gated_server.server.get_clients()) == 2, "the other page")
     assert in_software.all_pages
-    until(lambda: not in_software.all_pages, "the other page has said nothing for long enough")
+    until(lambda: not in_software.all_pages, "the timeout of the other page's report")
     assert in_software.looks(DrawStyle(), geometry, layout, alone=False) == DrawStyle()
     other.close()
-    until(lambda: in_software.all_pages, "the other page is gone")
+    until(lambda: in_software.all_pages, "the end of the other page")
     page.close()

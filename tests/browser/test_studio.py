@@ -42,7 +42,7 @@ def opened(task_file: Path, browser: Browser) -> Iterator[Page]:
         _,
     ):
         page.get_by_role("tab", name="Studio").click()
-        # It does not open empty: the first sensor camera is chosen.
+        # The tab opens with the first sensor camera chosen.
         expect(page.get_by_label("Camera", exact=True).locator("option:checked")).to_have_text(
             "base_camera · sensor"
         )
@@ -52,7 +52,7 @@ def opened(task_file: Path, browser: Browser) -> Iterator[Page]:
 
 @pytest.fixture
 def page(opened: Page) -> Page:
-    """base_camera is chosen, and placed as the file says."""
+    """The page with base_camera chosen, at the pose in the file."""
     choose(opened, "base_camera · sensor")
     expect(opened.get_by_text("Show the change", exact=True)).to_be_visible()
     if "wb-off" not in tool(opened, "Reset to file")["classes"]:
@@ -84,7 +84,7 @@ def bottom_of(part: Locator) -> float:
 
 
 def arc_about_x(page: Page) -> tuple[float, float] | None:
-    """A place on the handle that turns about the world's x: the rightmost of what is pink, on its upper part."""
+    """A point on the rotation handle about the world's x: the rightmost pink pixel on its upper part."""
     r, g, b = np.moveaxis(view(page), -1, 0)
     ys, xs = np.nonzero((r > 225) & (g < 90) & (b > 60) & (b < 150))
     if len(xs) < 50:
@@ -93,7 +93,7 @@ def arc_about_x(page: Page) -> tuple[float, float] | None:
     return float(xs[ys == row].max() - 1 + VIEW["x"]), float(row + VIEW["y"])
 
 
-def test_a_press_on_its_frustum_chooses_a_camera(page: Page, opened: Page) -> None:
+def test_a_press_on_a_frustum_chooses_its_camera(page: Page, opened: Page) -> None:
     choose(opened, NO_CAMERA)
     expect(opened.get_by_text("Choose a camera here, or click its frustum")).to_be_visible()
 
@@ -109,7 +109,7 @@ def test_a_press_on_its_frustum_chooses_a_camera(page: Page, opened: Page) -> No
     assert numbers(opened, "Position") == [0.45, 0, 0.6] and numbers(opened, "Looks at") == [0.08, 0, 0]
 
 
-def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_file: Path) -> None:
+def test_a_camera_is_dragged_written_to_the_file_checked_and_undone(page: Page, task_file: Path) -> None:
     text = task_file.read_text()
     until(lambda: end_of_the_left_arrow(page) is not None, "the gizmo")
     until(lambda: picture(page) != "", "the picture")
@@ -119,12 +119,12 @@ def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_
     page.mouse.down()
     for i in range(1, 5):
         page.mouse.move(x + 10 * i, y)
-    # While the button is still down.
+    # While the mouse button is still down.
     until(lambda: numbers(page, "Position")[1] > 0.05, "the number")
     until(lambda: picture(page) not in ("", before), "another picture")
     page.mouse.up()
     assert numbers(page, "Position")[::2] == [0.45, 0.6] and numbers(page, "Degrees")[:2] == [0, 58.34]
-    # All of it is one step of undo, which brings back what it looked at too.
+    # The whole drag is one undo step, which also restores the look-at point.
     page.keyboard.press("Control+z")
     until(lambda: numbers(page, "Position") == [0.45, 0, 0.6], "the drag undone")
     assert numbers(page, "Looks at") == [0.08, 0, 0]
@@ -146,14 +146,14 @@ def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_
     page.get_by_role("button", name="Close", exact=True).click()
 
 
-def test_typed_and_nudged_and_undone(page: Page) -> None:
+def test_a_camera_is_moved_by_typing_and_keys_and_undone(page: Page) -> None:
     unfold(page, "Lens and image", page.get_by_label("Vertical fov"))
     page.get_by_label("Vertical fov").fill("90")
     page.keyboard.press("Enter")
     until(lambda: numbers(page, "Radians") == [1.5708], "radians")
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Alt+ArrowLeft")
-    # Its left is towards -y: it looks along -x.
+    # Left is -y: the camera looks along -x.
     until(lambda: numbers(page, "Position") == [0.45, -0.01, 0.6], "the nudge")
     page.keyboard.press("Alt+Shift+ArrowUp")
     until(lambda: numbers(page, "Degrees")[1] == 57.34, "the turn")
@@ -167,10 +167,10 @@ def test_typed_and_nudged_and_undone(page: Page) -> None:
     page.get_by_text("Lens and image", exact=True).click()
 
 
-def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
+def test_a_camera_placed_at_the_viewpoint_stays_there_while_looking_through_it(page: Page) -> None:
     press(page, "Look through")
     tool(page, "Back to my view")
-    # Red only in the middle of this camera's picture: the target on the table fills the view.
+    # Only in the middle of this camera's picture is it red: the target on the table fills the view.
     until(lambda: bool((view(page)[..., 0] - view(page)[..., 2] > 90).mean() > 0.02), "its view")
     press(page, "Move to my view")
     assert np.allclose(numbers(page, "Position"), [0.45, 0, 0.6], atol=2e-4)
@@ -179,7 +179,7 @@ def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
     until(lambda: end_of_the_left_arrow(page) is not None, "the gizmo again")
 
 
-def test_turned_with_the_mouse(page: Page) -> None:
+def test_a_camera_is_rotated_with_the_mouse(page: Page) -> None:
     until(lambda: arc_about_x(page) is not None and picture(page) != "", "the handles")
     before, start = picture(page), numbers(page, "Degrees")
     x, y = arc_about_x(page) or (0, 0)
@@ -190,12 +190,12 @@ def test_turned_with_the_mouse(page: Page) -> None:
     until(lambda: numbers(page, "Degrees") != start, "the angles")
     until(lambda: picture(page) not in ("", before), "another picture")
     page.mouse.up()
-    assert numbers(page, "Position") == [0.45, 0, 0.6], "it was moved, not turned"
+    assert numbers(page, "Position") == [0.45, 0, 0.6], "the camera was moved, not rotated"
     page.keyboard.press("Control+z")
     until(lambda: numbers(page, "Degrees") == start, "the turn undone")
 
 
-def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_file: Path) -> None:
+def test_a_camera_is_added_at_the_viewpoint_renamed_and_removed(page: Page, task_file: Path) -> None:
     before = task_file.read_text()
     unfold(page, "Add, copy, rename, remove", page.get_by_role("button", name="Rename", exact=True))
     page.get_by_label("New name").fill("third")
@@ -205,7 +205,7 @@ def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_
     until(lambda: sight.evaluate("e => e.naturalWidth") == 128, "its picture, before it is written")
     assert task_file.read_text() == before
     leave = page.get_by_role("button", name="Discard the change")
-    until(lambda: bottom_of(leave) < HEIGHT, "the last of it in sight")
+    until(lambda: bottom_of(leave) < HEIGHT, "the last control in view")
     leave.click()
     expect(page.locator(".wb-diff:visible")).to_have_count(0)
     button(page, "Add human view")
@@ -228,7 +228,7 @@ def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_
     page.get_by_text("Add, copy, rename, remove", exact=True).click()
 
 
-def test_the_picture_stays_in_sight_and_is_looked_at_in_another_size(page: Page) -> None:
+def test_the_picture_stays_visible_and_can_be_shown_in_another_size(page: Page) -> None:
     choose(page, "base_camera · sensor")
     until(lambda: picture(page) != "", "the picture")
     press(page, "¼")
@@ -240,7 +240,7 @@ def test_the_picture_stays_in_sight_and_is_looked_at_in_another_size(page: Page)
     by_matrix.scroll_into_view_if_needed()
     box = image.bounding_box()
     assert box is not None and 0 < box["y"] < 120
-    # And nothing lies over it.
+    # And nothing covers it.
     on_top = "([x, y]) => document.elementFromPoint(x, y).closest('.wb-pane') !== null"
     assert page.evaluate(on_top, [box["x"] + box["width"] / 2, box["y"] + 60])
     press(page, "full")

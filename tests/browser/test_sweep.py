@@ -64,11 +64,11 @@ def shown(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterato
     gated_server.close()
 
 
-def test_a_line_a_row_and_an_episode_are_pressed_with_the_mouse(shown: Shown) -> None:
+def test_a_line_a_row_and_an_episode_can_be_pressed_with_the_mouse(shown: Shown) -> None:
     page = shown.page
     point = page.locator(".wb-sweep-point")
     expect(point).to_have_text("reach_weight = 2, robot_uids = panda")
-    # Where it is alone: between the axes of the weight and of the robot, next to the latter.
+    # Where no other line is: between the axes of the weight and of the robot, next to the latter.
     line = page.locator("polyline.wb-to-press").filter(has_text="reach_weight = 0.5, robot_uids = panda")
     (x1, y1), (x2, y2) = (
         map(float, pair.split(",")) for pair in str(line.get_attribute("points")).split()[:2]

@@ -29,7 +29,7 @@ def opened(example: At, browser: Browser) -> Iterator[Desk]:
 
 @pytest.fixture
 def desk(opened: Desk) -> Desk:
-    """Live, eight steps into an episode of seed 0, no input with the focus."""
+    """The desk, live, eight steps into an episode of seed 0, without a focused input."""
     opened.leave_inputs()
     opened.press("End", "Shift+R")
     opened.comes_to(0)
@@ -42,12 +42,12 @@ def desk(opened: Desk) -> Desk:
 
 
 def wait_for_the_range() -> None:
-    """The slider's range follows a moment later, and would go over a hand that is there already."""
+    """Wait until the slider's range is updated: a later update would override a drag."""
     time.sleep(RANGE_PERIOD_SECONDS)
 
 
 @pytest.mark.slow
-def test_arrow_keys_walk_through_the_past_and_end_is_live(desk: Desk) -> None:
+def test_arrow_keys_move_through_the_past_and_end_is_live(desk: Desk) -> None:
     desk.press("ArrowLeft", "ArrowLeft", "ArrowLeft")
     desk.comes_to(STEPS - 3)
     desk.timeline_says("3 steps ago")
@@ -86,16 +86,16 @@ def test_the_timeline_folds_to_a_transport_of_one_row_whose_strip_still_goes_to_
 
 
 @pytest.mark.slow
-def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk) -> None:
+def test_the_slider_moves_to_a_click_and_an_arrow_counts_once(desk: Desk) -> None:
     desk.page.get_by_role("button", name="this episode").click()
     expect(desk.page.locator(SLIDER)).to_have_attribute("min", str(-STEPS))
-    # By its own click, which waits until the panel, whose height has changed, stands still.
+    # Playwright's click waits until the panel, whose height has changed, is stable.
     desk.page.locator(SLIDER).last.click()
     desk.comes_to(STEPS // 2)
-    time.sleep(1.5)  # a slider that was touched just now is taken to have had the key itself
+    time.sleep(1.5)  # right after a touch the slider counts as the receiver of the key
     desk.page.keyboard.press("ArrowLeft")
     desk.comes_to(STEPS // 2 - 1)
-    time.sleep(1.5)  # the second step, of a slider that takes the key as well, would come by now
+    time.sleep(1.5)  # a second step, by a slider that also takes the key, would have arrived by now
     assert desk.elapsed() == STEPS // 2 - 1
     desk.page.get_by_role("button", name="all episodes").click()
 
@@ -124,7 +124,7 @@ def test_keys_work_after_a_click_on_a_tab_a_checkbox_or_a_dropdown_but_not_in_a_
     shown = page.get_by_label("Show", exact=True).locator("visible=true").first
     shown.select_option(label="contacts")
     shown.click()
-    page.keyboard.press("Escape")  # a list that was opened and closed again takes no letters
+    page.keyboard.press("Escape")  # a list that is closed again takes no letters
     page.get_by_role("checkbox").locator("visible=true").first.click()
     page.keyboard.press("Shift+R")
     expect(page.get_by_text("known after the next step")).to_be_visible()
@@ -139,7 +139,7 @@ def test_keys_work_after_a_click_on_a_tab_a_checkbox_or_a_dropdown_but_not_in_a_
 
 def empty(field: Locator) -> None:
     def emptied() -> bool:
-        # What the server says of the number before may come in between, and takes the selection away.
+        # The server's update of the last number may arrive in between and remove the selection.
         field.press("Control+a")
         field.press("Delete")
         return field.input_value() == ""
@@ -148,9 +148,9 @@ def empty(field: Locator) -> None:
 
 
 @pytest.mark.slow
-def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_again(desk: Desk) -> None:
+def test_a_number_is_committed_when_complete_and_an_invalid_one_is_reverted(desk: Desk) -> None:
     page = desk.page
-    said, past = (
+    rejection, past = (
         page.locator(".wb-not-taken").last,
         page.get_by_label("step of the past"),
     )
@@ -166,16 +166,16 @@ def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_a
     ):
         seed.press("Control+a")
         page.keyboard.press("Delete")
-        # In one go: the field puts its caret back some time after a key, so that on a busy machine
-        # digits that follow at once landed behind the first.
+        # In one go: the field resets its caret some time after a key, so on a busy machine digits
+        # typed right after the first would land behind it.
         page.keyboard.insert_text(typed)
         expect(seed).to_have_value(typed)
         page.keyboard.press("Tab" if typed == "abc" else "Enter")
-        expect(said).to_have_text(says)
+        expect(rejection).to_have_text(says)
         expect(seed).to_have_value("0")
     seed.press("Control+a")
     page.keyboard.insert_text("12")
-    time.sleep(1.0)  # longer than a seed waits until it is sent: every env would have been reset
+    time.sleep(1.0)  # longer than a seed's debounce: every env would have been reset
     expect(seed).to_have_value("12")
     desk.timeline_says(f"step {STEPS} /")
     page.keyboard.press("Escape")
@@ -191,19 +191,19 @@ def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_a
     page.keyboard.type("0")
     page.get_by_role("tab", name="Reward").click()
     desk.leave_inputs()
-    time.sleep(1.0)  # longer than a seed waits until it is sent
+    time.sleep(1.0)  # longer than a seed's debounce
     wait_for_the_range()
     page.get_by_role("tab", name="Run").click()
     expect(seed).to_have_value("0")
 
     past.filter(visible=True).last.fill("7")
     page.keyboard.press("Enter")
-    expect(said).to_have_text(re.compile(r"^step of the past: it goes from -\d+ to 0\. It stays 0\.$"))
+    expect(rejection).to_have_text(re.compile(r"^step of the past: it goes from -\d+ to 0\. It stays 0\.$"))
     past.filter(visible=True).last.fill("-2")
     page.keyboard.press("Enter")
     desk.timeline_says("2 steps ago")
     page.get_by_role("tab", name="Reward").click()
 
 
-def test_nothing_went_wrong_in_the_console(opened: Desk) -> None:
+def test_the_console_has_no_errors(opened: Desk) -> None:
     assert opened.errors == []

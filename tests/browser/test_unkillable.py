@@ -17,7 +17,7 @@ from workbench.machine.processes.family import family
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ARGUMENTS = "--num-envs 2 --env render_backend=none".split()
-"""Without pictures there are no shaders to wait for."""
+"""Without pictures there are no shaders to compile."""
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator
         yield Desk(page, errors, file, opened)
 
 
-def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> None:
+def test_a_loop_shows_a_banner_that_can_interrupt_it_with_its_traceback(desk: Desk) -> None:
     desk.tab("Run")
     provoke(desk.file, "evaluate", "loop")
     desk.button("Step").click()
@@ -35,7 +35,7 @@ def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> No
     expect(
         desk.page.get_by_text(re.compile(r"has been in evaluate for \d+ s — risky\.py:\d+"))
     ).to_be_visible()
-    # The page's own controls answer all the while.
+    # The page's own controls keep working.
     desk.button("next ›").click()
     until(lambda: "env 1: step" in desk.page.inner_text("body"), "the next env")
     desk.button("Interrupt").click()
@@ -48,7 +48,7 @@ def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> No
     expect(desk.page.get_by_text(re.compile("was interrupted in evaluate"))).to_have_count(0)
 
 
-def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
+def test_restart_ends_uninterruptible_work(desk: Desk) -> None:
     desk.tab("Run")
     at = re.search(r"step \d+ / \d+", desk.page.locator(".wb-timeline").inner_text())
     assert at is not None
@@ -63,13 +63,13 @@ def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
     expect(desk.page.get_by_text("paused", exact=True)).to_be_visible()
     desk.timeline_says(where)
     assert desk.opened.wait_for_line("worker failed.*stopped by hand in evaluate")
-    # The new one is a fork, and so is the next spare: none has done the imports for itself.
+    # The new worker and the next spare are forks: neither did the imports itself.
     every = [Path(f"/proc/{pid}/cmdline").read_text() for pid in family(desk.opened.process.pid)]
     assert any("worker.fork_server" in one for one in every)
     assert not any("session.worker.start" in one for one in every)
 
 
-def test_the_log_shows_what_was_printed_and_forgets_it(desk: Desk) -> None:
+def test_the_log_shows_printed_lines_and_can_be_cleared(desk: Desk) -> None:
     desk.tab("Run")
     provoke(desk.file, "reset", "flood")
     desk.button("Reset all").click()

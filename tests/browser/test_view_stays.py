@@ -1,4 +1,4 @@
-"""A key that is a command does not move the 3-D view as well."""
+"""A command key does not also move the 3-D view."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.browser
 
 
 @pytest.mark.slow
-def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
+def test_command_keys_do_not_move_the_view(browser: Browser) -> None:
     gated_server = open_server(ServerOptions(port=0))
     stepped, walked = threading.Event(), threading.Event()
     visitors = Visitors(gated_server.server, COMMANDS)
@@ -29,7 +29,7 @@ def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
     events = {Step(): stepped, StepBack(): walked}
     visitors.do = lambda command, visitor: events[command].set()
     register(gated_server.server, visitors, {Step, StepBack}, "live page")
-    # It comes after them: a key that is pressed before the page knows the commands is lost.
+    # It is drawn after the commands: a key that is pressed before the page knows them is lost.
     gated_server.server.gui.add_markdown("the commands are there")
     try:
         with page_at(browser, gated_server.url, 1000, 600) as (page, _):
@@ -42,10 +42,10 @@ def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
                 page.keyboard.down(key)
                 page.wait_for_timeout(
                     300
-                )  # the time is what is tested: viser moves its view as long as a key is down
+                )  # the duration is under test: viser moves its view while a key is down
                 page.keyboard.up(key)
             until(lambda: stepped.is_set() and walked.is_set(), "the commands")
-            # What the view tells of itself comes in order: behind a drag, it has told of all before.
+            # View updates arrive in order: after that of a drag, all earlier ones have arrived.
             np.testing.assert_allclose(client.camera.position, before, atol=1e-6)
             page.mouse.move(200, 400)
             page.mouse.down()
@@ -53,6 +53,6 @@ def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
             page.mouse.up()
             until(lambda: not np.allclose(client.camera.position, before), "the view that is dragged")
             height = client.camera.position[2]
-            assert height == pytest.approx(before[2], abs=1e-3), "it was moved up or down by a key"
+            assert height == pytest.approx(before[2], abs=1e-3), "a key moved the view up or down"
     finally:
         gated_server.close()

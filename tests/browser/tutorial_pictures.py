@@ -1,4 +1,4 @@
-"""The pictures of the tutorial: what its reader sees after each step, with the files that the page itself gives."""
+"""The pictures of the tutorial: the page after each step, with the files from the tutorial page itself."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from tests.docs.walk import FILE, STEPS, after, mistake
 if TYPE_CHECKING:
     from tests.browser.take_screenshots import Desk
 
-SETTLED = 10.0
-"""Seconds after a save in which a busy machine too has built the envs again."""
-CHECKED = 300_000
-"""Milliseconds until all rules are checked there."""
+SETTLE_SECONDS = 10.0
+"""Time after a save in which even a busy machine has rebuilt the envs."""
+CHECK_TIMEOUT_MS = 300_000
+"""Timeout for checking all rules on a busy machine."""
 
 
 def take_steps(desk: Desk) -> None:
-    """Steps 1 to 9; the page shows the file as the first one leaves it."""
+    """Take the pictures of steps 1 to 9; the page shows the file after the first step."""
     page = desk.page
     desk.press("Space")
     time.sleep(8)
@@ -73,26 +73,26 @@ def take_steps(desk: Desk) -> None:
 
 
 def do(desk: Desk, number: int) -> None:
-    """Save the file as a step of the page leaves it."""
+    """Save the file as it is after a step of the page."""
     save(desk, text_after(number))
 
 
 def go_wrong(desk: Desk, number: int) -> None:
-    """Save the first mistake of a step."""
+    """Save the file with the first mistake of a step."""
     first = next(fence for fence in STEPS[number - 1].fences if fence.language == "diff")
     save(desk, mistake(first, text_after(number)))
 
 
 def save(desk: Desk, text: str) -> None:
-    """Returns when the version is checked, with the tab of the checks open."""
+    """Save, and return when the version is checked, with the Checks tab open."""
     desk.file.write_text(text)
     desk.tab("Checks")
-    time.sleep(SETTLED)
-    expect(desk.page.get_by_text("rules checked in")).to_be_visible(timeout=CHECKED)
+    time.sleep(SETTLE_SECONDS)
+    expect(desk.page.get_by_text("rules checked in")).to_be_visible(timeout=CHECK_TIMEOUT_MS)
 
 
 def text_after(count: int) -> str:
-    """Of the task, after so many steps."""
+    """The task's text after `count` steps."""
     with tempfile.TemporaryDirectory() as folder:
         after(count, Path(folder))
         return (Path(folder) / FILE).read_text()

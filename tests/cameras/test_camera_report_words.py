@@ -1,4 +1,4 @@
-"""A camera's report in words: the worst first, and of an env what is worst in it."""
+"""The text of a camera report: worst objects first, and the worst problem of each env."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def seen(
 
 
 def depth_of(counts: dict[int, int], envs: int, farthest_object: float = 1.5) -> DepthReport:
-    """All pixels in these bins, and the objects end at a distance."""
+    """Return a depth report with pixel `counts` by bin and the distance of the farthest object."""
     rows = np.zeros((envs, len(DEPTH_EDGES_METRES) - 1), np.int64)
     for place, count in counts.items():
         rows[:, place] = count
@@ -58,7 +58,7 @@ def report_of(*objects: ObjectSeen) -> CameraReport:
     )
 
 
-def test_the_least_seen_object_comes_first_scenery_is_left_out_and_what_is_hidden_says_so() -> None:
+def test_rows_list_the_least_seen_object_first_without_scenery() -> None:
     report = report_of(
         seen("bowl", [90, 80, 70, 60]),
         seen("cube", [0, 50, 40, 30], unhindered=[20, 50, 80, 30], cut=(3,)),
@@ -74,7 +74,7 @@ def test_the_least_seen_object_comes_first_scenery_is_left_out_and_what_is_hidde
 
 
 @pytest.mark.parametrize(
-    ("thing", "said"),
+    ("thing", "words"),
     [
         (seen("cube", [0, 90]), "cube is not visible in 1 of 2 envs."),
         (
@@ -85,11 +85,11 @@ def test_the_least_seen_object_comes_first_scenery_is_left_out_and_what_is_hidde
         (seen("table", [50, 90], scenery=True), "No object is visible in these envs."),
     ],
 )
-def test_the_headline_says_the_worst(thing: ObjectSeen, said: str) -> None:
-    assert headline(report_of(thing)) == said
+def test_the_headline_names_the_worst_problem(thing: ObjectSeen, words: str) -> None:
+    assert headline(report_of(thing)) == words
 
 
-def test_an_env_is_called_by_what_is_worst_in_it() -> None:
+def test_an_env_is_labelled_with_its_worst_problem() -> None:
     free = [0.0, 30.0, 80.0, 90.0, 90.0, 20.0, 0.0, 45.0]
     cube = seen("cube", [0, 0, 40, 90, 90, 20, 0, 45], free, alone=[*free[:6], 50, 90], cut=(3,))
     report = report_of(cube, seen("bowl", [200] * 8))

@@ -1,4 +1,4 @@
-"""What the folders beside placing a camera say and show, without a page."""
+"""The Studio's folders for reports, comparison, search, export and edits, without a page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.drive.live import HandedSession
+from tests.drive.live import StubSession
 from tests.drive.panels import Panels
 from tests.drive.scenes import description, running, table_scene
 from workbench.cameras.commands import ReturnToKept, SaveCameraChange, ToggleWantedObject
@@ -66,13 +66,13 @@ def camera(mount_pose: np.ndarray | None = None, mount: str = "panda/panda_hand"
     return StudioCamera(("sensor", "base_camera"), info, SETTINGS, False, mount_pose)
 
 
-def test_two_placements_differ_by_how_far_and_how_much_they_were_turned() -> None:
+def test_differences_of_placements_are_listed_with_distance_and_angle() -> None:
     assert what_differs(SETTINGS, SETTINGS) == []
     half = math.radians(5) / 2
     new = replace(SETTINGS, position=(0.3, 0.02, 0.6), quaternion=(math.cos(half), 0.0, math.sin(half), 0.0))
     old = replace(SETTINGS, quaternion=(1.0, 0.0, 0.0, 0.0))
     assert what_differs(old, new) == ["moved 20.0 mm", "turned 5.00°"]
-    # The same orientation, said by the opposite quaternion.
+    # The negated quaternion is the same orientation.
     opposite = tuple(-number for number in SETTINGS.quaternion)
     assert what_differs(SETTINGS, replace(SETTINGS, quaternion=opposite)) == []
     assert what_differs(SETTINGS, replace(SETTINGS, fov=1.0, far=2.0, width=64)) == [
@@ -82,7 +82,7 @@ def test_two_placements_differ_by_how_far_and_how_much_they_were_turned() -> Non
     ]
 
 
-def test_hands_of_robots_are_offered_first_and_are_not_asked_for_by_themselves() -> None:
+def test_robot_hands_are_listed_before_other_links_and_are_not_preselected() -> None:
     objects = (
         ObjectToSee("cube", False),
         ObjectToSee("goal", True),
@@ -115,26 +115,28 @@ def test_hands_of_robots_are_offered_first_and_are_not_asked_for_by_themselves()
         ("x" * 500, "x" * 60 + ".json"),
     ],
 )
-def test_a_download_is_named_by_plain_letters(name: str, wanted: str) -> None:
+def test_a_downloads_file_name_has_plain_letters_only(name: str, wanted: str) -> None:
     assert file_name(name, "json") == wanted
     assert file_name(name, "ros") == wanted.replace(".json", "_ros.yaml")
 
 
-def looked_at(now: CameraSettings = SETTINGS, in_file: CameraSettings = SETTINGS, **more: Any) -> SessionView:
-    """A view in which this camera is chosen, of a task with a cube."""
+def view_of_camera(
+    now: CameraSettings = SETTINGS, in_file: CameraSettings = SETTINGS, **more: Any
+) -> SessionView:
+    """Return a view of a task with a cube, in which the camera is chosen."""
     one = camera()
     one = replace(one, info=replace(one.info, settings=in_file), now=now)
     task = replace(description(table_scene(1)[0]), objects=(ObjectToSee("cube", False),))
     return running(1, task=task, studio=StudioView(cameras=(one,), selected=one.key, **more))
 
 
-def test_a_placement_is_compared_with_that_of_the_file_before_it_was_saved(panels: Panels) -> None:
-    session = HandedSession()
+def test_a_saved_placement_is_compared_with_the_files_previous_one(panels: Panels) -> None:
+    session = StubSession()
     folder = CameraCompare(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
 
     def draw(settings: CameraSettings) -> None:
-        session.shown = looked_at(settings, settings)
+        session.shown = view_of_camera(settings, settings)
         folder.draw(session.shown)
 
     draw(SETTINGS)
@@ -147,30 +149,30 @@ def test_a_placement_is_compared_with_that_of_the_file_before_it_was_saved(panel
     assert session.asked == [ComparisonWanted(SETTINGS)]
 
 
-def test_a_placement_that_was_kept_is_what_it_is_then_compared_with_and_returns_to(panels: Panels) -> None:
-    session = HandedSession()
+def test_a_kept_placement_becomes_the_comparison_and_can_be_restored(panels: Panels) -> None:
+    session = StubSession()
     folder = CameraCompare(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
-    session.shown = looked_at()
+    session.shown = view_of_camera()
     folder.draw(session.shown)
     panels.do(ReturnToKept())
     assert "is kept yet" in panels.client.notices[-1]
     panels.press("Keep this placement as A")
     folder.draw(session.shown)
     assert panels.field("Now, with").value == NAMES["kept"] and not panels.shows("Return to A")
-    session.shown = looked_at(replace(SETTINGS, far=50.0))
+    session.shown = view_of_camera(replace(SETTINGS, far=50.0))
     folder.draw(session.shown)
     panels.press("Return to A")
     assert session.asked == [CameraPlaced(("sensor", "base_camera"), SETTINGS)]
 
 
-def test_a_box_around_the_eye_is_searched_until_one_is_written(panels: Panels) -> None:
-    session = HandedSession()
+def test_the_search_box_surrounds_the_eye_until_one_is_typed(panels: Panels) -> None:
+    session = StubSession()
     folder = CameraSuggest(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
 
     def draw(now: CameraSettings) -> None:
-        session.shown = looked_at(now)
+        session.shown = view_of_camera(now)
         folder.draw(session.shown)
 
     draw(SETTINGS)
@@ -182,17 +184,17 @@ def test_a_box_around_the_eye_is_searched_until_one_is_written(panels: Panels) -
     panels.set("Resets", 3)
     panels.press("Search")
     asked = SuggestionsWanted(("cube",), (0.0, -0.3, 0.9), (0.6, 0.3, 2.0), 3)
-    assert session.asked == [asked], "between the corners, in whatever order they are"
+    assert session.asked == [asked], "the corners must be sorted"
     panels.ask(ToggleWantedObject(name="cube"))
     panels.press("Search")
     assert session.asked == [asked] and "at least one object" in panels.client.notices[-1]
 
 
-def test_a_camera_is_measured_over_what_was_chosen(panels: Panels) -> None:
-    session = HandedSession()
+def test_a_camera_is_measured_over_the_chosen_set(panels: Panels) -> None:
+    session = StubSession()
     folder = CameraReportPanel(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
-    session.shown = looked_at()
+    session.shown = view_of_camera()
     for over, fields, wanted in (
         ("all envs now", (False, False), MeasureWanted("envs", 32)),
         ("fresh resets", (False, True), MeasureWanted("resets", 32)),
@@ -210,10 +212,10 @@ def test_a_camera_is_measured_over_what_was_chosen(panels: Panels) -> None:
 
 
 class Writing:
-    """The places where changes of the file are asked for."""
+    """The folder that requests edits of the file, with a scripted session."""
 
     def __init__(self, panels: Panels) -> None:
-        self.panels, self.session = panels, HandedSession()
+        self.panels, self.session = panels, StubSession()
         above = panels.server.gui.add_folder(None)
         self.part = WriteToFile(panels.server, cast(Any, self.session), lambda _, lens: lens, above)
         panels.visitors.do = self.do
@@ -229,23 +231,23 @@ class Writing:
         self.part.draw(view)
 
 
-def test_only_a_change_that_was_read_is_saved(panels: Panels) -> None:
+def test_only_the_shown_change_can_be_saved(panels: Panels) -> None:
     writing, moved = Writing(panels), replace(SETTINGS, far=50.0)
     planned = EditState("planned", EditRequest("edit", ("sensor", "base_camera"), SETTINGS))
-    writing.draw(looked_at())
+    writing.draw(view_of_camera())
     assert panels.button("Show the change").command is None and not panels.shows("Save")
-    writing.draw(looked_at(edit_state=planned))
+    writing.draw(view_of_camera(edit_state=planned))
     assert not panels.shows("Show the change")
-    writing.draw(looked_at(moved, edit_state=planned))
+    writing.draw(view_of_camera(moved, edit_state=planned))
     assert not panels.shows("Save") and panels.shows("Discard the change")
-    writing.draw(looked_at(edit_state=planned))
+    writing.draw(view_of_camera(edit_state=planned))
     panels.press("Save")
     assert writing.session.asked == [SaveCameraChange()]
 
 
-def test_a_camera_gets_the_name_that_was_typed_until_it_is_taken(panels: Panels) -> None:
-    writing, key = Writing(panels), looked_at().of(StudioView).cameras[0].key
-    writing.draw(looked_at())
+def test_a_typed_name_is_used_once(panels: Panels) -> None:
+    writing, key = Writing(panels), view_of_camera().of(StudioView).cameras[0].key
+    writing.draw(view_of_camera())
     for name, button, why_not in (
         ("", "Rename", "Type a new name"),
         ("a b", "Duplicate", "has letters"),
@@ -258,9 +260,9 @@ def test_a_camera_gets_the_name_that_was_typed_until_it_is_taken(panels: Panels)
     panels.press("Duplicate")
     request = EditRequest("duplicate", key, name="hand")
     assert writing.session.asked == [EditWanted(request)]
-    writing.draw(looked_at(edit_state=EditState("planned", replace(request, settings=SETTINGS))))
+    writing.draw(view_of_camera(edit_state=EditState("planned", replace(request, settings=SETTINGS))))
     assert panels.typed("New name") == "hand"
-    writing.draw(looked_at(edit_state=EditState("checked", request)))
+    writing.draw(view_of_camera(edit_state=EditState("checked", request)))
     assert panels.typed("New name") == ""
     panels.press("Duplicate")
     assert writing.session.asked[-1] == EditWanted(replace(request, name="base_camera_2"))
@@ -270,8 +272,10 @@ def test_a_camera_gets_the_name_that_was_typed_until_it_is_taken(panels: Panels)
     st.lists(st.floats(-2, 2), min_size=7, max_size=7),
     st.one_of(st.none(), st.lists(st.floats(-2, 2), min_size=7, max_size=7)),
 )
-def test_a_camera_goes_out_and_comes_in_where_it_was(pose: list[float], mount: list[float] | None) -> None:
-    """Also on a body that has moved since, where the file holds the pose in the frame of the env."""
+def test_an_exported_camera_is_imported_at_the_same_pose(
+    pose: list[float], mount: list[float] | None
+) -> None:
+    """Includes mounted cameras, whose pose the file holds in the env's frame."""
     assume(all(np.linalg.norm(one[3:]) > 0.1 for one in (pose, mount) if one is not None))
     on = None if mount is None else make_pose(mount[:3], mount[3:]).astype(np.float32)
     one = camera(on)
@@ -279,25 +283,25 @@ def test_a_camera_goes_out_and_comes_in_where_it_was(pose: list[float], mount: l
     text = calibration_text([replace(one, now=there)], "json")
     for metres in (1.0, 0.001):
         back = with_pose(SETTINGS, calibrated_pose(one, text, None, None, metres))
-        assert not differences(back, there, close=1e-5), "our own file is in metres whatever is chosen"
+        assert not differences(back, there, close=1e-5), "our own file is in metres whatever unit is chosen"
     assert calibration_text([one], "opencv") and calibration_text([one, one], "ros").count("---") == 1
-    assert why_not(lambda: calibrated_pose(one, "{}", None, None))
-    assert why_not(lambda: calibration_text([replace(one, now=None)], "json"))
+    assert refusal_of(lambda: calibrated_pose(one, "{}", None, None))
+    assert refusal_of(lambda: calibration_text([replace(one, now=None)], "json"))
     if mount is not None:
-        assert why_not(lambda: calibrated_pose(replace(one, mount_pose=None), text, None, None))
+        assert refusal_of(lambda: calibrated_pose(replace(one, mount_pose=None), text, None, None))
 
 
-def why_not(do: Callable[[], object]) -> str:
+def refusal_of(do: Callable[[], object]) -> str:
     with pytest.raises(ValueError) as refused:
         do()
     return str(refused.value)
 
 
-def test_a_pasted_calibration_is_read_as_was_chosen(panels: Panels) -> None:
-    session = HandedSession()
+def test_a_pasted_calibration_is_read_in_the_chosen_convention_and_units(panels: Panels) -> None:
+    session = StubSession()
     folder = CameraExport(panels.server, cast(Any, session))
     panels.visitors.do = folder.do
-    session.shown = looked_at()
+    session.shown = view_of_camera()
     folder.draw(session.shown)
     panels.press("Apply to the camera")
     assert session.asked == [] and "Paste a calibration" in panels.client.notices[-1]

@@ -22,7 +22,7 @@ def studio(selected: CameraKey | None) -> SessionView:
     return running(1, studio=StudioView(cameras=cameras, selected=selected))
 
 
-def test_a_camera_or_none_is_chosen_from_the_list(live_page: Live) -> None:
+def test_a_camera_or_none_can_be_chosen_from_the_list(live_page: Live) -> None:
     tab = live_page.part(TAB)
     live_page.show(running(1))
     assert not tab.shows("Camera")

@@ -1,4 +1,4 @@
-"""Cameras added, copied, renamed and removed in the author's file; and changes that do not come to what they should."""
+"""Camera edits in the author's file that are reverted, refused, or do not have the requested effect."""
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalSubscript=false
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("child_process")
 LIMITED = '''
 
 def limited(configs):
-    """Of its own mind, and of another once it is on the disk."""
+    """Changes configs, and differently after an edit is saved to disk."""
     text = open(limited.__code__.co_filename).read()
     for config in configs:
         if config.fov < 0.1:
@@ -74,51 +74,51 @@ def written(session: Session, stage: str = "checked") -> EditState:
     return view.of(StudioView).edit_state
 
 
-def there(session: Session, key: CameraKey) -> CameraSettings:
+def settings_in_file(session: Session, key: CameraKey) -> CameraSettings:
     found = camera(session, key).info.settings
     assert found is not None
     return found
 
 
 @pytest.mark.slow
-def test_while_the_disk_hangs_under_an_edit_the_session_answers(
+def test_the_session_answers_while_an_edit_waits_for_the_disk(
     session: Session, task_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    goes_on, hangs, apply = threading.Event(), threading.Event(), file_edits.apply
+    resume, waiting, apply = threading.Event(), threading.Event(), file_edits.apply
 
-    def slowly(edit: SourceEdit) -> None:
-        hangs.set()
-        goes_on.wait(60)
+    def apply_when_resumed(edit: SourceEdit) -> None:
+        waiting.set()
+        resume.wait(60)
         apply(edit)
 
-    monkeypatch.setattr(file_edits, "apply", slowly)
-    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=1.05)))
+    monkeypatch.setattr(file_edits, "apply", apply_when_resumed)
+    session.happen(CameraPlaced(BASE, replace(settings_in_file(session, BASE), fov=1.05)))
     session.happen(EditWanted(EditRequest("edit", BASE)))
     planned(session)
     session.do(SaveCameraChange())
     try:
-        assert hangs.wait(60)
+        assert waiting.wait(60)
         step(session)
         assert session.view().of(StudioView).edit_state.loading
     finally:
-        goes_on.set()
+        resume.set()
     wait_until(session, in_studio(lambda s: s.edit_state.stage == "checked"), "the check")
     assert "1.05" in task_file.read_text()
     session.do(RevertCameraChange())
     wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
-        "the file as it was",
+        "the original file",
     )
 
 
 @pytest.mark.slow
-def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_between(
+def test_changes_are_reverted_one_by_one_even_after_a_discarded_plan(
     session: Session, task_file: Path
 ) -> None:
     texts = [task_file.read_text()]
     for fov in (0.9, 0.95):
-        session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=fov)))
+        session.happen(CameraPlaced(BASE, replace(settings_in_file(session, BASE), fov=fov)))
         session.happen(EditWanted(EditRequest("edit", BASE)))
         written(session)
         texts.append(task_file.read_text())
@@ -126,13 +126,13 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
     planned(session)
     session.do(DropCameraChange())
     wait_until(
-        session, in_studio(lambda s: s.edit_state.stage == "checked"), "the change that can be taken back"
+        session, in_studio(lambda s: s.edit_state.stage == "checked"), "the change that can be reverted"
     )
     session.do(RevertCameraChange())
     view = wait_until(
         session, in_studio(lambda s: "Before it: base_camera" in s.edit_state.message), "the change before it"
     )
-    # It can be reverted at once.
+    # It can be reverted immediately.
     assert view.of(StudioView).edit_state.stage == "checked"
     assert view.of(StudioView).edit_state.message.startswith(f"Edit reverted in {task_file.name}.")
     assert task_file.read_text() == texts[1]
@@ -140,7 +140,7 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
     wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
-        "the file of before",
+        "the original file",
     )
     assert task_file.read_text() == texts[0]
     session.do(DropCameraChange())
@@ -149,9 +149,9 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
 
 
 @pytest.mark.slow
-def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session, task_file: Path) -> None:
+def test_a_change_is_not_reverted_in_a_file_that_was_edited_since(session: Session, task_file: Path) -> None:
     before = task_file.read_text()
-    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=0.9)))
+    session.happen(CameraPlaced(BASE, replace(settings_in_file(session, BASE), fov=0.9)))
     session.happen(EditWanted(EditRequest("edit", BASE)))
     written(session)
     edited = task_file.read_text() + "# more\n"
@@ -165,28 +165,26 @@ def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session
     assert task_file.read_text() == edited
     session.do(DropCameraChange())
     task_file.write_text(before)
-    wait_until(
-        session, lambda v: v.of(StudioView).camera(BASE).info.settings.fov == 1.0, "the file of before"
-    )
+    wait_until(session, lambda v: v.of(StudioView).camera(BASE).info.settings.fov == 1.0, "the original file")
 
 
-def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
+def test_a_camera_that_differs_from_the_edit_is_an_error_and_can_be_reverted(
     session: Session, task_file: Path
 ) -> None:
     before = task_file.read_text()
-    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=0.7)))
+    session.happen(CameraPlaced(BASE, replace(settings_in_file(session, BASE), fov=0.7)))
     session.happen(EditWanted(EditRequest("edit", BASE)))
     message = written(session, "mismatch").message
     assert (
         "base_camera is not what was written (fov: 0.8, not 0.7)" in message
         and "Revert the change" in message
     )
-    assert "fov=0.7" in task_file.read_text() and there(session, BASE).fov == 0.8
+    assert "fov=0.7" in task_file.read_text() and settings_in_file(session, BASE).fov == 0.8
     session.do(RevertCameraChange())
     wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
-        "the file of before",
+        "the original file",
     )
     assert task_file.read_text() == before
     session.do(PutMovedCamerasBack())
@@ -196,37 +194,39 @@ def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
 @pytest.mark.parametrize(
     ("fov", "why"), [(0.2, "does not give the camera the requested settings"), (0.05, "no lens at all")]
 )
-def test_a_change_that_the_hook_itself_makes_another_of_is_refused_before_it_is_written(
+def test_a_change_that_the_hook_overrides_is_refused_before_it_is_written(
     session: Session, task_file: Path, fov: float, why: str
 ) -> None:
     before = task_file.read_text()
-    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=fov)))
+    session.happen(CameraPlaced(BASE, replace(settings_in_file(session, BASE), fov=fov)))
     session.happen(EditWanted(EditRequest("edit", BASE)))
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage == "refused"), "the refusal")
     assert (
         why in view.of(StudioView).edit_state.message
         and f"fov={fov}" in view.of(StudioView).edit_state.snippet
     )
-    assert task_file.read_text() == before and there(session, BASE).fov == 1.0
+    assert task_file.read_text() == before and settings_in_file(session, BASE).fov == 1.0
     session.do(DropCameraChange())
     session.do(PutMovedCamerasBack())
 
 
 @pytest.mark.slow
-def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
+def test_a_change_that_breaks_loading_is_reported_and_can_be_reverted(
     session: Session, task_file: Path
 ) -> None:
     before = task_file.read_text()
-    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=0.4)))
+    session.happen(CameraPlaced(BASE, replace(settings_in_file(session, BASE), fov=0.4)))
     session.happen(EditWanted(EditRequest("edit", BASE)))
     planned(session)
     session.do(SaveCameraChange())
     view = wait_until(session, in_studio(lambda s: "does not load" in s.edit_state.message), "the failure")
-    assert "revert it if that is the reason" in view.of(StudioView).edit_state.message
+    assert "revert the change if that is the reason" in view.of(StudioView).edit_state.message
     assert view.problem is not None and "too narrow" in view.problem.message
-    assert there(session, BASE).fov == 1.0, "the version before goes on"
+    assert settings_in_file(session, BASE).fov == 1.0, "the previous version must keep running"
     session.do(RevertCameraChange())
     wait_until(
-        session, lambda v: v.problem is None and v.of(StudioView).edit_state.stage == "undone", "it back"
+        session,
+        lambda v: v.problem is None and v.of(StudioView).edit_state.stage == "undone",
+        "the reverted file",
     )
     assert task_file.read_text() == before

@@ -1,4 +1,4 @@
-"""A camera that cannot be drawn has a reason in its place, and everything else goes on."""
+"""A camera that cannot be rendered shows the reason, and everything else keeps working."""
 
 # A session that has a task has a step.
 # pyright: reportOptionalMemberAccess=false
@@ -61,7 +61,7 @@ def task(folder: Path, code: str, old: str = "", new: str = "") -> Path:
 
 
 @pytest.mark.slow
-def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
+def test_a_texture_that_the_shader_lacks_fails_its_camera(tmp_path: Path) -> None:
     file = task(
         tmp_path,
         OWN_SHADER,
@@ -76,14 +76,14 @@ def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
         session.happen(PagesCounted(1))
         view = wait_until(session, lambda v: SENSOR in v.failed_cameras and HUMAN in v.pictures, "both")
         assert f"{file}:{line}" in view.failed_cameras[SENSOR] and [*view.failed_cameras] == [SENSOR]
-        # Of the recording it is left out.
+        # The recording leaves this camera out.
         session.happen(RecordingWanted())
         step(session, 3)
         wait_until(session, lambda v: v.of(RecordingStatus).steps > 0, "recorded steps")
         session.do(StopRecording())
         view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written == 2, "the files")
         assert view.of(RecordingStatus).problem is None and view.problem is None
-        # What it can give it gives.
+        # The textures that the shader has are still rendered.
         session.change(cameras=(CameraRequest(HUMAN[1], "human"),))
         session.change(
             cameras=(CameraRequest(SENSOR[1], "sensor", ("rgb",)), CameraRequest(HUMAN[1], "human"))
@@ -93,12 +93,12 @@ def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_picture_that_never_comes(tmp_path: Path) -> None:
+def test_a_picture_that_hangs_fails_its_camera(tmp_path: Path) -> None:
     file = task(tmp_path, HANGS)
     with live_session(file, tmp_path / "recordings", draw=True, render_backend=RENDER_BACKEND) as session:
         session.change(cameras=(CameraRequest(HUMAN[1], "human"),))
         session.happen(PagesCounted(1))
-        view = wait_until(session, lambda v: HUMAN in v.failed_cameras, "the end of the picture")
+        view = wait_until(session, lambda v: HUMAN in v.failed_cameras, "the camera's failure")
         assert any(HUMAN[1] in line and str(file) in line for line in view.printed.texts)
         wait_until(session, lambda v: v.state == "paused", "the next worker")
         session.change(cameras=(CameraRequest(HUMAN[1], "human"), CameraRequest(SENSOR[1], "sensor")))

@@ -1,4 +1,4 @@
-"""Numbers of the chosen camera that are shown and typed."""
+"""The chosen camera's number fields."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Desk:
         self.numbers.draw(self.session.view().of(StudioView).placeable)
 
     def types(self, label: str, value: object, at: int = 0) -> CameraSettings:
-        """Type it, or choose it; `at` is the place in a row."""
+        """Type or choose `value`; `at` is the index in a row of fields. Returns the settings after it."""
         self.draw()
         if isinstance(value, str):
             self.panels.set(label, value)
@@ -88,8 +88,8 @@ with_a_fov, with_a_matrix = (
 
 
 @with_a_fov
-def test_all_is_shown_as_it_is_and_of_the_lens_and_the_orientation_one_way_to_say_it(desk: Desk) -> None:
-    said = {
+def test_all_settings_are_shown_with_one_form_of_lens_and_orientation(desk: Desk) -> None:
+    fields = {
         label: shown(desk, label)
         for label in (
             "Position",
@@ -101,7 +101,7 @@ def test_all_is_shown_as_it_is_and_of_the_lens_and_the_orientation_one_way_to_sa
             "Near, far",
         )
     }
-    assert said == {
+    assert fields == {
         "Position": (0.4512, 0.0, 0.61),
         "Looks at": (0.08, 0.0, 0.2),
         "Degrees": pytest.approx((0.0, 47.84, 180.0)),
@@ -129,10 +129,10 @@ def test_all_is_shown_as_it_is_and_of_the_lens_and_the_orientation_one_way_to_sa
 
 
 @with_a_fov
-def test_what_is_typed_is_taken_and_what_is_shown_beside_it_stays_to_the_last_digit(desk: Desk) -> None:
+def test_a_typed_number_is_set_and_the_others_stay_exact(desk: Desk) -> None:
     now = desk.types("Position", 0.1, at=1)
     assert now == replace(FILE, position=(EYE[0], 0.1, EYE[2]))
-    assert now.distance == FILE.distance, "what it looks at goes along"
+    assert now.distance == FILE.distance, "the target must move along"
     desk.types("Looks at", 0.0)
     desk.types("Looks at", 0.1, at=1)
     now = desk.types("Looks at", 0.3, at=2)
@@ -152,7 +152,7 @@ def test_what_is_typed_is_taken_and_what_is_shown_beside_it_stays_to_the_last_di
 
 
 @with_a_fov
-def test_an_eye_that_is_typed_alone_keeps_looking_at_its_target(desk: Desk) -> None:
+def test_typing_an_eye_keeps_the_target(desk: Desk) -> None:
     desk.two_handles[0] = True
     now = desk.types("Eye", 0.7, at=2)
     assert now.position == (EYE[0], EYE[1], 0.7) and not desk.panels.shows("Position")
@@ -163,7 +163,7 @@ def test_an_eye_that_is_typed_alone_keeps_looking_at_its_target(desk: Desk) -> N
 
 
 @with_a_fov
-def test_an_orientation_is_typed_as_a_quaternion_or_by_its_axes(desk: Desk) -> None:
+def test_an_orientation_can_be_typed_as_a_quaternion_or_axes(desk: Desk) -> None:
     desk.panels.set("Rotation", WXYZ)
     assert desk.types("w x y z", "[0.5, 0.5, 0.5, 0.5]").quaternion == (0.5, 0.5, 0.5, 0.5)
     desk.panels.set("Rotation", AXES)
@@ -182,7 +182,7 @@ def test_an_orientation_is_typed_as_a_quaternion_or_by_its_axes(desk: Desk) -> N
 
 
 @with_a_matrix
-def test_a_lens_that_is_a_matrix_is_typed_in_pixels_and_is_of_another_size_the_same_view(desk: Desk) -> None:
+def test_an_intrinsic_matrix_is_typed_in_pixels_and_scales_with_the_size(desk: Desk) -> None:
     assert shown(desk, "Lens as") == INTRINSIC and not desk.panels.shows("Vertical fov")
     assert shown(desk, "fx, fy") == (100.12, 90.0) and shown(desk, "cx, cy") == (64.0, 48.0)
     now = desk.types("fx, fy", 95.0, at=1)
@@ -211,7 +211,7 @@ def test_a_lens_that_is_a_matrix_is_typed_in_pixels_and_is_of_another_size_the_s
     ],
 )
 @with_a_fov
-def test_what_no_camera_has_is_refused_in_words(desk: Desk, label: str, value: Any, why: str) -> None:
+def test_an_invalid_number_is_refused_with_a_reason(desk: Desk, label: str, value: Any, why: str) -> None:
     desk.panels.set("Rotation", WXYZ)
     now = desk.types(label, value)
     assert why in desk.panels.client.notices[0]
@@ -219,7 +219,7 @@ def test_what_no_camera_has_is_refused_in_words(desk: Desk, label: str, value: A
 
 
 @with_a_fov
-def test_a_target_at_the_eye_an_axis_of_no_length_and_an_unknown_shader_are_refused(desk: Desk) -> None:
+def test_a_target_at_the_eye_a_zero_axis_and_an_unknown_shader_are_refused(desk: Desk) -> None:
     desk.types("Looks at", EYE[0])
     desk.types("Looks at", EYE[1], at=1)
     desk.types("Looks at", EYE[2], at=2)

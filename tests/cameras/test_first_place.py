@@ -1,4 +1,4 @@
-"""Where a sensor that is added stands: on the side that one looks from, near enough to see the task's objects."""
+"""The first pose of an added sensor: in the view's direction, close enough to see the task's objects."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ sides = st.tuples(metres, metres, st.floats(0.2, 1.0)).map(lambda v: np.array(v)
 
 
 @given(places, sides)
-def test_from_far_away_it_comes_near_along_the_direction_of_the_view_and_sees_most_objects(
-    things, side
-) -> None:
+def test_from_a_distant_view_the_sensor_moves_closer_and_sees_most_objects(things, side) -> None:
     middle = np.median(things, axis=0)
     (ex, ey, ez), (x, y, z) = (middle + 30 * side).tolist(), middle.tolist()
     seen_from = with_pose(NEW, pose_from_look_at(LookAt((ex, ey, ez), (x, y, z))))
@@ -31,20 +29,20 @@ def test_from_far_away_it_comes_near_along_the_direction_of_the_view_and_sees_mo
     towards = middle - found.position
     forward = axes_of(found.quaternion)[0]
     assert 0.55 < np.linalg.norm(towards) < 5 and np.allclose(np.cross(forward, towards), 0, atol=1e-3)
-    # All but the farthest tenth lie within the cone of its view.
+    # 90 % of the objects lie within its view cone.
     away = things - found.position
     angles = np.arccos(np.clip(away @ forward / np.linalg.norm(away, axis=1), -1, 1))
     assert np.quantile(angles, 0.9, method="lower") < 0.5 * 1.0  # half of its field of view
 
 
-def test_who_looks_from_about_there_is_taken_at_their_word() -> None:
+def test_a_close_view_is_used_unchanged() -> None:
     near = with_pose(NEW, pose_from_look_at(LookAt((0.5, 0.1, 0.4), (0.2, 0.3, 0.0))))
     assert first_place(near, ("cube",), np.array([[0.0, 0.0, 0.02]]))[0] == near
     far = replace(near, position=(50.0, 0.0, 9.0))
-    assert first_place(far, (), np.zeros((0, 3)))[0] == far, "a task without objects"
+    assert first_place(far, (), np.zeros((0, 3)))[0] == far, "without objects the view is used unchanged"
 
 
-def test_neither_robot_nor_what_is_hidden_counts_as_an_object_to_see() -> None:
+def test_robots_and_hidden_objects_are_not_objects_to_see() -> None:
     view = running(2)
     assert view.task is not None and view.step is not None
     objects = (

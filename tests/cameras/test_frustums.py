@@ -14,7 +14,7 @@ POSE = np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0], np.float32)
 GREY = np.full((6, 8, 3), 128, np.uint8)
 
 
-def test_camera_that_looks_along_x_looks_along_opencv_s_z() -> None:
+def test_a_camera_that_looks_along_x_has_opencvs_z_along_x() -> None:
     wxyz, position = frustum_pose(POSE, np.array([10, 0, 0], np.float32))
     turn = viser.transforms.SO3(wxyz)
     np.testing.assert_allclose(turn.apply(np.array([0.0, 0.0, 1.0])), [1, 0, 0], atol=1e-9)
@@ -22,7 +22,7 @@ def test_camera_that_looks_along_x_looks_along_opencv_s_z() -> None:
     np.testing.assert_allclose(position, [11, 2, 3])
 
 
-def test_frustums_follow_their_pictures_and_leave_with_them(panels: Panels) -> None:
+def test_frustums_follow_their_pictures_and_are_removed_with_them(panels: Panels) -> None:
     frustums = CameraFrustums(panels.server)
     cameras = (camera("base"), camera("hand"))
     offset = np.zeros(3, np.float32)
@@ -44,7 +44,7 @@ def test_frustums_follow_their_pictures_and_leave_with_them(panels: Panels) -> N
     assert panels.nodes("/cameras/") == []
 
 
-def test_the_nearest_frustum_that_a_ray_meets_is_the_one_pressed(panels: Panels) -> None:
+def test_a_click_selects_the_nearest_frustum_on_its_ray(panels: Panels) -> None:
     frustums = CameraFrustums(panels.server)
     behind = POSE + [0.3, 0, 0, 0, 0, 0, 0]
     pictures: dict[tuple[CameraKind, str], Picture] = {
@@ -56,9 +56,9 @@ def test_the_nearest_frustum_that_a_ray_meets_is_the_one_pressed(panels: Panels)
     # They look along x, one behind the other.
     assert frustums.under_ray(np.array([0.0, 2, 3]), along) == ("sensor", "base")
     assert frustums.under_ray(np.array([9.0, 2, 3]), -along) == ("sensor", "hand")
-    assert frustums.under_ray(np.array([2.0, 2, 3]), along) is None, "both lie behind"
+    assert frustums.under_ray(np.array([2.0, 2, 3]), along) is None, "both lie behind the ray's origin"
     assert frustums.under_ray(np.array([0.0, 2.2, 3]), along) is None
-    # Just inside and just outside of the edges that viser draws.
+    # Just inside and just outside the edges that viser draws.
     frustums.draw(
         (camera("base"),), {("sensor", "base"): pictures["sensor", "base"]}, np.zeros(3, np.float32), size=0.1
     )

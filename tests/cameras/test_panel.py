@@ -1,4 +1,4 @@
-"""The Cameras tab, drawn from views that are made by hand."""
+"""The Cameras tab, drawn from hand-made views."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) ->
     return shown_cameras(view)
 
 
-def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:
+def test_a_remaining_camera_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:
     panel = CamerasPanel(panels.server, clock=clock)
     panels.visitors.do = panel.do
     panel.draw(seen(1, (camera("base"), camera("hand"))))
@@ -51,12 +51,12 @@ def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: P
         CameraRequest("top", "sensor", ("rgb",)),
         CameraRequest("base", "sensor", ("rgb", "depth")),
     )
-    # What it can show is another choice of ticks.
+    # Other modalities mean other tick boxes.
     panel.draw(seen(3, (replace(camera("base"), modalities=("rgb",)),)))
     assert panels.folders() == [BASE] and not base.shows("depth") and base.images() != [image]
 
 
-def test_what_is_ticked_is_asked_for_and_stays_ticked_while_its_camera_is_gone(panels: Panels) -> None:
+def test_ticked_pictures_are_requested_and_stay_ticked_while_their_camera_is_gone(panels: Panels) -> None:
     panel = CamerasPanel(panels.server)
     panels.visitors.do = panel.do
     panel.draw(None)
@@ -78,7 +78,7 @@ def test_what_is_ticked_is_asked_for_and_stays_ticked_while_its_camera_is_gone(p
     assert panels.client.notices == ["No camera base gives albedo."]
 
 
-def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:
+def test_pictures_of_another_moment_are_marked(panels: Panels) -> None:
     panel = CamerasPanel(panels.server)
     cameras = (camera("base"),)
     panel.draw(seen(1, cameras))
@@ -89,27 +89,27 @@ def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:
     assert "another moment" not in panels.html()
 
 
-def test_pictures_that_follow_each_other_are_as_wide_as_the_panel_and_the_last_is_whole(
-    panels: Panels, clock: Clock
-) -> None:
+def test_frequent_pictures_have_the_panels_width_and_the_last_full_size(panels: Panels, clock: Clock) -> None:
     panel = CamerasPanel(panels.server, clock=clock)
 
     moving = seen(1, (camera("base"),))
     assert moving is not None
 
-    def drawn(serial: int, moving: ShownCameras = moving) -> int:
-        panel.draw(replace(moving, pictures_serial=serial, pictures=dict.fromkeys(moving.pictures, anew())))
+    def width_drawn(serial: int, moving: ShownCameras = moving) -> int:
+        panel.draw(
+            replace(moving, pictures_serial=serial, pictures=dict.fromkeys(moving.pictures, new_picture()))
+        )
         (image,) = panels.part(BASE).images()
         return image.image.shape[1]
 
-    def anew() -> Picture:
+    def new_picture() -> Picture:
         return Picture("base", "sensor", 0, POSE, np.zeros((600, 1000, 3), np.uint8))
 
-    assert drawn(1) == 1000, "the first"
+    assert width_drawn(1) == 1000, "the first picture has full size"
     clock.passes(0.1)
-    assert drawn(2) == 400
+    assert width_drawn(2) == 400
     clock.passes(0.1)
-    assert drawn(3) == 400
+    assert width_drawn(3) == 400
     (image,) = panels.part(BASE).images()
     clock.passes(0.2)
     panel.draw(replace(moving, pictures_serial=3))

@@ -1,4 +1,4 @@
-"""Cameras that are placed by hand: what is asked of the worker, what is one step of undo, and how far each looks."""
+"""Cameras placed by hand: requests to the worker, steps of undo, and the distance to the target."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.scenes import camera as scene_camera
-from tests.drive.session import BASE, Told, camera, moved, told_session
+from tests.drive.session import BASE, FakeWorkerSession, camera, fake_worker_session, moved
 from tests.drive.waiting import until
 from workbench.cameras.commands import PickPixel, PutMovedCamerasBack, RedoCamera, ScalePreview, UndoCamera
 from workbench.cameras.events import CameraChosen, CameraPlaced, EditWanted
@@ -34,10 +34,10 @@ from workbench.record.state import RecordingWanted
 pytestmark = pytest.mark.thorough
 
 EYE, TARGET = (0.45, 0.0, 0.6), (0.08, 0.0, 0.2)
-"""It looks at something above the ground, which a line of sight does not tell."""
+"""The target lies above the ground, so it cannot be found where the line of sight meets the ground."""
 LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0, None, 128, 128, 0.01, 10.0, "minimal")
 BARE = with_pose(LENS, pose_from_look_at(LookAt(EYE, TARGET)))
-"""As a file has it that names no target."""
+"""Settings from a file that names no target."""
 FILE = replace(BARE, distance=math.dist(EYE, TARGET))
 MOVED = replace(FILE, position=(0.45, 0.3, 0.6))
 NOTHING = ("sensor", "nothing")
@@ -48,32 +48,35 @@ def at(height: float) -> CameraSettings:
 
 
 def loaded(
-    told: Told, settings: CameraSettings | None = FILE, level: str | None = None, mount: str | None = None
+    fake: FakeWorkerSession,
+    settings: CameraSettings | None = FILE,
+    level: str | None = None,
+    mount: str | None = None,
 ) -> None:
-    """A version that says this of the camera; None if it has none."""
+    """Load a version whose camera has these settings, or no camera if None."""
     info = replace(scene_camera(), settings=settings, mount=mount)
-    told.load(level, cameras=() if settings is None else (info,), source_hash=str(settings))
-    told.reset()
+    fake.load(level, cameras=() if settings is None else (info,), source_hash=str(settings))
+    fake.reset()
 
 
 @pytest.fixture
-def one(told: Told) -> Told:
-    loaded(told)
-    told.asked(object)
-    return told
+def one(fake: FakeWorkerSession) -> FakeWorkerSession:
+    loaded(fake)
+    fake.asked(object)
+    return fake
 
 
-def now(told: Told) -> CameraSettings:
-    found = camera(told.session, BASE).now
+def now(fake: FakeWorkerSession) -> CameraSettings:
+    found = camera(fake.session, BASE).now
     assert found is not None
     return found
 
 
-def looks_at(told: Told) -> object:
-    return pytest.approx(target_of(now(told)), abs=1e-6)
+def looks_at(fake: FakeWorkerSession) -> object:
+    return pytest.approx(target_of(now(fake)), abs=1e-6)
 
 
-def test_what_is_placed_is_asked_of_the_worker_and_what_stands_so_already_is_not(one: Told) -> None:
+def test_a_placement_is_sent_to_the_worker_once(one: FakeWorkerSession) -> None:
     session = one.session
     session.happen(CameraPlaced(BASE, MOVED))
     session.happen(CameraPlaced(BASE, MOVED))
@@ -89,7 +92,7 @@ def test_what_is_placed_is_asked_of_the_worker_and_what_stands_so_already_is_not
     )
 
 
-def test_one_that_could_not_be_placed_is_asked_for_where_it_stood_once_each_time(one: Told) -> None:
+def test_after_a_failed_placement_the_previous_one_is_sent_once(one: FakeWorkerSession) -> None:
     for height in (0.7, 0.8):
         one.session.happen(CameraPlaced(BASE, at(height)))
         one.asked(object)
@@ -102,8 +105,8 @@ def test_one_that_could_not_be_placed_is_asked_for_where_it_stood_once_each_time
         assert one.asked(PlaceCamera) == [] and not moved(one.view)
 
 
-def test_placements_are_sent_again_to_each_version_and_worker_until_the_file_says_otherwise(
-    one: Told,
+def test_placements_are_sent_to_each_new_version_and_worker_until_the_file_changes_them(
+    one: FakeWorkerSession,
 ) -> None:
     session = one.session
     session.happen(CameraChosen(BASE))
@@ -123,18 +126,18 @@ def test_placements_are_sent_again_to_each_version_and_worker_until_the_file_say
     kept = one.session.kept_work()
     loaded(one, None, "cameras")
     assert one.view.of(StudioView).selected is None and one.view.of(StudioView).cameras == ()
-    with told_session(Path("nowhere"), kept=kept) as later:
+    with fake_worker_session(Path("nowhere"), kept=kept) as later:
         loaded(later, at(0.9))
         assert later.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)]
         assert later.view.of(StudioView).selected == BASE and now(later) == MOVED
 
 
-# --- undo ------------------------------------------------------------------------------------------------
+# --- undo -------------------------------------------------------------------------------------------
 
 DRAG = object()
 ONE_CAMERA = Placements({BASE: FILE})
 Placing = tuple[int, object, float, float]
-"""Millimetres above the ground, the control, seconds since the call before, and the pause of the control."""
+"""(height in mm, control, seconds since the previous call, the control's pause in seconds)."""
 CALLS = st.lists(
     st.tuples(
         st.integers(500, 520),
@@ -155,8 +158,8 @@ def placed(calls: list[Placing], first: Placements = ONE_CAMERA) -> Placements:
 
 
 @given(CALLS)
-def test_what_one_control_does_without_a_pause_is_one_step_of_undo(calls: list[Placing]) -> None:
-    before: list[float] = []  # heights to which undo goes
+def test_changes_by_one_control_without_a_pause_are_one_step_of_undo(calls: list[Placing]) -> None:
+    before: list[float] = []  # heights that undo restores
     seconds, was, last, last_control = 0.0, 0.6, -math.inf, None
     for height, control, after, pause in calls:
         seconds += after
@@ -173,7 +176,7 @@ def test_what_one_control_does_without_a_pause_is_one_step_of_undo(calls: list[P
 
 
 @given(CALLS, st.integers(0, 12))
-def test_undone_and_redone_every_step_is_where_it_was(calls: list[Placing], steps: int) -> None:
+def test_undo_and_redo_restore_every_step(calls: list[Placing], steps: int) -> None:
     last = placements = placed(calls)
     for _ in range(steps):
         placements = placements.undo()
@@ -183,11 +186,11 @@ def test_undone_and_redone_every_step_is_where_it_was(calls: list[Placing], step
     for _ in calls:
         placements = placements.undo()
     assert placements.placed == {} and placements.now(BASE) == FILE and placements.done == ()
-    assert last == placed(calls), "no value is written into"
+    assert last == placed(calls), "undo and redo must not modify a value in place"
 
 
 @given(CALLS, st.integers(500, 520), st.booleans())
-def test_a_placement_stays_over_a_load_unless_the_file_says_otherwise_and_is_never_lost(
+def test_a_placement_survives_a_load_unless_the_file_changes_the_camera(
     calls: list[Placing], height: int, own: bool
 ) -> None:
     before, in_file = placed(calls), {BASE: at(height / 1000)}
@@ -203,7 +206,7 @@ def test_a_placement_stays_over_a_load_unless_the_file_says_otherwise_and_is_nev
     assert (gone.placed, gone.done, gone.undone) == ({}, (), ())
 
 
-def test_what_was_taken_back_can_be_made_again_until_something_else_is_done(one: Told) -> None:
+def test_an_undone_step_can_be_redone_until_another_change(one: FakeWorkerSession) -> None:
     session = one.session
 
     def labels() -> tuple[str | None, str | None]:
@@ -220,27 +223,29 @@ def test_what_was_taken_back_can_be_made_again_until_something_else_is_done(one:
     session.do(RedoCamera())
     session.happen(CameraPlaced(BASE, at(0.8), DRAG))
     session.do(UndoCamera())
-    assert now(one) == at(0.7), "what was made again is whole: no drag goes on from it"
+    assert now(one) == at(0.7), "a drag after a redo must be a new step"
     session.happen(CameraPlaced(BASE, at(0.9)))
     with pytest.raises(Refused):
         session.do(RedoCamera())
     assert now(one) == at(0.9) and labels() == ("moved base_camera", None)
 
 
-# --- how far it looks --------------------------------------------------------------------------------------
+# --- the distance to the target ---------------------------------------------------------------------
 
 
-def test_the_target_is_the_one_that_the_file_gives_and_follows_it(one: Told) -> None:
-    assert looks_at(one) == TARGET, "not where the line of sight meets the ground"
+def test_the_target_comes_from_the_file_and_follows_its_changes(one: FakeWorkerSession) -> None:
+    assert looks_at(one) == TARGET, "the target must not be on the ground"
     loaded(one, replace(FILE, distance=1.5 * math.dist(EYE, TARGET)), "cameras")
     assert looks_at(one) == tuple(np.add(EYE, 1.5 * np.subtract(TARGET, EYE)))
 
 
-def test_moved_it_looks_as_far_as_it_did_and_back_in_its_place_at_what_the_file_gives(one: Told) -> None:
+def test_a_moved_camera_keeps_its_distance_and_a_restored_one_the_files_target(
+    one: FakeWorkerSession,
+) -> None:
     session = one.session
     session.happen(CameraPlaced(BASE, replace(FILE, distance=0.2)))
     assert now(one).distance == 0.2 and not moved(one.view) and one.view.of(StudioView).undo is None, (
-        "no placement"
+        "a new distance alone is not a placement"
     )
     session.happen(CameraPlaced(BASE, FILE))
     session.happen(CameraPlaced(BASE, MOVED))
@@ -248,119 +253,119 @@ def test_moved_it_looks_as_far_as_it_did_and_back_in_its_place_at_what_the_file_
     session.happen(CameraPlaced(BASE, replace(MOVED, distance=2.0)))
     assert now(one).distance == 2.0
     session.do(UndoCamera())
-    assert looks_at(one) == TARGET and not moved(one.view), "no step of its own"
+    assert looks_at(one) == TARGET and not moved(one.view), "a new distance alone is not a step of undo"
     session.do(RedoCamera())
-    assert now(one).distance == 2.0, "as it was set there"
+    assert now(one).distance == 2.0, "redo must restore the distance set there"
 
 
-def test_without_a_target_in_the_file_it_looks_at_the_ground_and_moved_it_goes_on_to_look_so_far(
-    told: Told,
+def test_without_a_target_in_the_file_the_ground_sets_the_distance(
+    fake: FakeWorkerSession,
 ) -> None:
-    loaded(told, BARE)
-    assert looks_at(told) == (-0.105, 0, 0)
-    told.session.happen(CameraPlaced(BASE, replace(now(told), position=(0.45, 0.0, 0.9))))
-    assert looks_at(told) == (-0.105, 0, 0.3)
-    loaded(told, replace(BARE, position=(0.45, 0.0, 0.9)), "cameras")
-    assert looks_at(told) == (-0.105, 0, 0.3) and not moved(told.view), (
-        "the file has it now, without a target"
+    loaded(fake, BARE)
+    assert looks_at(fake) == (-0.105, 0, 0)
+    fake.session.happen(CameraPlaced(BASE, replace(now(fake), position=(0.45, 0.0, 0.9))))
+    assert looks_at(fake) == (-0.105, 0, 0.3)
+    loaded(fake, replace(BARE, position=(0.45, 0.0, 0.9)), "cameras")
+    assert looks_at(fake) == (-0.105, 0, 0.3) and not moved(fake.view), (
+        "the distance stays once the file has the placement without a target"
     )
 
 
 @pytest.mark.parametrize("forward", [(1.0, 0.0, 0.0), (0.0, 0.6, 0.8), (0.999, 0.0, -0.0447)])
-def test_where_the_ground_is_not_before_it_or_far_away_it_looks_a_metre_ahead(
-    told: Told, forward: tuple[float, float, float]
+def test_without_ground_nearby_the_target_is_one_metre_ahead(
+    fake: FakeWorkerSession, forward: tuple[float, float, float]
 ) -> None:
-    loaded(told, with_pose(LENS, pose_from_look_at(LookAt(EYE, tuple(np.add(EYE, forward))))))
-    assert now(told).distance == 1.0
+    loaded(fake, with_pose(LENS, pose_from_look_at(LookAt(EYE, tuple(np.add(EYE, forward))))))
+    assert now(fake).distance == 1.0
 
 
-def test_the_ground_before_a_mounted_camera_is_that_of_the_env(told: Told) -> None:
-    """The hand is 0.5 m above it and upright: the camera looks from 0.1 m above the hand straight to the ground."""
+def test_a_mounted_cameras_distance_is_measured_to_the_envs_ground(fake: FakeWorkerSession) -> None:
+    """The hand is upright, 0.5 m above the ground; the camera looks straight down from 0.1 m above the hand."""
     down = with_pose(LENS, pose_from_look_at(LookAt((0, 0, 0.1), (0, 0, 0))))
-    loaded(told, down, mount="arm/hand")
-    assert now(told).distance == pytest.approx(0.6)
+    loaded(fake, down, mount="arm/hand")
+    assert now(fake).distance == pytest.approx(0.6)
 
 
-# --- the file ----------------------------------------------------------------------------------------------
+# --- the file ---------------------------------------------------------------------------------------
 
 
 @contextmanager
-def opened(folder: Path) -> Iterator[tuple[Told, Path]]:
+def opened(folder: Path) -> Iterator[tuple[FakeWorkerSession, Path]]:
     file = folder / "push.py"
     file.write_text('@register_env("Alone-v1")\nclass PushEnv:\n    """Nothing but a place."""\n')
-    with told_session(folder / "recordings", str(file)) as told:
+    with fake_worker_session(folder / "recordings", str(file)) as fake:
         source = {str(file): file.read_text()}
         info = replace(scene_camera(), settings=FILE)
-        told.load(file=str(file), source_files=(str(file),), source=source, cameras=(info,))
-        told.reset()
-        told.asked(object)
-        yield told, file
+        fake.load(file=str(file), source_files=(str(file),), source=source, cameras=(info,))
+        fake.reset()
+        fake.asked(object)
+        yield fake, file
 
 
 @pytest.fixture
-def with_file(tmp_path: Path) -> Iterator[tuple[Told, Path]]:
-    with opened(tmp_path) as made:
-        yield made
+def with_file(tmp_path: Path) -> Iterator[tuple[FakeWorkerSession, Path]]:
+    with opened(tmp_path) as file_session:
+        yield file_session
 
 
-def asks(told: Told) -> Call:
-    """A plan, for which the worker is asked what comes of it, and which waits for the answer."""
-    told.session.happen(EditWanted(EditRequest("add", ("human", "side"), FILE)))
+def plan_waiting_for_worker(fake: FakeWorkerSession) -> Call:
+    """Request a plan and return its question to the worker, for whose answer the plan waits."""
+    fake.session.happen(EditWanted(EditRequest("add", ("human", "side"), FILE)))
     found: list[Any] = []
 
     def asked() -> bool:
-        found.extend(call for call in told.asked(Call) if isinstance(call.request, RunCameras))
+        found.extend(call for call in fake.asked(Call) if isinstance(call.request, RunCameras))
         return bool(found)
 
-    until(asked, "the worker being asked")
+    until(asked, "a question to the worker")
     return found[0]
 
 
-def test_the_end_of_a_session_ends_what_waits_for_its_worker_and_begins_nothing_more(
-    with_file: tuple[Told, Path],
+def test_closing_a_session_ends_waiting_plans_and_starts_no_more(
+    with_file: tuple[FakeWorkerSession, Path],
 ) -> None:
     told, file = with_file
-    asks(told)
-    told.session.happen(EditWanted(EditRequest("edit", BASE, MOVED)))  # behind it
+    plan_waiting_for_worker(told)
+    told.session.happen(EditWanted(EditRequest("edit", BASE, MOVED)))  # queued
     closing = threading.Thread(target=told.session.close)
     closing.start()
     closing.join(20)
-    assert not closing.is_alive(), "it waits for an answer that nobody gives"
+    assert not closing.is_alive(), "the close waits for an answer that never comes"
     state = told.view.of(StudioView).edit_state
     assert state.stage == "refused" and state.request is not None and state.request.what == "add"
     told.session.happen(EditWanted(EditRequest("edit", BASE, MOVED)))
     assert told.asked(Call) == [] and told.view.of(StudioView).edit_state == state
 
 
-def test_a_save_and_a_death_end_what_waits_for_the_worker_and_the_next_is_asked(
-    with_file: tuple[Told, Path],
+def test_a_save_or_a_dead_worker_ends_a_waiting_plan_and_the_next_plan_asks_again(
+    with_file: tuple[FakeWorkerSession, Path],
 ) -> None:
     told, file = with_file
     for end in (told.die, lambda: file.write_text(file.read_text() + "\n")):
-        call = asks(told)
+        call = plan_waiting_for_worker(told)
         end()
         until(lambda: told.view.of(StudioView).edit_state.stage == "refused", "the end of the plan")
         assert "did not answer" in told.view.of(StudioView).edit_state.message
-        assert asks(told).number != call.number
+        assert plan_waiting_for_worker(told).number != call.number
         told.die()
         until(lambda: told.view.of(StudioView).edit_state.stage == "refused", "the end of the second")
 
 
-def test_no_thread_of_a_session_is_left_when_it_is_closed_whatever_waited(tmp_path: Path) -> None:
+def test_closing_a_session_leaves_no_thread(tmp_path: Path) -> None:
     before = set(threading.enumerate())
     with opened(tmp_path) as (told, _):
         session = told.session
-        asks(told)
+        plan_waiting_for_worker(told)
         session.happen(PagesCounted(1))
         session.happen(CameraChosen(BASE))
         session.do(ScalePreview(scale=0.5))
         session.do(PickPixel(x=0.5, y=0.5))
-        heard: list[Call] = []
-        until(lambda: heard.extend(told.asked(Call)) or len(heard) == 2, "both questions")
+        calls: list[Call] = []
+        until(lambda: calls.extend(told.asked(Call)) or len(calls) == 2, "both questions")
         session.happen(RecordingWanted())
         told.reset()
         told.step(2)
         assert len(set(threading.enumerate()) - before) >= 5
-    left = [thread.name for thread in set(threading.enumerate()) - before if thread.is_alive()]
-    assert left == []
-    assert session.wait(-1, 60.0) >= 0, "a page that waits is woken"
+    remaining = [thread.name for thread in set(threading.enumerate()) - before if thread.is_alive()]
+    assert remaining == []
+    assert session.wait(-1, 60.0) >= 0, "a waiting page must be woken"

@@ -1,4 +1,4 @@
-"""What a hand's movement makes of a camera: there and back between view and config, steps, turns."""
+"""Camera poses under a user's gestures: conversion between view and config, snapping, rotation."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ poses = st.builds(lambda p, a: make_pose(p, quaternion_from_rpy(*a)), points, an
 
 
 @given(poses, poses, points, st.booleans())
-def test_there_and_back_between_the_view_and_the_config(pose, mount, offset, mounted: bool) -> None:
+def test_view_and_config_poses_survive_a_round_trip(pose, mount, offset, mounted: bool) -> None:
     camera = with_pose(SETTINGS, pose)
     frame = Frame(mount.astype(np.float32) if mounted else None, np.array(offset, np.float32))
-    # What was not moved is not said in other digits.
+    # A camera that was not moved keeps its exact numbers.
     assert frame.from_view(camera, frame.to_view(camera)) == camera
     expected = compose(frame.mount, pose) if frame.mount is not None else pose
     np.testing.assert_allclose(frame.to_view(camera)[:3], expected[:3] + frame.offset, atol=1e-9)
@@ -58,19 +58,17 @@ def test_there_and_back_between_the_view_and_the_config(pose, mount, offset, mou
 @given(poses, points)
 def test_looking_at_a_target_keeps_the_eye_and_the_roll(pose, target) -> None:
     if np.linalg.norm(np.subtract(target, pose[:3])[:2]) < 0.05:
-        return  # straight up or down there is another idea of upright
+        return  # straight up or down, roll is defined differently
     roll = rpy_of(pose[3:])[0]
-    there = looking_at(pose, pose[:3], target)
-    np.testing.assert_allclose(there[:3], pose[:3])
+    result = looking_at(pose, pose[:3], target)
+    np.testing.assert_allclose(result[:3], pose[:3])
     aimed = np.subtract(target, pose[:3]) / np.linalg.norm(np.subtract(target, pose[:3]))
-    np.testing.assert_allclose(axes_of(there[3:])[0], aimed, atol=1e-9)
-    assert (rpy_of(there[3:])[0] - roll + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
+    np.testing.assert_allclose(axes_of(result[3:])[0], aimed, atol=1e-9)
+    assert (rpy_of(result[3:])[0] - roll + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
 
 
 @given(poses, poses, points, st.booleans())
-def test_a_camera_that_is_turned_to_a_point_looks_at_it_from_where_it_stands(
-    pose, mount, target, mounted: bool
-) -> None:
+def test_turning_a_camera_to_a_point_keeps_its_position(pose, mount, target, mounted: bool) -> None:
     if np.linalg.norm(np.subtract(target, pose[:3])) < 0.05:
         return
     camera = with_pose(SETTINGS, pose)
@@ -80,11 +78,11 @@ def test_a_camera_that_is_turned_to_a_point_looks_at_it_from_where_it_stands(
     np.testing.assert_allclose(target_of(turned), target, atol=1e-6)
 
 
-def test_snapping_along_the_world_falls_on_the_env_s_grid() -> None:
+def test_snapping_in_world_axes_uses_the_envs_grid() -> None:
     start, origin = make_pose((1.233, 2.0, 0.557), UNTURNED), (0.5, 0.0, 0.0)
     moved = make_pose((1.301, 2.0, 0.557), UNTURNED)
-    there = snapped(start, moved, Snap(metres=0.05), False, origin)
-    np.testing.assert_allclose(there[:3], [1.3, 2.0, 0.557])
+    result = snapped(start, moved, Snap(metres=0.05), False, origin)
+    np.testing.assert_allclose(result[:3], [1.3, 2.0, 0.557])
 
 
 @given(st.floats(-179, 179))
@@ -96,14 +94,14 @@ def test_turning_snaps_to_whole_steps(degrees: float) -> None:
     assert yaw / 15 == pytest.approx(round(yaw / 15), abs=1e-6)
 
 
-def test_a_turn_of_the_world_s_gizmo_turns_about_the_world_s_axis() -> None:
+def test_a_turn_of_the_world_gizmo_turns_about_the_worlds_axis() -> None:
     turned = turned_in_world(LOOKING_DOWN, LOOKING_DOWN[:3], quaternion_from_rpy(0, 0, 90))
     forward = axes_of(LOOKING_DOWN[3:])[0]
     np.testing.assert_allclose(axes_of(turned[3:])[0], [-forward[1], forward[0], forward[2]], atol=1e-9)
 
 
-def test_keys_move_along_what_is_seen_and_turn_in_place() -> None:
-    # It looks along -x, so its left is -y.
+def test_keys_move_along_the_view_and_turn_in_place() -> None:
+    # The camera looks along -x, so its left is -y.
     np.testing.assert_allclose(nudged(LOOKING_DOWN, (0, 0.01, 0))[:3], [0.45, -0.01, 0.6], atol=1e-9)
     up = panned(LOOKING_DOWN, 0, 5)
     assert rpy_of(up[3:])[1] == pytest.approx(rpy_of(LOOKING_DOWN[3:])[1] - 5)
@@ -112,8 +110,8 @@ def test_keys_move_along_what_is_seen_and_turn_in_place() -> None:
     np.testing.assert_allclose(left[:3], LOOKING_DOWN[:3])
 
 
-def test_viewer_s_rotation_is_opencv_s() -> None:
-    # viser looks along its z; without a turn that is the world's z, with x to the right.
+def test_the_viewers_rotation_is_opencvs() -> None:
+    # viser looks along its own z; unrotated that is the world's z, with x to the right.
     forward, left, up = axes_of(viewer_pose((1, 2, 3), UNTURNED)[3:])
     np.testing.assert_allclose([forward, left, up], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-12)
     with pytest.raises(ValueError, match="zeros"):
@@ -121,10 +119,10 @@ def test_viewer_s_rotation_is_opencv_s() -> None:
 
 
 @given(poses, st.floats(0.1, 2.5))
-def test_corners_of_the_picture_fall_on_its_corners(pose, fov: float) -> None:
+def test_projected_picture_corners_are_the_pixel_corners(pose, fov: float) -> None:
     camera = replace(SETTINGS, fov=fov)
     extrinsic = opencv_extrinsic(pose)
-    seen = picture_corners(camera, pose, 0.2) @ extrinsic[:, :3].T + extrinsic[:, 3]
-    pixels = seen @ intrinsic_of(camera).T / seen[:, 2:]
+    in_camera = picture_corners(camera, pose, 0.2) @ extrinsic[:, :3].T + extrinsic[:, 3]
+    pixels = in_camera @ intrinsic_of(camera).T / in_camera[:, 2:]
     np.testing.assert_allclose(pixels[:, :2], [[0, 0], [64, 0], [64, 48], [0, 48]], atol=1e-6)
-    np.testing.assert_allclose(seen[:, 2], 0.2)
+    np.testing.assert_allclose(in_camera[:, 2], 0.2)

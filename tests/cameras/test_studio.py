@@ -1,4 +1,4 @@
-"""The camera studio in a real session: cameras placed, undone, kept over reloads, written into the file, and judged."""
+"""The camera studio in a real session: placement, undo, reloads, edits of the file, and measurements."""
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalSubscript=false, reportOptionalOperand=false
 
@@ -46,27 +46,27 @@ pytestmark = pytest.mark.usefixtures("child_process")
 
 @dataclass
 class Copied:
-    """What a session said of an installed task, from its refusal to write it to the camera in the copy of it."""
+    """A session's views of an installed task: the refused edit, the plan in a copy, and the checked copy."""
 
     folder: Path
     refused: SessionView
     planned: SessionView
     ended: SessionView
     named: str
-    """The task, as a command line would name it then."""
+    """The copied task, as a command line would name it."""
 
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, Copied]]:
-    """A session that began with an installed task, and went on to the copy of it.
+    """A session that opened an installed task and then a copy of it.
 
-    Its tests go on in that process: the shaders of another take 6 s.
+    Its tests share one process, since compiling shaders in another takes 6 s.
     """
     folder = tmp_path_factory.mktemp("copied")
     (folder / "push_cube.py").write_text("somebody's own")
     options = TaskOptions(num_envs=2, env_kwargs={"obs_mode": "rgb"})
     with pytest.MonkeyPatch.context() as patch:
-        # The copy goes to where the session was begun.
+        # The copy is written to the session's start folder.
         patch.chdir(folder)
         session = Session("PushCube-v1", options, recordings=tmp_path_factory.mktemp("recordings"))
     try:
@@ -94,7 +94,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, 
 def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
     session, _ = opened
     text = task_file.read_text()
-    # Small pictures: what is tested is where they are taken from.
+    # Small pictures: only the camera's pose matters.
     task_file.write_text(text.replace("512", "64"))
     session.do(PutMovedCamerasBack())
     session.happen(PagesCounted(1))
@@ -106,7 +106,7 @@ def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
 
 @pytest.fixture
 def session(studio_session: Session) -> Session:
-    """At rest, and every camera as the file has it; one of them is worked on."""
+    """Return the session paused, with every camera placed as in the file and one chosen."""
     studio_session.do(PauseRun())
     studio_session.happen(MomentShown(None))
     studio_session.do(PutMovedCamerasBack())
@@ -116,7 +116,7 @@ def session(studio_session: Session) -> Session:
 
 
 def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView], bool]:
-    """Whether the newest picture was taken from there, with that size."""
+    """Return a predicate: the newest picture has the pose and size of `settings`."""
 
     def reached(view: SessionView) -> bool:
         picture = view.pictures.get(key)
@@ -129,7 +129,7 @@ def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView
     return reached
 
 
-def test_what_cannot_be_is_refused_in_words_and_changes_nothing(session: Session) -> None:
+def test_invalid_placements_are_refused_with_a_reason_and_change_nothing(session: Session) -> None:
     start = camera(session, BASE).now
     session.happen(CameraPlaced(BASE, replace(start, near=5.0, far=1.0)))
     view = wait_until(session, in_studio(lambda s: "near must be" in s.problem), "the reason")
@@ -143,9 +143,9 @@ def test_what_cannot_be_is_refused_in_words_and_changes_nothing(session: Session
     wait_until(session, in_studio(lambda s: "there is no sensor camera nobody" in s.problem), "the reason")
 
 
-def test_a_placement_is_written_compared_and_taken_back(session: Session, task_file: Path) -> None:
+def test_a_placement_is_written_compared_and_reverted(session: Session, task_file: Path) -> None:
     saved = task_file.read_bytes()
-    before = saved.replace(b"\n", b"\r\n")  # as an editor on Windows saves it
+    before = saved.replace(b"\n", b"\r\n")  # as a Windows editor saves it
     task_file.write_bytes(before)
     start = camera(session, BASE).now
     session.happen(CameraPlaced(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2)))
@@ -168,11 +168,11 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     view = wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
-        "the file of before",
+        "the original file",
     )
     assert task_file.read_bytes() == before
     task_file.write_bytes(saved)
-    # Taken back is the placement too, and one step of undo brings it again.
+    # The revert also resets the placement, and one step of undo restores it.
     assert (
         not moved(view)
         and view.of(StudioView).camera(BASE).now == view.of(StudioView).camera(BASE).info.settings == start
@@ -180,16 +180,14 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     assert view.of(StudioView).edit_state.message.endswith(
         "base_camera is where the file places it; Undo restores your placement."
     )
-    wait_until(session, seen_from(BASE, start), "the camera where the file has it")
+    wait_until(session, seen_from(BASE, start), "the camera where the file places it")
     assert view.of(StudioView).undo == "reverted the change of base_camera"
     session.do(UndoCamera())
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert not differences(view.of(StudioView).camera(BASE).now, now.now)
 
 
-def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
-    session: Session, task_file: Path
-) -> None:
+def test_a_camera_removed_from_the_file_returns_at_its_placement(session: Session, task_file: Path) -> None:
     before = task_file.read_text()
     there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
     session.happen(CameraPlaced(BASE, there))
@@ -202,7 +200,7 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
-        "the file of before",
+        "the original file",
     )
     assert task_file.read_text() == before
     assert moved(session.view()) == {BASE} and camera(session, BASE).now == there
@@ -211,7 +209,7 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
 
 
 def settled(session: Session, reached: Callable[[StudioView], bool], what: str) -> StudioView:
-    """The studio once its work in the background is done."""
+    """Wait until the studio's background work is done and `reached` holds; return the studio."""
     view = wait_until(
         session, in_studio(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what
     )
@@ -219,7 +217,7 @@ def settled(session: Session, reached: Callable[[StudioView], bool], what: str) 
     return view.of(StudioView)
 
 
-def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
+def test_a_camera_is_measured_in_all_envs_and_its_report_is_stale_after_a_move(session: Session) -> None:
     session.happen(MeasureWanted("envs"))
     report = settled(session, lambda s: s.results.report_of == BASE, "the judgement").results.report
     assert sorted(report.envs) == [0, 1] and not session.view().of(StudioView).report_stale
@@ -228,13 +226,13 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
     session.happen(SheetWanted())
     sheet = settled(session, lambda s: len(s.results.sheet) == 2, "the pictures of all envs").results.sheet
     assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
-    # Turned to the sky.
+    # Point the camera at the sky.
     start = camera(session, BASE).now
     away = replace(start, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
     session.happen(CameraPlaced(BASE, away))
     assert session.view().of(StudioView).report_stale
     session.happen(MeasureWanted("envs"))
-    studio = settled(session, lambda s: s.results.report is not report, "the judgement of the placement")
+    studio = settled(session, lambda s: s.results.report is not report, "the report on the placement")
     assert (
         studio.results.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
     )
@@ -246,7 +244,7 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
     wait_until(session, seen_from(BASE, away), "the camera where it was placed, after the comparison")
 
 
-def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
+def test_a_camera_is_measured_over_the_steps_of_the_shown_episode(session: Session) -> None:
     start_over(session, 0)
     step(session, 4)
     session.happen(MeasureWanted("steps"))
@@ -262,22 +260,24 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
         session, lambda s: len(s.results.report_moments) == 2, "its ends"
     ).results.report_moments
     assert [moment.step for moment in moments] == [0, 4], (
-        "of the whole episode, also where a moment in it is shown"
+        "the report covers the whole episode, even while one of its steps is shown"
     )
     session.happen(EnvsReset())
     wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
     session.happen(MomentShown(None))
     session.happen(MeasureWanted("steps"))
-    settled(session, lambda s: len(s.results.report_moments) == 1, "the episode that has just begun")
+    settled(session, lambda s: len(s.results.report_moments) == 1, "the new episode")
 
 
-def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> None:
+def test_a_picked_pixel_returns_the_point_seen_there(session: Session) -> None:
     view = session.view()
     cube = view.step.poses[0, list(view.task.geometry.body_names).index("cube")]
-    # From the side that the robot does not stand on, level with the cube.
+    # From the side away from the robot, level with the cube.
     x, y, z = (float(v) for v in cube[:3])
-    beside = replace(camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0))
-    session.happen(CameraPlaced(BASE, beside))
+    next_to_cube = replace(
+        camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0)
+    )
+    session.happen(CameraPlaced(BASE, next_to_cube))
     session.do(PickPixel(x=0.5, y=0.5))
     picked = settled(session, lambda s: s.results.picked is not None, "the pixel").results.picked
     assert picked.body == "cube" and abs(picked.depth - 0.38) < 2e-3
@@ -285,7 +285,7 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
 
 
 @pytest.mark.slow
-def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session: Session) -> None:
+def test_measuring_seeds_and_searching_run_in_a_separate_process(session: Session) -> None:
     session.happen(MeasureWanted("resets", 3))
     assert session.view().of(StudioView).progress is not None
     found = settled(session, lambda s: s.results.report_seeds == 3, "three seeds")
@@ -314,7 +314,7 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     wait_until(session, in_studio(lambda s: "no object 'nothing'" in s.problem), "why not")
 
 
-def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_copy(
+def test_an_installed_task_is_copied_and_the_placement_planned_in_the_copy(
     opened: tuple[Session, Copied],
 ) -> None:
     _, copied = opened
@@ -329,8 +329,8 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
     assert view.of(StudioView).edit_state.message.startswith(
         f"This is your copy of the task, {file}. This changes"
     )
-    assert moved(view) == {BASE}, "the placement is lost"
-    assert copied.named.startswith(str(file)), "its command line opens the copy"
+    assert moved(view) == {BASE}, "the placement must be kept"
+    assert copied.named.startswith(str(file)), "the command line must name the copy"
     view = copied.ended
     assert view.of(StudioView).edit_state.stage == "checked", view.of(StudioView).edit_state.message
     assert (copied.folder / "push_cube.py").read_text() == "somebody's own"

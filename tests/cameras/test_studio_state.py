@@ -1,4 +1,4 @@
-"""The studio by its events alone: whatever happens in whatever order, the value is the same and can be shown."""
+"""The studio's state under any sequence of events is deterministic, valid and can be shown."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from tests.drive.scenes import camera as scene_camera
 from tests.drive.scenes import problem
-from tests.drive.session import BASE, DEATH, PEOPLE, Told, told_session
+from tests.drive.session import BASE, DEATH, PEOPLE, FakeWorkerSession, fake_worker_session
 from workbench.cameras import events as of
 from workbench.cameras.apply import apply
 from workbench.cameras.commands import (
@@ -53,40 +53,40 @@ EDIT = SourceEdit(FILE, "old", "new", (), SETTINGS)
 NOTHING: CameraKey = ("sensor", "nothing")
 ODD: CameraKey = ("sensor", "odd")
 Happens = tuple[object, int, float]
-"""An event, the run that it meets, and seconds since the event before."""
+"""(event, index into `runs`, seconds since the previous event)."""
 
 
 @cache
 def runs() -> tuple[Run, ...]:
-    """Before a task is loaded; with the edit and without it, live and in the past; on a GPU; without cameras."""
+    """Return runs: before a task is loaded, without and with the edit, at a past step, on a GPU, and without cameras."""
     found: list[Run] = []
 
-    def note(told: Told) -> None:
-        found.append(told.session.look(lambda run: run))
+    def note(fake: FakeWorkerSession) -> None:
+        found.append(fake.session.look(lambda run: run))
 
     cameras = (
         replace(scene_camera(), settings=SETTINGS, mount="arm/hand"),
         replace(scene_camera("render_camera", "human"), settings=replace(SETTINGS, distance=0.5)),
         scene_camera("odd"),
     )
-    with tempfile.TemporaryDirectory() as folder, told_session(Path(folder)) as told:
-        note(told)
+    with tempfile.TemporaryDirectory() as folder, fake_worker_session(Path(folder)) as fake:
+        note(fake)
         for text in ("old", "new"):
-            told.load(cameras=cameras, file=FILE, source_files=(FILE,), source={FILE: text})
-            told.reset()
-            told.step(2)
-            note(told)
-        told.session.happen(MomentShown(1, env=2))
-        note(told)
-        told.load("rebuilt", cameras=cameras, backend="gpu")
-        note(told)
-        told.load("rebuilt", cameras=())
-        note(told)
+            fake.load(cameras=cameras, file=FILE, source_files=(FILE,), source={FILE: text})
+            fake.reset()
+            fake.step(2)
+            note(fake)
+        fake.session.happen(MomentShown(1, env=2))
+        note(fake)
+        fake.load("rebuilt", cameras=cameras, backend="gpu")
+        note(fake)
+        fake.load("rebuilt", cameras=())
+        note(fake)
     return tuple(found)
 
 
 def loaded(level: str | None) -> VersionLoaded:
-    """Of the studio only the level counts: what was loaded is in the run."""
+    """Return a load event; the studio reads only its level, since the run holds the loaded task."""
     report: Any = None if level is None else SimpleNamespace(level=level)
     nothing: Any = None
     return VersionLoaded(Loaded(nothing, nothing, {}, report), on_disk=True)
@@ -162,7 +162,7 @@ sequences = st.lists(st.tuples(events, st.integers(0, 5), st.sampled_from([0.0, 
 
 
 def after(happened: list[Happens], see: Callable[[object, Studio, Change, Run], None]) -> Studio:
-    """The value after all events; `see` gets each event, the value before it, and what it came to."""
+    """Apply all events and return the final state; `see` gets each event, the state before it, and the change."""
     studio, seconds = Studio(), 0.0
     for event, at, later in happened:
         run, seconds = runs()[at], seconds + later
@@ -176,12 +176,12 @@ def after(happened: list[Happens], see: Callable[[object, Studio, Change, Run], 
     return studio
 
 
-def no_look(event: object, before: Studio, change: Change, run: Run) -> None:
+def ignore(event: object, before: Studio, change: Change, run: Run) -> None:
     pass
 
 
 @given(sequences)
-def test_the_same_events_give_the_same_value_and_each_can_be_shown(happened: list[Happens]) -> None:
+def test_the_same_events_give_the_same_state_and_every_state_can_be_shown(happened: list[Happens]) -> None:
     def shows(event: object, before: Studio, change: Change, run: Run) -> None:
         view = view_of(change[0], run, None)
         assert {one.key for one in view.cameras if one.moved} <= {
@@ -189,11 +189,11 @@ def test_the_same_events_give_the_same_value_and_each_can_be_shown(happened: lis
         }
         assert view_of(change[0], run, None).selected == view.selected == change[0].selected
 
-    assert after(happened, shows) == after(happened, no_look)
+    assert after(happened, shows) == after(happened, ignore)
 
 
 @given(sequences)
-def test_a_camera_is_sent_as_it_is_placed_then(happened: list[Happens]) -> None:
+def test_sent_cameras_match_the_current_placements(happened: list[Happens]) -> None:
     def sent(event: object, before: Studio, change: Change, run: Run) -> None:
         studio, effects = change
         requests = [effect.request for effect in effects if isinstance(effect, Send)]
@@ -208,7 +208,7 @@ def test_a_camera_is_sent_as_it_is_placed_then(happened: list[Happens]) -> None:
 
 
 @given(sequences)
-def test_edits_are_made_one_after_the_other_and_none_after_the_end(happened: list[Happens]) -> None:
+def test_edits_run_one_at_a_time_and_none_after_the_close(happened: list[Happens]) -> None:
     ends = of.PlanFound, of.FileChanged, of.FileNotChanged, of.TaskCopied, of.EditFailed
 
     def one_by_one(event: object, before: Studio, change: Change, run: Run) -> None:
@@ -222,8 +222,8 @@ def test_edits_are_made_one_after_the_other_and_none_after_the_end(happened: lis
 
 
 @given(sequences)
-def test_every_step_can_be_undone_and_then_there_is_none(happened: list[Happens]) -> None:
-    studio, run, now = after(happened, no_look), runs()[1], Now(0.0, 0.0)
+def test_every_step_can_be_undone_until_none_is_left(happened: list[Happens]) -> None:
+    studio, run, now = after(happened, ignore), runs()[1], Now(0.0, 0.0)
     while (placements := studio.placements).done:
         studio, effects = apply(studio, Asked(UndoCamera()), run, now)
         (step,) = placements.done[len(studio.placements.done) :]
@@ -234,7 +234,7 @@ def test_every_step_can_be_undone_and_then_there_is_none(happened: list[Happens]
 
 
 @given(settings.filter(lambda one: one != SETTINGS), st.booleans())
-def test_only_a_change_that_was_read_is_saved(moved: CameraSettings, back: bool) -> None:
+def test_only_the_shown_change_can_be_saved(moved: CameraSettings, back: bool) -> None:
     run, now = runs()[1], Now(0.0, 0.0)
     request = EditRequest("edit", BASE, SETTINGS)
     steps = [
@@ -245,7 +245,7 @@ def test_only_a_change_that_was_read_is_saved(moved: CameraSettings, back: bool)
         of.CameraPlaced(BASE, moved),
         *([Asked(PutMovedCamerasBack())] if back else []),
     ]
-    studio = after([(event, 1, 0.0) for event in steps], no_look)
+    studio = after([(event, 1, 0.0) for event in steps], ignore)
     if studio.placements.now(BASE) == SETTINGS:
         assert apply(studio, Asked(SaveCameraChange()), run, now)[1][-1] == of.ChangeFile(EDIT, revert=False)
     else:

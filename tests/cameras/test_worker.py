@@ -1,4 +1,4 @@
-"""A worker's cameras without its loop: a real task and renderer, and a clock that goes when the test says so."""
+"""A worker's cameras without its loop, with a real task and renderer and a manual clock."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ NOTHING = CameraRequest("nothing", "sensor")
 class Clock:
     now: float = 1000.0
     tick: float = 0.0
-    """By how much every look at it moves it on."""
+    """Seconds by which every read advances the clock."""
 
     def monotonic(self) -> float:
         self.now += self.tick
@@ -60,7 +60,7 @@ class Clock:
 
 
 class Desk:
-    """A worker's cameras, and what the server hears of them."""
+    """A worker's cameras, and the events that the server receives from them."""
 
     def __init__(self, opened: OpenedTask, clock: Clock) -> None:
         ours, theirs = socket.socketpair()
@@ -69,29 +69,29 @@ class Desk:
         os.ftruncate(heartbeat, mmap.PAGESIZE)
         self.heartbeat, interrupts = HeartbeatReader(heartbeat), Interrupts()
         line = ServerConnection(theirs.detach(), interrupts, QUESTIONS)
-        self.held = GuardedTask(line, interrupts, HeartbeatWriter(heartbeat), StepEvents(), lambda: None)
+        self.guarded = GuardedTask(line, interrupts, HeartbeatWriter(heartbeat), StepEvents(), lambda: None)
         os.close(heartbeat)
-        self.held.opened = opened
+        self.guarded.opened = opened
         self.first: list[bool] = []
-        self.cameras = WorkerCameras(self.held, self.first.append)
+        self.cameras = WorkerCameras(self.guarded, self.first.append)
 
-    def heard(self) -> list[Any]:
+    def received(self) -> list[Any]:
         events = []
         while (event := self.server.receive(0.0)) is not None:
             events.append(event)
         return events
 
-    def makes(self) -> list[Any]:
-        """What is heard of one turn of the loop that has nothing else to do."""
+    def iterate(self) -> list[Any]:
+        """Run one idle iteration of the loop and return the received events."""
         self.cameras.make(may_block=True)
-        return self.heard()
+        return self.received()
 
     def wait(self) -> float | None:
         return self.cameras.wait(self.clock.now)
 
     def placed(self, key: CameraKey, **changes: Any) -> CameraSettings:
-        assert self.held.opened is not None
-        info = self.held.opened.description.camera(key)
+        assert self.guarded.opened is not None
+        info = self.guarded.opened.description.camera(key)
         assert info is not None and info.settings is not None
         return replace(info.settings, **changes)
 
@@ -113,46 +113,46 @@ def desk(opened: OpenedTask, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desk]:
     monkeypatch.setattr(under_test, "time", SimpleNamespace(monotonic=clock.monotonic))
     desk = Desk(opened, clock)
     yield desk
-    desk.held.opened = opened
+    desk.guarded.opened = opened
     for key in (BASE, PEOPLE):
         desk.cameras.place_now(opened, PlaceCamera(key, None))
     desk.server.end.close()
 
 
 def shown(events: list[Any]) -> list[CameraKey]:
-    """Of the only event: the cameras that it has pictures of."""
+    """Return the cameras whose pictures the only event holds."""
     (event,) = events
     assert isinstance(event, Pictures)
     return [(picture.kind, picture.camera) for picture in event.pictures]
 
 
-def test_sensors_come_first_and_each_kind_as_soon_as_it_is_there(desk: Desk) -> None:
-    assert desk.wait() is None and desk.makes() == [], "nobody looks"
+def test_sensors_come_first_and_each_kind_is_sent_when_ready(desk: Desk) -> None:
+    assert desk.wait() is None and desk.iterate() == [], "no page watches a camera"
     desk.cameras.watch(1, (HUMAN, NOTHING, SENSOR))
     assert desk.wait() == 0.0
-    assert desk.makes() == [] and desk.first == [False]
-    assert shown(desk.makes()) == [BASE] and desk.first == [False, True]
-    (human,) = desk.makes()
+    assert desk.iterate() == [] and desk.first == [False]
+    assert shown(desk.iterate()) == [BASE] and desk.first == [False, True]
+    (human,) = desk.iterate()
     assert [picture.env for picture in human.pictures] == [1] and shown([human]) == [PEOPLE]
-    assert desk.wait() is None and desk.makes() == [], "they are of the moment that is"
+    assert desk.wait() is None and desk.iterate() == [], "the pictures are current"
     assert desk.first == [False, True] and desk.heartbeat.read().doing == "drawing"
 
 
 @pytest.mark.skipif(RENDER_DEVICE == "cuda", reason="a GPU draws exact pictures throughout")
-def test_pictures_are_fast_while_something_moves_and_exact_when_it_stands_still(desk: Desk) -> None:
+def test_pictures_are_fast_during_motion_and_exact_at_rest(desk: Desk) -> None:
     def next_picture(*degree: str) -> Any:
-        desk.makes()
-        (pictures,) = desk.makes()
+        desk.iterate()
+        (pictures,) = desk.iterate()
         assert not degree or (pictures.pictures[0].degree,) == degree
         return pictures.pictures[0].rgb.astype(int)
 
     desk.cameras.watch(0, (SENSOR,))
     exact = next_picture("exact")
     desk.cameras.watch(0, (SENSOR,), "auto")
-    assert desk.wait() is None, "nothing moved, and what is shown is exact"
+    assert desk.wait() is None, "nothing moved, and the shown picture is exact"
     desk.cameras.scene_changed()
     desk.clock.now += 1.0
-    next_picture()  # the meshes may have to be made first
+    next_picture()  # the meshes may have to be simplified first
     for thread in threading.enumerate():
         if thread.name == under_test.SIMPLIFYING:
             thread.join()
@@ -163,38 +163,38 @@ def test_pictures_are_fast_while_something_moves_and_exact_when_it_stands_still(
     assert desk.wait() == pytest.approx(0.3)
     desk.clock.now += 0.31
     np.testing.assert_array_equal(next_picture("exact"), exact)
-    assert desk.wait() is None, "until something moves again"
+    assert desk.wait() is None, "nothing to draw until something moves again"
 
 
-def test_of_placements_that_wait_the_last_is_made_after_the_picture_and_its_picture_comes_first(
+def test_the_last_waiting_placement_is_made_after_the_picture_and_drawn_first(
     desk: Desk,
 ) -> None:
     desk.cameras.watch(0, (SENSOR, HUMAN))
-    desk.makes()
+    desk.iterate()
     first, last = (desk.placed(PEOPLE, position=(0.5, 0.1 * k, 0.7)) for k in (1, 2))
     for settings in (first, last):
         desk.cameras.place(PlaceCamera(PEOPLE, settings))
-    assert not desk.cameras.placing_due, "a picture is under way"
-    assert shown(desk.makes()) == [BASE]
-    assert shown(desk.makes()) == [PEOPLE]
+    assert not desk.cameras.placing_due, "a picture is being drawn"
+    assert shown(desk.iterate()) == [BASE]
+    assert shown(desk.iterate()) == [PEOPLE]
     assert desk.cameras.placing_due
     desk.cameras.place_waiting()
-    (placed,) = desk.heard()
+    (placed,) = desk.received()
     assert isinstance(placed, Placed) and placed.settings == last and not placed.why_not
-    assert not desk.cameras.placing_due and desk.wait() == 0.0, "without a pause"
-    assert desk.makes() == []
-    (pictures,) = desk.makes()
-    assert shown([pictures]) == [PEOPLE], "alone"
+    assert not desk.cameras.placing_due and desk.wait() == 0.0, "the new picture must be drawn at once"
+    assert desk.iterate() == []
+    (pictures,) = desk.iterate()
+    assert shown([pictures]) == [PEOPLE], "only the placed camera is drawn"
     assert np.allclose(pictures.pictures[0].pose[:3], last.position, atol=1e-5)
-    assert desk.wait() != 0.0, "the others when it rests"
+    assert desk.wait() != 0.0, "the other cameras wait for a pause"
     desk.clock.now += 1.0
-    assert desk.makes() == [] and shown(desk.makes()) == [BASE]
+    assert desk.iterate() == [] and shown(desk.iterate()) == [BASE]
 
 
-def test_a_sensor_of_another_size_is_observed_in_it_and_one_that_is_not_there_is_not_placed(
+def test_a_resized_sensor_changes_the_observation_and_a_missing_one_is_refused(
     desk: Desk,
 ) -> None:
-    opened = desk.held.opened
+    opened = desk.guarded.opened
     assert opened is not None
     answer = desk.cameras.place_now(opened, PlaceCamera(BASE, desk.placed(BASE, width=40, height=24)))
     assert answer.reshaped and answer.info is not None and (answer.info.width, answer.info.height) == (40, 24)
@@ -203,26 +203,28 @@ def test_a_sensor_of_another_size_is_observed_in_it_and_one_that_is_not_there_is
     assert "nothing" in wrong.why_not and wrong.info is None
 
 
-def test_a_moment_of_the_past_is_drawn_after_what_waits_and_a_failure_is_told(desk: Desk) -> None:
-    opened = desk.held.opened
+def test_a_past_step_is_drawn_after_waiting_placements_and_failures_are_sent(desk: Desk) -> None:
+    opened = desk.guarded.opened
     assert opened is not None
     there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
     desk.cameras.watch(0, (SENSOR,))
-    desk.makes()
+    desk.iterate()
     desk.cameras.place(PlaceCamera(BASE, there))
     poses = opened.first.poses[1]
     desk.cameras.draw_past(DrawPast(poses, 1, (SENSOR,), 7))
-    placed, past = desk.heard()
+    placed, past = desk.received()
     assert isinstance(placed, Placed) and isinstance(past, PastPictures) and past.origin == 7
     assert np.allclose(past.pictures[0].pose[:3], there.position, atol=1e-5)
     desk.cameras.draw_past(DrawPast(poses, 1, (NOTHING,), 8))
-    (failed,) = desk.heard()
+    (failed,) = desk.received()
     assert isinstance(failed, TaskFailed) and "nothing" in failed.problem.message
-    assert desk.makes() == [] and shown(desk.makes()) == [BASE], "the one that was left is made anew"
+    assert desk.iterate() == [] and shown(desk.iterate()) == [BASE], (
+        "the interrupted picture must be drawn again"
+    )
 
 
-def test_a_moment_is_captured_with_pictures_of_the_envs_that_are_named(desk: Desk) -> None:
-    opened = desk.held.opened
+def test_a_moment_is_captured_with_pictures_of_the_given_envs(desk: Desk) -> None:
+    opened = desk.guarded.opened
     assert opened is not None
     snapshot = pickle.dumps(opened.env.snapshot())
     with_pictures = desk.cameras.capture(opened, CaptureMoment(snapshot, (1,), pictures=True))

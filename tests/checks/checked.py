@@ -1,4 +1,4 @@
-"""Runs the check of one rule on an edited copy of the example task, or on a text."""
+"""Runs the check of one rule on an edited copy of the example task, or on another text."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Checked = Callable[..., RuleResult]
 
 @pytest.fixture
 def checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Checked:
-    """``checked(rule, (old, new), ..., text=..., num_envs=4, seeds=8, **env_kwargs)``: the rule's result.
+    """A function ``checked(rule, (old, new), ..., text=..., num_envs=4, seeds=8, **env_kwargs)`` that returns the rule's result.
 
     Each `old` must be in the text, which is the example's by default.
     """
 
-    # Other tests of the process leave the example's id registered, by another file.
+    # Other tests in this process leave the example's id registered by another file.
     for known in (REGISTERED_ENVS, gymnasium.registry):
         for env_id in ("WorkbenchPushCube-v1", "WorkbenchPushCube"):
             monkeypatch.delitem(known, env_id, raising=False)
@@ -75,7 +75,7 @@ def check_rules(
 
 
 def results_of(checkup: Checkup, degrees: Mapping[str, Any]) -> list[RuleResult]:
-    """What the rules that are not off came to, those of GPU simulation last."""
+    """Results of all rules that are not off; rules of GPU simulation come last."""
     results: list[RuleResult] = []
     for group in run.GROUPS:
         for rule, check in group.checks.items():
@@ -87,7 +87,7 @@ def results_of(checkup: Checkup, degrees: Mapping[str, Any]) -> list[RuleResult]
 
 
 def the_finding(result: RuleResult) -> Finding:
-    """The only finding of a rule that is broken."""
+    """The only finding of a broken rule."""
     assert result.state == "broken", result
     (finding,) = result.findings
     return finding

@@ -1,4 +1,4 @@
-"""The fixture of all tests of rules."""
+"""The shared fixture for tests of rules."""
 
 from tests.checks.checked import checked
 

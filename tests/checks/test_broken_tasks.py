@@ -1,4 +1,4 @@
-"""Each task of ``tasks/broken`` breaks the rule that it is there to show, and no other that stops a task."""
+"""Each task in ``tasks/broken`` breaks the rule that it demonstrates, and no other rule that stops a task."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ BROKEN = {
     "tip_block": ("loop-over-envs", "for i in range(self.num_envs):"),
     "touch_cube": ("camera-sees", ""),
 }
-"""The rule, and how the line of its finding begins."""
+"""The broken rule of each task, and the beginning of the line of its finding."""
 WHEN_SOLVED = {"reach_ball": ("reward-exploited", "def compute_dense_reward(")}
-"""Likewise, of rules that need planned episodes."""
-BESIDES = {
+"""The same for rules that need planned episodes."""
+ALSO_BROKEN = {
     "calm_reach": {"rows-rewritten"},
     "push_to_square": {"reward-changes"},
     "gather_blocks": {"initial-pose", "robot-pose", "overlap-at-load"},
     "knock_can": {"unseeded-random", "actions-replay"},
     "nudge_ball": {"loop-over-envs"},
 }
-"""Rules that the same mistake breaks too."""
+"""Other rules that the same mistake breaks."""
 QUICK = {"knock_can"}
-"""Every rule has tests of its own in the files beside this one."""
+"""Tasks of the quick tests; the other files in this folder test every rule."""
 
 
 def test_every_small_task_is_listed() -> None:
@@ -47,35 +47,35 @@ def test_every_small_task_is_listed() -> None:
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in BROKEN]
 )
-def test_its_rule_is_broken_at_its_line_and_no_other(name: str, renderer: None) -> None:
+def test_a_broken_task_breaks_its_rule_at_its_line_and_no_other(name: str, renderer: None) -> None:
     rule, line = BROKEN[name]
     results = check_rules(RULES.keys() - SOLVE_RULES, str(FOLDER / f"{name}.py"), num_envs=4, seeds=4)
     assert the_finding(results[rule]).code.startswith(line)
     broken = {each for each, result in results.items() if result.state == "broken"}
-    assert broken - {rule} <= BESIDES.get(name, set())
+    assert broken - {rule} <= ALSO_BROKEN.get(name, set())
     assert not [result for result in results.values() if result.state == "failed"]
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)  # it plans for eight seeds
 @pytest.mark.parametrize("name", WHEN_SOLVED)
-def test_its_rule_is_broken_where_it_is_solved_and_no_other(name: str) -> None:
+def test_a_broken_task_breaks_its_planning_rule_and_no_other(name: str) -> None:
     rule, line = WHEN_SOLVED[name]
-    # Of fewer seeds none is solved, and then nothing says what success pays.
+    # With fewer seeds none is solved, and then the reward of success is unknown.
     file = str(FOLDER / f"{name}.py")
     results = check_rules(SOLVE_RULES, file, num_envs=4, seeds=8, render_backend="none")
     finding = the_finding(results[rule])
     assert finding.code.startswith(line) and "without success" in finding.message
-    # How many is a matter of the processor's last bits.
+    # The number of solved seeds depends on floating-point details of the CPU.
     assert re.match(r"planning solved [1-8] of 8 seeds", results[rule].notes[0])
     broken = {each for each, result in results.items() if result.state in ("broken", "failed")}
-    # The reward does not hold the hand at the ball either.
+    # The reward also does not keep the hand at the ball.
     assert broken <= {rule, "success-lost"}
 
 
 @pytest.mark.slow
-def test_the_mended_version_of_it_breaks_none() -> None:
-    # Of fewer seeds it says that they are few.
+def test_the_fixed_version_breaks_no_planning_rule() -> None:
+    # With fewer seeds the result notes that they are too few.
     file = str(FOLDER / "mended" / "reach_ball.py")
     results = check_rules(SOLVE_RULES, file, num_envs=4, seeds=8, render_backend="none")
     states = {rule: result.state for rule, result in results.items()}

@@ -1,4 +1,4 @@
-"""Rules of the sensor cameras, each with a task that breaks it and one that keeps it."""
+"""Rules for sensor cameras, each with a task that breaks it and one that keeps it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_a_camera_that_looks_past_the_objects(checked: Checked, renderer: None) 
 
 
 @pytest.mark.slow
-def test_an_object_needs_one_camera_of_several_and_a_fixed_camera_an_object(
+def test_an_object_must_be_in_one_camera_and_a_fixed_camera_must_see_an_object(
     checked: Checked, renderer: None
 ) -> None:
     above = CAMERA.replace("[", '[CameraConfig("above", pose=pose, width=64, height=64, fov=0.6), ', 1)
@@ -49,7 +49,7 @@ def test_a_camera_that_looks_straight_down(checked: Checked) -> None:
 
 
 @pytest.mark.parametrize("robot", ["panda", "panda_wristcam"])
-def test_two_cameras_of_one_name(checked: Checked, robot: str) -> None:
+def test_two_cameras_with_one_name(checked: Checked, robot: str) -> None:
     name = "base_camera" if robot == "panda" else "hand_camera"
     second = CAMERA.replace("[", f'[CameraConfig("{name}", pose=pose, width=64, height=64, fov=1.0), ', 1)
     supported = 'SUPPORTED_ROBOTS = ["panda", "fetch"]', 'SUPPORTED_ROBOTS = ["panda", "panda_wristcam"]'

@@ -1,4 +1,4 @@
-"""What checks share: envs with a renderer where there must be one, and what is told of a task that raises."""
+"""The part that checks share: envs with a renderer where one is needed, and reports on a task that raises."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ def test_a_task_that_cannot_be_built_without_a_renderer_gets_one(renderer: None)
         with checkup.env(1) as task:
             assert checkup.reset(task, 0).poses.shape[0] == 1
         names = [each.name for each in checkup.builds if each.place is not None]
-        assert names and len(names) == len(set(names)), "the build that raised is forgotten"
+        assert names and len(names) == len(set(names)), "the failed build must not be counted"
     finally:
         checkup.close()
         undo_load(loaded)
 
 
-def test_a_task_that_raises_with_a_renderer_too_is_told_once(renderer: None, tmp_path: Path) -> None:
+def test_a_task_that_raises_with_and_without_a_renderer_is_reported_once(
+    renderer: None, tmp_path: Path
+) -> None:
     file = tmp_path / "task.py"
     file.write_text(EXAMPLE.read_text().replace('name="goal"', "name=self.gone"))
     loaded = load_task(str(file))
@@ -47,7 +49,7 @@ ONLY = "        if kwargs.get('num_envs', 1) != 1: raise ValueError('one env onl
 
 
 @pytest.mark.slow
-def test_of_one_env_no_rule_makes_more_and_what_needs_more_is_not_known(
+def test_with_one_env_no_rule_makes_more_envs_and_rules_that_need_more_are_not_known(
     tmp_path: Path, renderer: None
 ) -> None:
     text = EXAMPLE.read_text()
@@ -76,7 +78,7 @@ WRITTEN_FOR_ONE = (
 
 
 @pytest.mark.parametrize(("rule", "before", "line"), WRITTEN_FOR_ONE)
-def test_a_task_that_is_written_for_one_env_is_told_so_at_its_line(
+def test_a_task_written_for_one_env_is_reported_at_its_line(
     checked: Checked, rule: str, before: str, line: str
 ) -> None:
     edit = before, f"        {line}\n{before}"

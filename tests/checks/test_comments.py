@@ -1,4 +1,4 @@
-"""Which silencing comments are told of, and which silence something."""
+"""Reports on silencing comments that have no effect."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def silenced(rule: str, line: int) -> RuleResult:
     return RuleResult(rule, "silenced", silenced=(Silenced(finding, "for all", line),))
 
 
-def told(*results: RuleResult) -> list[tuple[int, str]]:
+def ineffective(*results: RuleResult) -> list[tuple[int, str]]:
     found = comments_without_effect({FILE: TASKS}, results, "Mine", ["Other"])
     return [(one.line, one.message.split("]")[0]) for one in found]
 
 
-def test_a_comment_that_lacks_a_reason_or_names_no_rule_is_told() -> None:
+def test_a_comment_without_a_reason_or_a_rule_is_reported() -> None:
     text = (
         "x = 1  # workbench: off[reward-rows]\n"
         "y = 2  # workbench: off[reward-row] one env only\n"
@@ -44,23 +44,23 @@ def test_a_comment_that_lacks_a_reason_or_names_no_rule_is_told() -> None:
     )
     found = comments_without_effect({"a.py": text})
     assert [(one.line, one.message) for one in found] == [
-        (1, "off[reward-rows] silences nothing until a reason stands behind it"),
+        (1, "off[reward-rows] silences nothing until a reason follows it"),
         (2, "no rule is called reward-row (did you mean reward-rows?)"),
         (3, "the comment names no rule, as in off[reward-rows]"),
         (5, "no rule is called nothing_like_it"),
     ]
 
 
-def test_a_comment_whose_rule_found_nothing_there_is_told() -> None:
+def test_a_comment_whose_rule_has_no_finding_there_is_reported() -> None:
     kept = RuleResult("reward-finite", "kept")
-    assert told(kept) == [(8, "off[reward-finite"), (14, "off[reward-finite")]
-    assert told(kept, silenced("success-at-reset", 3)) == [
+    assert ineffective(kept) == [(8, "off[reward-finite"), (14, "off[reward-finite")]
+    assert ineffective(kept, silenced("success-at-reset", 3)) == [
         (8, "off[reward-finite, success-at-reset"),
         (14, "off[reward-finite"),
     ]
 
 
-def test_a_rule_that_was_not_decided_says_nothing_of_a_comment() -> None:
+def test_an_undecided_rule_does_not_judge_a_comment() -> None:
     for state in ("failed", "not_known", "not_applicable"):
-        assert told(RuleResult("reward-finite", state)) == []
-    assert told() == []
+        assert ineffective(RuleResult("reward-finite", state)) == []
+    assert ineffective() == []

@@ -1,4 +1,4 @@
-"""The rule of controllers that do not declare which drive targets they set."""
+"""The rule for controllers that do not declare which drive targets they set."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_controller_that_declares_no_targets_is_reported_at_its_class(checked:
     assert "lacks sets_target_qpos and sets_target_qvel" in finding.message
 
 
-def test_a_controller_that_declares_them_is_not(checked: Checked) -> None:
+def test_a_controller_that_declares_its_targets_is_not_reported(checked: Checked) -> None:
     declared = OWN_CONTROLLER.replace("FLAGS", FLAGS)
     result = checked("controller-targets", (CLASS, declared + CLASS), seeds=1, robot_uids="still_panda")
     assert result.state == "kept"

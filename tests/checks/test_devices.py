@@ -1,4 +1,4 @@
-"""Rules of loops over envs, copies to the host and the device of tensors, with tasks that break and keep them."""
+"""Rules for loops over envs, copies to the host and tensor devices, with tasks that break and keep them."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def test_loops_over_envs_in_evaluate_and_in_what_it_calls(checked: Checked) -> N
     method = "    def count(self):\n        return [i for i in range(self.num_envs)]  # called\n\n    def evaluate("
     calls = AT + "".join(f"        {line}\n" for line in (*LOOPS, "self.count()"))
     result = checked("loop-over-envs", ("    def evaluate(", method), (AT, calls))
-    told = {finding.code: finding.function for finding in result.findings}
-    assert told == {
+    found = {finding.code: finding.function for finding in result.findings}
+    assert found == {
         **dict.fromkeys(LOOPS, "evaluate"),
         "return [i for i in range(self.num_envs)]  # called": "count",
     }
 
 
-def test_other_loops_are_none_over_envs(checked: Checked) -> None:
+def test_other_loops_are_not_taken_for_loops_over_envs(checked: Checked) -> None:
     lines = (
         "x, y, z = self.cube.pose.p[0]",
         "for actor in (self.cube, self.goal): actor.pose.p",
@@ -61,11 +61,11 @@ COPIES = {
 
 def test_copies_to_the_host(checked: Checked) -> None:
     result = in_evaluate(checked, "device-copies", *COPIES)
-    told = {finding.code: finding for finding in result.findings}
-    assert told.keys() == COPIES.keys()
+    found = {finding.code: finding for finding in result.findings}
+    assert found.keys() == COPIES.keys()
     for line, written in COPIES.items():
-        assert written in told[line].message and told[line].count == 1, "the message says how often"
-    assert " once in each step" in told["distance.cpu()"].message
+        assert written in found[line].message and found[line].count == 1, "the message holds the count"
+    assert " once in each step" in found["distance.cpu()"].message
 
 
 def test_copies_that_only_some_steps_make(checked: Checked) -> None:
@@ -76,7 +76,7 @@ def test_copies_that_only_some_steps_make(checked: Checked) -> None:
     assert "2 times in 3 steps" in message
 
 
-def test_copies_of_host_tensors_and_at_resets_are_none(checked: Checked) -> None:
+def test_copies_of_host_tensors_and_at_resets_are_not_reported(checked: Checked) -> None:
     edits = (
         (AT, f"{AT}        float(torch.tensor([1.0, 2.0])[0])\n"),
         (GOAL, f"{GOAL}            cube.cpu()\n"),
@@ -98,27 +98,27 @@ MEET = (
 )
 
 
-def test_host_tensors_meet_those_of_the_device(checked: Checked) -> None:
+def test_operations_that_mix_host_and_device_tensors(checked: Checked) -> None:
     result = in_evaluate(checked, "foreign-device", *MEET)
     assert {finding.code for finding in result.findings} == set(MEET)
     assert {finding.function for finding in result.findings} == {"evaluate"}
 
 
-def test_what_a_gpu_takes(checked: Checked) -> None:
+def test_operations_that_a_gpu_accepts(checked: Checked) -> None:
     lines = (
         "distance + torch.tensor(2.0)",  # no dimension
         "distance[torch.arange(2)]",  # an index
-        "self.cube.pose.p.clone()[:, :2] = torch.zeros(2)",  # copied over
+        "self.cube.pose.p.clone()[:, :2] = torch.zeros(2)",  # the assignment copies to the device
         "distance + torch.zeros(self.num_envs).to(self.device)",
         "distance + torch.zeros(self.num_envs).to(distance)",
         "distance + torch.zeros(self.num_envs, device=self.device)",
         "distance + torch.zeros_like(distance)",
         "distance + distance.new_zeros(self.num_envs)",
-        "x = torch.zeros(3) + torch.ones(3)",  # two of the host
+        "x = torch.zeros(3) + torch.ones(3)",  # both on the host
         "distance.clone().copy_(torch.zeros(self.num_envs))",
         "Pose.create_from_pq(torch.zeros((self.num_envs, 3)), device=self.device).p + self.cube.pose.p",
         "Pose.create_from_pq(torch.zeros((1, 3))).p + torch.ones((1, 3))",
-        "distance + torch.Tensor([1])",  # its origin is not seen
+        "distance + torch.Tensor([1])",  # its creation is not tracked
         "self.cube.pose * sapien.Pose(p=[0, 0, 1])",
         "with torch.device(self.device): distance + torch.zeros(self.num_envs)",
     )

@@ -1,4 +1,4 @@
-"""Rules of what ``evaluate`` says, each with a task that breaks it and one that keeps it."""
+"""Rules for the entries of ``evaluate``, each with a task that breaks it and one that keeps it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_success_right_after_a_reset(checked: Checked) -> None:
     assert finding.code.startswith('"success": (distance < 1)') and finding.function == "evaluate"
 
 
-def test_no_entry_for_success(checked: Checked) -> None:
+def test_a_missing_success_entry(checked: Checked) -> None:
     finding = the_finding(
         checked(
             "success-stays-possible",
@@ -92,6 +92,6 @@ def test_a_comment_with_a_reason_silences_a_finding(checked: Checked) -> None:
     )
 
 
-def test_an_entry_for_all_envs_together(checked: Checked) -> None:
+def test_an_entry_without_a_row_per_env(checked: Checked) -> None:
     finding = the_finding(checked("info-rows", ('"cube_height": height', '"cube_height": height.mean()')))
     assert "'cube_height'" in finding.message and finding.code.startswith('"cube_height"')

@@ -1,4 +1,4 @@
-"""What the Checks tab lists, and in which order."""
+"""The findings that the Checks tab lists, and their order."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ DONE = ChecksView(
 )
 
 
-def test_what_stops_comes_first_and_the_findings_of_a_rule_are_together() -> None:
+def test_stopping_findings_come_first_and_findings_are_grouped_by_rule() -> None:
     shown = cards(DONE, [PLAYED])
     assert [card.rule.id for card in shown] == ["success-at-reset", "reward-changes", "not-applied"]
     assert [len(card.rows) for card in shown] == [1, 2, 1] and count(shown) == 4
     assert summary(DONE, shown) == "1 stop, 3 warn, 1 kept, 1 not applicable"
 
 
-def test_what_was_seen_while_playing_says_how_often_and_since_when_and_is_no_second_row() -> None:
+def test_a_breach_seen_while_playing_is_counted_in_one_row() -> None:
     (played,) = cards(ChecksView(), [PLAYED])
     assert played.rows[0].played == "while playing 10 times and more, first at step 3"
     of_check = ChecksView("done", results=(RuleResult("not-applied", "broken", (PLAYED,)),))
@@ -43,7 +43,7 @@ def test_what_was_seen_while_playing_says_how_often_and_since_when_and_is_no_sec
     assert len(both.rows) == 1 and both.rows[0].played
 
 
-def test_an_outlier_that_both_saw_is_one_finding_at_its_line() -> None:
+def test_an_outlier_seen_by_check_and_play_is_one_finding() -> None:
     exact, at_hook = finding("entries-finite", line=30), finding("entries-finite", line=24)
     of_check = ChecksView("done", results=(RuleResult("entries-finite", "broken", (exact,)),))
     (card,) = cards(of_check, [at_hook])
@@ -59,7 +59,7 @@ def test_a_rule_that_is_broken_while_playing_is_not_counted_as_kept() -> None:
     assert summary(kept, cards(kept, [PLAYED])) == "1 warn, 1 kept"
 
 
-def test_findings_of_the_version_before_come_last_and_count() -> None:
+def test_findings_of_the_previous_version_come_last_and_are_counted() -> None:
     view = ChecksView(
         "checking", before=(STOPS,), results=(RuleResult("reward-changes", "broken", (WARNS,)),)
     )

@@ -1,4 +1,4 @@
-"""The job of ``workbench check``: the same results in any number of processes, and what becomes of a task that raises."""
+"""The job of ``workbench check``: equal results with any number of processes, and results for a task that raises."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TURNED = (
     '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),',
     '"success": self.agent.robot.qpos[:, 0] > 0.6,',
 )
-"""No random action turns the first joint so far; the largest do it in some twenty steps."""
+"""Success that random actions do not reach, but the largest actions reach in about twenty steps."""
 
 
 def task_of(folder: Path, *edits: tuple[str, str]) -> str:
@@ -56,28 +56,30 @@ def states(report: CheckReport) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_each_rule_has_its_result_in_the_order_of_the_table_whoever_looked(
+def test_results_are_in_the_order_of_the_table_with_any_number_of_workers(
     tmp_path: Path, child_process: None
 ) -> None:
-    """The first two are of other groups, and the last is seen while they look."""
+    """The first two rules are in different groups; the last is observed while these groups run."""
     task = task_of(tmp_path, AT_ONCE, LOSES_ROWS)
     rules = ("reward-finite", "success-at-reset", "rows-lost")
     seen: list[str] = []
     alone = check(options(task, *rules), on_result=lambda result: seen.append(result.rule))
-    assert seen == ["success-at-reset", "reward-finite", "rows-lost"], "as they come"
+    assert seen == ["success-at-reset", "reward-finite", "rows-lost"], (
+        "progress is reported in order of completion"
+    )
     several = check(options(task, *rules, workers=2), executor=Processes(2))
     assert states(alone) == states(several) and list(states(alone)) == [r for r in RULES if r in rules]
     assert states(alone) == {"rows-lost": "broken", "success-at-reset": "broken", "reward-finite": "kept"}
-    told = [(finding.key, finding.message, finding.degree, finding.line) for finding in alone.findings]
-    assert told == [(one.key, one.message, one.degree, one.line) for one in several.findings]
-    # Its notices tell of the ids that other tests of this process have registered.
+    comparable = [(finding.key, finding.message, finding.degree, finding.line) for finding in alone.findings]
+    assert comparable == [(one.key, one.message, one.degree, one.line) for one in several.findings]
+    # The notices name ids that other tests of this process have registered.
     assert replace(alone.task, notices=()) == replace(several.task, notices=())
     assert alone.task.env_id == "WorkbenchPushCube-v1"
     for report in (alone, several):
         assert report.fails("stop") and 0 < report.start_seconds < report.seconds
 
 
-def test_a_rule_of_gpu_simulation_is_looked_at_where_no_other_is(tmp_path: Path) -> None:
+def test_a_gpu_rule_is_checked_alone(tmp_path: Path) -> None:
     report = check(options(task_of(tmp_path, LOSES_ROWS), "rows-lost"))
     (finding,) = report.findings
     assert finding.degree == "stop" and finding.code == "self.drawn = torch.rand((b, 2))"
@@ -103,13 +105,13 @@ def test_a_task_that_raises_breaks_one_rule_and_leaves_the_others_undecided(tmp_
     )
 
 
-def test_a_rule_that_is_not_decided_is_no_success(tmp_path: Path) -> None:
-    """Where `runs` is not asked for, nothing else would tell a job in CI."""
+def test_an_undecided_rule_is_no_success(tmp_path: Path) -> None:
+    """Without `runs` selected, nothing else would make a CI job fail."""
     report = check(options(task_of(tmp_path, RAISES), "reward-finite"))
     assert report.findings == () and report.fails("stop")
 
 
-def test_a_job_that_is_stopped_gives_what_it_has(tmp_path: Path) -> None:
+def test_a_stopped_job_returns_its_results_so_far(tmp_path: Path) -> None:
     seen: list[RuleResult] = []
     rules = "success-at-reset", "reward-finite"
     report = check(options(task_of(tmp_path), *rules), on_result=seen.append, stop=lambda: bool(seen))
@@ -127,7 +129,7 @@ def test_a_task_that_cannot_be_imported_or_lacks_a_download_is_not_judged(
         check(options("PickSingleYCB-v1", "runs"))
 
 
-def test_what_several_processes_say_of_one_rule_becomes_one_result() -> None:
+def test_results_of_several_processes_for_one_rule_are_merged() -> None:
     finding = Finding("runs", "stop", "step: it raised", "a.py", 3, "x()", "evaluate", 1, 0)
     other = Finding("runs", "stop", "reset: it raised", "a.py", 9, "y()", "reset", 1, 0)
     again = Finding("runs", "stop", "step: it raised", "a.py", 3, "x()", "evaluate", 4, 0)
@@ -147,7 +149,7 @@ def test_what_several_processes_say_of_one_rule_becomes_one_result() -> None:
     assert of_other_seeds.count == 5
 
 
-# --- many seeds: several parts, whoever looks at them -----------------------------------------------------
+# --- many seeds: several parts, on any worker -------------------------------------------------------------
 
 DIES_ONCE = (
     (
@@ -165,13 +167,13 @@ DIES_ONCE = (
 
 
 def parts(task: str) -> CheckOptions:
-    """40 seeds: 32, and 8. The rules are of three groups, of which the last looks at the first part alone."""
+    """Options for 40 seeds: parts of 32 and 8. The rules are in three groups; the last checks only the first part."""
     made = TaskOptions(num_envs=8, env_kwargs=PLAIN, seed=100)
     return CheckOptions(task, made, seeds=40, select=("outside-reach", "success-at-reset", "body-names"))
 
 
-def told(report: CheckReport) -> object:
-    """All but how long it took."""
+def comparable(report: CheckReport) -> object:
+    """A report without its durations."""
     return (
         [replace(result, seconds=0.0) for result in report.results],
         replace(report.task, notices=()),
@@ -181,7 +183,7 @@ def told(report: CheckReport) -> object:
 
 
 @pytest.mark.slow
-def test_many_seeds_come_to_the_same_with_any_number_of_workers_and_deaths(
+def test_many_seeds_give_equal_results_with_any_number_of_workers_and_deaths(
     tmp_path: Path, child_process: None
 ) -> None:
     task = task_of(tmp_path, AT_ONCE, *DIES_ONCE)
@@ -196,12 +198,12 @@ def test_many_seeds_come_to_the_same_with_any_number_of_workers_and_deaths(
     mark.unlink()
     for workers in (1, 2):
         several = check(parts(task), executor=Processes(workers))
-        assert told(several) == told(alone)
-    assert mark.exists(), "one was killed"
+        assert comparable(several) == comparable(alone)
+    assert mark.exists(), "one worker must have died"
 
 
 @pytest.mark.slow
-def test_parts_of_a_job_are_put_together_and_a_job_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_parts_of_a_job_are_merged_and_a_job_is_resumed(tmp_path: Path) -> None:
     task = task_of(tmp_path, AT_ONCE)
     what = parts(task)
     whole = check(what)
@@ -212,21 +214,21 @@ def test_parts_of_a_job_are_put_together_and_a_job_goes_on_where_it_was(tmp_path
         assert part.missing == (2, 3)[number - 1]
         file.close()
     kept = read_parts(files)
-    assert told(report_of(what, kept.results(ItemOutcome))) == told(whole)
+    assert comparable(report_of(what, kept.results(ItemOutcome))) == comparable(whole)
 
     file = JobFile(files[0], job_of("check", task, what, ("workers",)))
     seen: list[str] = []
     again = check(what, on_activity=seen.append, executor=Kept(ThisProcess(), file))
     file.close()
-    assert told(again) == told(whole)
+    assert comparable(again) == comparable(whole)
     assert [text for text in seen if "part 1" in text] == [] and "seeds, part 2 of 2: success" in seen
 
 
-# --- who acts beside random actions ----------------------------------------------------------------------
+# --- given actions besides random ones --------------------------------------------------------------------
 
 
 def turns(steps: int) -> np.ndarray:
-    """(steps, 8) that turn the first joint as fast as it goes."""
+    """Actions (steps, 8) that turn the first joint at full speed."""
     actions = np.zeros((steps, 8), np.float32)
     actions[:, 0] = 1
     return actions
@@ -236,8 +238,8 @@ def notes(report: CheckReport) -> dict[str, tuple[str, ...]]:
     return {result.rule: result.notes for result in report.results}
 
 
-def test_the_actions_of_a_file_reach_what_random_ones_do_not(tmp_path: Path) -> None:
-    """One array is tried from each seed; of several each from its own, and no more than there are seeds."""
+def test_actions_from_a_file_reach_states_that_random_actions_do_not(tmp_path: Path) -> None:
+    """A single array is tried from each seed; several arrays each from one seed, at most as many as there are seeds."""
     task = task_of(tmp_path, TURNED)
     np.save(tmp_path / "one.npy", turns(20))
     np.savez(tmp_path / "two.npz", turns(20), turns(3))
@@ -253,8 +255,8 @@ def test_the_actions_of_a_file_reach_what_random_ones_do_not(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_a_recording_begins_where_it_was_recorded(tmp_path: Path, child_process: None) -> None:
-    """Its seed is not among those of the check, and its success is at its last step."""
+def test_a_replayed_recording_begins_with_its_own_seed(tmp_path: Path, child_process: None) -> None:
+    """Its seed is not one of the check's seeds, and it succeeds at its last step."""
     task = task_of(tmp_path, TURNED)
     np.save(tmp_path / "one.npy", turns(20))
     made = RecordOptions(
@@ -271,7 +273,7 @@ def test_a_recording_begins_where_it_was_recorded(tmp_path: Path, child_process:
     assert notes(check(what))["success-stays-possible"][1] == "success in 1 of 1 given episode"
 
 
-def test_what_is_wrong_in_given_episodes_alone_is_found(tmp_path: Path) -> None:
+def test_a_breach_only_in_given_episodes_is_found(tmp_path: Path) -> None:
     fails = '"fail": height < -0.1,', '"fail": self.agent.robot.qpos[:, 0] > 0.5,'
     task = task_of(tmp_path, TURNED, fails)
     np.save(tmp_path / "one.npy", turns(20))
@@ -281,8 +283,8 @@ def test_what_is_wrong_in_given_episodes_alone_is_found(tmp_path: Path) -> None:
     assert "in 4 of 4 given episodes" in finding.message
 
 
-def test_a_task_that_only_one_env_can_run_is_checked_with_one(tmp_path: Path) -> None:
-    """It asks the simulation of one env for its contacts, in a step alone, when much was seen of several envs already."""
+def test_a_task_that_runs_with_one_env_only_is_checked_with_one(tmp_path: Path) -> None:
+    """It queries contacts, which works with one env only, and only in a step, after several envs were already used."""
     hook = next(line for line in TEXT.splitlines() if "def compute_dense_reward" in line)
     task = task_of(tmp_path, (hook, f"{hook}\n        self.scene.px.get_contacts()"))
     report = check(

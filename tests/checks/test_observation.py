@@ -1,4 +1,4 @@
-"""Rules of the observation, each with a task that breaks it and one that keeps it."""
+"""Rules for observations, each with a task that breaks it and one that keeps it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_an_observation_that_is_nan(checked: Checked) -> None:
     assert finding.function == "_get_obs_extra" and finding.degree == "stop"
 
 
-def test_an_observation_that_is_nan_where_random_actions_do_not_lead(checked: Checked) -> None:
+def test_an_observation_that_is_nan_in_states_that_random_actions_do_not_reach(checked: Checked) -> None:
     edit = GOAL, f"{GOAL} 'log': torch.log((info['cube_to_goal'] - 0.001).sign()),"
     assert "with bodies at the place of goal" in the_finding(checked("observation-finite", edit)).message
 
@@ -45,7 +45,7 @@ def test_ground_truth_in_a_mode_with_pictures(checked: Checked, renderer: None) 
     assert finding.code.startswith('"goal_pos"') and finding.function == "_get_obs_extra"
 
 
-def test_a_hidden_goal_that_the_policy_is_not_told(checked: Checked, renderer: None) -> None:
+def test_a_hidden_goal_that_is_not_observed(checked: Checked, renderer: None) -> None:
     hide = HIDDEN_GOAL[0], "".join(HIDDEN_GOAL)
     finding = the_finding(checked("hidden-goal", hide, (GOAL, "")))
     assert "goal is hidden from pictures" in finding.message and finding.code.startswith("def _get_obs_extra")

@@ -1,4 +1,4 @@
-"""What several parts of the seeds come to together: what one part alone would not say."""
+"""Merging the results of several parts of the seeds into verdicts that one part alone could not give."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def judged(rule: str, *rows: Seen) -> list[Found | Note]:
 
 
 def result(rule: str, *rows: Seen) -> RuleResult:
-    """Of one part of the seeds."""
+    """The result of one part of the seeds."""
     try:
         found = judged(rule, *rows)
     except NotKnown as reason:
@@ -46,7 +46,7 @@ def test_breaches_are_counted_over_all_seeds() -> None:
     assert "of 3 of 70 seeds (seed 3, 65, 66)" in finding.message
 
 
-def test_the_worst_of_all_parts_is_told() -> None:
+def test_the_worst_value_of_all_parts_is_reported() -> None:
     loose = Seen(("loose", "cube"))
 
     def falls(metres: float, *seeds: int) -> tuple[Seen, ...]:
@@ -63,12 +63,12 @@ def test_the_worst_of_all_parts_is_told() -> None:
         finding.message.startswith("cube falls 0.30 m")
         and "3 of 64 seeds (seed 4, 40, 41)" in finding.message
     )
-    # What is held at one seed may slip at all.
+    # A body that is held at one seed may slip at all seeds.
     held = result("falls-at-reset", Seen(("wanted", "cube")), loose, Seen(tried=32))
     assert over_seeds([*parts, held], "warn").state == "not_known"
 
 
-def test_what_changes_between_parts_is_not_constant() -> None:
+def test_a_value_that_changes_between_parts_is_not_constant() -> None:
     def rewards(most: float, least: float) -> RuleResult:
         return result("reward-changes", Seen(place=PLACE, tried=50, numbers=(most, least), texts=("0",)))
 
@@ -92,12 +92,12 @@ def test_what_changes_between_parts_is_not_constant() -> None:
 
     assert over_seeds([shelf(0.1), shelf(0.2)], "warn").state == "kept"
     assert over_seeds([shelf(0.1), shelf(0.1)], "warn").state == "broken"
-    # One seed alone in its part says nothing by itself, and is counted with the others.
+    # A part of a single seed is not conclusive alone, and is counted with the others.
     last = result("kinematic-never-moved", Seen(tried=1), Seen(("shelf",), PLACE, numbers=(0.0,) * 14))
     assert last.state == "not_known" and over_seeds([shelf(0.1), last], "warn").state == "kept"
 
 
-def test_what_is_out_of_reach_at_some_seeds_is_told_and_what_always_is_is_not_known() -> None:
+def test_a_body_out_of_reach_at_some_seeds_is_reported_and_at_all_seeds_is_not_known() -> None:
     def cube(tried: int, *beyond: int) -> RuleResult:
         return result("outside-reach", Seen(("cube",), PLACE, tried, beyond, size=0.9, numbers=(0.8,)))
 
@@ -123,9 +123,9 @@ def test_successes_are_counted_over_all_parts() -> None:
     assert (never.state, often.state) == ("not_known", "broken")
     assert over_seeds([never, often], "warn").state == "broken"
     holds = result("success-flickers", flickers(20, 0))
-    assert over_seeds([often, holds], "warn").state == "kept", "2 of 24 times"
+    assert over_seeds([often, holds], "warn").state == "kept", "2 of 24 times is below the limit"
     assert over_seeds([never, never], "warn").state == "not_known"
-    assert result("success-flickers", flickers(4, 1)).state == "kept", "once is chance"
+    assert result("success-flickers", flickers(4, 1)).state == "kept", "a single flicker may be chance"
 
 
 @pytest.mark.parametrize("state", ["not_known", "failed"])
@@ -143,5 +143,5 @@ def test_a_part_that_raises_leaves_the_rule_undecided_unless_another_breaks_it(
 
 
 @pytest.mark.parametrize("rule", RULES_OVER_SEEDS)
-def test_nothing_that_was_seen_breaks_no_rule(rule: str) -> None:
+def test_no_observations_break_no_rule(rule: str) -> None:
     assert [*RULES_OVER_SEEDS[rule].so_far(())] == []

@@ -1,4 +1,4 @@
-"""The Checks tab: what it says, folds, and asks the session for."""
+"""The Checks tab: its texts, its folding, and the commands that it sends to the session."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Checks:
         self.serial = 100
 
     def draw(self, checks: ChecksView = DONE, **changes: Any) -> str:
-        """What the list says."""
+        """Draw the checks; returns the list's HTML."""
         self.serial += 1
         self.view = running(4, checks=replace(checks, serial=self.serial), **changes)
         self.live.show(self.view)
@@ -113,11 +113,11 @@ def test_a_comment_that_silences_nothing_is_listed_with_its_line(checks: Checks)
     assert task is not None
     task = replace(task, source={"/home/me/push.py": text})
     html = checks.draw(replace(DONE, state="checking"), task=task)
-    assert "push.py:2" in html and "push.py:1" not in html, "its rule may not be checked yet"
+    assert "push.py:2" in html and "push.py:1" not in html, "the comment's rule may not be checked yet"
     assert "push.py:1" in checks.draw(DONE, task=task)
 
 
-def test_why_and_the_rules_without_a_finding_are_folded_out_and_in_by_a_press(checks: Checks) -> None:
+def test_the_reason_and_the_kept_rules_are_unfolded_and_folded_by_a_press(checks: Checks) -> None:
     why = "no tried episode succeeds"
     unknown = [RuleResult(rule, "not_known", why=why) for rule in ("reward-order", "success-flickers")]
     view = replace(DONE, results=(*RESULTS, *unknown))
@@ -151,11 +151,11 @@ def test_a_rule_whose_check_failed_is_shown_with_its_place_and_traceback(checks:
         (ChecksView("failed", why="the process died"), "the process died"),
     ],
 )
-def test_one_line_says_how_far_it_is(checks: ChecksView, says: str) -> None:
+def test_one_line_shows_the_progress(checks: ChecksView, says: str) -> None:
     assert says in status_html(checks, [])
 
 
-def test_only_what_runs_can_be_stopped(checks: Checks) -> None:
+def test_only_a_running_check_can_be_stopped(checks: Checks) -> None:
     checks.draw(ChecksView("checking", total=58))
     assert not checks.live.shows(CHECK_NOW)
     checks.live.press(STOP_CHECKS)
@@ -165,7 +165,7 @@ def test_only_what_runs_can_be_stopped(checks: Checks) -> None:
     assert checks.live.asked == [StopChecks(), CheckNow(), CheckAfterSave(on=False)]
 
 
-def test_what_was_seen_while_playing_is_in_the_same_list_and_leaves_it(checks: Checks) -> None:
+def test_findings_while_playing_are_added_to_and_removed_from_the_same_list(checks: Checks) -> None:
     played = Finding("not-applied", "warn", "the pose was set", None, None, "", "", 1, 0)
     odd = Finding(
         "bodies-stay", "warn", "cube dropped 0.9 m", "/home/me/push.py", 70, "def it", "reset", 40, 2
@@ -193,7 +193,7 @@ PROFILED = StepProfile(
 )
 
 
-def test_where_a_step_goes_is_asked_for_and_shown_by_hook_and_line(checks: Checks) -> None:
+def test_a_step_profile_is_requested_and_shown_by_hook_and_line(checks: Checks) -> None:
     checks.draw()
     checks.live.press(PROFILE)
     checks.draw(profile=ProfileView("running", 1))
@@ -214,7 +214,7 @@ def test_where_a_step_goes_is_asked_for_and_shown_by_hook_and_line(checks: Check
         "push.py:93",
     ):
         assert words in text
-    assert "push.py:94" not in text, "lines that take next to nothing"
+    assert "push.py:94" not in text, "lines that take almost no time are left out"
     checks.draw(profile=ProfileView("failed", 3, why="no agent"))
     assert "no agent" in checks.live.html() and not checks.live.html("wb-profile")
 
@@ -253,11 +253,11 @@ def test_each_seed_has_a_row_that_opens_its_recording_and_verdicts_are_cards(ser
     looked_at: list[Path] = []
     live = Live(server, on_look=looked_at.append)
     live.show(running(1, seeds=SEEDS))
-    said = live.html()
-    assert "1 of 2 seeds" in said and "earned &lt;0.9&gt; a step without success" in said and "21.5" in said
+    html = live.html()
+    assert "1 of 2 seeds" in html and "earned &lt;0.9&gt; a step without success" in html and "21.5" in html
     live.ask(ShowSolved(seed=1))
     assert looked_at == [Path("/r/seed1.rrd")]
-    assert 'data-rule="reward-exploited"' in said and "(seeds 1)" in said and "<b>Mend</b>" not in said
+    assert 'data-rule="reward-exploited"' in html and "(seeds 1)" in html and "<b>Mend</b>" not in html
     live.ask(ToggleVerdict(rule="reward-exploited"))
     live.again()
     assert "<b>Mend</b>" in live.html()

@@ -1,4 +1,4 @@
-"""Rules of where a reset puts things, each with a task that breaks it and one that keeps it."""
+"""Rules for the placement of bodies at resets, each with a task that breaks it and one that keeps it."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def test_a_cube_above_the_table(checked: Checked) -> None:
     assert "cube falls 0.06 m" in finding.message and finding.code == CUBE_POSE
 
 
-def test_a_whole_batch_in_a_partial_reset(checked: Checked) -> None:
+def test_full_batch_values_in_a_partial_reset(checked: Checked) -> None:
     edit = "cube = torch.zeros((b, 3))", "cube = torch.zeros((self.num_envs, 3))"
     fails = "cube[:, :2] = (2 * torch.rand((b, 2))", "cube[:, :2] = (2 * torch.rand((self.num_envs, 2))"
     finding = the_finding(checked("batch-of-reset", edit, fails))
     assert "self.num_envs" in finding.code and "len(env_idx)" in finding.message
 
 
-def test_a_whole_batch_of_which_rows_are_taken_is_right(checked: Checked) -> None:
+def test_selecting_rows_of_a_full_batch_is_correct(checked: Checked) -> None:
     edit = "torch.rand((b, 2))", "torch.rand((self.num_envs, 2))[env_idx]"
     assert checked("batch-of-reset", edit).state == "kept"
 
@@ -49,7 +49,7 @@ MINE = "            if len(env_idx) < self.num_envs: raise ValueError('my own mi
         pytest.param((f"            {CUBE_POSE}\n", f"            {CUBE_POSE}\n{KEPT}{MINE}"), id="in a partial reset"),
     ],
 )  # fmt: skip
-def test_a_buffer_of_all_envs_is_not_to_blame_for_another_mistake(
+def test_a_buffer_of_all_envs_is_not_blamed_for_another_error(
     checked: Checked, edit: tuple[str, str]
 ) -> None:
     buffer = f"            {CUBE_POSE}\n", f"            {CUBE_POSE}\n{KEPT}"
@@ -65,7 +65,7 @@ TURNED = """half = torch.rand(b) * 3
             self.cube.set_pose(Pose.create_from_pq(p=cube, q=q))"""
 
 
-def test_quaternions_with_w_last(checked: Checked) -> None:
+def test_quaternions_in_xyzw_order(checked: Checked) -> None:
     wrong = TURNED.format("zero, zero, half.sin(), half.cos()")
     finding = the_finding(checked("quaternion-order", (CUBE_POSE, wrong)))
     assert "x, y, z, w" in finding.message and finding.code.startswith("self.cube.set_pose")
@@ -85,7 +85,7 @@ def test_quaternions_of_scipy(checked: Checked) -> None:
         assert checked("quaternion-order", (CUBE_POSE, lines.format(order))).state == "kept"
 
 
-def test_a_quaternion_that_is_too_long(checked: Checked) -> None:
+def test_a_quaternion_that_is_not_normalised(checked: Checked) -> None:
     edit = CUBE_POSE, CUBE_POSE.replace("[1, 0, 0, 0]", "[1, 0, 0, 1]")
     finding = the_finding(checked("unit-quaternion", edit))
     assert "has length 1.41" in finding.message and "[1, 0, 0, 1]" in finding.code

@@ -1,4 +1,4 @@
-"""The time of a step of the running version, on a background process that answers what a test tells it."""
+"""The step profile of the running version, with a scripted background process."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.drive.scenes import problem
-from tests.drive.session import Told, work_with
+from tests.drive.session import FakeWorkerSession, work_with
 from tests.drive.waiting import until
 from workbench.checks.commands import StopProfile, TimeStep
 from workbench.checks.profile import ProfileView
@@ -21,7 +21,7 @@ PROFILE = StepProfile(3, 20, 1.0, (HookTime("evaluate", 1.0, 1.0),), ())
 
 
 class Timer:
-    """Answers with the profile, or fails, once it is let."""
+    """Returns the profile, or fails, once `let` is set."""
 
     def __init__(self) -> None:
         self.let = False
@@ -42,38 +42,38 @@ class Timer:
 
 
 @pytest.fixture
-def timer(told: Told) -> Timer:
+def timer(fake: FakeWorkerSession) -> Timer:
     timer = Timer()
-    work_with(told.session, timer)
+    work_with(fake.session, timer)
     return timer
 
 
-def test_a_step_is_timed_and_its_profile_is_old_as_soon_as_another_version_runs(
-    told: Told, timer: Timer
+def test_a_step_is_timed_and_its_profile_is_stale_once_another_version_runs(
+    fake: FakeWorkerSession, timer: Timer
 ) -> None:
     with pytest.raises(Refused):
-        told.session.do(TimeStep())
-    told.load()
-    told.session.do(TimeStep())
-    assert told.view.of(ProfileView).state == "running"
+        fake.session.do(TimeStep())
+    fake.load()
+    fake.session.do(TimeStep())
+    assert fake.view.of(ProfileView).state == "running"
     timer.let = True
-    until(lambda: told.view.of(ProfileView).state == "done", "the profile")
-    assert told.view.of(ProfileView).profile == PROFILE and not told.view.of(ProfileView).stale
-    told.load("patched")
-    assert told.view.of(ProfileView).profile == PROFILE and told.view.of(ProfileView).stale
+    until(lambda: fake.view.of(ProfileView).state == "done", "the profile")
+    assert fake.view.of(ProfileView).profile == PROFILE and not fake.view.of(ProfileView).stale
+    fake.load("patched")
+    assert fake.view.of(ProfileView).profile == PROFILE and fake.view.of(ProfileView).stale
 
 
-def test_a_load_and_a_person_end_it(told: Told, timer: Timer) -> None:
-    told.load()
-    for end in (lambda: told.load("patched"), lambda: told.session.do(StopProfile())):
-        told.session.do(TimeStep())
+def test_a_load_and_the_stop_button_end_a_profile(fake: FakeWorkerSession, timer: Timer) -> None:
+    fake.load()
+    for end in (lambda: fake.load("patched"), lambda: fake.session.do(StopProfile())):
+        fake.session.do(TimeStep())
         end()
-        assert told.view.of(ProfileView).state == "stopped"
+        assert fake.view.of(ProfileView).state == "stopped"
 
 
-def test_what_the_code_raises_is_shown(told: Told, timer: Timer) -> None:
-    told.load()
+def test_an_error_of_the_task_is_shown(fake: FakeWorkerSession, timer: Timer) -> None:
+    fake.load()
     timer.let, timer.fails = True, JobFailed("it cannot be timed", problem())
-    told.session.do(TimeStep())
-    until(lambda: told.view.of(ProfileView).state == "failed", "the failure")
-    assert told.view.of(ProfileView).problem == problem()
+    fake.session.do(TimeStep())
+    until(lambda: fake.view.of(ProfileView).state == "failed", "the failure")
+    assert fake.view.of(ProfileView).problem == problem()

@@ -1,4 +1,4 @@
-"""Rules of running in any order and of doing the same again, each with a task that breaks it and one that keeps it."""
+"""Rules for running in any order and for reproducible runs, each with a task that breaks it and one that keeps it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_a_partial_reset_that_fails(checked: Checked) -> None:
     assert finding.degree == "stop" and finding.code.startswith("cube[:, :2] = ")
 
 
-def test_unseeded_numbers(checked: Checked) -> None:
+def test_unseeded_random_numbers(checked: Checked) -> None:
     finding = the_finding(
         checked("same-seed", (DRAWN, "torch.tensor(np.random.rand(b, 2)).float()"), seeds=4)
     )
@@ -26,7 +26,7 @@ def test_unseeded_numbers(checked: Checked) -> None:
     assert "actors/cube" in finding.message and "np.random.rand" in finding.code
 
 
-def test_numbers_that_another_hook_draws_are_told_there(checked: Checked) -> None:
+def test_random_numbers_are_reported_at_the_hook_that_draws_them(checked: Checked) -> None:
     noisy = '"cube_height": height,', '"cube_height": height + torch.rand(self.num_envs),'
     finding = the_finding(checked("same-seed", noisy, seeds=4))
     assert finding.function == "evaluate" and finding.code.startswith('"cube_height": height + torch.rand')
@@ -47,7 +47,7 @@ def test_a_value_that_only_the_first_reset_draws(checked: Checked) -> None:
     assert "actors/cube" in the_finding(checked("same-seed", *edits, seeds=4)).message
 
 
-def test_a_goal_that_is_in_no_state(checked: Checked) -> None:
+def test_a_goal_that_is_missing_in_the_state(checked: Checked) -> None:
     kept = (
         (GOAL_POSE, "self.goal_pos[env_idx] = goal"),
         (

@@ -1,4 +1,4 @@
-"""Rules of the reward, each with a task that breaks it and one that keeps it."""
+"""Rules for rewards, each with a task that breaks it and one that keeps it."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def test_a_sparse_reward_above_one(checked: Checked) -> None:
     assert checked("reward-normalized", reward_mode="dense").state == "not_applicable"
 
 
-def test_a_reward_that_is_nan_where_random_actions_do_not_lead(checked: Checked) -> None:
-    # The cube comes within a millimetre of the goal only where it is put there.
+def test_a_reward_that_is_nan_in_states_that_random_actions_do_not_reach(checked: Checked) -> None:
+    # The cube is within a millimetre of the goal only if it is placed there.
     nan = "reward = reach + push + torch.sqrt((info['cube_to_goal'] - 0.001).sign())\n"
     finding = the_finding(checked("reward-finite", ("reward = reach + push\n", nan)))
     assert "with bodies at the place of goal" in finding.message
 
 
-def test_a_normalized_reward_that_is_another_reward(checked: Checked) -> None:
+def test_a_normalized_reward_that_is_not_proportional(checked: Checked) -> None:
     edit = (
         "self.compute_dense_reward(obs, action, info) / 3",
         "(self.compute_dense_reward(obs, action, info) / 3).sqrt()",
@@ -69,7 +69,7 @@ def test_a_normalized_reward_with_an_offset_is_noted(checked: Checked) -> None:
 
 
 @pytest.mark.parametrize("paid", ["0", "0.5"])
-def test_success_that_earns_less_than_the_way_to_it(checked: Checked, paid: str) -> None:
+def test_success_that_earns_less_than_the_approach(checked: Checked, paid: str) -> None:
     edit = 'reward[info["success"]] = 3', f'reward[info["success"]] = {paid}'
     finding = the_finding(checked("reward-order", edit))
     assert f"{float(paid) / 3:.4g} " in finding.message and finding.function == "compute_dense_reward"
@@ -78,7 +78,7 @@ def test_success_that_earns_less_than_the_way_to_it(checked: Checked, paid: str)
 OUT_OF_REACH = '"success": (distance < GOAL_RADIUS)', '"success": (self.elapsed_steps > 1000)'
 
 
-def test_success_that_pays_less_is_found_though_no_episode_succeeds(checked: Checked) -> None:
+def test_success_that_pays_less_is_found_without_a_successful_episode(checked: Checked) -> None:
     edit = 'reward[info["success"]] = 3', 'reward[info["success"]] = 0.5'
     finding = the_finding(checked("reward-order", OUT_OF_REACH, edit))
     assert 'is 0.1667 wherever info["success"] is true' in finding.message
@@ -90,7 +90,7 @@ def test_success_that_pays_less_is_found_though_no_episode_succeeds(checked: Che
 
 
 @pytest.mark.parametrize("rule", ["reward-order", "reward-needs-success", "success-flickers"])
-def test_what_success_pays_is_not_known_where_none_was_seen(checked: Checked, rule: str) -> None:
+def test_the_reward_of_success_is_not_known_without_a_success(checked: Checked, rule: str) -> None:
     result = checked(rule, OUT_OF_REACH)
     assert result.state == "not_known" and "episode succeeds" in result.why
     without = (
@@ -104,12 +104,12 @@ RULES_OF_REWARDS = ("reward-finite", "reward-changes", "reward-order", "reward-n
 
 
 @pytest.mark.parametrize("rule", [*RULES_OF_REWARDS, "reward-normalized", "reward-rows", "reward-flat"])
-def test_a_task_without_a_reward_has_no_rules_of_rewards(checked: Checked, rule: str) -> None:
+def test_reward_rules_do_not_apply_to_a_task_without_a_reward(checked: Checked, rule: str) -> None:
     assert checked(rule, seeds=4, reward_mode="none").state == "not_applicable"
 
 
 def test_the_largest_reward_without_success(checked: Checked) -> None:
-    # All of it where the cube is near the goal, and the target is half as wide as that.
+    # The full reward is paid near the goal; the success radius is half as large.
     near = "reward[info['cube_to_goal'] < 0.25] = 3"
     finding = the_finding(checked("reward-needs-success", ('reward[info["success"]] = 3', near)))
     assert "without success" in finding.message
@@ -119,7 +119,7 @@ IN_TIME = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005)', '"succ
 
 
 def test_a_reward_is_compared_with_the_success_of_its_own_step(tmp_path: Path) -> None:
-    """Success for one step, and the largest reward at that step, or at the one before it or after it."""
+    """Success lasts one step; the largest reward is at that step, or at the step before or after it."""
     rules, most = ("reward-needs-success", "reward-order"), 'reward[info["success"]] = 3'
     for step in (6, 7, 8):
         paid = f"{most[:-1]}1\n        reward[self.elapsed_steps == {step}] = 3"
@@ -128,5 +128,7 @@ def test_a_reward_is_compared_with_the_success_of_its_own_step(tmp_path: Path) -
         (tmp_path / "task.py").write_text(text)
         results = check_rules(rules, str(tmp_path / "task.py"), num_envs=4, seeds=4, render_backend="none")
         for rule in rules:
-            told = [finding.message for finding in results[rule].findings]
-            assert len(told) == (step != 7) and all(f"(step {step} of seed " in one for one in told), told
+            messages = [finding.message for finding in results[rule].findings]
+            assert len(messages) == (step != 7) and all(
+                f"(step {step} of seed " in one for one in messages
+            ), messages

@@ -1,4 +1,4 @@
-"""Rules of what is built, each with a task that breaks it and one that keeps it."""
+"""Rules for the built scene, each with a task that breaks it and one that keeps it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ REGISTERED = """for part in parts:
 
 
 def added(code: str) -> tuple[str, str]:
-    """An edit that runs this after the cube is built."""
+    """An edit that runs `code` after the cube is built."""
     return CUBE, f"{CUBE}        {code}\n"
 
 
@@ -61,7 +61,7 @@ def test_a_body_that_stays_at_the_origin_needs_no_pose(checked: Checked) -> None
             assert checked(rule, away, seeds=4).state == "kept"
 
 
-def test_a_body_at_the_origin_that_is_inside_another_is_told(checked: Checked) -> None:
+def test_a_body_at_the_origin_inside_another_is_reported(checked: Checked) -> None:
     built = FIXED.format(x=0, build="build_kinematic").replace("fixed.build", "self.fixed = fixed.build")
     kinematic = added(built)
     aside = GOAL_POSE, f"{GOAL_POSE}\n            self.fixed.set_pose(Pose.create_from_pq(p=[0, 0.4, 0]))"
@@ -109,7 +109,7 @@ def test_an_articulation_of_many_links(checked: Checked) -> None:
 
 
 def meshed(file: Path, call: str) -> tuple[str, str]:
-    """An edit that builds a body of a mesh file."""
+    """An edit that builds a body from a mesh file."""
     return added(f"""each = self.scene.create_actor_builder()
         each.{call.format(repr(str(file)))}
         each.initial_pose = sapien.Pose(p=[0.4, 0.4, 0.3])
@@ -117,7 +117,7 @@ def meshed(file: Path, call: str) -> tuple[str, str]:
 
 
 def open_box() -> trimesh.Trimesh:
-    """Four walls and a floor."""
+    """A mesh with four walls and a floor."""
     floor = trimesh.creation.box(extents=(0.2, 0.2, 0.01))
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         wall = trimesh.creation.box(extents=(0.01, 0.2, 0.1) if x else (0.2, 0.01, 0.1))
@@ -126,7 +126,7 @@ def open_box() -> trimesh.Trimesh:
     return floor
 
 
-def test_a_box_that_its_hull_closes(checked: Checked, tmp_path: Path) -> None:
+def test_an_open_box_with_a_convex_hull(checked: Checked, tmp_path: Path) -> None:
     open_box().export(tmp_path / "box.stl")
     call = "add_convex_collision_from_file({})"
     finding = the_finding(checked("hull-fills-hollow", meshed(tmp_path / "box.stl", call), seeds=4))
@@ -135,7 +135,7 @@ def test_a_box_that_its_hull_closes(checked: Checked, tmp_path: Path) -> None:
     assert checked("hull-fills-hollow", meshed(tmp_path / "solid.stl", call), seeds=4).state == "kept"
 
 
-def test_a_decomposition_where_it_is_built(checked: Checked) -> None:
+def test_a_convex_decomposition_while_building(checked: Checked) -> None:
     call = "if False:\n            builder.add_multiple_convex_collisions_from_file('box.ply', decomposition={!r})"
     finding = the_finding(checked("decomposition-at-load", added(call.format("coacd")), seeds=4))
     assert "decomposition='coacd'" in finding.code and ".coacd.ply" in finding.message
@@ -151,7 +151,7 @@ def test_a_mesh_of_many_triangles(checked: Checked, tmp_path: Path) -> None:
         assert not result.findings or "327,680 triangles" in result.findings[0].message
 
 
-def test_parts_that_stay_in_the_state(checked: Checked) -> None:
+def test_merged_parts_that_stay_in_the_state(checked: Checked) -> None:
     merge = "from mani_skill.utils.structs import Actor\n        self.merged = Actor.merge(parts, name='box')"
     finding = the_finding(checked("merged-actors", boxes(merge), seeds=4))
     assert finding.count == 4 and "part_0 and 3 more have 1 rows" in finding.message
@@ -179,7 +179,7 @@ NO_COLLISION = "self.marker.has_collision_shapes = False"
 
 
 def markers(of_each: str = "pass", after: str = "pass") -> tuple[str, str]:
-    """An edit that builds a marker for each env, and merges them."""
+    """An edit that builds and merges a marker per env."""
     return added(MARKERS.format(of_each=of_each, after=after))
 
 
@@ -189,7 +189,7 @@ def test_hidden_parts_of_an_actor_that_is_not_hidden(checked: Checked) -> None:
     assert NO_COLLISION in finding.message and HIDE.format("self.marker") in finding.message
 
 
-def test_what_cannot_be_hidden(checked: Checked) -> None:
+def test_a_body_that_cannot_be_hidden(checked: Checked) -> None:
     hide = HIDE.format("self.marker")
     for edit, line in (
         (markers(after=hide), hide),
@@ -199,7 +199,7 @@ def test_what_cannot_be_hidden(checked: Checked) -> None:
         assert the_finding(checked("hidden-objects", edit, seeds=4)).code == line
 
 
-def test_one_env_with_the_same_objects_for_ever(checked: Checked) -> None:
+def test_one_env_that_always_has_the_same_objects(checked: Checked) -> None:
     drawn = boxes("pass", size="0.02 + 0.01 * self._batched_episode_rng[i].rand()")
     assert "never rebuilt" in the_finding(checked("reconfigures", drawn, seeds=4)).message
     freq = "super().__init__(*args, robot_uids=robot_uids, **kwargs)"

@@ -1,4 +1,4 @@
-"""Rules on planned episodes: off unless they are asked for, and not judged where nothing can be planned."""
+"""Rules on planned episodes: off by default, and not judged where no plan can be made."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from workbench.planning.verdicts import RULES as VERDICTS
 TASKS = Path(__file__).parents[2] / "tasks"
 
 
-def test_they_are_off_unless_they_are_asked_for() -> None:
+def test_planning_rules_are_off_by_default() -> None:
     assert set(VERDICTS) == SOLVE_RULES
     assert {degree_of_each()[rule] for rule in SOLVE_RULES} == {"off"}
     assert {degree_of_each(solve=True)[rule] for rule in SOLVE_RULES} == {"warn"}

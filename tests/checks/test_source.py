@@ -1,4 +1,4 @@
-"""Rules of the class, its registration and its source, each with mistakes that break it and what only looks like one."""
+"""Rules for the class, its registration and its source, with mistakes that break them and code that only looks similar."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ IMPORTS = (
     ),
 )
 NEVER = "if self.num_envs > 99: "
-"""What is read only, and does not run."""
+"""Prefix for code that is parsed by the check but never runs."""
 
 
 def source_results(folder: Path, *edits: tuple[str, str]) -> dict[str, RuleResult]:
-    """Those of all rules of the source, of one text with all of these edits."""
+    """Results of all source rules on one text with all of these edits."""
     rules = ("versioned-id", "time-limit", "supported-robots", "reward-modes", "unknown-name", "unseeded-random",
              "backend-only-call", "missing-file", "undeclared-assets")  # fmt: skip
     text = EXAMPLE.read_text()
@@ -38,7 +38,7 @@ def source_results(folder: Path, *edits: tuple[str, str]) -> dict[str, RuleResul
 
 
 def lines(place: str, *statements: str) -> tuple[str, str]:
-    """An edit that adds statements below this line."""
+    """An edit that adds statements below the line `place`."""
     indent = place[: len(place) - len(place.lstrip())]
     return place, place + "".join(f"{indent}{statement}\n" for statement in statements)
 
@@ -74,23 +74,26 @@ def test_each_mistake_is_found_at_its_line(tmp_path: Path) -> None:
         ),
     )
 
-    def told(rule: str) -> dict[str, Finding]:
+    def findings_by_code(rule: str) -> dict[str, Finding]:
         assert results[rule].state == "broken", results[rule]
         return {finding.code.removeprefix(NEVER): finding for finding in results[rule].findings}
 
-    (code,) = told("versioned-id")
-    assert code.startswith("@register_env") and "'WorkbenchPushCube-v1'" in told("versioned-id")[code].message
-    assert [*told("time-limit")] == ['@register_env("WorkbenchPushCube")']
-    assert "'panda'" in told("supported-robots")['SUPPORTED_ROBOTS = ["fetch"]'].message
-    assert "'normalised_dense'" in next(iter(told("reward-modes").values())).message
+    (code,) = findings_by_code("versioned-id")
+    assert (
+        code.startswith("@register_env")
+        and "'WorkbenchPushCube-v1'" in findings_by_code("versioned-id")[code].message
+    )
+    assert [*findings_by_code("time-limit")] == ['@register_env("WorkbenchPushCube")']
+    assert "'panda'" in findings_by_code("supported-robots")['SUPPORTED_ROBOTS = ["fetch"]'].message
+    assert "'normalised_dense'" in next(iter(findings_by_code("reward-modes").values())).message
     for code, named in {
         "builder.inital_pose = 3": "initial_pose",
         "self.get_pairwise_contact_forces(self.cube, self.goal)": "self.scene.get_pairwise_contact_forces()",
         "self.evalute()": "self.evaluate()",
         "self.scene.create_actor_bulder()": "self.scene.create_actor_builder()",
     }.items():
-        assert named in told("unknown-name")[code].message
-    drawn = told("unseeded-random")
+        assert named in findings_by_code("unknown-name")[code].message
+    drawn = findings_by_code("unseeded-random")
     assert drawn.keys() == {
         *("x = np.random.rand()", "x = np.random.default_rng().random()", "x = random.uniform(0, 1)"),
         "self.size = np.random.rand()",
@@ -99,7 +102,7 @@ def test_each_mistake_is_found_at_its_line(tmp_path: Path) -> None:
     assert "_batched_episode_rng" in drawn["self.size = np.random.rand()"].message
     backends = {
         code: "GPU" in finding.message.split("simulation only")[0]
-        for code, finding in told("backend-only-call").items()
+        for code, finding in findings_by_code("backend-only-call").items()
     }
     assert backends == {
         "self.scene._gpu_apply_all()": True,
@@ -110,10 +113,10 @@ def test_each_mistake_is_found_at_its_line(tmp_path: Path) -> None:
     missing = [finding.message for finding in results["missing-file"].findings]
     assert all(any(name in one for one in missing) for name in ("cup.glb", "/mug.glb", "/bowl.obj")), missing
     assert {finding.degree for finding in results["missing-file"].findings} == {"stop"}
-    assert "asset_download_ids=['ycb']" in next(iter(told("undeclared-assets").values())).message
+    assert "asset_download_ids=['ycb']" in next(iter(findings_by_code("undeclared-assets").values())).message
 
 
-def test_what_only_looks_like_one_is_none(tmp_path: Path) -> None:
+def test_code_that_only_looks_like_a_mistake_is_not_reported(tmp_path: Path) -> None:
     (tmp_path / "cup.glb").write_bytes(b"")
     results = source_results(
         tmp_path,
@@ -144,7 +147,7 @@ def test_what_only_looks_like_one_is_none(tmp_path: Path) -> None:
     assert {rule: result.findings for rule, result in results.items() if result.findings} == {}
 
 
-def test_a_class_without_an_id_and_one_with_that_of_another_task(checked: Checked) -> None:
+def test_a_class_without_an_id_and_with_another_tasks_id(checked: Checked) -> None:
     finding = the_finding(checked("registered", (REGISTERED, "")))
     assert finding.code.startswith("class PushCubeEnv") and '@register_env("PushCube-v1"' in finding.message
     finding = the_finding(checked("id-taken", ("WorkbenchPushCube-v1", "PushCube-v1")))
@@ -161,7 +164,7 @@ def test_a_class_without_an_id_and_one_with_that_of_another_task(checked: Checke
         ),
     ],
 )
-def test_what_is_missing_is_named_with_what_to_write(
+def test_a_missing_robot_or_reward_mode_is_named_with_a_fix(
     checked: Checked, edit: tuple[str, str], named: str
 ) -> None:
     rule = "supported-robots" if "ROBOTS" in edit[0] else "reward-modes"

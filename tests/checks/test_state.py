@@ -1,4 +1,4 @@
-"""The rules of a running version, on a background process that answers what a test tells it."""
+"""Checks of the running version, with a scripted background process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.drive.session import Told, live_session, told_session, wait_until, work_with
+from tests.drive.session import FakeWorkerSession, fake_worker_session, live_session, wait_until, work_with
 from tests.drive.waiting import until
 from workbench.checks.commands import CheckAfterSave, CheckNow, StopChecks
 from workbench.checks.questions import CheckedGroup, CheckGroup, RuleProgress
@@ -45,7 +45,7 @@ def broken(rule: str) -> RuleResult:
 
 
 class ScriptedBackground:
-    """Answers each group with its results, once it is let."""
+    """Returns the results of each group once `let` allows it."""
 
     def __init__(self) -> None:
         self.comes_to: dict[str, RuleResult] = {}
@@ -53,9 +53,9 @@ class ScriptedBackground:
         self.priorities: list[str] = []
         self.loads: list[Load] = []
         self.give_way_after = 99
-        """Results of a group after which a job of higher priority comes, once."""
+        """Number of results of a group after which a job of higher priority preempts it, once."""
         self.dies_at = ""
-        """The rule that ends the process."""
+        """The rule that kills the process."""
         self.fails: JobFailed | None = None
         self.let = threading.Semaphore(1000)
 
@@ -100,23 +100,23 @@ def background() -> ScriptedBackground:
 
 
 @pytest.fixture
-def checks(background: ScriptedBackground, tmp_path: Path) -> Iterator[Told]:
-    with told_session(tmp_path / "recordings", check=True) as told:
-        work_with(told.session, background)
-        yield told
+def checks(background: ScriptedBackground, tmp_path: Path) -> Iterator[FakeWorkerSession]:
+    with fake_worker_session(tmp_path / "recordings", check=True) as fake:
+        work_with(fake.session, background)
+        yield fake
 
 
-def load(told: Told, text: str = FIRST_TEXT, **changes: Any) -> None:
-    told.load("patched", source={FILE: text}, **changes)
+def load(fake: FakeWorkerSession, text: str = FIRST_TEXT, **changes: Any) -> None:
+    fake.load("patched", source={FILE: text}, **changes)
 
 
-def ended(told: Told) -> ChecksView:
+def ended(fake: FakeWorkerSession) -> ChecksView:
     until(
-        lambda: told.view.of(ChecksView).state not in RUNNING,
+        lambda: fake.view.of(ChecksView).state not in RUNNING,
         "the end of the checks",
-        seen=lambda: told.view.of(ChecksView),
+        seen=lambda: fake.view.of(ChecksView),
     )
-    return told.view.of(ChecksView)
+    return fake.view.of(ChecksView)
 
 
 def rules_of(view: ChecksView) -> list[str]:
@@ -124,7 +124,7 @@ def rules_of(view: ChecksView) -> list[str]:
 
 
 def test_each_load_is_checked_group_by_group_with_the_degree_of_each_rule(
-    checks: Told, background: ScriptedBackground
+    checks: FakeWorkerSession, background: ScriptedBackground
 ) -> None:
     background.comes_to = {SECOND: broken(SECOND)}
     load(checks)
@@ -136,7 +136,9 @@ def test_each_load_is_checked_group_by_group_with_the_degree_of_each_rule(
     assert background.loads[0].source == {FILE: FIRST_TEXT}
 
 
-def test_the_same_version_is_not_checked_twice(checks: Told, background: ScriptedBackground) -> None:
+def test_the_same_version_is_not_checked_twice(
+    checks: FakeWorkerSession, background: ScriptedBackground
+) -> None:
     for _ in range(2):
         load(checks)
         ended(checks)
@@ -154,8 +156,8 @@ def test_the_same_version_is_not_checked_twice(checks: Told, background: Scripte
     ],
     ids=lambda changed: next(iter(changed)),
 )
-def test_envs_that_are_made_otherwise_are_checked_anew(
-    checks: Told, background: ScriptedBackground, changed: dict[str, Any]
+def test_envs_with_other_options_are_checked_again(
+    checks: FakeWorkerSession, background: ScriptedBackground, changed: dict[str, Any]
 ) -> None:
     load(checks)
     ended(checks)
@@ -164,8 +166,8 @@ def test_envs_that_are_made_otherwise_are_checked_anew(
     assert len(background.asked) == 4
 
 
-def test_findings_of_the_version_before_stay_until_their_rule_is_checked(
-    checks: Told, background: ScriptedBackground
+def test_findings_of_the_previous_version_stay_until_their_rule_is_checked(
+    checks: FakeWorkerSession, background: ScriptedBackground
 ) -> None:
     background.comes_to = {FIRST: broken(FIRST), SECOND: broken(SECOND)}
     load(checks)
@@ -186,7 +188,9 @@ def test_findings_of_the_version_before_stay_until_their_rule_is_checked(
     assert view.before == () and [one.rule for one in view.findings] == [SECOND]
 
 
-def test_a_finding_goes_with_the_line_that_it_is_about(checks: Told, background: ScriptedBackground) -> None:
+def test_a_finding_disappears_with_its_line(
+    checks: FakeWorkerSession, background: ScriptedBackground
+) -> None:
     background.comes_to = {FIRST: broken(FIRST)}
     load(checks)
     ended(checks)
@@ -195,7 +199,9 @@ def test_a_finding_goes_with_the_line_that_it_is_about(checks: Told, background:
     assert checks.view.of(ChecksView).before == () and checks.view.of(ChecksView).findings == ()
 
 
-def test_another_task_has_no_findings_of_the_one_before(checks: Told, background: ScriptedBackground) -> None:
+def test_another_task_starts_without_findings(
+    checks: FakeWorkerSession, background: ScriptedBackground
+) -> None:
     background.comes_to = {FIRST: broken(FIRST)}
     load(checks)
     ended(checks)
@@ -204,7 +210,9 @@ def test_another_task_has_no_findings_of_the_one_before(checks: Told, background
     assert checks.view.of(ChecksView).before == () and checks.view.of(ChecksView).findings == ()
 
 
-def test_a_save_stops_it_and_what_is_known_stays(checks: Told, background: ScriptedBackground) -> None:
+def test_a_save_stops_a_check_and_results_so_far_stay(
+    checks: FakeWorkerSession, background: ScriptedBackground
+) -> None:
     background.hold()
     load(checks)
     background.let.release()
@@ -215,14 +223,14 @@ def test_a_save_stops_it_and_what_is_known_stays(checks: Told, background: Scrip
         StoppedBy.SAVE,
     )
     assert rules_of(checks.view.of(ChecksView)) == [FIRST]
-    # The same text again, or what could not be loaded taken back.
+    # The same text again, or a save that could not be loaded and was undone.
     background.let = threading.Semaphore(10)
     load(checks)
     assert ended(checks).state == "done"
 
 
-def test_a_group_that_gave_way_is_asked_without_the_rules_that_are_known(
-    checks: Told, background: ScriptedBackground
+def test_a_preempted_group_is_resumed_without_the_finished_rules(
+    checks: FakeWorkerSession, background: ScriptedBackground
 ) -> None:
     background.give_way_after = 1
     load(checks)
@@ -231,8 +239,8 @@ def test_a_group_that_gave_way_is_asked_without_the_rules_that_are_known(
     assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
 
 
-def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
-    checks: Told, background: ScriptedBackground
+def test_a_rule_that_kills_the_process_fails_and_the_others_continue(
+    checks: FakeWorkerSession, background: ScriptedBackground
 ) -> None:
     background.dies_at = FIRST
     load(checks)
@@ -243,8 +251,8 @@ def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
     assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
 
 
-def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
-    checks: Told, background: ScriptedBackground
+def test_without_automatic_checks_a_load_marks_the_findings_as_old(
+    checks: FakeWorkerSession, background: ScriptedBackground
 ) -> None:
     background.comes_to = {FIRST: broken(FIRST)}
     load(checks)
@@ -256,8 +264,8 @@ def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
     assert len(background.asked) == 2
 
 
-def test_the_choice_is_kept_and_what_was_not_checked_is_checked_as_soon_as_it_is_wanted(
-    checks: Told, background: ScriptedBackground
+def test_turning_automatic_checks_on_is_remembered_and_checks_at_once(
+    checks: FakeWorkerSession, background: ScriptedBackground
 ) -> None:
     with pytest.raises(Refused):
         checks.session.do(CheckNow())
@@ -270,7 +278,7 @@ def test_the_choice_is_kept_and_what_was_not_checked_is_checked_as_soon_as_it_is
     assert ended(checks).state == "done"
 
 
-def test_what_is_stopped_by_hand_says_so(checks: Told, background: ScriptedBackground) -> None:
+def test_a_check_stopped_by_hand_says_so(checks: FakeWorkerSession, background: ScriptedBackground) -> None:
     background.hold()
     load(checks)
     checks.session.do(StopChecks())
@@ -284,7 +292,7 @@ def test_what_is_stopped_by_hand_says_so(checks: Told, background: ScriptedBackg
 
 
 @pytest.mark.slow
-def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_clears_it(
+def test_a_broken_save_is_found_at_its_line_while_playing_and_a_fix_clears_it(
     child_process: None, task_file: Path
 ) -> None:
     text = task_file.read_text()
@@ -302,7 +310,7 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
         (one,) = (each for each in view.of(ChecksView).findings if each.rule == FIRST)
         assert (one.file, one.line, one.degree) == (str(task_file), line, "stop") and bad in one.code
         assert view.playing
-        # Somebody waits for this: the checks give way, and go on.
+        # A person waits for this request: the checks are preempted and then resumed.
         session.happen(SaveWanted((0,)))
         wait_until(session, lambda view: view.of(RecordingStatus).saving.message != "", "the saved episode")
         task_file.write_text(text)

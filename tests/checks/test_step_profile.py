@@ -1,4 +1,4 @@
-"""Where the time of a control step goes."""
+"""The profile of a control step, by hook and line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def profile(file: Path, text: str) -> StepProfile:
         undo_load(loaded)
 
 
-def test_hooks_and_lines_share_the_step(tmp_path: Path) -> None:
+def test_times_of_hooks_and_lines_add_up_to_the_step(tmp_path: Path) -> None:
     found = profile(tmp_path / "task.py", EXAMPLE.read_text())
     assert (found.num_envs, found.steps) == (4, 20) and found.milliseconds > 0
     names = {hook.name: hook for hook in found.hooks}
@@ -41,7 +41,7 @@ def test_hooks_and_lines_share_the_step(tmp_path: Path) -> None:
     assert sys.gettrace() is None or "workbench" not in sys.gettrace().__module__  # type: ignore[union-attr]
 
 
-def test_a_slow_line_is_the_first(tmp_path: Path) -> None:
+def test_the_slowest_line_comes_first(tmp_path: Path) -> None:
     text = EXAMPLE.read_text()
     assert SLOW in text
     slow = "        self.wait()\n"

@@ -1,4 +1,4 @@
-"""The table of rules: each has one check, and those of outliers have a line."""
+"""The table of rules: each rule has one check, and each outlier belongs to a rule."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def silenced(tmp_path: Path) -> Iterator[LoadedTask]:
     undo_load(loaded)
 
 
-def test_an_outlier_is_told_at_the_hook_of_its_rule_unless_that_is_silenced_or_off(
+def test_an_outlier_is_reported_at_its_rules_hook_unless_silenced_or_off(
     silenced: LoadedTask,
 ) -> None:
     rules = rules_of_outliers(silenced, None)
@@ -48,12 +48,12 @@ def test_an_outlier_is_told_at_the_hook_of_its_rule_unless_that_is_silenced_or_o
     assert rules_of_outliers(silenced, "off") == {}
 
 
-def test_each_rule_of_the_table_has_one_check_and_each_check_is_of_the_table() -> None:
+def test_rules_in_the_table_and_checks_match_one_to_one() -> None:
     checked = Counter(rule for group in GROUPS for rule in group.checks)
     assert set(checked) == RULES.keys() - GPU_RULES.keys() and max(checked.values()) == 1
 
 
-def test_each_outlier_is_of_a_rule_that_is_checked_but_an_action_which_no_task_makes() -> None:
+def test_each_outlier_except_actions_belongs_to_a_checked_rule() -> None:
     without = {kind for kind in OutlierKind if kind.rule is None}
     assert (
         without == {OutlierKind.ACTION_NOT_FINITE} and RULES.keys() - GPU_RULES.keys() >= OUTLIER_RULES.keys()

@@ -1,4 +1,4 @@
-"""Arguments that the command line turns into something else."""
+"""Parsing of command line arguments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_size_is_read_as_people_write_it(text: str, size: int) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "0", "many", "-3MB", "12XB", "1e9MB", "10", "nan GB", "9" * 400 + "GB"])
-def test_a_size_that_is_none_is_refused_with_an_example(text: str) -> None:
+def test_an_invalid_size_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(ValueError, match="such as 256MB or 2GB"):
         history_bytes(text)
 
@@ -30,7 +30,7 @@ def test_a_size_that_is_none_is_refused_with_an_example(text: str) -> None:
     [(1, 0, None), (4096, 2**31 - 1, None), (1, -1, "--seed"), (1, 2**31, "--seed")]
     + [(0, 0, "--num-envs"), (4097, 0, "--num-envs")],
 )
-def test_the_limits_themselves_are_taken_and_what_is_past_them_is_not(
+def test_values_at_the_limits_are_accepted_and_beyond_them_refused(
     num_envs: int, seed: int, named: str | None
 ) -> None:
     if named is None:
@@ -41,7 +41,7 @@ def test_the_limits_themselves_are_taken_and_what_is_past_them_is_not(
             EnvArguments(num_envs, seed=seed).options()
 
 
-def test_an_argument_of_the_env_is_json_or_else_a_string() -> None:
+def test_an_env_argument_is_parsed_as_json_or_else_a_string() -> None:
     given = ("robot_uids=fetch", "flag=true", "size=0.5", "pair=[1, 2]", "text=a=b")
     options = EnvArguments(env=given).options()
     assert options.env_kwargs == {
@@ -52,10 +52,10 @@ def test_an_argument_of_the_env_is_json_or_else_a_string() -> None:
             EnvArguments(env=(wrong,)).options()
 
 
-def test_a_package_that_is_older_than_the_range_is_named_with_the_command(
+def test_a_package_older_than_the_range_is_named_with_the_pip_command(
     child_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # As if a name that an older viser lacks were imported.
+    # Simulates an import of a name that an older viser lacks.
     monkeypatch.setitem(sys.modules, "workbench.cli.page", None)
     with pytest.raises(ImportError):
         main.main(["review", str(tmp_path)])
@@ -68,12 +68,12 @@ def test_a_package_that_is_older_than_the_range_is_named_with_the_command(
 
 
 @pytest.mark.parametrize("given", [["--envs-per-worker", "0"], ["--envs_per_worker=0"]])
-def test_the_old_name_of_an_option_works_and_is_told_once(
+def test_the_old_name_of_an_option_works_and_warns_once(
     given: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     example = str(Path(__file__).parents[2] / "tasks" / "push_cube.py")
     with pytest.raises(SystemExit) as ended:
         main.main(["check", example, *given])
-    told = capsys.readouterr().err
-    assert ended.value.code == 2 and "--num-envs must be from 1 to 4096, not 0" in told
-    assert told.count("is called --num-envs now") == 1
+    stderr = capsys.readouterr().err
+    assert ended.value.code == 2 and "--num-envs must be from 1 to 4096, not 0" in stderr
+    assert stderr.count("is called --num-envs now") == 1

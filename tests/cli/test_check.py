@@ -1,4 +1,4 @@
-"""What ``workbench check`` prints, writes for other programs, and exits with."""
+"""The output, report files and exit codes of ``workbench check``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ EDITS = (
     ("height < -0.1", "height < 1"),
     ('reward[info["fail"]] = 0', 'reward[info["fail"]] = 2  # workbench: off[reward-rows]'),
 )
-"""One breach of a rule that stops, one of a rule that warns, one that is silenced, and a comment that silences nothing."""
+"""A breach of a rule that stops, one of a rule that warns, a silenced one, and a comment that silences nothing."""
 RULES_OF_IT = "success-at-reset,success-and-fail,reward-normalized,reward-finite,reward-rows"
 FEW = ("--num-envs", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
 
@@ -48,11 +48,11 @@ class Ended:
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> Ended:
     with pytest.raises(SystemExit) as ended:
         main(["check", *arguments])
-    told = capsys.readouterr()
-    return Ended(int(ended.value.code or 0), told.out, told.err)
+    printed = capsys.readouterr()
+    return Ended(int(ended.value.code or 0), printed.out, printed.err)
 
 
-def in_a_process(*words: str) -> subprocess.CompletedProcess[str]:
+def run_in_subprocess(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "workbench.cli.main", *words],
         capture_output=True,
@@ -65,7 +65,7 @@ def in_a_process(*words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder ``lab`` of a repository, with a task that works and one that breaks rules."""
+    """The folder ``lab`` in a repository, with a task that works and one that breaks rules."""
     (tmp_path / ".git").mkdir()
     folder = tmp_path / "lab"
     folder.mkdir()
@@ -85,7 +85,7 @@ def line_of(file: Path, words: str) -> int:
     return text[: text.index(words)].count("\n") + 1
 
 
-def test_findings_are_told_by_degree_with_line_and_reason(
+def test_findings_are_printed_by_degree_with_line_and_reason(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ended = run(capsys, "bad.py", "--select", RULES_OF_IT, *FEW)
@@ -102,7 +102,7 @@ def test_findings_are_told_by_degree_with_line_and_reason(
     assert "printed by the task" in ended.err and "printed by the task" not in ended.out
     comment = line_of(place / "bad.py", "off[reward-rows]")
     assert f"comment bad.py:{comment}: off[reward-rows] silences nothing until a reason" in ended.out
-    assert "success-and-fail: broken" in ended.err, "a line as it comes, for the log of a job"
+    assert "success-and-fail: broken" in ended.err, "a line per finished rule, for the log of a job"
 
 
 def test_exit_codes(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -126,9 +126,12 @@ def test_a_task_that_cannot_be_imported_is_an_error_in_every_report_at_its_line(
     ended = run(capsys, "gone.py", "--json", *files, *FEW)
     assert ended.code == 2 and "gone.py:3: ModuleNotFoundError" in ended.err
     assert ended.out == (place / "a.json").read_text()
-    said = json.loads(ended.out)
-    assert said["fails"] and (said["error"]["file"], said["error"]["line"]) == ("gone.py", 3)
-    assert said["error"]["code"] == "import nothing_of_this_name" and "nothing_of" in said["error"]["message"]
+    report = json.loads(ended.out)
+    assert report["fails"] and (report["error"]["file"], report["error"]["line"]) == ("gone.py", 3)
+    assert (
+        report["error"]["code"] == "import nothing_of_this_name"
+        and "nothing_of" in report["error"]["message"]
+    )
     (made,) = json.loads((place / "a.sarif").read_text())["runs"]
     (result,) = made["results"]
     at = result["locations"][0]["physicalLocation"]
@@ -143,18 +146,20 @@ def test_a_task_that_cannot_be_imported_is_an_error_in_every_report_at_its_line(
     assert error is not None and "ModuleNotFoundError" in error.get("message", "")
 
 
-def test_as_many_seeds_as_were_asked_for_are_tried(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of three, with two envs: the fourth is not counted."""
+def test_exactly_the_requested_number_of_seeds_is_tried(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Three seeds with two envs: the fourth episode is not counted."""
     few = ("--num-envs", "2", "--seeds", "3", "--workers", "1", "--env", "render_backend=none")
     ended = run(capsys, "bad.py", "--select", "success-at-reset,success-stays-possible", "--json", *few)
-    said = json.loads(ended.out)
-    (finding,) = said["findings"]
+    report = json.loads(ended.out)
+    (finding,) = report["findings"]
     assert finding["count"] == 3 and "3 of 3 seeds (seed 0, 1, 2)" in finding["message"]
-    (noted,) = (one["notes"] for one in said["rules"] if one["rule"] == "success-stays-possible")
+    (noted,) = (one["notes"] for one in report["rules"] if one["rule"] == "success-stays-possible")
     assert noted == ["success in 3 of 3 random episodes"]
 
 
-def test_a_comment_that_silences_nothing_any_more_is_told(
+def test_a_comment_that_no_longer_silences_anything_is_reported(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = (place / "good.py").read_text()
@@ -170,7 +175,7 @@ def test_a_comment_that_silences_nothing_any_more_is_told(
     assert silenced not in [one["line"] for one in json.loads(ended.out)["comments"]]
 
 
-def test_what_acts_in_further_episodes_is_named(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_source_of_given_actions_is_named(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "policies.py").write_text(
         "import torch\n\n\ndef still(obs):\n    return torch.zeros(8)\n\n\n"
         "def wrong(obs):\n    raise KeyError('no such key')\n"
@@ -189,8 +194,8 @@ def test_what_acts_in_further_episodes_is_named(place: Path, capsys: pytest.Capt
     assert check("nowhere.npy").code == 2
 
 
-def reads_what_is_drawn(place: Path) -> Path:
-    """A task that cannot be built without a renderer, and has made materials when that shows."""
+def reads_render_shapes(place: Path) -> Path:
+    """Write a task that needs a renderer to build, and fails without one only after it has created materials."""
     text = (place / "good.py").read_text()
     reads = 'self.goal = builder.build_kinematic(name="goal")'
     assert reads in text
@@ -200,10 +205,10 @@ def reads_what_is_drawn(place: Path) -> Path:
     return file
 
 
-def test_a_task_that_needs_a_renderer_and_is_given_none_is_told_so(
+def test_a_task_that_needs_a_renderer_but_has_none_is_reported(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = reads_what_is_drawn(place)
+    file = reads_render_shapes(place)
     ended = run(capsys, "drawn.py", "--select", "runs,camera-size", "--json", *FEW)
     (finding,) = json.loads(ended.out)["findings"]
     assert ended.code == 1 and finding["line"] == line_of(file, "self.shape")
@@ -212,8 +217,8 @@ def test_a_task_that_needs_a_renderer_and_is_given_none_is_told_so(
 
 @pytest.mark.slow
 def test_a_task_that_needs_a_renderer_gets_one(place: Path, child_process: None) -> None:
-    """In a process that has rendered nothing before."""
-    reads_what_is_drawn(place)
+    """The check runs in a process that has not rendered anything."""
+    reads_render_shapes(place)
     words = [
         "check",
         "drawn.py",
@@ -226,39 +231,39 @@ def test_a_task_that_needs_a_renderer_gets_one(place: Path, child_process: None)
         "--select",
         "runs",
     ]
-    ended = in_a_process(*words)
+    ended = run_in_subprocess(*words)
     assert ended.returncode == 0, ended.stdout + ended.stderr
 
 
-def test_json_is_all_that_is_printed_and_equals_the_file(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_only_json_is_printed_and_it_equals_the_file(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ended = run(capsys, "bad.py", "--select", RULES_OF_IT, "--json", "--json-file", "report.json", *FEW)
     assert ended.code == 1
-    said = json.loads(ended.out)
+    report = json.loads(ended.out)
     assert ended.out == (place / "report.json").read_text()
-    assert (said["task"]["file"], said["num_envs"], said["seeds"]) == ("bad.py", 2, 2)
-    assert said["fails"] and said["fail_on"] == "stop"
-    (first, second) = said["findings"]
+    assert (report["task"]["file"], report["num_envs"], report["seeds"]) == ("bad.py", 2, 2)
+    assert report["fails"] and report["fail_on"] == "stop"
+    (first, second) = report["findings"]
     assert (first["rule"], first["degree"], first["file"]) == ("success-at-reset", "stop", "bad.py")
     assert first["line"] == line_of(place / "bad.py", '"success": (distance') == second["line"]
-    assert {one["rule"]: one["state"] for one in said["rules"]} == {
+    assert {one["rule"]: one["state"] for one in report["rules"]} == {
         "reward-rows": "kept",
         "success-at-reset": "broken",
         "success-and-fail": "broken",
         "reward-finite": "kept",
         "reward-normalized": "silenced",
     }
-    (silenced,) = next(one["silenced"] for one in said["rules"] if one["rule"] == "reward-normalized")
-    assert silenced["reason"] == REASON and silenced["line"] and [c["line"] for c in said["comments"]]
+    (silenced,) = next(one["silenced"] for one in report["rules"] if one["rule"] == "reward-normalized")
+    assert silenced["reason"] == REASON and silenced["line"] and [c["line"] for c in report["comments"]]
 
 
-def test_sarif_has_what_code_scanning_asks_for(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The properties that GitHub's page on SARIF support calls required, and paths from the root of the repository."""
+def test_sarif_has_the_properties_that_code_scanning_requires(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The properties that GitHub's SARIF documentation requires, and paths relative to the repository's root."""
     run(capsys, "bad.py", "--select", RULES_OF_IT, "--sarif", "report.sarif", *FEW)
-    said: dict[str, Any] = json.loads((place / "report.sarif").read_text())
-    assert said["version"] == "2.1.0" and said["$schema"].endswith("sarif-2.1.0.json")
-    (made,) = said["runs"]
+    report: dict[str, Any] = json.loads((place / "report.sarif").read_text())
+    assert report["version"] == "2.1.0" and report["$schema"].endswith("sarif-2.1.0.json")
+    (made,) = report["runs"]
     driver = made["tool"]["driver"]
     assert driver["name"] and driver["semanticVersion"]
     for rule in driver["rules"]:
@@ -301,8 +306,8 @@ def test_junit_has_a_test_case_for_each_rule(place: Path, capsys: pytest.Capture
         assert cases.keys() == set(rules.split(","))
         assert all(case.get("classname") and float(case.get("time", "")) >= 0 for case in cases.values())
         for name in ("failure", "skipped", "error"):
-            told = {"failure": "failures", "error": "errors"}.get(name, name)
-            assert suite.get(told) == str(sum(case.find(name) is not None for case in suite))
+            attribute = {"failure": "failures", "error": "errors"}.get(name, name)
+            assert suite.get(attribute) == str(sum(case.find(name) is not None for case in suite))
     assert good[0].get("failures") == "0" and good[0].get("skipped") == "2"
     skipped = [case.find("skipped") for case in good[0].findall("testcase")]
     assert {each.get("type") for each in skipped if each is not None} == {"workbench.not_known"}
@@ -310,14 +315,16 @@ def test_junit_has_a_test_case_for_each_rule(place: Path, capsys: pytest.Capture
     failure = cases["success-at-reset"].find("failure")
     assert failure is not None and failure.get("type") == "success-at-reset"
     assert "lab/bad.py:" in (failure.text or "") and cases["success-at-reset"].get("file") == "lab/bad.py"
-    # It does not make the exit code 1.
+    # A finding that does not set the exit code to 1 is no failure.
     assert cases["success-and-fail"].find("failure") is None
     assert "`success & ~fail`" in cases["success-and-fail"].findtext("system-out", "")
     assert REASON in cases["reward-normalized"].findtext("system-out", "")
 
 
-def test_reports_hold_whatever_a_task_says(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Colours, controls and brackets: XML cannot hold some, and a terminal would obey others."""
+def test_reports_stay_valid_with_any_message_of_a_task(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Colours, control characters and brackets: some are invalid in XML, others would control a terminal."""
     text = (place / "good.py").read_text()
     raises = "raise ValueError('\\x1b[2J\\x00[red]<&\\ufffe')"
     (place / "loud.py").write_text(text.replace("distance = torch.linalg.norm(self.cube", f"{raises}\n        distance = torch.linalg.norm(self.cube", 1))  # fmt: skip
@@ -349,12 +356,12 @@ for group in GROUPS:
     if "entry-name" in group.checks:
         group.checks["entry-name"] = {entry}
 """
-"""Breaks checks of the workbench, in each process that imports the task."""
+"""Task code that breaks checks of the workbench in each process that imports it."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_a_rule_whose_check_raises_fails_and_no_other(
+def test_only_the_rule_whose_check_raises_fails(
     place: Path, capsys: pytest.CaptureFixture[str], child_process: None, workers: str
 ) -> None:
     (place / "breaks.py").write_text(BREAKS.format(entry="group.checks['entry-name']"))
@@ -362,10 +369,10 @@ def test_a_rule_whose_check_raises_fails_and_no_other(
     files = ("--json-file", "a.json", "--sarif", "a.sarif", "--junit", "a.xml")
     words = ["check", "good.py", "--import", "breaks", "--select", rules, *files]
     words += [*FEW[:4], "--workers", workers, "--env", "render_backend=none"]
-    ended = in_a_process(*words)
-    said = json.loads((place / "a.json").read_text())
-    assert ended.returncode == 1 and said["fails"] and said["findings"] == []
-    of_rule = {one["rule"]: one for one in said["rules"]}
+    ended = run_in_subprocess(*words)
+    report = json.loads((place / "a.json").read_text())
+    assert ended.returncode == 1 and report["fails"] and report["findings"] == []
+    of_rule = {one["rule"]: one for one in report["rules"]}
     states = {rule: one["state"] for rule, one in of_rule.items()}
     assert states == {"versioned-id": "failed", "time-limit": "kept", "success-at-reset": "kept"}
     error = of_rule["versioned-id"]["error"]
@@ -382,53 +389,51 @@ def test_a_rule_whose_check_raises_fails_and_no_other(
 
 
 @pytest.mark.slow
-def test_a_rule_that_ends_its_process_fails_and_no_other(place: Path, child_process: None) -> None:
+def test_only_the_rule_that_kills_its_process_fails(place: Path, child_process: None) -> None:
     (place / "breaks.py").write_text(BREAKS.format(entry="dies"))
     rules = "entry-name,success-at-reset,info-rows,time-limit"
     words = ["check", "good.py", "--import", "breaks", "--select", rules, "--json", *FEW[:4]]
-    ended = in_a_process(*words, "--workers", "2", "--env", "render_backend=none")
-    said = json.loads(ended.stdout)
-    states = {one["rule"]: one["state"] for one in said["rules"]}
+    ended = run_in_subprocess(*words, "--workers", "2", "--env", "render_backend=none")
+    report = json.loads(ended.stdout)
+    states = {one["rule"]: one["state"] for one in report["rules"]}
     assert ended.returncode == 1 and states.pop("entry-name") == "failed"
     assert states == {"success-at-reset": "kept", "info-rows": "kept", "time-limit": "kept"}
-    (why,) = (one["why"] for one in said["rules"] if one["state"] == "failed")
+    (why,) = (one["why"] for one in report["rules"] if one["state"] == "failed")
     assert "SIGKILL" in why
 
 
 @pytest.mark.slow
 def test_the_command_as_a_job_in_ci_runs_it(place: Path, child_process: None) -> None:
-    """In processes of its own, with an id that has no file here, and no terminal."""
+    """The command runs in subprocesses, without a terminal, on an id without a file here."""
     words = ["check", "PushCube-v1", "--num-envs", "2", "--seeds", "2", "--workers", "2"]
     words += ["--select", "success-at-reset,reward-finite", "--env", "render_backend=none", "--json"]
-    ended = in_a_process(*words)
+    ended = run_in_subprocess(*words)
     assert ended.returncode == 0, ended.stderr
-    said = json.loads(ended.stdout)
-    assert said["task"]["id"] == "PushCube-v1" and said["counts"] == {"kept": 2}
+    report = json.loads(ended.stdout)
+    assert report["task"]["id"] == "PushCube-v1" and report["counts"] == {"kept": 2}
 
 
 MERGED = ("--junit", "merged.xml", "--sarif", "merged.sarif")
 
 
 @pytest.mark.slow
-def test_parts_that_are_merged_print_what_the_whole_would(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_merged_parts_print_the_same_as_the_whole(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     few = ("bad.py", *FEW, "--select", "success-at-reset,entry-name,body-names")
     whole = run(capsys, *few, "--json-file", "whole.json", "--junit", "whole.xml", "--sarif", "whole.sarif")
     for part in ("1/2", "2/2"):
         assert f"Part {part} is in check-{part[0]}-of-2.job" in run(capsys, *few, "--shard", part).err
     with pytest.raises(SystemExit) as ended:
         main(["merge", "check-1-of-2.job", "check-2-of-2.job", "--json-file", "merged.json", *MERGED])
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert ended.value.code == whole.code == 1
-    assert told.splitlines()[:-1] == whole.out.splitlines()[:-1]
-    said, merged = (json.loads((place / name).read_text()) for name in ("whole.json", "merged.json"))
-    for one in (said, merged):
+    assert printed.splitlines()[:-1] == whole.out.splitlines()[:-1]
+    report, merged = (json.loads((place / name).read_text()) for name in ("whole.json", "merged.json"))
+    for one in (report, merged):
         for name in ("seconds", "start_seconds", "picture_seconds"):
             del one[name]
         for rule in one["rules"]:
             del rule["seconds"]
-    assert merged == said
+    assert merged == report
     assert (place / "merged.sarif").read_text() == (place / "whole.sarif").read_text()
     seconds = re.compile(r' time(stamp)?="[^"]*"')
     whole_xml, merged_xml = (

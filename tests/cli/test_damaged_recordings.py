@@ -1,5 +1,4 @@
-"""Every command that takes recordings names the damaged ones, gives the exit code 1, and does its work with the others,
-whatever they are called."""
+"""Commands on recordings name the damaged ones, exit with code 1, and process the others, whatever their names."""
 
 from __future__ import annotations
 
@@ -52,7 +51,7 @@ DAMAGES: dict[str, Damage] = {
 
 
 def ours(folder: Path, name: str) -> Path:
-    """A recording of the workbench with this name; its .json."""
+    """Write a workbench recording with this name; returns its .json."""
     path = write(folder / "made", made(4, seed=3, task="PickCube-v1"))
     for suffix in (".rrd", ".h5", ".json"):
         path.with_suffix(suffix).rename(folder / f"{name}{suffix}")
@@ -67,7 +66,7 @@ def dataset(folder: Path) -> Path:
 
 
 def run(*arguments: object) -> int:
-    """The exit code of a command."""
+    """Run a command; returns its exit code."""
     with pytest.raises(SystemExit) as ended:
         main([*map(str, arguments)])
     return int(ended.value.code or 0)
@@ -86,7 +85,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("broken", "kind"), CASES)
-def test_each_command_names_it(
+def test_each_command_names_the_damaged_recording(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], broken: str, kind: str
 ) -> None:
     folder = tmp_path / "recordings"
@@ -100,7 +99,7 @@ def test_each_command_names_it(
         dataset(folder)
     file = folder / broken
     DAMAGES[kind](next(file.rglob("*.parquet")) if file.is_dir() else file)
-    # Long ago: the .json of a new .h5 might still come.
+    # Make the files old: for a new .h5, a .json might still be written.
     for path in folder.iterdir():
         os.utime(path, (1e9, 1e9), follow_symlinks=False)
 
@@ -115,46 +114,46 @@ def test_each_command_names_it(
         "lerobot": ["export", folder, "--lerobot", out / "set"],
         "maniskill": ["export", folder, "--maniskill", out / "demos.h5"],
     }
-    # LeRobot's are passed over by a rescoring, and ours need their task, which takes seconds to open.
+    # Rescoring skips LeRobot datasets, and our recordings need their task, which takes seconds to open.
     if stem == "theirs" or (stem == "ours" and kind == "cut"):
         commands["rescore"] = ["rescore", folder, "--json", "--trust"]
     for name, command in commands.items():
         capsys.readouterr()
         code = run(*command)
-        said = capsys.readouterr()
-        assert code == 1, (name, said)
+        printed = capsys.readouterr()
+        assert code == 1, (name, printed)
         if name == "rescore":
-            (row,) = [row for row in json.loads(said.out) if row["damaged"]]
+            (row,) = [row for row in json.loads(printed.out) if row["damaged"]]
             assert stem in row["episode"] and stem in row["not_judged"] + row["not_carried"]
         else:
-            assert stem in said.err, (name, said)
+            assert stem in printed.err, (name, printed)
         if name != "share":
             assert not out.exists() or not any(out.rglob("*")), name
         shutil.rmtree(out, ignore_errors=True)
 
 
-def test_the_whole_ones_beside_it_are_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_other_recordings_of_the_folder_are_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     ours(tmp_path / "recordings", "whole")
     halve(ours(tmp_path / "recordings", "half").with_suffix(".h5"))
     halve(write_foreign(tmp_path / "recordings"))
     folder, out = tmp_path / "recordings", tmp_path / "out"
     assert run("share", folder, "--sheet", "--out", out) == 1
     assert {path.name for path in out.iterdir()} == {"whole.sheet.png", "half.sheet.png"}
-    said = capsys.readouterr().err
-    assert "half.h5" in said and "theirs.h5" in said and "whole" not in said
+    printed = capsys.readouterr().err
+    assert "half.h5" in printed and "theirs.h5" in printed and "whole" not in printed
     for option, made_of in (("--lerobot", out / "set"), ("--maniskill", out / "demos.h5")):
         assert run("export", folder, option, made_of) == 1 and not made_of.exists()
         capsys.readouterr()
-        # Left out as it was asked for, and named.
+        # Skipped as requested, and named.
         assert run("export", folder, option, made_of, "--only-fitting") == 0 and made_of.exists()
-        said = capsys.readouterr()
-        assert "half.h5" in said.err and "theirs.h5" in said.err and "1 episode" in said.out
+        printed = capsys.readouterr()
+        assert "half.h5" in printed.err and "theirs.h5" in printed.err and "1 episode" in printed.out
 
 
 @pytest.mark.slow
-def test_a_name_that_is_not_utf_8_is_one_like_the_others(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_name_that_is_not_utf_8_works(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, out = tmp_path / "recordings", tmp_path / "out"
     odd = os.fsdecode(b"od\xffd")
     made_first = ours(folder, "ours")
@@ -169,8 +168,8 @@ def test_a_name_that_is_not_utf_8_is_one_like_the_others(
     for option, made_of in (("--lerobot", out / "sets"), ("--maniskill", out / "demos.h5")):
         capsys.readouterr()
         assert run("export", folder, option, made_of, "--only-fitting") == 0
-        said = capsys.readouterr()
-        assert "2 episodes" in said.out and "od\\udcffd" in said.err and "theirs" not in said.err
+        printed = capsys.readouterr()
+        assert "2 episodes" in printed.out and "od\\udcffd" in printed.err and "theirs" not in printed.err
     made_of = [source for source in find_all_sources([folder]) if source.part is None]
     (archive,) = make(MakeRequest("zip", tuple(made_of), out)).paths
     with zipfile.ZipFile(archive) as opened:

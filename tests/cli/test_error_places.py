@@ -1,4 +1,4 @@
-"""Where an error of a task is, as ``workbench check`` and ``record`` say it: file, line, and what came before."""
+"""The place of a task's error as ``workbench check`` and ``record`` report it: file, line, and the errors before it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Check = Callable[..., dict[str, Any]]
 
 @pytest.fixture
 def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Check:
-    """Checks ``runs`` of a task below `tmp_path`; its error, or else its finding. Paths are relative."""
+    """A function that checks ``runs`` on a task below `tmp_path` and returns its error or finding. Paths are relative."""
     (tmp_path / ".git").mkdir()
     monkeypatch.chdir(tmp_path)
 
@@ -28,8 +28,8 @@ def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
         capsys.readouterr()
         with pytest.raises(SystemExit):
             main(["check", task, "--select", "runs", "--json", *FEW, *more])
-        told = json.loads(capsys.readouterr().out)
-        return told["error"] or (told["findings"] or [{}])[0]
+        report = json.loads(capsys.readouterr().out)
+        return report["error"] or (report["findings"] or [{}])[0]
 
     return run
 
@@ -40,7 +40,7 @@ def line_of(file: Path, words: str) -> int:
 
 
 def edited(folder: Path, *edits: tuple[str, str]) -> Path:
-    """The smallest example, with other texts in place of some of its."""
+    """Write the smallest example with these replacements."""
     text = (TASKS / "minimal.py").read_text()
     for old, new in edits:
         assert old in text, old
@@ -53,7 +53,7 @@ def edited(folder: Path, *edits: tuple[str, str]) -> Path:
 RESET, EVALUATED = "        self.cube.set_pose(Pose.create_from_pq(p=p))\n", 'return {"success":'
 
 
-def test_a_refusal_of_the_core_that_the_task_caught_is_told_before_the_error_that_it_led_to(
+def test_a_caught_refusal_of_the_core_is_reported_before_the_error_that_follows(
     tmp_path: Path, check: Check
 ) -> None:
     caught = """
@@ -69,15 +69,15 @@ def test_a_refusal_of_the_core_that_the_task_caught_is_told_before_the_error_tha
         self.cube.set_pose(Pose.create_from_pq(torch.full((1, 3), torch.nan)))
 """
     file = edited(tmp_path, (RESET, caught))
-    told = check("task.py")
-    assert told["line"] == line_of(file, "self.places[0]") and told["file"] == "task.py"
-    said = told["message"]
+    problem = check("task.py")
+    assert problem["line"] == line_of(file, "self.places[0]") and problem["file"] == "task.py"
+    message = problem["message"]
     refused, swallowed = (
         f"task.py:{line_of(file, words)}" for words in ("torch.full((1, 3), torch.nan)", "self.moved()")
     )
-    assert said.index(refused) < said.index(swallowed) < said.index("IndexError"), said
-    assert "NaN" in said
-    # What is refused while no error follows is not told, and of the next call it is no part.
+    assert message.index(refused) < message.index(swallowed) < message.index("IndexError"), message
+    assert "NaN" in message
+    # A refusal without a later error is not reported, and is not part of the next call's error.
     file.write_text(file.read_text().replace("        self.places[0]\n", ""))
     assert check("task.py") == {}
     file.write_text(
@@ -101,19 +101,19 @@ def test_a_refusal_of_the_core_that_the_task_caught_is_told_before_the_error_tha
         ),
     ],
 )
-def test_a_method_that_lacks_an_argument_is_told_at_its_def(
+def test_a_method_that_lacks_an_argument_is_reported_at_its_def(
     line: str, without: str, tmp_path: Path, check: Check
 ) -> None:
     text = (TASKS / "minimal.py").read_text()
     head = line.split("(")[0]
     given = next(each for each in text.splitlines(keepends=True) if each.startswith(head))
     file = edited(tmp_path, (given, without))
-    told = check("task.py")
-    assert told["line"] == line_of(file, without.split("\n")[0]) and told["file"] == "task.py"
-    assert "TypeError" in told["message"]
+    problem = check("task.py")
+    assert problem["line"] == line_of(file, without.split("\n")[0]) and problem["file"] == "task.py"
+    assert "TypeError" in problem["message"]
 
 
-def test_the_first_exception_of_a_chain_is_told_with_its_line(tmp_path: Path, check: Check) -> None:
+def test_the_first_exception_of_a_chain_is_reported_with_its_line(tmp_path: Path, check: Check) -> None:
     chain = """
         try:
             {}["table"]
@@ -121,14 +121,14 @@ def test_the_first_exception_of_a_chain_is_told_with_its_line(tmp_path: Path, ch
             raise ValueError("no such place") from error
 """
     file = edited(tmp_path, (RESET, chain))
-    told = check("task.py")
-    assert told["line"] == line_of(file, "raise ValueError")
-    assert told["message"].index(f"task.py:{line_of(file, '{}[')}") < told["message"].index("ValueError")
+    problem = check("task.py")
+    assert problem["line"] == line_of(file, "raise ValueError")
+    assert problem["message"].index(f"task.py:{line_of(file, '{}[')}") < problem["message"].index(
+        "ValueError"
+    )
 
 
-def test_what_evaluate_returned_without_rows_is_named_where_another_hook_fails_with_it(
-    tmp_path: Path, check: Check
-) -> None:
+def test_an_entry_without_rows_is_named_when_another_hook_fails_with_it(tmp_path: Path, check: Check) -> None:
     hooks = """apart = self.cube.pose.p[:1, 0].repeat(3)
         return {
             "apart": apart,
@@ -144,10 +144,10 @@ def test_what_evaluate_returned_without_rows_is_named_where_another_hook_fails_w
     def old(self):
         return {"success":"""
     file = edited(tmp_path, (EVALUATED, hooks), ('("sparse", "none")', '("normalized_dense", "dense")'))
-    told = check("task.py")
-    assert told["line"] == line_of(file, 'return info["apart"]')
+    problem = check("task.py")
+    assert problem["line"] == line_of(file, 'return info["apart"]')
     entry = line_of(file, '"apart": apart')
-    assert "(3,)" in told["message"] and f"task.py:{entry}" in told["message"]
+    assert "(3,)" in problem["message"] and f"task.py:{entry}" in problem["message"]
 
 
 BROKEN = {
@@ -167,7 +167,7 @@ def test_a_module_of_another_folder_that_cannot_be_imported_is_named_with_its_li
     kind: str, where: str, tmp_path: Path, check: Check
 ) -> None:
     text, words = BROKEN[kind]
-    # Python keeps a package that another test of this process has imported.
+    # Python caches packages that other tests of this process have imported.
     lab = f"lab_{kind.replace(' ', '_')}_{where.replace('/', '_').removesuffix('.py')}"
     names = ("__init__.py", "robots/__init__.py", "robots/dual.py", "tasks/__init__.py")
     files = dict.fromkeys(names, "") | {where: text.replace("LAB", lab)}
@@ -176,8 +176,10 @@ def test_a_module_of_another_folder_that_cannot_be_imported_is_named_with_its_li
         file = tmp_path / lab / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(held)
-    told = check(f"{lab}/tasks/reach.py")
-    assert (told["file"], told["line"]) == (f"{lab}/{where}", line_of(tmp_path / lab / where, words)), told
+    problem = check(f"{lab}/tasks/reach.py")
+    assert (problem["file"], problem["line"]) == (f"{lab}/{where}", line_of(tmp_path / lab / where, words)), (
+        problem
+    )
 
 
 ROBOT = """
@@ -248,7 +250,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("kind", MISTAKES)
-def test_a_mistake_in_a_robots_file_is_told_with_its_line_and_the_line_that_names_the_file(
+def test_an_error_in_a_robots_file_is_reported_with_its_line_and_the_line_naming_the_file(
     kind: str, tmp_path: Path, check: Check
 ) -> None:
     text, old, new, words, named = MISTAKES[kind]
@@ -257,25 +259,27 @@ def test_a_mistake_in_a_robots_file_is_told_with_its_line_and_the_line_that_name
     robot.write_text(ROBOT.replace("KIND", name).replace("NAME", kind.replace(" ", "_").replace("'", "")))
     described = tmp_path / "stick.xml"
     described.write_text(text.replace(old, new))
-    told = check("stick.py")
+    problem = check("stick.py")
     line = text.replace(old, new).count("\n") + 1 if words is None else line_of(described, words)
-    assert (told["file"], told["line"]) == ("stick.py", line_of(robot, f"{name}_path")), told
-    assert f"{described}:{line}" in told["message"] and named in told["message"], told
+    assert (problem["file"], problem["line"]) == ("stick.py", line_of(robot, f"{name}_path")), problem
+    assert f"{described}:{line}" in problem["message"] and named in problem["message"], problem
 
 
-def test_what_a_robot_names_and_is_not_there_is_told_with_the_line(tmp_path: Path, check: Check) -> None:
+def test_a_missing_file_or_joint_of_a_robot_is_reported_with_its_line(tmp_path: Path, check: Check) -> None:
     robot = tmp_path / "stick.py"
     text = ROBOT.replace("KIND", "urdf")
     robot.write_text(text.replace("NAME", "no_file"))
-    told = check("stick.py")
-    assert told["line"] == line_of(robot, "urdf_path") and str(tmp_path / "stick.xml") in told["message"]
+    problem = check("stick.py")
+    assert (
+        problem["line"] == line_of(robot, "urdf_path") and str(tmp_path / "stick.xml") in problem["message"]
+    )
     (tmp_path / "stick.xml").write_text(URDF)
     robot.write_text(text.replace("NAME", "no_joint").replace('["hinge"]', '["hing"]'))
-    told = check("stick.py")
-    assert told["line"] == line_of(robot, '["hing"]') and "'hinge'" in told["message"], told
+    problem = check("stick.py")
+    assert problem["line"] == line_of(robot, '["hing"]') and "'hinge'" in problem["message"], problem
 
 
-def test_a_mesh_that_is_not_there_is_told_with_the_link_that_names_it(
+def test_a_missing_mesh_is_reported_with_the_link_naming_it(
     renderer: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot, described = tmp_path / "stick.py", tmp_path / "stick.xml"
@@ -285,8 +289,8 @@ def test_a_mesh_that_is_not_there_is_told_with_the_link_that_names_it(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
         main(["record", "stick.py", "--episodes", "1", "--num-envs", "1"])
-    said = capsys.readouterr().err
+    stderr = capsys.readouterr().err
     assert ended.value.code == 1
-    assert f"{robot}:{line_of(robot, 'urdf_path')}" in said, said
-    assert f"{described}:{line_of(described, visual)}" in said and "'arm'" in said
-    assert str(tmp_path / "meshes" / "arm.stl") in said
+    assert f"{robot}:{line_of(robot, 'urdf_path')}" in stderr, stderr
+    assert f"{described}:{line_of(described, visual)}" in stderr and "'arm'" in stderr
+    assert str(tmp_path / "meshes" / "arm.stl") in stderr

@@ -1,4 +1,4 @@
-"""``workbench help``: the list of topics, one topic in the terminal, and what is said of a name that is none."""
+"""``workbench help``: the list of topics, one topic in the terminal, and the answer to an unknown topic."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from workbench.machine.processes.child_python import python_command
 pytestmark = pytest.mark.thorough
 
 
-def said(capsys: pytest.CaptureFixture[str], *call: str) -> tuple[int, str]:
+def help_output(capsys: pytest.CaptureFixture[str], *call: str) -> tuple[int, str]:
     with pytest.raises(SystemExit) as ended:
         main.main(["help", *call])
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out + told.err
+    printed = capsys.readouterr()
+    return int(ended.value.code or 0), printed.out + printed.err
 
 
 @pytest.mark.parametrize("topic", topics(), ids=lambda topic: topic.name)
 def test_a_topic_is_shown(topic: Topic, capsys: pytest.CaptureFixture[str]) -> None:
-    code, text = said(capsys, topic.name)
+    code, text = help_output(capsys, topic.name)
     assert code == Exit.DONE
     title = topic.text.partition("\n")[0].removeprefix("# ")
     assert title in " ".join(text.split()) and "\x1b" not in text
@@ -45,14 +45,14 @@ def test_a_topic_is_shown(topic: Topic, capsys: pytest.CaptureFixture[str]) -> N
         ("\x1b[2J", "no topic"),
     ],
 )
-def test_a_name_that_is_no_topic_is_answered_with_advice(
+def test_an_unknown_topic_is_answered_with_advice(
     name: str, advice: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, text = said(capsys, name)
+    code, text = help_output(capsys, name)
     assert code == Exit.REFUSED and advice in text and "\x1b" not in text
 
 
-def test_in_a_terminal_a_pager_has_it(child_process: None) -> None:
+def test_in_a_terminal_a_topic_is_shown_in_a_pager(child_process: None) -> None:
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     env = {**os.environ, "TERM": "xterm", "PAGER": "sed -e 's/^/PAGED /'", "MANPAGER": ""}
@@ -73,8 +73,8 @@ def test_in_a_terminal_a_pager_has_it(child_process: None) -> None:
     assert len(lines) > 24 and all(line.startswith("PAGED ") for line in lines)
 
 
-def test_a_reader_that_has_left_ends_a_command_without_a_word(child_process: None) -> None:
-    """As of ``workbench open --help | head``."""
+def test_a_closed_pipe_ends_a_command_without_a_message(child_process: None) -> None:
+    """This happens with ``workbench open --help | head``."""
     reader, writer = os.pipe()
     os.close(reader)
     command = python_command("-m", "workbench.cli.main", "open", "--help")

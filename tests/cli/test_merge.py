@@ -1,4 +1,4 @@
-"""``--shard`` and ``workbench merge``: parts that were run apart are the whole, to the bit."""
+"""``--shard`` and ``workbench merge``: separately run parts equal the whole, bit for bit."""
 
 from __future__ import annotations
 
@@ -47,7 +47,9 @@ def record(*arguments: str) -> int:
     return run("record", "my_task.py", *few, *QUICK, *arguments)
 
 
-def test_parts_and_what_they_lacked_are_the_whole(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_merged_parts_completed_by_a_resumed_job_equal_the_whole(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert record("--out", "whole") == 0
     for part in ("1/3", "3/3"):
         assert record("--shard", part, "--out", f"parts/{part[0]}") == 0
@@ -61,18 +63,18 @@ def test_parts_and_what_they_lacked_are_the_whole(place: Path, capsys: pytest.Ca
     )
     capsys.readouterr()
     assert record("--out", "demos", "--job", "whole.job") == 0
-    # Those that are there already are no progress.
+    # Existing episodes are not reported as progress.
     assert re.findall(r"^episode (\d):", capsys.readouterr().err, re.M) == ["2", "3"]
     assert bits(place / "demos") == bits(place / "whole") and len(bits(place / "demos")) == 6
     assert run("merge", "whole.job") == 0
     assert str(place / "demos") in capsys.readouterr().out
 
 
-def test_an_episode_that_was_deleted_is_made_again(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_deleted_episode_is_recorded_again(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert record("--out", "demos", "--job", "a.job") == 0
     before = bits(place / "demos")
-    (gone,) = (place / "demos").glob("*seed0003*.json")
-    gone.unlink()
+    (deleted,) = (place / "demos").glob("*seed0003*.json")
+    deleted.unlink()
     assert record("--out", "demos", "--job", "a.job") == 0
     made = capsys.readouterr().out
     (again,) = (place / "demos").glob("*seed0003*.json")
@@ -89,7 +91,7 @@ def test_a_part_of_another_job_is_refused(place: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.slow
-def test_the_script_of_the_docs_does_its_part_as_a_task_of_an_array(place: Path) -> None:
+def test_the_script_of_the_docs_runs_its_part_as_an_array_task(place: Path) -> None:
     page = (web_assets_folder() / "docs" / "jobs" / "cluster.md").read_text()
     (script,) = re.findall(r"```sh fragment\n(#!/bin/bash\n.*?)```", page, re.DOTALL)
     merge = next(line for line in page.splitlines() if line.startswith("workbench merge"))

@@ -1,4 +1,4 @@
-"""`workbench open` with a ManiSkill of another version: a copy of the installed one in which names have moved."""
+"""`workbench open` with another ManiSkill version: a copy of the installed one with renamed members."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("child_process")
 
 
 def copy_of_maniskill(folder: Path, renamed: dict[str, str]) -> None:
-    """ManiSkill 9.9.9 in `folder`, with these words renamed in its code; what is no code is linked."""
+    """Write ManiSkill 9.9.9 into `folder`, with these words renamed in its code; other files are linked."""
     spec, installed = find_spec("mani_skill"), maniskill()
     assert spec is not None and spec.submodule_search_locations and installed is not None
 
@@ -46,7 +46,7 @@ def copy_of_maniskill(folder: Path, renamed: dict[str, str]) -> None:
 
 
 def printed_by_open(folder: Path, end: str) -> str:
-    """What ``workbench open`` prints with this folder in front, until `end` is in it."""
+    """The output of ``workbench open`` with this folder first on the path, until it contains `end`."""
     log = folder / "log.txt"
     with log.open("w") as output:
         process = subprocess.Popen(
@@ -76,21 +76,21 @@ def printed_by_open(folder: Path, end: str) -> str:
 
 
 @pytest.mark.slow
-def test_what_has_moved_is_named_with_what_it_disables_and_the_task_opens(tmp_path: Path) -> None:
+def test_moved_names_are_listed_with_what_they_disable_and_the_task_opens(tmp_path: Path) -> None:
     moved = {"_cached_local_pose": "_cached_local", "_hidden_objects": "_concealed_objects"}
     copy_of_maniskill(tmp_path, moved)
-    said = printed_by_open(tmp_path, "The tested versions")
-    assert "loaded PickCube-v1" in said
-    assert "placing cameras (needs RenderCamera._cached_local_pose)" in said
-    assert "(needs BaseEnv._hidden_objects)" in said
+    printed = printed_by_open(tmp_path, "The tested versions")
+    assert "loaded PickCube-v1" in printed
+    assert "placing cameras (needs RenderCamera._cached_local_pose)" in printed
+    assert "(needs BaseEnv._hidden_objects)" in printed
     installed = maniskill()
     assert installed is not None
-    assert f"Not tested with the workbench: {installed[0]} 9.9.9" in said
-    assert f"pip install {installed[0]}=={installed[1]}" in said
+    assert f"Not tested with the workbench: {installed[0]} 9.9.9" in printed
+    assert f"pip install {installed[0]}=={installed[1]}" in printed
 
 
 @pytest.mark.slow
-def test_one_that_cannot_be_imported_is_named_with_the_tested_versions(tmp_path: Path) -> None:
+def test_a_maniskill_that_cannot_be_imported_is_named_with_the_tested_versions(tmp_path: Path) -> None:
     copy_of_maniskill(tmp_path, {"class RenderCamera": "class CameraOfAnotherYear"})
-    said = printed_by_open(tmp_path, "The tested versions")
-    assert "cannot import name 'RenderCamera'" in said and "9.9.9" in said and "loaded" not in said
+    printed = printed_by_open(tmp_path, "The tested versions")
+    assert "cannot import name 'RenderCamera'" in printed and "9.9.9" in printed and "loaded" not in printed

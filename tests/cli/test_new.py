@@ -1,4 +1,4 @@
-"""``workbench new``: what it says, what it asks in a terminal, and that what it writes passes its checks."""
+"""``workbench new``: its output, its questions in a terminal, and that the new task passes its checks."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from workbench.task.new_task import TEMPLATES
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
     with pytest.raises(SystemExit) as ended:
         main([*arguments])
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out, told.err
+    printed = capsys.readouterr()
+    return int(ended.value.code or 0), printed.out, printed.err
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("template", [template.name for template in TEMPLATES])
-def test_what_it_writes_breaks_no_rule(
+def test_a_new_task_breaks_no_rule(
     place: Path, capsys: pytest.CaptureFixture[str], template: str, renderer: None
 ) -> None:
     code, out, _ = run(capsys, "new", "stack_two", "--from", template)
@@ -43,7 +43,7 @@ def test_what_it_writes_breaks_no_rule(
     assert code == 0 and "StackTwo-v1: " in out and ", 0 broken, " in out and "not decided" not in out
 
 
-def test_the_first_template_is_taken_where_none_is_named_and_a_second_time_it_is_refused(
+def test_the_first_template_is_the_default_and_an_existing_file_is_refused(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(capsys, "new", "first")[0] == 0
@@ -55,11 +55,11 @@ def test_the_first_template_is_taken_where_none_is_named_and_a_second_time_it_is
 
 
 class Terminal:
-    """``workbench new`` at a terminal of its own."""
+    """``workbench new`` in a pseudo-terminal."""
 
     def __init__(self, folder: Path, *words: str) -> None:
         self._ours, theirs = os.openpty()
-        self._said = ""
+        self._printed = ""
         self.process = subprocess.Popen(
             [sys.executable, "-m", "workbench.cli.main", "new", *words],
             stdin=theirs,
@@ -71,17 +71,17 @@ class Terminal:
         os.close(theirs)
 
     def says(self, words: str) -> str:
-        """Wait until it has said them; returns all since the last time."""
+        """Wait until these words were printed; returns all output since the last call."""
         ends_at = time.monotonic() + 60
-        while words not in self._said:
-            assert select.select([self._ours], [], [], ends_at - time.monotonic())[0], self._said
+        while words not in self._printed:
+            assert select.select([self._ours], [], [], ends_at - time.monotonic())[0], self._printed
             try:
-                self._said += os.read(self._ours, 4096).decode()
-            except OSError:  # it has ended
+                self._printed += os.read(self._ours, 4096).decode()
+            except OSError:  # the process has ended
                 break
-        assert words in self._said, self._said
-        said, self._said = self._said, ""
-        return said
+        assert words in self._printed, self._printed
+        printed, self._printed = self._printed, ""
+        return printed
 
     def type(self, words: str) -> None:
         os.write(self._ours, words.encode())
@@ -92,13 +92,11 @@ class Terminal:
         return code
 
 
-def test_in_a_terminal_it_asks_for_template_and_name_until_they_will_do(
-    place: Path, child_process: None
-) -> None:
+def test_in_a_terminal_template_and_name_are_asked_for_until_valid(place: Path, child_process: None) -> None:
     (place / "taken.py").write_text("mine")
     terminal = Terminal(place)
-    said = terminal.says("Enter: minimal): ")
-    listed = [line.split(maxsplit=2) for line in said.splitlines() if line[:2] == "  "]
+    printed = terminal.says("Enter: minimal): ")
+    listed = [line.split(maxsplit=2) for line in printed.splitlines() if line[:2] == "  "]
     assert listed == [[str(n), one.name, one.about] for n, one in enumerate(TEMPLATES, 1)]
     terminal.type(f"{len(TEMPLATES) + 1}\n")
     assert f"Type a number from 1 to {len(TEMPLATES)}" in terminal.says("): ")
@@ -115,7 +113,7 @@ def test_in_a_terminal_it_asks_for_template_and_name_until_they_will_do(
     assert "compute_dense_reward" in (place / "push_it.py").read_text()
 
 
-def test_whoever_ends_the_questions_gets_nothing(place: Path, child_process: None) -> None:
+def test_cancelling_the_questions_writes_no_file(place: Path, child_process: None) -> None:
     terminal = Terminal(place, "--from", "PickCube-v1")
     terminal.says("Name of the task")
     terminal.type("\x04")

@@ -1,4 +1,4 @@
-"""A ray traced camera on a machine whose driver traces no rays: each command works, and names the camera's line."""
+"""A ray-traced camera on a machine without ray tracing: each command works, and names the camera's line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CAMERA = 'CameraConfig("render_camera", pose=pose, width=512, height=512,'
 
 @pytest.fixture
 def traced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, int]:
-    """The file, and the line of its camera."""
+    """The task file, and the line of its camera."""
     if why_no_ray_tracing() is None:
         pytest.skip("this machine traces rays")
     monkeypatch.chdir(tmp_path)
@@ -32,7 +32,7 @@ def traced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, int]:
     return file, next(n for n, line in enumerate(text.splitlines(), 1) if 'shader_pack="rt"' in line)
 
 
-def test_it_is_recorded_and_the_recording_says_how(
+def test_a_ray_traced_camera_is_recorded_and_the_recording_says_how(
     traced: tuple[Path, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, line = traced
@@ -48,7 +48,9 @@ def test_it_is_recorded_and_the_recording_says_how(
     }
 
 
-def test_its_check_ends_with_a_finding(traced: tuple[Path, int], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_check_of_a_ray_traced_camera_ends_with_a_finding(
+    traced: tuple[Path, int], capsys: pytest.CaptureFixture[str]
+) -> None:
     file, line = traced
     with pytest.raises(SystemExit) as ended:
         rules = "ray-traced,camera-sees,hidden-goal"

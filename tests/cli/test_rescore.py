@@ -1,4 +1,4 @@
-"""What ``workbench rescore`` prints, on terminals that are wide and narrow."""
+"""The output of ``workbench rescore`` on wide and narrow terminals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VERDICTS = [
 
 
 @pytest.mark.parametrize("width", [60, 80, 200])
-def test_names_are_whole_on_a_terminal_of_any_width(width: int) -> None:
+def test_names_are_not_truncated_on_a_terminal_of_any_width(width: int) -> None:
     out = io.StringIO()
     print_verdicts(VERDICTS, Console(file=out, width=width))
     lines = out.getvalue().splitlines()

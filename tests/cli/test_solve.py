@@ -1,4 +1,4 @@
-"""``workbench solve``: a row for each seed, verdicts, reports for programs, the episodes in the library."""
+"""``workbench solve``: a row per seed, verdicts, reports for programs, and the episodes in the library."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def options_of(file: Path, seeds: int = 3) -> SolveOptions:
 
 
 @pytest.mark.slow
-def test_each_seed_is_told_and_its_episode_is_in_the_library(lift: Path) -> None:
+def test_each_seed_is_reported_and_its_episode_is_in_the_library(lift: Path) -> None:
     report = solve(options_of(lift))
     assert [one.seed for one in report.seeds] == [4, 5, 6]
     assert all(1 <= one.solved_at <= 8 and one.in_the_way == "" for one in report.seeds)
@@ -95,8 +95,8 @@ def test_each_seed_is_told_and_its_episode_is_in_the_library(lift: Path) -> None
 
 
 @pytest.mark.slow
-def test_what_pays_without_success_is_told_with_its_seeds(lift: Path) -> None:
-    # Where the cube begins beyond x, no height is a success: what the reward does not know.
+def test_reward_without_success_is_reported_with_its_seeds(lift: Path) -> None:
+    # If the cube starts beyond x, no height is a success, but the reward does not reflect that.
     lift.write_text(LIFT.replace("half = 9.0", "half = 0.013"))
     report = solve(options_of(lift, seeds=4))
     (verdict,) = [one for one in report.verdicts if one.rule == "reward-exploited"]
@@ -105,13 +105,13 @@ def test_what_pays_without_success_is_told_with_its_seeds(lift: Path) -> None:
     assert "height" in verdict.message
 
 
-def test_a_seed_whose_time_is_up_ends_at_its_next_step_and_its_progress_is_told(lift: Path) -> None:
+def test_a_seed_that_times_out_ends_at_its_next_step_and_reports_its_progress(lift: Path) -> None:
     seen: list[RecordProgress] = []
     what = replace(options_of(lift, seeds=2), seconds_per_seed=1e-6)
     report = solve(what, on_progress=seen.append)
     assert [one.steps for one in report.seeds] == [1, 1] and all(one.cut_off for one in report.seeds)
     assert "wall time limit reached after 1 step (" in report.seeds[0].in_the_way and report.verdicts == ()
-    # The first plan is still to be made, and nothing is done.
+    # The first plan is not made yet, so no seed is done.
     assert (seen[0].by_seed(4), seen[0].limit, seen[0].done) == ({4: 0}, 8, 0)
     assert (seen[1].by_seed(4), seen[1].done) == ({4: 1}, 1 / 8)
     assert (seen[-1].running, seen[-1].done, seen[-1].steps) == ({}, 2, 2)
@@ -132,7 +132,9 @@ FOUND = SolveReport(
 @pytest.mark.parametrize(
     ("fail_on", "found", "unsolved"), [("stop", False, True), ("warn", True, True), ("never", False, False)]
 )
-def test_the_exit_code_has_the_degrees_of_the_checks(fail_on: FailOn, found: bool, unsolved: bool) -> None:
+def test_the_exit_code_follows_the_degrees_of_the_verdicts(
+    fail_on: FailOn, found: bool, unsolved: bool
+) -> None:
     output = SolveOutput(fail_on=fail_on)
     assert output.fails(FOUND) == found
     rule = RuleResult(
@@ -155,7 +157,7 @@ def test_the_report_is_the_same_with_several_processes(lift: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_done_is_kept_and_reported_where_it_is_stopped(lift: Path) -> None:
+def test_a_stopped_job_keeps_and_reports_its_finished_seeds(lift: Path) -> None:
     done = threading.Event()
 
     def on_progress(progress: RecordProgress) -> None:
@@ -167,7 +169,7 @@ def test_what_is_done_is_kept_and_reported_where_it_is_stopped(lift: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_real_ctrl_c_in_a_terminal_keeps_and_reports_what_is_done(lift: Path) -> None:
+def test_ctrl_c_in_a_terminal_keeps_and_reports_the_finished_seeds(lift: Path) -> None:
     ours, theirs = pty.openpty()
     kept, folder = lift.parent / "out", lift.parent
     given = ["--seeds", "500", "--workers", "2", "--rollouts", "16", "--horizon", "0.2"]
@@ -179,24 +181,24 @@ def test_a_real_ctrl_c_in_a_terminal_keeps_and_reports_what_is_done(lift: Path) 
         stdout=theirs,
         stderr=theirs,
         start_new_session=True,
-        # Only a process whose terminal this is gets the signal of its keys, and so do those that it started.
+        # Only processes with this controlling terminal get the signals of its keys.
         preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     )
     os.close(theirs)
-    said: list[bytes] = []
+    pieces: list[bytes] = []
 
     def read() -> None:
         try:
             while piece := os.read(ours, 65536):
-                said.append(piece)
-        except OSError:  # nobody has the other end any more
+                pieces.append(piece)
+        except OSError:  # the other end was closed
             return
 
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
 
     def printed() -> str:
-        return b"".join(said).decode(errors="replace")
+        return b"".join(pieces).decode(errors="replace")
 
     try:
         until(lambda: len(list(kept.glob("*.json"))) >= 2, "two episodes", seen=printed)
@@ -207,10 +209,10 @@ def test_a_real_ctrl_c_in_a_terminal_keeps_and_reports_what_is_done(lift: Path) 
         process.wait()
         reader.join(timeout=10)
         os.close(ours)
-    told = json.loads((folder / "solved.json").read_text())
+    report = json.loads((folder / "solved.json").read_text())
     count = len(list(kept.glob("*.json")))
-    assert told["stopped"] and 2 <= told["tried"] == count < 500
-    assert f"{count} of 500 seeds are done, {told['solved']} solved" in printed()
+    assert report["stopped"] and 2 <= report["tried"] == count < 500
+    assert f"{count} of 500 seeds are done, {report['solved']} solved" in printed()
     assert "interrupted; finished episodes were kept" in printed() and "Traceback" not in printed()
 
 
@@ -220,11 +222,16 @@ def test_the_command_prints_and_writes_reports(lift: Path, capsys: pytest.Captur
     written = f"--json-file {files['json']} --csv-file {files['csv']} --junit {files['xml']}"
     with pytest.raises(SystemExit) as ended:
         main(f"{call} {written}".split())
-    said = capsys.readouterr().out
-    assert ended.value.code == 0, said
-    assert "Solved 2 of 2 seeds, in" in said and "workbench review" in said
-    told = json.loads(files["json"].read_text())
-    assert (told["solved"], told["tried"], told["fails"], told["plan"]["rollouts"]) == (2, 2, False, 16)
+    stdout = capsys.readouterr().out
+    assert ended.value.code == 0, stdout
+    assert "Solved 2 of 2 seeds, in" in stdout and "workbench review" in stdout
+    report = json.loads(files["json"].read_text())
+    assert (report["solved"], report["tried"], report["fails"], report["plan"]["rollouts"]) == (
+        2,
+        2,
+        False,
+        16,
+    )
     rows = list(csv.DictReader(io.StringIO(files["csv"].read_text())))
     assert [row["seed"] for row in rows] == ["0", "1"] and all(
         Path(row["recording"]).is_file() for row in rows

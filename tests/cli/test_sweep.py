@@ -1,4 +1,4 @@
-"""``workbench sweep`` as a person types it: its table, its files, its parts put together, and a job that goes on."""
+"""``workbench sweep``: its table, its files, merged parts, and a resumed job."""
 
 from __future__ import annotations
 
@@ -58,23 +58,23 @@ def test_a_sweep_prints_its_points_and_writes_its_results(
         "--csv-file",
         "a.csv",
     )
-    said = capsys.readouterr()
+    printed = capsys.readouterr()
     assert code == 1
-    assert "3 failed" in said.out and "0 % (0 - 56)" in said.out
-    assert "workbench review sweeps/reward_terms" in said.out and "nobody" in said.err
+    assert "3 failed" in printed.out and "0 % (0 - 56)" in printed.out
+    assert "workbench review sweeps/reward_terms" in printed.out and "nobody" in printed.err
     results = read_results(tmp_path / "sweeps" / "reward_terms" / RESULTS)
     assert len(results.episodes) == 12
-    told = json.loads((tmp_path / "a.json").read_text())
-    assert [point["set"]["MOST"] for point in told["points"]] == [1, 5, 5, 1]
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert [point["set"]["MOST"] for point in report["points"]] == [1, 5, 5, 1]
     rows = list(csv.DictReader((tmp_path / "a.csv").read_text().splitlines()))
     assert [row["set.robot_uids"] for row in rows] == (["panda"] * 3 + ["nobody"] * 3) * 2
     assert rows[0]["return"] == str(results.episodes[0].total_reward)
-    # Another sweep does not mix with it.
+    # Another sweep must not be mixed with it.
     assert sweep("--set", "MOST=3") == 2
     assert "holds the results of another sweep" in capsys.readouterr().err
 
 
-def test_a_job_goes_on_after_what_is_done(
+def test_a_job_is_resumed_after_its_finished_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -87,12 +87,12 @@ def test_a_job_goes_on_after_what_is_done(
     assert "resuming after 6 results" in capsys.readouterr().err
     assert numbers(tmp_path / "out") == before
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "out").glob("*/*")} == made
-    # Another one does not take its file.
+    # Another sweep must not use its job file.
     assert sweep("--set", "MOST=5,2", "--out", "other", "--job", "s.job") == 2
     assert "belongs to another job" in capsys.readouterr().err
 
 
-def test_what_is_uploaded_is_a_whole_sweep_and_goes_on(
+def test_an_upload_is_a_complete_sweep_and_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -103,11 +103,11 @@ def test_what_is_uploaded_is_a_whole_sweep_and_goes_on(
     assert results == read_results(tmp_path / "here" / RESULTS) and len(results.episodes) == 6
     assert all((there / row.recording).is_file() for row in results.episodes)
     assert not list((tmp_path / "here").glob("*/*"))
-    said = capsys.readouterr().out
-    assert f"workbench review here, once what is below {there.as_uri()} is copied there" in said
+    printed = capsys.readouterr().out
+    assert f"workbench review here, once what is below {there.as_uri()} is copied there" in printed
     made = {file: file.stat().st_mtime_ns for file in there.glob("*/*")}
     assert sweep(*given) == 0
     assert {file: file.stat().st_mtime_ns for file in there.glob("*/*")} == made
-    # What has been copied back is opened as what was made there.
+    # A sweep copied back from the upload opens like one made locally.
     assert run("merge", "s.job") == 0
     assert read_results(there / RESULTS) == results

@@ -1,4 +1,4 @@
-"""Nothing that comes from elsewhere does more to a terminal than show text in colours: real commands on a real terminal."""
+"""Foreign text only shows as text and colours in a terminal: real commands in a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ CLIPBOARD = "\x1b]52;c;aGk=\x1b\\"
 LINK = "\x1b]8;;http://127.0.0.1/\x1b\\press me\x1b]8;;\x1b\\"
 EVIL = f"{TITLE}{CLIPBOARD}{LINK}\x1b[2J\x1b[H\x1b[10A\x9b2J\x90q\x9c\x1bc\x07\x08\u202eback"
 BARS = re.compile("\x1b\\[(\\?25[lh]|1A|2K)|\r")
-"""How a bar of ours moves the cursor."""
+"""Cursor movements of our progress bars."""
 COLOURS = re.compile("\x1b\\[[0-9;:]*m")
 
 
 def harmful(text: str) -> set[str]:
-    """Controls in `text` besides ends of lines and colours."""
+    """Control characters in `text` except line ends and colours."""
     return {c for c in COLOURS.sub("", text) if unicodedata.category(c) == "Cc" and c not in "\n\t"}
 
 
 class Terminal:
-    """A command on a terminal of its own, and all that the terminal got."""
+    """A command in a pseudo-terminal, and all of its output."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
         ours, theirs = pty.openpty()
@@ -76,13 +76,13 @@ class Terminal:
                 continue
             try:
                 piece = os.read(self._ours, 65536)
-            except OSError:  # nobody has the other end any more
+            except OSError:  # the other end was closed
                 return
             self._got += piece
 
     @property
     def text(self) -> str:
-        # The terminal driver writes ends of lines so.
+        # The terminal driver writes line ends as \r\n.
         return self._got.decode(errors="replace").replace("\r\n", "\n")
 
     def wait_for(self, pattern: str, seconds: float = 90.0) -> re.Match[str]:
@@ -133,15 +133,15 @@ def test_a_task_and_a_request_full_of_escapes_do_nothing_to_the_terminal(
     text = terminal.text
     assert harmful(text) == set(), text
     assert "\\x1b]0;owned\\x07" in text and "\\x1b]52;c;" in text and "\\u202eback" in text
-    assert "\x1b[1;32mgreen\x1b[0m and hidden" in text, "colours are kept, and nothing is hidden"
+    assert "\x1b[1;32mgreen\x1b[0m and hidden" in text, "colours are kept, and no text is hidden"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_a_task_that_is_recorded_does_nothing_to_the_terminal(
+def test_a_recorded_task_does_nothing_to_the_terminal(
     child_process: None, workers: str, tmp_path: Path
 ) -> None:
-    """Its code runs in the command's own process, or in some that write to the terminal themselves."""
+    """The task's code runs in the command's own process, or in subprocesses that write to the terminal themselves."""
     (tmp_path / "mine.py").write_text(
         f"import sys\nprint({EVIL!r} + 'printed')\nprint({EVIL!r} + 'said', file=sys.stderr)\n"
         f"print('\\x1b[1;32mgreen\\x1b[0m')\nraise RuntimeError({EVIL!r} + 'raised')\n"
@@ -154,7 +154,7 @@ def test_a_task_that_is_recorded_does_nothing_to_the_terminal(
 
 
 @pytest.mark.slow
-def test_a_recording_full_of_escapes_is_told_as_text(child_process: None, tmp_path: Path) -> None:
+def test_a_recording_full_of_escapes_is_printed_as_text(child_process: None, tmp_path: Path) -> None:
     info: dict[str, Any] = {"task": f"Push{EVIL}-v1", "source_file": f"{EVIL}.py"}
     first = write(tmp_path, made(3, **info), pictures=False)
     for file in sorted(tmp_path.glob(f"{first.stem}.*")):
@@ -166,7 +166,7 @@ def test_a_recording_full_of_escapes_is_told_as_text(child_process: None, tmp_pa
     assert "\\x1b]0;owned\\x07" in text and "\\u202e" in text
 
 
-def test_a_row_of_the_library_is_told_as_text(child_process: None, tmp_path: Path) -> None:
+def test_a_row_of_the_library_is_printed_as_text(child_process: None, tmp_path: Path) -> None:
     first = write(tmp_path, made(3, task=f"Push{EVIL}-v1"), pictures=False)
     for file in sorted(tmp_path.glob(f"{first.stem}.*")):
         file.rename(file.with_name(f"a\u202e{TITLE}b{file.suffix}"))
@@ -176,32 +176,32 @@ def test_a_row_of_the_library_is_told_as_text(child_process: None, tmp_path: Pat
         (row,) = library.view().rows
     finally:
         library.close()
-    told = cells(row, None, datetime.datetime.now(datetime.timezone.utc))
-    said = "".join((told["task"], told["about"], row.name, row.problem or "", row.note, *row.tags))
-    assert harmful(said) == set() and "\u202e" not in said and "]0;owned" in said
+    shown = cells(row, None, datetime.datetime.now(datetime.timezone.utc))
+    text = "".join((shown["task"], shown["about"], row.name, row.problem or "", row.note, *row.tags))
+    assert harmful(text) == set() and "\u202e" not in text and "]0;owned" in text
 
 
-# --- what each way to say something lets through ------------------------------------------------------
+# --- what each way to print something lets through ----------------------------------------------------
 
 
 @contextmanager
 def both_streams() -> Iterator[io.StringIO]:
-    said = io.StringIO()
-    with redirect_stdout(said), redirect_stderr(said):
-        yield said
+    output = io.StringIO()
+    with redirect_stdout(output), redirect_stderr(output):
+        yield output
 
 
-def test_all_that_the_commands_say_is_text() -> None:
+def test_all_output_of_the_commands_is_text() -> None:
     with both_streams() as streams:
         print_text(EVIL)
         refuse(f"there is no file {EVIL}")
         warn(EVIL)
         print_problem(Problem("import", EVIL, f"/{EVIL}.py", 3, EVIL, f"Traceback\n  {EVIL}\n"))
         print_line(PrintedLine("stdout", "plain", (StyledText("plain", Style(color="color(1)")),)))
-    said = streams.getvalue()
-    assert harmful(said) == set() and "\\x1b]0;owned\\x07" in said
-    assert "  | plain\n" in said, "no colours where there is no terminal"
-    assert said.count("there is no file") == 1 and "/[" not in said
+    output = streams.getvalue()
+    assert harmful(output) == set() and "\\x1b]0;owned\\x07" in output
+    assert "  | plain\n" in output, "no colours without a terminal"
+    assert output.count("there is no file") == 1 and "/[" not in output
 
 
 def test_a_loggers_record_is_one_line_and_its_traceback_is_text(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,20 +215,20 @@ def test_a_loggers_record_is_one_line_and_its_traceback_is_text(monkeypatch: pyt
             logger.exception("The route %s failed on %s.", "/docs", f"/{EVIL}\nFAKE a line of ours")
         print(EVIL, file=sys.stderr)
         sys.stderr.writelines([EVIL, "\x1b[31mred\x1b[0m\n"])
-    said = streams.getvalue()
-    assert harmful(said) == set()
-    assert "\nFAKE" not in said and "\\nFAKE" in said
-    assert "Traceback" in said and "ValueError" in said and "\x1b[31mred\x1b[0m" in said
+    output = streams.getvalue()
+    assert harmful(output) == set()
+    assert "\nFAKE" not in output and "\\nFAKE" in output
+    assert "Traceback" in output and "ValueError" in output and "\x1b[31mred\x1b[0m" in output
 
 
-def test_bars_still_move_and_what_they_say_is_text() -> None:
-    said = io.StringIO()
-    console = SafeConsole(file=said, force_terminal=True, width=100)
+def test_progress_bars_still_move_and_their_labels_are_text() -> None:
+    output = io.StringIO()
+    console = SafeConsole(file=output, force_terminal=True, width=100)
     columns = (TextColumn("{task.description}", markup=False), BarColumn())
     with Progress(*columns, console=console) as bar:
         bar.update(bar.add_task("opening", total=2), description=f"importing [/b]{EVIL}")
         bar.refresh()
-    text = said.getvalue()
+    text = output.getvalue()
     assert "\x1b[2K" in text or "\x1b[?25l" in text, "rich's own controls"
     assert harmful(BARS.sub("", text)) == set()
     assert "[/b]" in text and "\\x1b]0;owned" in text
@@ -242,8 +242,8 @@ def test_bars_still_move_and_what_they_say_is_text() -> None:
     )
 )
 def test_no_renderable_brings_a_control_through_our_console(parts: list[str]) -> None:
-    said = io.StringIO()
-    console = SafeConsole(file=said, force_terminal=True, width=80, highlight=False)
+    output = io.StringIO()
+    console = SafeConsole(file=output, force_terminal=True, width=80, highlight=False)
     text = "".join(parts)
     table = Table(title="t")
     table.add_column("c", overflow="fold")
@@ -252,4 +252,4 @@ def test_no_renderable_brings_a_control_through_our_console(parts: list[str]) ->
     console.print(Text(text))
     console.print(Text.from_ansi(text))
     console.print(text.replace("[/", "(/"))
-    assert harmful(said.getvalue()) == set()
+    assert harmful(output.getvalue()) == set()

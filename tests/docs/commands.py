@@ -1,4 +1,4 @@
-"""The commands of a fence, and those that open a page."""
+"""Parses and runs the commands of a documentation fence."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OPENS_A_PAGE = ("open", "review")
 
 
 def commands(fence: Fence) -> Iterator[list[str]]:
-    """The commands of a fence, as words; what follows a # or redirects is not among them."""
+    """The commands of a fence, split into words, without comments and redirections."""
     for line in re.sub(r"\\\n", "", fence.text).splitlines():
         words = shlex.split(line, comments=True)
         if words:
@@ -24,7 +24,7 @@ def commands(fence: Fence) -> Iterator[list[str]]:
 
 
 def opens(words: list[str], desk: Path) -> None:
-    """It prints an address, the page answers there, and Ctrl-C ends it."""
+    """Run a command that opens a page: assert that it prints an address, answers there, and ends on Ctrl-C."""
     with open_workbench(*words[2:], cwd=desk, what=words[1]) as opened:
         browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
         with browser.open(opened.url, timeout=60) as answer:

@@ -1,10 +1,10 @@
-"""Writes the parts of the docs that are made from the code: the keys, the commands, and the rules.
+"""Generates the parts of the docs that come from the code: keys, commands and rules.
 
-    python -m tests.docs.generate          # `test_generated.py` fails where a page says something else
+    python -m tests.docs.generate          # `test_generated.py` fails if a page differs
 
-Keys are those of the list of commands, commands what ``--help`` prints. Rules are read where they are declared: in the decorators
-and docstrings of `checks.rules`, in `envs.gpu_rules` and in `envs.outliers`. Their pages and the table that the package reads
-(`checks.rule_table`) are made from there.
+Keys come from the list of commands, command pages from ``--help``. Rules come from their declarations: the decorators and
+docstrings of `checks.rules`, `envs.gpu_rules` and `envs.outliers`. The rule pages and the table that the package reads
+(`checks.rule_table`) are generated from these.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ CLI_COMMANDS = (
     "doctor",
     "help",
 )
-"""In the order in which a reader meets them; `test_generated.py` compares them with those that there are."""
+"""Commands in reading order; `test_generated.py` compares them with the existing commands."""
 
 
 # --- keys ---------------------------------------------------------------------------------------------
@@ -109,17 +109,17 @@ def cli_page() -> str:
 
 
 def help_of(command: str) -> str:
-    """In a hundred columns, without colours."""
+    """The help text of a command, 100 columns wide, without colours."""
     plain = {"COLUMNS": "100", "NO_COLOR": "1"}
-    said = io.StringIO()
-    with patch.dict(os.environ, plain), redirect_stdout(said):
+    printed = io.StringIO()
+    with patch.dict(os.environ, plain), redirect_stdout(printed):
         for name in ("FORCE_COLOR", "TTY_COMPATIBLE"):
             os.environ.pop(name, None)
         try:
             main.main([command, "--help"])
         except SystemExit as ended:
             assert not ended.code, command
-    return "\n".join(line.rstrip() for line in said.getvalue().strip().splitlines())
+    return "\n".join(line.rstrip() for line in printed.getvalue().strip().splitlines())
 
 
 # --- rules --------------------------------------------------------------------------------------------
@@ -140,7 +140,7 @@ HOOKS = (
     "_default_sensor_configs",
     "_default_human_render_camera_configs",
 )
-"""The hooks in the order of the page of all rules, about the order in which an author writes them."""
+"""Hooks in their order on the page of all rules, roughly the order in which an author writes them."""
 
 
 def declared_rules() -> list[DeclaredRule]:
@@ -167,7 +167,7 @@ def rule_page(rule: DeclaredRule) -> str:
 
 
 def wrapped(sentence: str) -> str:
-    """In lines of at most 110 characters."""
+    """Wrap a sentence at 110 characters."""
     return textwrap.fill(sentence, 110, break_long_words=False, break_on_hyphens=False)
 
 
@@ -186,17 +186,17 @@ def gpu_rules_table() -> str:
 
 
 def all_rules_page() -> str:
-    """A table for each hook."""
+    """The page of all rules, with a table per hook."""
     by_hook: dict[str, list[Rule]] = {hook: [] for hook in HOOKS}
-    # Those of GPU simulation come last.
+    # Rules of GPU simulation come last.
     for rule in sorted(declared_rules(), key=lambda rule: rule.id in GPU_RULES):
         by_hook[rule.hook].append(rule)
     lines = [
         "# Rules",
         "",
-        "What [`workbench check`](../checks.md) looks at, by the hook in which a mistake is mended. Where a rule with the degree",
-        "*stop* is broken, the exit code is 1. `workbench help RULE` shows the page of one rule. Those of GPU simulation are also",
-        "checked [while a task runs](../batched_env.md#what-goes-wrong-on-a-gpu-goes-wrong-here). This page is made from the code.",
+        "The rules of [`workbench check`](../checks.md), by the hook that a fix changes. A broken rule with the degree *stop* gives",
+        "the exit code 1. `workbench help RULE` shows the page of one rule. Rules of GPU simulation are also checked",
+        "[while a task runs](../batched_env.md#what-goes-wrong-on-a-gpu-goes-wrong-here). This page is made from the code.",
         "",
     ]
     for hook, rules in by_hook.items():
@@ -212,16 +212,16 @@ def linked(rule: str, folder: str = "../rules") -> str:
 
 
 def code(sentence: str) -> str:
-    """Names of functions and attributes set as code."""
+    """Put names of functions and attributes in backticks."""
     name = r"@?(?:\w+\.)*\w*_\w+(?:\.\w+)*(?:\([\w, ]*\))?|\w+\.\w+\(\)|\w+\(\w*_\w+\)|evaluate\(\)"
-    # What is code already stays.
+    # Text in backticks stays unchanged.
     return re.sub(
         rf"`[^`]*`|(?<!\w)({name})", lambda found: f"`{found[1]}`" if found[1] else found[0], sentence
     )
 
 
 def with_rules(text: str) -> str:
-    """The page with the table between its marks."""
+    """Replace the table between the page's marks."""
     before, begin, rest = text.partition("<!-- rules -->\n")
     _, end, after = rest.partition("<!-- /rules -->")
     assert begin and end
@@ -229,7 +229,7 @@ def with_rules(text: str) -> str:
 
 
 def pages() -> dict[Path, str]:
-    """The text of every file that is made here."""
+    """The text of every generated file."""
     return {
         KEYS: keys_page(),
         CLI: cli_page(),

@@ -1,4 +1,4 @@
-"""README and the docs as tests read them: pages, and the fences of a page."""
+"""Reads README and the docs: pages, and the fences of a page."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 class Fence:
     page: Path
     line: int
-    """Of its first line of text, counted from 1."""
+    """Line number of its first line of text, from 1."""
     language: str
     mark: str
-    """What stands behind the language: ``slow``, ``fragment``, ``wrong``, or nothing."""
+    """The word after the language: ``slow``, ``fragment``, ``wrong``, or empty."""
     text: str
 
     @property

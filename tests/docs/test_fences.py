@@ -1,4 +1,4 @@
-"""What README and the docs tell people to type works: every fence is run, parsed, or gives the message it promises."""
+"""Every fence in README and the docs works: it is run, parsed, or gives the error message that the page shows."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ KINDS = {
 }
 RUN = ("", "slow", "wrong")
 JOBS = {name: getattr(jobs, name) for name in ("record", "check", "solve", "sweep", "merge", "rescore")}
-PAGES_AND_MORE = {
+OTHER_COMMANDS = {
     name: getattr(main, name) for name in ("new", "review", "share", "export", "view", "doctor")
 }
-COMMANDS = {"open": main.open_page, **JOBS, **PAGES_AND_MORE}
+COMMANDS = {"open": main.open_page, **JOBS, **OTHER_COMMANDS}
 TYPED = [
     page for page in PAGES if any(f.language in ("python", "sh") and f.mark in RUN for f in fences(page))
 ]
 
 
-def learns(printed: str) -> None:
-    """The example of the page on the batched env finds a policy that pushes better than the first ones."""
+def check_that_it_learns(printed: str) -> None:
+    """Assert that the example of the page on the batched env improves its policy."""
     shares = [float(share) for share in re.findall(r"succeeded ([\d.]+)", printed)]
     assert len(shares) >= 2 and shares[-1] > shares[0] + 0.2, shares
 
@@ -59,18 +59,18 @@ PRINTS = {
     ),  # the restore report, and a contact
     "api": lambda printed: "table-workspace" in printed,
 }
-"""Of pages whose Python prints what readers are told to look for."""
+"""Checks of the Python output that a page promises, by page."""
 FEWER = {("--seeds", "16"): "2", ("--successes", "20"): "2", ("--episodes", "8"): "2"}
-"""A flag and its number on a page, to what is typed here: those of the page take many minutes."""
+"""Maps a flag and its number on a page to a smaller number for the test: the page's numbers take many minutes."""
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_fence_says_what_it_is(page: Path) -> None:
+def test_a_fence_names_its_kind(page: Path) -> None:
     kinds = {(fence.language, fence.mark) for fence in fences(page)}
     assert kinds <= KINDS
     prose = without_fences(page)
     assert "```" not in prose
-    # Code that is set in by four spaces would be run by nobody.
+    # No test would run code that is indented by four spaces.
     assert re.findall(r"\n\n    .*", prose) == []
 
 
@@ -90,7 +90,7 @@ def test_a_fragment_is_well_formed(page: Path) -> None:
 
 def well_formed(words: list[str], fence: Fence) -> None:
     if words[0] == "workbench" and len(words) > 1:
-        # Only its arguments are read: the command itself does nothing.
+        # Only the arguments are parsed; the command does not run.
         command = functools.wraps(COMMANDS[words[1]])(lambda *args, **named: 0)
         config = (tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
         assert tyro.cli(command, args=words[2:], config=config) == 0, fence.place
@@ -101,7 +101,7 @@ def well_formed(words: list[str], fence: Fence) -> None:
 
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with what the pages take for granted: the examples, a task, a policy, and a package with a task."""
+    """A folder with the files that the pages assume: the examples, a task, a policy, and a package with a task."""
     shutil.copytree(ROOT / "tasks", tmp_path / "tasks", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "tasks" / "push_cube.py", tmp_path / "my_task.py")
     shutil.copy(ROOT / "tests" / "browser" / "pusher.py", tmp_path / "my_policy.py")
@@ -122,7 +122,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TYPED, ids=lambda page: page.stem)
-def test_what_a_page_says_to_type_works(page: Path, desk: Path, renderer: None, child_process: None) -> None:
+def test_the_commands_of_a_page_work(page: Path, desk: Path, renderer: None, child_process: None) -> None:
     printed = type_all(page, desk, ("", "wrong"))
     if page.stem in PRINTS:
         assert PRINTS[page.stem](printed), printed
@@ -135,12 +135,12 @@ def test_what_a_page_says_to_type_works(page: Path, desk: Path, renderer: None, 
     [page for page in TYPED if any(f.mark == "slow" for f in fences(page))],
     ids=lambda page: page.stem,
 )
-def test_all_that_a_page_says_to_type_works(
+def test_the_slow_commands_of_a_page_work_too(
     page: Path, desk: Path, renderer: None, child_process: None
 ) -> None:
     printed = type_all(page, desk, RUN)
     if page.stem == "batched_env":
-        learns(printed)
+        check_that_it_learns(printed)
 
 
 def type_all(page: Path, desk: Path, marks: tuple[str, ...]) -> str:
@@ -164,7 +164,7 @@ def type_all(page: Path, desk: Path, marks: tuple[str, ...]) -> str:
 
 
 def promised(fence: Fence, below: Fence | None) -> str | None:
-    """The message that a wrong one must give."""
+    """The error message that a fence marked ``wrong`` must give."""
     if fence.mark != "wrong":
         return None
     assert below is not None and below.language == "text", f"{fence.place}: its message is missing below it"
@@ -172,7 +172,7 @@ def promised(fence: Fence, below: Fence | None) -> str | None:
 
 
 def run_python(fence: Fence, names: dict[str, object], out: io.StringIO, wanted: str | None) -> None:
-    # With its real line numbers in a traceback.
+    # Keeps the page's line numbers in tracebacks.
     code = compile("\n" * (fence.line - 1) + fence.text, str(fence.page), "exec")
     with redirect_stdout(out), warnings.catch_warnings():
         if wanted is None:
@@ -181,13 +181,13 @@ def run_python(fence: Fence, names: dict[str, object], out: io.StringIO, wanted:
             return
         with pytest.raises(Exception) as raised:
             exec(code, names)
-    said = " ".join(f"{type(raised.value).__name__}: {raised.value}".split())
-    assert wanted in said, f"{fence.place} says {said}"
+    printed = " ".join(f"{type(raised.value).__name__}: {raised.value}".split())
+    assert wanted in printed, f"{fence.place} says {printed}"
 
 
 def run_command(words: list[str], fence: Fence, desk: Path, wanted: str | None) -> None:
     if words[:2] == ["workbench", "new"]:
-        # The desk has a task for pages that take one for granted.
+        # The folder already has a task, for pages that assume one.
         (desk / f"{words[2]}.py").unlink(missing_ok=True)
     if wanted is None and words[:1] == ["workbench"] and words[1] in OPENS_A_PAGE:
         opens(words, desk)
@@ -196,6 +196,6 @@ def run_command(words: list[str], fence: Fence, desk: Path, wanted: str | None) 
     ended = subprocess.run(
         words, cwd=desk, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=800
     )
-    said = " ".join((ended.stdout + ended.stderr).split())
-    assert (ended.returncode == 0) == (wanted is None), f"{fence.place}: {shlex.join(words)} says {said}"
-    assert wanted is None or wanted in said, f"{fence.place}: {shlex.join(words)} says {said}"
+    printed = " ".join((ended.stdout + ended.stderr).split())
+    assert (ended.returncode == 0) == (wanted is None), f"{fence.place}: {shlex.join(words)} says {printed}"
+    assert wanted is None or wanted in printed, f"{fence.place}: {shlex.join(words)} says {printed}"

@@ -1,4 +1,4 @@
-"""The files that are made from the code are what the code says today."""
+"""The generated files match the code."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.benchmarks import table
 from tests.docs import generate
 from workbench.checks.rule_pages import sections
 
-AGAIN = "write it again: python -m tests.docs.generate"
+AGAIN = "generate it again: python -m tests.docs.generate"
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def made(child_process: None) -> dict[Path, str]:
             generate.CLI,
             marks=pytest.mark.skipif(
                 Version(version("tyro")) < Version("1.0.16"),
-                reason="earlier versions of tyro draw help another way",
+                reason="earlier versions of tyro format help differently",
             ),
         ),
         generate.GPU_RULES_PAGE,
@@ -37,30 +37,30 @@ def made(child_process: None) -> dict[Path, str]:
     ],
     ids=lambda page: page.name,
 )
-def test_a_page_says_what_the_code_says(page: Path, made: dict[Path, str]) -> None:
+def test_a_generated_page_matches_the_code(page: Path, made: dict[Path, str]) -> None:
     assert page.read_text() == made[page], AGAIN
 
 
-def test_each_rule_has_the_page_that_its_declaration_says_and_no_other_page_is_there(
+def test_each_rule_has_the_page_of_its_declaration_and_there_is_no_other_page(
     made: dict[Path, str],
 ) -> None:
     there = {page: page.read_text() for page in generate.RULE_PAGES.iterdir()}
     assert there == {path: text for path, text in made.items() if path.parent == generate.RULE_PAGES}, AGAIN
 
 
-def test_each_rule_says_why_how_to_mend_it_and_how_it_is_checked() -> None:
+def test_each_rule_explains_why_how_to_fix_it_and_how_it_is_checked() -> None:
     for rule in generate.declared_rules():
         assert list(sections(rule.page)) == ["Why", "Mend", "How it is checked"], rule.id
         assert rule.asks[-1] == rule.otherwise[-1] == ".", rule.id
 
 
-def test_the_page_of_benchmarks_is_made_from_their_results() -> None:
+def test_the_benchmark_page_is_generated_from_the_results() -> None:
     assert table.PAGE.read_text() == table.page(table.read()), (
-        "write it again: python -m tests.benchmarks.table"
+        "generate it again: python -m tests.benchmarks.table"
     )
 
 
-def test_the_table_of_benchmarks_is_short_and_names_scripts_that_there_are() -> None:
+def test_the_table_of_benchmarks_is_short_and_names_existing_scripts() -> None:
     rows = table.read()
     assert len(rows) <= table.MAX_ROWS and len({row.what for row in rows}) == len(rows)
     assert all((table.RESULTS.parent / row.script).is_file() for row in rows)
@@ -76,7 +76,7 @@ def test_the_table_of_benchmarks_is_short_and_names_scripts_that_there_are() -> 
         (1.36, None, "MB", "less", ""),
     ],
 )
-def test_a_ratio_says_which_side_is_better(ours, other, unit, better, ratio) -> None:
+def test_a_ratio_names_the_better_side(ours, other, unit, better, ratio) -> None:
     assert table.Row("x", ours, other, unit, better, "core.py").ratio == ratio
 
 

@@ -1,4 +1,4 @@
-"""The pages of Help: every topic is one, links and pictures lead somewhere, and no other file is given out."""
+"""The help pages: every topic has one, links and pictures exist, and no other file is served."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ ELSEWHERE = {"github.com"}
 """Hosts that pages link to."""
 
 
-class Seen(HTMLParser):
-    """Ids, addresses of links, and addresses of pictures of a page."""
+class PageParts(HTMLParser):
+    """Collects a page's ids, and the addresses of its links and pictures."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -34,14 +34,14 @@ class Seen(HTMLParser):
         self.pictures |= {found[name] for name in ("src", "srcset") if name in found}
 
 
-def page_of(topic: Topic) -> Seen:
+def page_of(topic: Topic) -> PageParts:
     status, kind, body = reply(topic.name)
     assert status == 200 and kind.startswith("text/html")
-    return Seen(body.decode())
+    return PageParts(body.decode())
 
 
 @pytest.mark.parametrize("topic", topics(), ids=lambda topic: topic.name)
-def test_every_link_leads_somewhere(topic: Topic) -> None:
+def test_every_link_has_a_target(topic: Topic) -> None:
     seen = page_of(topic)
     for link in seen.links:
         if link.startswith("https://"):
@@ -54,11 +54,13 @@ def test_every_link_leads_somewhere(topic: Topic) -> None:
 
 
 @pytest.mark.parametrize("topic", topics(), ids=lambda topic: topic.name)
-def test_every_picture_is_there_dark_and_light(topic: Topic) -> None:
+def test_every_picture_exists_dark_and_light(topic: Topic) -> None:
     pictures = page_of(topic).pictures - {"/workbench/logo.svg"}
     assert all(address.startswith("/workbench/screenshots/") for address in pictures)
-    gone = [one for one in pictures if not (web_assets_folder() / one.removeprefix("/workbench/")).is_file()]
-    assert gone == []
+    missing = [
+        one for one in pictures if not (web_assets_folder() / one.removeprefix("/workbench/")).is_file()
+    ]
+    assert missing == []
     dark = {one for one in pictures if "/dark/" in one}
     assert {one.replace("/dark/", "/light/") for one in dark} == {one for one in pictures if "/light/" in one}
 
@@ -66,13 +68,13 @@ def test_every_picture_is_there_dark_and_light(topic: Topic) -> None:
 @pytest.mark.parametrize(
     "name", ["../safety.md", "%2e%2e", "/etc/passwd", "docs/safety.md", "README.md/..", "\u202e"]
 )
-def test_a_name_that_is_no_topic_gives_the_list_and_nothing_of_a_file(name: str) -> None:
+def test_an_unknown_topic_gives_the_list_and_no_file_content(name: str) -> None:
     status, _, body = reply(name)
     assert status == 404 and "There is no such page" in body.decode() and "root:" not in body.decode()
     assert name not in body.decode()
 
 
-def test_what_looks_like_html_in_the_text_of_a_page_is_shown() -> None:
+def test_html_in_the_text_of_a_page_is_shown_as_text() -> None:
     topic = Topic(
         "x", "x", "Use it", "web_assets/docs/x.md", "# x\n\n`<b>` and\n\n```sh\necho '<script>'\n```\n"
     )

@@ -1,6 +1,6 @@
-"""The walk of the tutorial, done in its order with the files that it gives: each mistake breaks the rule that the page quotes, at its line.
+"""Follows the tutorial step by step with its own files: each mistake breaks the rule that the page quotes, at its line.
 
-``WORKBENCH_RENEW=1`` writes the quotes again as the checks say them now.
+``WORKBENCH_RENEW=1`` updates the quotes to the current output of the checks.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from workbench.cli.main import main
 
 ENV_ID = "PushIt-v1"
 UNTIL_LATER = {"3. The scene": {"kinematic-never-moved"}, "4. Where an episode begins": {"success-at-reset"}}
-"""What the page says that a step leaves to the next one."""
+"""Broken rules that the page leaves to the next step, by step."""
 QUICK = {"record": ["--no-pictures", "--workers", "1"], "check": ["--workers", "1"]}
-"""Put behind what the page says to type: pictures take seconds of a process's first, and so does each process."""
+"""Options added to the page's commands to save time: first pictures and extra processes take seconds each."""
 OF_NUMBERS = "... times"
-"""In a quote that leaves out numbers which another machine computes a little differently."""
+"""Marks a quote without numbers, because they differ slightly between machines."""
 _PLACE = re.compile(rf"^{re.escape(FILE)}:\d+: [\w-]+ \(\w+", re.MULTILINE)
 _RULE = re.compile(rf"^{re.escape(FILE)}:\d+: ([\w-]+) \(", re.MULTILINE)
 
@@ -42,7 +42,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.title)
-def test_a_step_does_what_the_page_says(
+def test_a_step_works_as_the_page_says(
     step: Step, folder: Path, renderer: None, child_process: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
     after(STEPS.index(step), folder)
@@ -50,16 +50,18 @@ def test_a_step_does_what_the_page_says(
         if fence.language == "python":
             write(fence, folder)
         elif fence.language == "diff":
-            goes_wrong(fence, below, folder / FILE, capfd)
+            check_mistake(fence, below, folder / FILE, capfd)
         elif fence.language == "sh":
             for words in commands(fence):
                 if not is_long(words):
-                    type_in(words[1:], capfd)
-    # As the reader leaves it: what the mistakes broke is kept, and any envs can be reset and stepped.
-    told = {rule for fence in step.fences if fence.language == "text" for rule in _RULE.findall(fence.text)}
-    rules = ",".join(sorted({"runs", *told}))
-    said = type_in(["check", FILE, "--seeds", "8", "--select", rules], capfd)
-    assert " 0 broken" in said, said
+                    run_command(words[1:], capfd)
+    # After the step, the rules that the mistakes broke are kept, and any envs can be reset and stepped.
+    rules_shown = {
+        rule for fence in step.fences if fence.language == "text" for rule in _RULE.findall(fence.text)
+    }
+    rules = ",".join(sorted({"runs", *rules_shown}))
+    printed = run_command(["check", FILE, "--seeds", "8", "--select", rules], capfd)
+    assert " 0 broken" in printed, printed
     if step is STEPS[-1]:
         (recorded,) = (folder / "recordings").glob("*.json")
         success = workbench.read_episode(recorded).evaluate["success"]
@@ -71,20 +73,20 @@ def test_a_step_does_what_the_page_says(
 def test_a_step_keeps_all_rules_and_opens(
     step: Step, folder: Path, renderer: None, child_process: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """But for those that the page names as left to the next step."""
+    """Except for the rules that the page leaves to the next step."""
     after(STEPS.index(step) + 1, folder)
-    said = type_in(["check", FILE], capfd)
-    assert set(_RULE.findall(said)) == UNTIL_LATER.get(step.title, set()), said
+    printed = run_command(["check", FILE], capfd)
+    assert set(_RULE.findall(printed)) == UNTIL_LATER.get(step.title, set()), printed
     for fence in step.fences:
         for words in commands(fence) if fence.language == "sh" else ():
             if words[1] in OPENS_A_PAGE:
                 opens(words, folder)
             elif words[1] == "record":
-                type_in(words[1:], capfd)
+                run_command(words[1:], capfd)
 
 
-def test_all_of_the_page_is_walked() -> None:
-    """A heading or a fence that the walk overlooks would be checked by nobody."""
+def test_the_whole_page_is_covered() -> None:
+    """No other test would check a heading or fence that the walk misses."""
     assert [step.title.split(".")[0] for step in STEPS] == [str(number) for number in range(1, 11)]
     assert sum(len(step.fences) for step in STEPS) == len(fences(PAGE))
     assert all(fence.mark in ("", "fragment") for fence in fences(PAGE))
@@ -92,43 +94,43 @@ def test_all_of_the_page_is_walked() -> None:
 
 
 def pairs(step: Step) -> Iterator[tuple[Fence, Fence | None]]:
-    """Each fence of a step with the one below it."""
+    """Each fence of a step with the next one."""
     return zip(step.fences, (*step.fences[1:], None))
 
 
 def is_long(words: list[str]) -> bool:
-    """Whether `make test-all` alone types it: it opens a page, or checks every rule."""
+    """Whether only `make test-all` runs the command: it opens a page, or checks every rule."""
     return words[1] in (*OPENS_A_PAGE, "check")
 
 
-def goes_wrong(fence: Fence, below: Fence | None, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def check_mistake(fence: Fence, below: Fence | None, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Make a mistake, check the rules that the fence below it quotes, and undo it."""
     assert below is not None and below.language == "text", f"{fence.place}: its message is missing below it"
     rules = _RULE.findall(below.text)
     assert rules, f"{below.place} names no rule"
     right = file.read_text()
     file.write_text(mistake(fence, right))
-    said = type_in(["check", FILE, "--select", ",".join(rules)], capfd)
+    printed = run_command(["check", FILE, "--select", ",".join(rules)], capfd)
     if os.environ.get("WORKBENCH_RENEW") and OF_NUMBERS not in below.text:
-        PAGE.write_text(PAGE.read_text().replace(below.text, quoted(said, rules)))
+        PAGE.write_text(PAGE.read_text().replace(below.text, quoted(printed, rules)))
     else:
-        assert set(_PLACE.findall(below.text)) <= set(_PLACE.findall(said)), f"{below.place}:\n\n{said}"
+        assert set(_PLACE.findall(below.text)) <= set(_PLACE.findall(printed)), f"{below.place}:\n\n{printed}"
     file.write_text(right)
 
 
-def quoted(said: str, rules: list[str]) -> str:
-    """What was said of each rule, as the page has it."""
-    found = [re.search(rf"^({FILE}:\d+: {rule} \(.+\))\n  (.+)$", said, re.MULTILINE) for rule in rules]
-    assert all(found), said
+def quoted(printed: str, rules: list[str]) -> str:
+    """The report of each rule, formatted as on the page."""
+    found = [re.search(rf"^({FILE}:\d+: {rule} \(.+\))\n  (.+)$", printed, re.MULTILINE) for rule in rules]
+    assert all(found), printed
     wrap = TextWrapper(98, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)
     return "\n\n".join(f"{one[1]}\n{wrap.fill(one[2])}" for one in found if one) + "\n"
 
 
-def type_in(words: list[str], capfd: pytest.CaptureFixture[str]) -> str:
-    """What a command prints in this process."""
+def run_command(words: list[str], capfd: pytest.CaptureFixture[str]) -> str:
+    """Run a command in this process; returns its output."""
     linecache.checkcache()
     for known in (REGISTERED_ENVS, gymnasium.registry):
-        # As in a process of its own: a recording leaves the task registered, by another test's file.
+        # Start as in a new process: another test's recording may have left the task registered.
         known.pop(ENV_ID, None)
     capfd.readouterr()
     with pytest.raises(SystemExit):

@@ -1,4 +1,4 @@
-"""The tutorial as steps: what each writes into the reader's files, and the mistakes that it shows."""
+"""The tutorial as steps: the edits of the reader's files, and the mistakes that it shows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _HEADING = re.compile(r"^## (.+)$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Step:
-    """What stands under one heading."""
+    """The content under one heading."""
 
     title: str
     fences: tuple[Fence, ...]
@@ -39,11 +39,11 @@ def _steps() -> tuple[Step, ...]:
 
 
 STEPS = _steps()
-"""Those with something to type."""
+"""The steps that have fences."""
 
 
 def after(count: int, folder: Path) -> None:
-    """Write the files that a reader has after the first steps."""
+    """Write the files that a reader has after the first `count` steps."""
     if count:
         write_new_task(FILE.removesuffix(".py"), "minimal", folder)
     for fence in (fence for step in STEPS[:count] for fence in step.fences if fence.language == "python"):
@@ -51,10 +51,10 @@ def after(count: int, folder: Path) -> None:
 
 
 def write(fence: Fence, folder: Path) -> None:
-    """Do in the folder what a fence of Python tells the reader to do.
+    """Apply a Python fence to the files in the folder, as the reader would.
 
-    One whose first line is a comment with a file's name is that file. Of any other, imports and constants go below the
-    imports of the task, and the class's docstring, attributes and methods take the place of those of the same name.
+    If the first line is a comment with a file name, the fence is that whole file. Otherwise its imports and constants go
+    below the task's imports, and its docstring, attributes and methods replace those of the same name in the class.
     """
     named = _NAMED.match(fence.text)
     if named is not None:
@@ -67,7 +67,7 @@ def write(fence: Fence, folder: Path) -> None:
 
 
 def mistake(fence: Fence, text: str) -> str:
-    """The text of the task with the change of a fence ``diff``: its lines with - and without a sign are there once."""
+    """Apply a ``diff`` fence to the task's text, which must contain its old lines exactly once."""
     lines = fence.text.splitlines()
     assert all(line[:1] in ("-", "+", " ") for line in lines), fence.place
     old, new = (
@@ -108,15 +108,15 @@ def _into_class(text: str, added: str) -> str:
 
 
 def _with_lines(text: str, changes: Sequence[tuple[int, int, str]]) -> str:
-    """The text with (lines before, lines that go, lines that come), several at one place in their order."""
+    """Apply changes (line number, number of lines removed, new text); changes at one place keep their order."""
     lines = text.splitlines(keepends=True)
-    for at, gone, new in sorted(changes, key=lambda change: change[0])[::-1]:
-        lines[at : at + gone] = [new]
+    for at, removed, new in sorted(changes, key=lambda change: change[0])[::-1]:
+        lines[at : at + removed] = [new]
     return "".join(lines)
 
 
 def _first(node: ast.stmt) -> int:
-    """The line of its first decorator, else its own."""
+    """The line of the node's first decorator, or its own line."""
     return min([node.lineno, *(each.lineno for each in getattr(node, "decorator_list", ()))])
 
 

@@ -1,4 +1,4 @@
-"""Brings the browser that the tests drive, and what Playwright needs, by apt where that is possible."""
+"""Installs, with apt where possible, the browser that the tests drive and the library that Playwright needs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from workbench.machine.doctor import CHROMIUM_VARIABLE, find_chromium, how_to_ge
 
 
 def ensure_chromium() -> str | None:
-    """Find a Chromium; on Debian as root install one. None, after a sentence on stderr, if there is none."""
+    """Find a Chromium; on Debian as root install one. Without one, print how to get it and return None."""
     found = find_chromium()
     if (
         found is None
@@ -23,7 +23,7 @@ def ensure_chromium() -> str | None:
         and os_release().get("ID") == "debian"
     ):
         try:
-            # Without its recommended packages: they bring a Mesa that is too old for SAPIEN.
+            # No recommended packages: they install a Mesa that is too old for SAPIEN.
             apt_install("chromium", "fonts-liberation")
         except AptFailed as failure:
             print(failure, file=sys.stderr)
@@ -34,7 +34,7 @@ def ensure_chromium() -> str | None:
 
 
 def driver_complaint() -> str | None:
-    """Why Playwright's own Node does not start here; None if it does, or if Playwright is not installed."""
+    """Return why Playwright's own Node does not start; None if it does, or if Playwright is not installed."""
     package = importlib.util.find_spec("playwright")
     if package is None or package.origin is None:
         return None
@@ -57,7 +57,7 @@ def _lacks_libatomic() -> bool:
 
 
 def ensure_driver() -> None:
-    """Bring the one library that Playwright's Node loads and a bare Debian lacks."""
+    """Install libatomic1: Playwright's Node loads it, and a bare Debian lacks it."""
     complaint = driver_complaint()
     if complaint is not None and _lacks_libatomic() and can_install_packages():
         try:

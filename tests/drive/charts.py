@@ -1,4 +1,4 @@
-"""The curves that a page shows, read from the pixels of the canvas."""
+"""Reads the curves that a page shows from the canvas pixels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COLUMNS_OF = """([colour]) => {
     }
     return found;
 }"""
-"""Which columns of the first chart, as shares of its width, have a pixel of a colour."""
+"""Pixel columns of the first chart that contain the colour, as fractions of its width."""
 
 
 def drawn(page: Page) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""What a person has in front of them: the page, the task file, the terminal."""
+"""What a user has open: the page, the task file, the terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.drive.waiting import until
 class Desk:
     page: Page
     errors: list[str]
-    """What is wrong on the page so far."""
+    """Errors on the page so far."""
     file: Path
     opened: Opened
 
@@ -31,11 +31,11 @@ class Desk:
             self.page.keyboard.press(key)
 
     def leave_inputs(self) -> None:
-        """So that no slider takes the keys. A click on the view would select the env that happens to lie there."""
+        """Blur the focused input, so that no slider takes the keys. A click on the view could select an env instead."""
         self.page.evaluate("document.activeElement?.blur()")
 
     def edit(self, old: str, new: str) -> None:
-        """Write the example's text with this change into the file."""
+        """Write the example's text into the file, with `old` replaced by `new`."""
         text = TASK.read_text()
         assert old in text
         self.file.write_text(text.replace(old, new))
@@ -46,7 +46,7 @@ class Desk:
         return [cell.strip() for cell in row.first.locator("td, th").all_inner_texts()]
 
     def elapsed(self) -> int:
-        """Steps of the selected env, as the Reward tab shows them."""
+        """Elapsed steps of the selected env, as the Reward tab shows them."""
         return int(self.row("elapsed steps")[1].split("/")[0])
 
     def comes_to(self, steps: int) -> None:
@@ -63,12 +63,12 @@ class Desk:
             expect(timeline).not_to_contain_text(f"env {now[1]}")
 
     def moments_kept(self) -> int:
-        """Control steps that the timeline says it has."""
+        """Control steps in the history, as the timeline shows them."""
         found = re.search(r"history: (\d+) steps?,", self.page.locator(".wb-timeline").inner_text())
         return 0 if found is None else int(found[1])
 
     def box(self, what: str) -> FloatRect:
-        """Where it lies on the page, in pixels."""
+        """Bounding box of the last element that the selector `what` finds, in page pixels."""
         place = self.page.locator(what).last
-        # What is drawn anew is gone for a moment.
+        # An element that is redrawn is missing for a moment.
         return until(place.bounding_box, f"{what} on the page")

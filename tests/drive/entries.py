@@ -1,4 +1,4 @@
-"""Any dict that an author's evaluate() may return."""
+"""Hypothesis strategies for any dict that an author's evaluate() may return."""
 
 from __future__ import annotations
 

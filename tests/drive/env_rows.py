@@ -1,4 +1,4 @@
-"""Six envs of which each stands differently."""
+"""Six envs, each in a different state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Envs on the CPU: batched, as the workbench makes them, and ManiSkill's own single one beside them."""
+"""CPU envs: batched, as the workbench makes them, and ManiSkill's own single env."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workbench.envs.gpu_rules import Degree, Finding
 from workbench.envs.task_env import EnvOptions, make_env
 
 CPU: Any = {"backend": "cpu", "render_backend": "none"}
-"""For `workbench.make`, without a renderer."""
+"""Arguments of `workbench.make` for the CPU without a renderer."""
 PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 PUSH_CUBE: Any = REGISTERED_ENVS["PushCube-v1"].cls
 
@@ -29,7 +29,7 @@ def batched(
     on_finding: Callable[[Finding], None] = warn_of,
     **kwargs: Any,
 ) -> Any:
-    """The task of an id or a class, unwrapped; `kwargs` are its own."""
+    """The unwrapped env of a task id or class; `kwargs` go to the task."""
     spec = REGISTERED_ENVS[task] if isinstance(task, str) else None
     options = EnvOptions(num_envs, "cpu", render=render, rules=rules, on_finding=on_finding, kwargs=kwargs)
     if spec is None:
@@ -38,5 +38,5 @@ def batched(
 
 
 def stock(task: str, render_backend: str = "none", **kwargs: Any) -> Any:
-    """ManiSkill's own env, unwrapped: one, on the CPU."""
+    """ManiSkill's own single CPU env, unwrapped."""
     return gym.make(task, num_envs=1, render_backend=render_backend, **kwargs).unwrapped

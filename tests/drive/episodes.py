@@ -1,4 +1,4 @@
-"""Episodes as arrays whose numbers can be checked by hand, and their files by the real writer."""
+"""Episodes with numbers that can be checked by hand, and their files from the real writer."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BODY = {"ground": 0, "table": 1, "arm/hand": 2, "cube": 3}
 def made(
     steps: int = 10, success_from: int | None = None, seed: int = 3, speed: float = 0.01, **info: Any
 ) -> Episode:
-    """An episode in which a cube moves along x, `speed` metres a step, and the reward is the number of the step."""
+    """An episode in which a cube moves along x by `speed` metres a step; the reward is the step number."""
     geometry, poses = table_scene(1)
     track = np.repeat(poses, steps + 1, axis=0)
     track[:, BODY["cube"], 0] = np.arange(steps + 1) * speed
@@ -62,7 +62,7 @@ def made(
 
 
 def poses_of(episode: Episode) -> NDArray[np.float32]:
-    """Those of an episode that has some; to be written to."""
+    """The episode's pose array itself, so that a test can change it; fails if there is none."""
     assert episode.poses is not None
     return episode.poses
 
@@ -73,19 +73,19 @@ def geometry_of(episode: Episode) -> SceneGeometry:
 
 
 def begin(folder: Path, episode: Episode) -> None:
-    """All of it in a journal, as a writer leaves it that was killed before it made the files."""
+    """Write the whole episode into a journal only, as a writer that is killed before the export leaves it."""
     writer = appended(folder, episode, pictures=False)
     journal_of(writer).write()
     writer.close()
 
 
 def journal_of(writer: EpisodeWriter) -> Journal:
-    """For a test that says itself when it is written: else a thread does, now and then."""
+    """The writer's journal, for a test that flushes it itself; normally a thread does, periodically."""
     return writer._journal
 
 
 def header_of(journal: Path) -> Header:
-    """As `recover` reads it, of a journal that has one."""
+    """The journal's header as `recover` reads it; fails if there is none."""
     with contextlib.closing(JournalReader(journal)) as reader:
         header = read_header(reader, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
     assert header is not None
@@ -93,13 +93,13 @@ def header_of(journal: Path) -> Header:
 
 
 def entries_of(journal: Path) -> list[JournalEntry]:
-    """All that can be read of it."""
+    """All readable entries of the journal."""
     with contextlib.closing(JournalReader(journal)) as reader:
         return [entry for _, entries in reader for entry in entries]
 
 
 def write(folder: Path, episode: Episode, pictures: bool = True, every: int = 1) -> Path:
-    """Its files in `folder`, with a camera whose picture at state k, of each of so many, is k * 20 bright; returns the .json."""
+    """Write the episode's files; the picture at each `every`-th state k has brightness k * 20. Return the .json."""
     return appended(folder, episode, pictures, every).finish().json
 
 
@@ -131,7 +131,7 @@ def appended(folder: Path, episode: Episode, pictures: bool, every: int = 1) -> 
 
 
 def row_at(episode: Episode | Made, state: int, **others: Any) -> EpisodeRow:
-    """What a recorder is given of a state and of the step that led to it."""
+    """The row that a recorder gets for a state and the step that led to it."""
     assert episode.poses is not None
     return EpisodeRow(
         poses=episode.poses[state],

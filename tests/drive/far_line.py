@@ -1,52 +1,56 @@
-"""A line to a page that is far away: a relay on loopback with a limited rate, a delay, and the room that ssh has."""
+"""Emulates a slow connection to a distant page: a loopback relay with a rate limit, a delay and ssh's buffer."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit, urlunsplit
 
-PIECE = 4096
-"""Bytes that are relayed at once; small, so that connections share the line."""
+PORTS = range(20_000, 32_000)
+"""Below the kernel's ephemeral ports: a page that keeps reconnecting to a port without a listener could be given that very
+port as its own, connect to itself, and keep the relay from coming back."""
+PIECE_BYTES = 4096
+"""Bytes relayed at once; small, so that connections share the line."""
 
 
 @dataclass
 class FarLine:
-    """A relay to one port. Its directions are independent, and all connections share each of them.
+    """A relay to one port. All connections share the rate limit of each direction; the directions are independent.
 
-    It takes what comes as eagerly as ``ssh -L`` does, up to `room` bytes a connection: a sender sees a line without
-    delay until some megabytes are in flight.
+    Like ``ssh -L`` it accepts up to `room` bytes a connection at once: a sender sees no delay until some megabytes
+    are in flight.
     """
 
     bits_per_second: float = float("inf")
-    """Of each direction."""
+    """Rate limit of each direction."""
     delay: float = 0.0
-    """Seconds, one way."""
+    """One-way delay in seconds."""
     room: int = 2 << 20
-    """Bytes a connection that wait in it: the window of a channel of ssh."""
+    """Buffer per connection in bytes: the window of an ssh channel."""
     port: int = 0
-    """Its near end; 0 takes any free one."""
+    """Port that the browser connects to; 0 takes any free one of `PORTS`."""
     down: int = 0
-    """Bytes that reached the browsers so far."""
+    """Bytes delivered to the browsers so far."""
     up: int = 0
-    """Bytes that came from them."""
+    """Bytes delivered from the browsers to the server so far."""
     waiting: int = 0
-    """Bytes on the way to the browsers."""
+    """Bytes in flight to the browsers."""
     loop: asyncio.AbstractEventLoop = field(init=False)
     ended: asyncio.Event = field(default_factory=asyncio.Event)
 
     def address(self, url: str) -> str:
-        """The same page, seen over this line."""
+        """The URL of the same page through this relay."""
         return urlunsplit(urlsplit(url)._replace(netloc=f"127.0.0.1:{self.port}"))
 
     async def serve(self, port: int, ready: threading.Event) -> None:
         free_at = {"down": 0.0, "up": 0.0}
 
-        async def carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, way: str) -> None:
+        async def carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, direction: str) -> None:
             loop = asyncio.get_running_loop()
             pieces: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
             queued, drained = 0, asyncio.Event()
@@ -62,7 +66,7 @@ class FarLine:
                     if not piece:
                         writer.close()
                         return
-                    if way == "down":
+                    if direction == "down":
                         self.down += len(piece)
                         self.waiting -= len(piece)
                     else:
@@ -73,13 +77,13 @@ class FarLine:
             delivering = asyncio.create_task(deliver())
             try:
                 while not delivering.done():
-                    piece = await reader.read(PIECE)
-                    begins = max(loop.time(), free_at[way])
-                    free_at[way] = begins + 8 * len(piece) / self.bits_per_second
+                    piece = await reader.read(PIECE_BYTES)
+                    begins = max(loop.time(), free_at[direction])
+                    free_at[direction] = begins + 8 * len(piece) / self.bits_per_second
                     queued += len(piece)
-                    if way == "down":
+                    if direction == "down":
                         self.waiting += len(piece)
-                    pieces.put_nowait((free_at[way] + self.delay, piece))
+                    pieces.put_nowait((free_at[direction] + self.delay, piece))
                     if not piece:
                         break
                     while queued > self.room:
@@ -98,7 +102,12 @@ class FarLine:
             with contextlib.suppress(asyncio.CancelledError):
                 await asyncio.gather(carry(reader, out, "up"), carry(back, writer, "down"))
 
-        server = await asyncio.start_server(accept, "127.0.0.1", self.port)
+        for near in [self.port] if self.port else random.sample(PORTS, 20):
+            with contextlib.suppress(OSError):
+                server = await asyncio.start_server(accept, "127.0.0.1", near)
+                break
+        else:
+            raise OSError(f"port {near} is taken")
         self.port = server.sockets[0].getsockname()[1]
         self.loop = asyncio.get_running_loop()
         ready.set()
@@ -109,7 +118,7 @@ class FarLine:
 def line_to(
     url: str, bits_per_second: float = float("inf"), delay: float = 0.0, port: int = 0
 ) -> Iterator[FarLine]:
-    """A line to the server of this address. At its end all its connections are lost."""
+    """A relay to the server at `url`. Leaving the context closes all its connections."""
     line, ready = FarLine(bits_per_second, delay, port=port), threading.Event()
     far_port = urlsplit(url).port
     assert far_port is not None

@@ -1,4 +1,4 @@
-"""A real Firefox, driven by WebDriver BiDi over its own websocket: Playwright drives no Firefox that a distribution ships."""
+"""A real Firefox, driven by WebDriver BiDi: Playwright cannot drive the Firefox that a distribution ships."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from workbench.machine.apt import AptFailed, apt_install, can_install_packages
 
 PREFERENCES = {
     "webgl.force-enabled": True,
-    # Without these it looks up its maker's hosts at every start.
+    # Without these Firefox looks up Mozilla's hosts at every start.
     "app.normandy.enabled": False,
     "app.update.auto": False,
     "browser.safebrowsing.downloads.remote.enabled": False,
@@ -41,9 +41,8 @@ START_SECONDS = 60
 
 
 def why_no_firefox() -> str:
-    """Why there is none to drive; empty where there is one, which is installed on Debian as root.
-
-    An X server goes with it: without a screen Firefox has no WebGL.
+    """Return why Firefox cannot be driven, or an empty string. On Debian as root a missing Firefox is installed,
+    with an X server: without a screen Firefox has no WebGL.
     """
     if _found():
         return ""
@@ -80,7 +79,7 @@ class Firefox:
         self._call("browsingContext.navigate", context=self._page, url=url, wait="complete")
 
     def evaluate(self, expression: str) -> Any:
-        """The value of JavaScript, as JSON has it."""
+        """The value of a JavaScript expression, as JSON."""
         made = self._call(
             "script.evaluate",
             expression=f"(async () => JSON.stringify(await ({expression})))()",
@@ -96,7 +95,7 @@ class Firefox:
         return self.evaluate("document.body.innerText")
 
     def click(self, role: str, name: str) -> None:
-        """With the mouse, what has this role and exactly this text."""
+        """Click with the mouse the element that has this role and exactly this text."""
         script = (
             f"(() => {{ const e = [...document.querySelectorAll({json.dumps(role)})]"
             f".find(e => e.innerText.trim() === {json.dumps(name)} && e.checkVisibility());"
@@ -124,18 +123,18 @@ class Firefox:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            said = json.loads(self._socket.recv(timeout=60))
-            if said.get("method") == "log.entryAdded" and said["params"]["level"] == "error":
-                self.errors.append(str(said["params"]["text"]))
-            if said.get("id") == self._number:
-                if said["type"] == "error":
-                    raise AssertionError(f"{method}: {said['message']}")
-                return said["result"]
+            message = json.loads(self._socket.recv(timeout=60))
+            if message.get("method") == "log.entryAdded" and message["params"]["level"] == "error":
+                self.errors.append(str(message["params"]["text"]))
+            if message.get("id") == self._number:
+                if message["type"] == "error":
+                    raise AssertionError(f"{method}: {message['message']}")
+                return message["result"]
 
 
 @contextmanager
 def open_firefox(width: int = 1280, height: int = 720) -> Iterator[Firefox]:
-    """Start one on a screen of its own, with an empty profile; end both."""
+    """Start a Firefox with an empty profile on its own X server; stop both at the end."""
     program = _found()
     assert program is not None
     with tempfile.TemporaryDirectory(prefix="workbench-firefox-") as folder:
@@ -168,7 +167,7 @@ def open_firefox(width: int = 1280, height: int = 720) -> Iterator[Firefox]:
 
 @contextmanager
 def _screen() -> Iterator[str]:
-    """An X server that no other is in the way of."""
+    """Start an X server on a free display number."""
     reading, writing = os.pipe()
     server = subprocess.Popen(
         ["Xvfb", "-displayfd", str(writing), "-screen", "0", "2000x1200x24", "-nolisten", "tcp"],
@@ -187,7 +186,7 @@ def _screen() -> Iterator[str]:
 
 
 def _address(process: subprocess.Popen[str]) -> str:
-    """The websocket that it prints; what it prints later is read too, or it would wait."""
+    """The websocket address that Firefox prints. Later output is read too: with a full pipe Firefox would block."""
     lines: list[str] = []
     stream = process.stderr
     assert stream is not None

@@ -1,4 +1,4 @@
-"""A disk that hangs under the server of a real command: from a moment on, calls that touch a folder never return."""
+"""A hung disk for the server process of a real command: once switched on, calls on a folder never return."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.drive.waiting import until
 
-# The server alone: what it starts has another command line.
+# Only the server hangs: the processes that it starts have another command line.
 _HANGS = """
 import os, sys, time
 
@@ -56,12 +56,12 @@ class HungDisk:
 
     folder: Path
     aside: Path
-    """A folder elsewhere, for what makes them hang."""
+    """A folder on another path, for the switch and the hook."""
     calls: Sequence[str]
-    """Of: open (to read), write (an open to write), stat, lstat, pwrite, fsync, fdatasync, scandir, listdir, rename, link."""
+    """Some of: open (to read), write (open to write), stat, lstat, pwrite, fsync, fdatasync, scandir, listdir, rename, link."""
 
     def environment(self) -> dict[str, str]:
-        """For the command."""
+        """Environment variables for the command."""
         (self.aside / "sitecustomize.py").write_text(_HANGS)
         return {
             "PYTHONPATH": os.pathsep.join([str(self.aside), *filter(None, [os.environ.get("PYTHONPATH")])]),
@@ -71,14 +71,14 @@ class HungDisk:
         }
 
     def hang(self) -> None:
-        """From now on."""
+        """Let the calls hang from now on."""
         (self.aside / "switch").touch()
 
     def until_it_hangs(self, meanwhile: Callable[[], object] = lambda: None) -> None:
         """Wait until a call hangs.
 
         Args:
-            meanwhile: done again and again, such as a press.
+            meanwhile: called repeatedly, for example a key press.
         """
 
         def hangs() -> bool:

@@ -1,4 +1,4 @@
-"""A client of the door that says and asks whatever a test wants, over a real socket."""
+"""A client of the door that sends any request or message over a real socket."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def cookie_of(gated_server: GatedServer) -> str:
 def ask(
     gated_server: GatedServer, path: str = "/", **headers: str | None
 ) -> tuple[int, http.client.HTTPMessage, bytes]:
-    """One request. ``headers``: Host, Cookie and so on, with _ for -; the right Host and cookie are sent
-    unless they are given, None leaves one out."""
+    """Send one HTTP request. ``headers``: Host, Cookie and so on, with _ for -; None omits one. By default the right
+    Host and cookie are sent."""
     fields: dict[str, str | None] = {
         "Host": f"127.0.0.1:{gated_server.port}",
         "Cookie": cookie_of(gated_server),
@@ -65,7 +65,7 @@ def ask(
 
 
 def knock(gated_server: GatedServer, **headers: str | None) -> int:
-    """Status of a websocket handshake: 101 is in."""
+    """Status of a websocket handshake: 101 is accepted."""
     handshake: dict[str, str | None] = {
         "Upgrade": "websocket",
         "Connection": "Upgrade",
@@ -84,7 +84,7 @@ def both(gated_server: GatedServer, **headers: str | None) -> tuple[int, int]:
 
 @contextlib.contextmanager
 def client(gated_server: GatedServer) -> Iterator[Connection]:
-    """An authenticated client that viser counts as connected; what it is sent is thrown away."""
+    """An authenticated client that viser counts as connected; incoming messages are discarded."""
     known = set(gated_server.server.get_clients())
     with connect(
         f"ws://127.0.0.1:{gated_server.port}",
@@ -104,7 +104,7 @@ def say(connection: Connection, message: object) -> None:
 
 
 class Bell:
-    """An entry of the palette that a page chooses: it rings when the server has taken what that page sent before."""
+    """A palette command used as a barrier: when it runs, the server has handled all earlier messages of that page."""
 
     def __init__(self, gated_server: GatedServer) -> None:
         self.rung = 0

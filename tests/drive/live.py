@@ -1,7 +1,6 @@
-"""The live page without a browser or a worker: open it, show it a view, press, and see what the session is asked.
+"""The live page without a browser or a worker: open it, show it a view, press, and see what it asks of the session.
 
-Everything that a test knows of how a page gets its view stands here: what follows the models of the session is this file,
-not its tests.
+Only this file knows how a page gets its view: when the session's models change, this file changes and its tests do not.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ FILE = "push.py"
 
 
 class _Asked:
-    """A part of the session: what is called of it is noted, under its path, unless there is an answer to it."""
+    """A part of the session: records each call under its dotted path, unless `answers` has an entry for it."""
 
-    def __init__(self, path: str, session: HandedSession) -> None:
+    def __init__(self, path: str, session: StubSession) -> None:
         self._path, self._session = path, session
 
     def __getattr__(self, name: str) -> Any:
@@ -37,8 +36,8 @@ class _Asked:
         self._session.asked.append((self._path, *args, *([named] if named else [])))
 
 
-class HandedSession:
-    """Shows the view that it was handed, and notes what it is asked: ``Step()``, ``("stop_recording",)``."""
+class StubSession:
+    """Stub session: shows the view that it was given and records what is asked: ``Step()``, ``("stop_recording",)``."""
 
     def __init__(self) -> None:
         self.shown = EMPTY
@@ -73,7 +72,7 @@ class HandedSession:
 
 
 class Live(Panels):
-    """The live page on a server, with a hand on it."""
+    """The live page on a server, operated by a test."""
 
     def __init__(
         self,
@@ -82,20 +81,20 @@ class Live(Panels):
         on_look: Callable[[Any], None] = lambda path: None,
     ) -> None:
         super().__init__(server)
-        self.clock, self.session = clock or Clock(), HandedSession()
+        self.clock, self.session = clock or Clock(), StubSession()
         self._envs = self._scenes = 0
         self.asked_by_drawing: list[Any] = []
-        """Of the session, by the last drawing."""
+        """What the last redraw asked of the session."""
         self.page = Page(server, self.visitors, self.session, on_look=on_look, clock=self.clock)  # type: ignore[arg-type]
         self.visitors.do = self.page.do
 
     @property
     def asked(self) -> list[Any]:
-        """Of the session, by what was pressed."""
+        """What presses asked of the session."""
         return self.session.asked
 
     def show(self, view: SessionView, rows: EnvRows | None = None, seconds: float = 60.0) -> None:
-        """Draw this view, so many seconds after the one before."""
+        """Draw this view, `seconds` after the last one."""
         if view.task is not None and view.task.num_envs != self._envs:
             self._envs, self._scenes = view.task.num_envs, self._scenes + 1
         view = replace(view, scene_serial=view.scene_serial + self._scenes)
@@ -106,12 +105,12 @@ class Live(Panels):
         self.asked_by_drawing, self.session.asked = self.session.asked, pressed
 
     def all_drawn(self) -> dict[str, object]:
-        """All that can be seen once every part was drawn, whatever its key says."""
+        """Everything visible after a forced redraw of every part."""
         forget_what_was_drawn(self.page._parts)
         self.again()
         return self.everything()
 
     def again(self, seconds: float = 60.0) -> None:
-        """Draw what was shown, with what was pressed since."""
+        """Redraw the last view, with the effect of presses since."""
         shown = self.session.shown
         self.show(replace(shown, scene_serial=shown.scene_serial - self._scenes), self.session.rows, seconds)

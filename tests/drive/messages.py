@@ -1,4 +1,4 @@
-"""Values made of the schema of a message, and whether two are the same."""
+"""Hypothesis strategies for message values by schema, and a deep equality."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from hypothesis import strategies as st
 from msgspec import inspect
 
-WHATEVER = st.recursive(
+ANY_VALUE = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5) | st.binary(max_size=9)
     | st.builds(msgspec.msgpack.Ext, st.integers(-128, 127), st.binary(max_size=12)),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5) | st.integers(0, 9), inner, max_size=3),
@@ -44,9 +44,9 @@ def same(one: object, other: object) -> bool:
 
 @st.composite
 def of_schema(draw: st.DrawFn, kind: inspect.Type, wrong: float) -> Any:
-    """Data as a message of this kind has it; each part of it is something else with this probability."""
+    """Encoded data for a message of this type; each part is replaced by another value with probability `wrong`."""
     if wrong and draw(st.floats(0, 1)) < wrong:
-        return draw(WHATEVER)
+        return draw(ANY_VALUE)
     again = lambda one: draw(of_schema(one, wrong))  # noqa: E731
     several = lambda one: [again(one) for _ in range(draw(st.integers(0, 2)))]  # noqa: E731
     match kind:
@@ -96,7 +96,7 @@ def of_schema(draw: st.DrawFn, kind: inspect.Type, wrong: float) -> Any:
         case inspect.NoneType():
             return None
     assert isinstance(kind, inspect.AnyType), kind
-    return draw(WHATEVER.filter(lambda value: not _has_extension(value)))
+    return draw(ANY_VALUE.filter(lambda value: not _has_extension(value)))
 
 
 def _hashable(value: Any) -> Any:

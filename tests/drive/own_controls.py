@@ -1,4 +1,4 @@
-"""What a person finds in our HTML of a panel: fields and buttons, by what is written on them."""
+"""Finds the fields and buttons in our HTML of a panel by their labels."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _VOID = {"input", "br", "hr", "img", "meta"}
 
 @dataclass
 class SeenField:
-    """One of our own inputs, or a row of them under one label."""
+    """An input in our HTML, or a row of inputs under one label."""
 
     label: str = ""
     names: list[str] = field(default_factory=list)
     asks: list[tuple[str, dict[str, Any], str]] = field(default_factory=list)
-    """Of each input: the command, its other fields, and the field that what is entered goes into."""
+    """For each input: the command, its other fields, and the field that takes the entered value."""
     values: list[Any] = field(default_factory=list)
     off: bool = False
     options: dict[str, Any] = field(default_factory=dict)
@@ -29,20 +29,20 @@ class SeenField:
 
     @property
     def value(self) -> Any:
-        """What it shows: of a choice the option's text; several of a row."""
+        """What the field shows: a choice's option text, a list for a row of inputs."""
         if self.options:
             return next((shown for shown, one in self.options.items() if one == self.values[0]), None)
         return self.values[0] if len(self.values) == 1 else tuple(self.values)
 
     def command(self, entered: Any, at: int = 0) -> Command:
-        """What entering this asks for. Raises `Refused`."""
+        """The command that entering this value sends. Raises `Refused`."""
         name, fields, into = self.asks[at]
         return COMMANDS.decode(name, {**fields, into: self.options[entered] if self.options else entered})
 
 
 @dataclass
 class SeenButton:
-    """A part that can be pressed; `command` is None while it would do nothing."""
+    """A pressable part; `command` is None while it is disabled."""
 
     text: str
     command: Command | None
@@ -59,20 +59,20 @@ class Controls(HTMLParser):
         self.buttons: list[SeenButton] = []
         self._field: SeenField | None = None
         self._open: list[SeenButton | None] = []
-        """What each element that is open is."""
+        """The button for each open element, or None."""
         self._labelled = False
         self._shown: dict[str, tuple[Any, bool, dict[str, Any]]] = {}
         self.feed(html)
         self.close()
-        # While a page is taken down, a field may have lost what it shows.
+        # While a page is torn down, a field may already have lost its value.
         self.fields = [one for one in self.fields if self._shown.keys() >= set(one.names)]
         for one in self.fields:
             shown = [self._shown[name] for name in one.names]
             one.values, one.off = [value for value, _, _ in shown], any(off for _, off, _ in shown)
-            told = shown[0][2]
-            one.bounds = tuple(told["bounds"]) if "bounds" in told else None  # type: ignore[assignment]
-            if "options" in told:
-                one.options = {name: json.loads(value) for name, value in told["options"]}
+            attributes = shown[0][2]
+            one.bounds = tuple(attributes["bounds"]) if "bounds" in attributes else None  # type: ignore[assignment]
+            if "options" in attributes:
+                one.options = {name: json.loads(value) for name, value in attributes["options"]}
                 one.values = [json.loads(value) for value in one.values]
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:

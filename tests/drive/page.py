@@ -1,4 +1,4 @@
-"""``workbench open`` and its like as a person types them, and a real Chromium in front of them."""
+"""Runs ``workbench open`` and similar commands as a user does, with a real Chromium on their page."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from tests.drive.waiting import until
 from workbench.machine.kept_choices import keep_check_after_save
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
-"""The example task; what is edited is a copy of it."""
+"""The example task; tests edit copies of it."""
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
-    # As Chromium does where it finds no graphics card. Else the whole page is composed by the software that draws WebGL: half of all
-    # that the browser takes of the processor.
+    # As Chromium does without a graphics card. Otherwise the WebGL software renderer also composites the page: half of
+    # the browser's CPU time.
     "--disable-gpu-compositing",
-    # Without these Chromium looks up its maker's hosts at every start.
+    # Without these Chromium looks up Google's hosts at every start.
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
@@ -49,7 +49,7 @@ CHROMIUM_ARGUMENTS = (
 )
 START_SECONDS = 60.0
 expect.set_options(timeout=60_000)
-DRAWN_WHEN_LOOKED_AT = """
+DRAW_ON_REQUEST_JS = """
 [window.viewIsSeen, window.drawnInView] = [false, 0];
 for (const name of ["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"]) {
     const draw = WebGL2RenderingContext.prototype[name];
@@ -67,7 +67,7 @@ for (const name of ["clear", "clearBufferfv", "clearBufferiv", "clearBufferuiv",
     };
 }
 """
-"""A frame of the 3-D view takes half a second of processor to draw in software, and keys wait for it. All else is done."""
+"""Draws the 3-D view only on request: a frame takes 0.5 s of CPU in software, and keys wait for it."""
 
 
 @dataclass
@@ -77,7 +77,7 @@ class Opened:
     process: subprocess.Popen[str]
     url: str
     lines: list[str] = field(default_factory=list)
-    """What it printed so far, stdout and stderr."""
+    """stdout and stderr so far."""
 
     def wait_for_line(self, pattern: str, seconds: float = 60.0) -> str:
         return until(
@@ -90,7 +90,7 @@ class Opened:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a person would have seen when a test failed: a page, or a terminal (without a picture)."""
+    """What a page or a terminal (without a picture) showed when a test failed."""
 
     log: str
     picture: bytes | None = None
@@ -99,11 +99,11 @@ class Sight:
 _pages: list[tuple[Page, list[str]]] = []
 _commands: list[Opened] = []
 _seen: list[Sight] = []
-"""What was there when an exception closed it, before the test's failure is reported."""
+"""What pages and terminals showed when an exception closed them, until the test's failure is reported."""
 
 
 def seen_at_failure(failed: bool) -> list[Sight]:
-    """Pages and terminals that are open, and those that an exception has closed since the last call; none if not `failed`."""
+    """Open pages and terminals, and those that an exception closed since the last call; none if not `failed`."""
     _pages[:] = [(page, errors) for page, errors in _pages if not page.is_closed()]
     closed = list(_seen)
     _seen.clear()
@@ -116,7 +116,7 @@ def seen_at_failure(failed: bool) -> list[Sight]:
 def _sight_of(page: Page, errors: list[str]) -> Sight:
     log = "\n".join([page.url, *errors])
     try:
-        # Not `evaluate`, which waits for ever for a page that hangs.
+        # `evaluate` would wait forever for a page that hangs.
         page.wait_for_function("() => (viewIsSeen = true)", timeout=10_000)
         page.wait_for_timeout(1500)  # viser draws once a second
         return Sight(log, page.screenshot(timeout=10_000))
@@ -132,10 +132,10 @@ def open_workbench(
     env: dict[str, str] | None = None,
     checks: bool = False,
 ) -> Iterator[Opened]:
-    """Start ``workbench open``, or `what`, on a free port; end it with Ctrl-C's signal and insist that it ends.
+    """Start ``workbench open``, or `what`, on a free port; stop it with SIGINT and fail if it does not exit.
 
     Args:
-        checks: Whether rules are checked after each load, which takes a core for some seconds.
+        checks: Check rules after each load, which takes a core for some seconds.
     """
     keep_check_after_save(checks)
     command = [sys.executable, "-m", "workbench.cli.main", what, *arguments, "--port", "0"]
@@ -188,8 +188,8 @@ def browser_at(chromium: str) -> Iterator[Browser]:
         browser.close()
 
 
-OF_RERUN = re.compile(r"fonts\.googleapis\.com|rerun-io/rerun/releases|tel\.rerun\.io")
-"""What rerun's viewer asks of other servers, which our policy refuses, as it should."""
+BLOCKED_RERUN_HOSTS = re.compile(r"fonts\.googleapis\.com|rerun-io/rerun/releases|tel\.rerun\.io")
+"""Requests of rerun's viewer to other servers, which our content policy rightly blocks."""
 
 
 def new_page(
@@ -198,18 +198,18 @@ def new_page(
     """A page with the timeline open, and the console errors and uncaught exceptions that it has so far.
 
     Args:
-        drawn: Whether the 3-D view is drawn at all times; without it, for `picture_of_view` alone.
+        drawn: Draw the 3-D view continuously; otherwise only for `picture_of_view`.
     """
     page = browser.new_page(viewport={"width": width, "height": height})
     page.add_init_script(
         "addEventListener('DOMContentLoaded', () => document.documentElement.setAttribute('data-timeline-open', ''))"
     )
     if not drawn:
-        page.add_init_script(DRAWN_WHEN_LOOKED_AT)
+        page.add_init_script(DRAW_ON_REQUEST_JS)
     errors: list[str] = []
 
     def on_console(message: ConsoleMessage) -> None:
-        if message.type == "error" and not OF_RERUN.search(message.text):
+        if message.type == "error" and not BLOCKED_RERUN_HOSTS.search(message.text):
             errors.append(message.text)
 
     page.on("console", on_console)
@@ -246,10 +246,10 @@ def page_on(
     spare: bool = False,
     checks: bool = False,
 ) -> Iterator[tuple[Page, list[str], Opened]]:
-    """A page that shows the file's task, paused; what is wrong on it so far; and the terminal.
+    """A page that shows the file's task, paused; the list of its errors; and the running command.
 
     Args:
-        spare: Whether a second worker warms up beside, which takes a core for some ten seconds.
+        spare: Warm up a spare worker, which takes a core for some ten seconds.
         checks: As in `open_workbench`.
     """
     arguments = arguments if spare else (*arguments, "--no-spare")
@@ -262,9 +262,9 @@ def page_on(
 
 
 def picture_of_view(page: Page, clip: FloatRect) -> NDArray[np.uint8]:
-    """What that part of the 3-D view shows, as RGB."""
+    """Screenshot of that part of the 3-D view, as RGB."""
     before = page.evaluate("viewIsSeen = true, drawnInView")
-    # viser draws once a second, also what has not changed.
+    # viser redraws once a second even without changes.
     page.wait_for_function("before => drawnInView > before", arg=before)
     shot = page.screenshot(clip=clip)
     page.evaluate("viewIsSeen = false")
@@ -272,7 +272,7 @@ def picture_of_view(page: Page, clip: FloatRect) -> NDArray[np.uint8]:
 
 
 def open_tab(page: Page, name: str) -> None:
-    """Click it until it is open: a mark that comes above the tabs moves them away from under the mouse."""
+    """Click the tab until it is open: a message that appears above the tabs moves them away from the mouse."""
     tab = page.get_by_role("tab", name=name)
 
     def opened() -> bool:
@@ -283,8 +283,8 @@ def open_tab(page: Page, name: str) -> None:
 
 
 def close_notice(page: Page) -> None:
-    """Close viser's notice that the browser draws in software: it lies over what is below it."""
-    # By script: one that goes by itself would be waited for.
+    """Close viser's notice about software rendering: it covers other controls."""
+    # By script: Playwright would wait for a notice that disappears on its own.
     page.evaluate(
         "for (const close of document.querySelectorAll('.mantine-Notification-closeButton')) close.click()"
     )

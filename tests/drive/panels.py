@@ -1,7 +1,7 @@
-"""Reads and presses the controls of a page without a browser. Uses viser's private names, so that tests need none.
+"""Reads and presses the controls of a page without a browser. Only this file uses viser's private names.
 
-A control is found by what is written on it, a part of our HTML by its command. A press is a command, and returns when
-everything that it began on viser's threads is done. Only what a page offers can be pressed.
+A control is found by its label, a part of our HTML by its command. A press is a command; it returns when everything
+that it started on viser's threads is done. Only what a page offers can be pressed.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportPrivateUsage=false
@@ -29,15 +29,15 @@ from workbench.page.widgets.templates import asks
 from workbench.page.widgets.visitors import PATH, Visitor, Visitors
 
 Kind = Literal["button", "field"]
-"""Of an input. A button and what it is for may have the same label."""
+"""Kind of an input: a button and a field may have the same label."""
 _NOT_SEEN = {"order", "visible", "container_uuid", "parent_uuid", "_tab_container_ids"}
-"""Of what is told of a part."""
+"""Properties of a part that are not visible on the page."""
 _Roots = list[tuple[Any, bool]]
-"""Containers, and whether each is seen."""
+"""Containers, and whether each is visible."""
 
 
 class Clock:
-    """A clock for a page's parts that moves when it is told to."""
+    """A clock for a page's parts that only moves in `passes`."""
 
     def __init__(self) -> None:
         self.now = 1000.0
@@ -51,7 +51,7 @@ class Clock:
 
 @dataclass(eq=False)
 class Client:
-    """The page that presses, as far as a callback asks for it."""
+    """The client of a callback, with the few members that callbacks use."""
 
     client_id: int = 1
     notices: list[str] = field(default_factory=list)
@@ -61,7 +61,7 @@ class Client:
 
 
 class _Threads:
-    """Stands before viser's pool of threads, and waits for what was begun in it."""
+    """Wraps viser's thread pool, and waits for the jobs that were submitted."""
 
     def __init__(self, pool: Any) -> None:
         self._pool = pool
@@ -82,7 +82,7 @@ class _Threads:
 
 
 def held_by(server: viser.ViserServer) -> dict[str, int]:
-    """How many things of each kind the server has for its pages. Words for things that went are swept away first."""
+    """Number of objects of each kind that the server holds for its pages, after viser's garbage collection."""
     server._run_garbage_collector(force=True)
     gui, sockets = server.gui, server._websock_server
     return {
@@ -98,7 +98,7 @@ def held_by(server: viser.ViserServer) -> dict[str, int]:
 
 
 def drop_viser(gated_server: GatedServer) -> None:
-    """Cut viser's connection of each open page; the channel of commands stays."""
+    """Abort viser's connection of each open page; the command channel stays."""
     listening: Any = gated_server._gated._serving.server
 
     def drop() -> None:
@@ -110,18 +110,18 @@ def drop_viser(gated_server: GatedServer) -> None:
 
 
 def forget_what_was_drawn(parts: Parts[Any]) -> None:
-    """So that each part of a page is drawn with the next view, whatever its key says."""
+    """Force every part of a page to redraw with the next view."""
     for _, due in parts._parts:
         due._drawn = None
 
 
-def told_so_far(server: viser.ViserServer) -> int:
-    """How many messages the server has put on their way to all pages."""
+def messages_sent(server: viser.ViserServer) -> int:
+    """Number of messages that the server has broadcast to all pages."""
     return server._websock_server._broadcast_buffer.message_counter
 
 
 def difference(before: dict[str, object], after: dict[str, object]) -> str:
-    """What is otherwise in the one than in the other; empty if nothing is."""
+    """Keys whose values differ, one per line; empty if none do."""
     keys = [key for key in {**before, **after} if before.get(key) != after.get(key)]
     return "\n".join(f"{key}: {before.get(key)!r:.300} -> {after.get(key)!r:.300}" for key in keys)
 
@@ -132,7 +132,7 @@ def inputs_of(gui: viser.GuiApi) -> list[Any]:
 
 
 class Panels:
-    """All that a server shows in its panels; `part` is one tab or folder of it."""
+    """Everything that a server shows in its panels; `part` is one tab or folder."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.server = server
@@ -144,53 +144,53 @@ class Panels:
         gui._resolve_client = lambda client_id: self.client
         self.visitor = Visitor("a page", self.client)  # type: ignore[arg-type]
         self.come_to(Visitors(server, COMMANDS))
-        self.visitors.do = _nobody_does
+        self.visitors.do = _unexpected_command
 
     def come_to(self, visitors: Visitors) -> None:
-        """Be one of the open pages that these know."""
+        """Join these visitors as an open page."""
         self.visitors = visitors
         visitors._by_name[self.visitor.name] = visitors._by_client[self.client.client_id] = self.visitor
 
     def part(self, label: str) -> Panels:
-        """One tab, folder or tab of a panel."""
+        """The tab or folder with this label."""
         part = object.__new__(Panels)
         part.__dict__.update(self.__dict__, _path=(*self._path, label))
         return part
 
-    # --- what is seen ------------------------------------------------------------------------------
+    # --- what is shown ------------------------------------------------------------------------------
 
     def shows(self, name: str, kind: Kind | None = None) -> bool:
-        """Whether a button or a field is there and can be seen."""
+        """Whether a button or a field with this name is visible."""
         own = [one.text.strip() for one in self.buttons()] if kind != "field" else []
         own += [one.label for one in self.fields()] if kind != "button" else []
         return name in own
 
     @property
     def seen(self) -> bool:
-        """Of a part: whether it can be seen once its tab is in front."""
+        """Whether this part is visible once its tab is in front."""
         return any(seen for _, seen in self._roots())
 
     def html(self, mark: str = "") -> str:
-        """The HTML that is seen and has `mark` in it, such as a class of the style sheet."""
+        """The visible HTML that contains `mark`, such as a CSS class."""
         return "\n".join(handle.content for handle in self.htmls() if mark in handle.content)
 
     def htmls(self) -> list[viser.GuiHtmlHandle]:
         return self._of(viser.GuiHtmlHandle)
 
     def charts(self, hidden: bool = False) -> list[viser.GuiUplotHandle]:
-        """Those that are seen, and the hidden ones too if that is said."""
+        """The visible charts; with `hidden`, the hidden ones too."""
         return self._of(viser.GuiUplotHandle, hidden)
 
     def images(self) -> list[viser.GuiImageHandle]:
         return self._of(viser.GuiImageHandle)
 
     def folders(self) -> list[str]:
-        """Labels of what there is in folders and tabs, in the order of the page."""
+        """Labels of the folders and tabs, in the order of the page."""
         containers = sorted(_containers(self._roots()), key=lambda one: getattr(one[0], "order", 0.0))
         return [label for one, seen in containers if seen and (label := _label_of(one)) is not None]
 
     def commands(self) -> list[str]:
-        """Of the palette, by their labels."""
+        """Labels of the palette's commands."""
         return list(self._commands())
 
     def takes(self, label: str) -> bool:
@@ -198,28 +198,28 @@ class Panels:
         return not self._commands()[label][1].disabled
 
     def is_folded(self, label: str) -> bool:
-        """Of a panel with a tab of this name: whether the page was last told to make a strip of it."""
+        """Whether the page last collapsed the panel that has a tab with this label."""
         panels = self.server.gui._panel_handle_from_uuid
         (uuid,) = (uuid for uuid, one in panels.items() if label in map(_label_of, one._tab_handles))
         messages = list(self.server._websock_server._broadcast_buffer.message_from_id.values())
-        told = [m for m in messages if isinstance(m, GuiSetPanelCollapsedMessage) and m.uuid == uuid]
-        return bool(told) and told[-1].collapsed
+        sent = [m for m in messages if isinstance(m, GuiSetPanelCollapsedMessage) and m.uuid == uuid]
+        return bool(sent) and sent[-1].collapsed
 
     def bodies(self, word: str) -> list[viser.BatchedMeshHandle]:
-        """The shapes in the 3-D view of what has `word` in its name."""
+        """The meshes in the 3-D view with `word` in their names."""
         return [node for node in self.nodes(word) if hasattr(node, "batched_positions")]
 
     def labels(self) -> list[str]:
-        """What is written in the 3-D view."""
+        """Texts of the visible labels in the 3-D view."""
         return [node.text for node in self.nodes("") if isinstance(node, viser.LabelHandle) and node.visible]
 
     def nodes(self, word: str) -> list[Any]:
-        """What is in the 3-D view with `word` in its name."""
+        """The nodes of the 3-D view with `word` in their names."""
         nodes = self.server.scene._handle_from_node_name
         return [handle for name, handle in sorted(nodes.items()) if word in name]
 
     def everything(self) -> dict[str, object]:
-        """All that can be seen, by its place on the page: to be compared with what is seen at another time."""
+        """Everything visible, by its place on the page, to compare with another time."""
 
         def plain(value: object) -> object:
             if isinstance(value, bytes):
@@ -251,16 +251,16 @@ class Panels:
             seen[f"command {label}"] = of(command)
         return seen
 
-    # --- what a person does ------------------------------------------------------------------------
+    # --- what a user does ------------------------------------------------------------------------
 
     def press(self, name: str) -> None:
-        """Press the button with this on it."""
+        """Press the button with this text."""
         button = self.button(name)
         assert button.command is not None, f"no page offers {name}"
         self.do(button.command)
 
     def type(self, label: str, value: object, at: int = 0) -> None:
-        """Type into one of our own fields, and leave it; `at` is the place in a row of them."""
+        """Type into one of our own fields and leave it; `at` is the index in a row of fields."""
         self._enter(self.field(label), value, at)
 
     def typed(self, label: str) -> Any:
@@ -268,21 +268,21 @@ class Panels:
         return self.field(label).value
 
     def field(self, label: str) -> SeenField:
-        """One of our own inputs, that is seen."""
+        """The one visible input of ours with this label."""
         found = [one for one in self.fields() if one.label == label]
         assert len(found) == 1, (label, [one.label for one in self.fields()])
         return found[0]
 
     def fields(self) -> list[SeenField]:
-        """Our own inputs that are seen."""
+        """Our own visible inputs."""
         return self._own().fields
 
     def buttons(self) -> list[SeenButton]:
-        """What of our own can be pressed, or could if it were not off."""
+        """Our own buttons, disabled ones too."""
         return self._own().buttons
 
     def button(self, text: str) -> SeenButton:
-        """One of our own buttons, by what is on it."""
+        """The one button of ours with this text."""
         (found,) = (one for one in self.buttons() if one.text.strip() == text)
         return found
 
@@ -299,16 +299,16 @@ class Panels:
             self.do(command)
 
     def presses(self, command: Command) -> bool:
-        """Whether something that does this can be seen."""
+        """Whether a visible part sends this command."""
         return f"{escape(asks(command))}" in self.html("data-do")
 
     def ask(self, command: Command) -> None:
-        """Press the part of our HTML that does this."""
+        """Press the part of our HTML that sends this command."""
         assert self.presses(command), f"no page offers {command}"
         self.do(command)
 
     def do(self, command: Command) -> None:
-        """Ask for this, as a key or a script does; why it was refused is among the notices."""
+        """Run this command, as a key or a script does; a refusal is added to the notices."""
         try:
             result_of(self.visitors._carry_out(command, self.visitor))
         except Refused as reason:
@@ -316,17 +316,17 @@ class Panels:
         self._threads.wait()
 
     def set(self, name: str, value: object) -> None:
-        """Move a slider, choose of a list, tick, type a text or a number."""
+        """Move a slider, choose from a list, tick a box, or type a text or a number."""
         self._enter(self.field(name), value)
 
     def command(self, label: str) -> None:
-        """Choose a command of the palette."""
+        """Choose a command in the palette."""
         uuid, handle = self._commands()[label]
         assert not handle.disabled, f"{label} is greyed"
         self._handled(self.server.gui._handle_command_trigger, CommandTriggerMessage(uuid))
 
     def settle(self) -> None:
-        """Wait until viser has done what it was given: its loop, and what that began."""
+        """Wait until viser's event loop and the jobs that it started are done."""
 
         async def nothing() -> None: ...
 
@@ -356,7 +356,7 @@ class Panels:
         roots += [(modal, True) for modal in gui._modal_handle_from_uuid.values()]
         for label in self._path:
             roots = [(one, seen) for one, seen in _containers(roots) if _label_of(one) == label]
-            assert roots, f"there is no {label}"
+            assert roots, f"no tab or folder {label}"
         return roots
 
     def _walk(self, roots: _Roots) -> Iterator[tuple[Any, bool]]:
@@ -365,8 +365,8 @@ class Panels:
                 yield child, seen and child.visible
 
 
-def _nobody_does(command: Command, visitor: Visitor) -> None:
-    raise AssertionError(f"the test does not say who does {command}")
+def _unexpected_command(command: Command, visitor: Visitor) -> None:
+    raise AssertionError(f"the test has no handler for {command}")
 
 
 def _containers(roots: _Roots) -> Iterator[tuple[Any, bool]]:

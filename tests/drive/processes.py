@@ -1,4 +1,4 @@
-"""The worker processes of a page's server, and of a test."""
+"""Finds the worker processes of a page's server or of a test."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import psutil
 
 
 def workers_of(server: psutil.Process) -> list[psutil.Process]:
-    """The keeper of each, the oldest first; a worker is its only child."""
+    """The keeper process of each worker, oldest first; the worker is its only child."""
     keepers: list[psutil.Process] = []
     for child in server.children():
         try:
             command = " ".join(child.cmdline())
-        except psutil.NoSuchProcess:  # it has ended, and is waited for or not
+        except psutil.NoSuchProcess:  # it has exited, reaped or not
             continue
         if "workbench.app.worker.start" in command:
             keepers.append(child)

@@ -1,4 +1,4 @@
-"""Fixtures: episodes to write and read, a real one and small ones made by hand."""
+"""Fixtures: episodes to write and read, a real one and small synthetic ones."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session")
 def recorded(renderer: None) -> Recorded:
-    # Here, since ManiSkill takes seconds to import, and most of these tests need none of it.
+    # Imported here: ManiSkill takes seconds to import, and most of these tests do not need it.
     from tests.episodes.stock import record_stock
 
     return record_stock("PickCube-v1", robot_uids="panda_wristcam")
@@ -26,7 +26,7 @@ def recorded(renderer: None) -> Recorded:
 
 @pytest.fixture(scope="session")
 def make_episode() -> Callable[..., Made]:
-    """A small episode made by hand, for the cases that no simulation gives; fields can be replaced."""
+    """A small synthetic episode for cases that no simulation produces; fields can be replaced."""
     return _make_episode
 
 

@@ -1,8 +1,8 @@
-"""The one device on which this machine's tests render: SAPIEN has one in a process, under one name."""
+"""The device on which this machine's tests render: SAPIEN allows one per process, under one name."""
 
 import torch
 
 RENDER_DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-"""SAPIEN's name."""
+"""SAPIEN's name for the device."""
 RENDER_BACKEND = "gpu" if torch.cuda.is_available() else "cpu"
-"""ManiSkill's name, for ``render_backend``."""
+"""ManiSkill's name for the device, for ``render_backend``."""

@@ -1,4 +1,4 @@
-"""The review's page on real files, without a browser: open recordings, do something with them, and see what is shown."""
+"""The review page on real files, without a browser: open recordings, operate on them, and see what is shown."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from workbench.task.description import TaskOptions
 
 
 def no_session(*_: object) -> Session:
-    raise AssertionError("nobody goes live from a recording")
+    raise AssertionError("no test here goes live from a recording")
 
 
 class Reviewed(Panels):
-    """The review of a folder, with a hand on it; who makes one asks for the fixture `child_process`."""
+    """The review page of a folder, operated by a test; needs the fixture `child_process`."""
 
     def __init__(self, gated_server: GatedServer, folder: Path) -> None:
         super().__init__(gated_server.server)
@@ -43,9 +43,9 @@ class Reviewed(Panels):
         self.page.redraw()
 
     def all_drawn(self) -> dict[str, object]:
-        """All that can be seen once every part was drawn, whatever its key says."""
+        """Everything visible after a forced redraw of every part."""
         unread = 'class="wb-library-picture"></td>'
-        until(lambda: self.draw() or unread not in self.html(unread), "the pictures of the library")
+        until(lambda: self.draw() or unread not in self.html(unread), "the thumbnails of the library")
         forget_what_was_drawn(self.page._parts)
         self.draw()
         return self.everything()
@@ -55,7 +55,7 @@ class Reviewed(Panels):
         self.review.open([rows[seed] for seed in seeds])
         until(
             lambda: len(self.review.view().opened) == len(seeds) and not self.review.view().loading,
-            "what was opened",
+            "the opened recordings",
             seen=lambda: self.review.view().problems,
         )
         self.draw()

@@ -1,4 +1,4 @@
-"""One state of one env said by hand, and given to a writer as a recorder gives it."""
+"""One state of one env, written by hand and passed to a writer as a recorder does."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class EpisodeRow:
     env_states: Mapping[str, NDArray] = field(default_factory=dict)
     obs: Mapping[str, NDArray] = field(default_factory=dict)
     action: NDArray | None = None
-    """(A,) that led here; None in state 0."""
+    """(A,) action that led to this state; None in state 0."""
     reward: float = 0.0
     terminated: bool = False
     truncated: bool = False
@@ -35,7 +35,7 @@ _packers: WeakKeyDictionary[EpisodeWriter, BatchPacker] = WeakKeyDictionary()
 
 
 def packed(row: EpisodeRow, packer: BatchPacker, actions: int) -> tuple[Layout, bytes]:
-    """`row` of a task with so many actions, as a batch of this env alone."""
+    """`row` as a batch of one env; `actions` is the length of an action."""
     action = np.zeros(actions) if row.action is None else row.action
     columns: dict[str, object] = {
         "poses": np.asarray(row.poses, np.float32),

@@ -1,4 +1,4 @@
-"""Small hand-made scenes and snapshots of a session, with numbers that can be checked by hand."""
+"""Small synthetic scenes and session views, with numbers that can be checked by hand."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ BODIES: tuple[tuple[str, BodyKind], ...] = (
 
 
 def table_scene(num_envs: int) -> tuple[SceneGeometry, np.ndarray]:
-    """A floor, a 1.2 x 2.4 m table, a hand of two parts and a cube; and (N, B, 7) poses of it."""
+    """A floor, a 1.2 x 2.4 m table, a two-part hand and a cube; and their (N, B, 7) poses."""
     ground = box_mesh((40, 40, 0.001), (0, 0, -0.92))
     visuals = (
         visual("ground/0", ground, num_envs, 0),
@@ -116,10 +116,10 @@ def description(geometry: SceneGeometry, cameras: tuple[CameraInfo, ...] = ()) -
 EMPTY = SessionView(
     activity="a worker process", features={RecordingStatus: RecordingStatus(folder="recordings")}
 )
-"""A session that has just begun."""
+"""View of a session that has just started."""
 
 
-_WAYS = np.broadcast_to(np.arange(5, dtype=np.float32)[:, None] / 10, (3, 5, 3)).astype(np.float32)
+_PATHS = np.broadcast_to(np.arange(5, dtype=np.float32)[:, None] / 10, (3, 5, 3)).astype(np.float32)
 PLAN = PlannedEnv(
     env=0,
     actions=np.zeros((1, 2), np.float32),
@@ -128,16 +128,16 @@ PLAN = PlannedEnv(
     plan=1,
     hold=3,
     success_at=np.array([3, 0, 0, 0, 0], np.int32),
-    paths=_WAYS,
+    paths=_PATHS,
     drawn=(0, 2, 4),
     traced="arm/hand",
     seconds=0.25,
 )
-"""Five rollouts of four steps, of which three are drawn."""
+"""Five rollouts of four steps; three of them are drawn."""
 
 
 def running(num_envs: int, *, selected_env: int = 0, speed: float = 1.0, **changes: object) -> SessionView:
-    """A session that plays the table scene."""
+    """View of a session that plays the table scene."""
     geometry, poses = table_scene(num_envs)
     view = replace(
         EMPTY,
@@ -156,7 +156,7 @@ def running(num_envs: int, *, selected_env: int = 0, speed: float = 1.0, **chang
 
 
 def changed(view: SessionView, **changes: Any) -> SessionView:
-    """The view with other fields, and with other views of features, by any name."""
+    """The view with these fields, or the fields of its feature views, replaced."""
     own = {name: value for name, value in changes.items() if hasattr(EMPTY, name)}
     features = {type(value): value for name, value in changes.items() if name not in own}
     return replace(view, features={**view.features, **features}, **own)

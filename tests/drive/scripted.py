@@ -1,4 +1,4 @@
-"""A fake worker without a process: it answers a session at once with a scene made by hand."""
+"""A fake worker without a process: it answers a session at once with a synthetic scene."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from workbench.live.process.worker_process import Output
 from workbench.task.description import Restored, Stepped, TaskDescription
 
 STEP_SECONDS = 0.02
-"""Between two steps while it plays."""
+"""Time between two steps while playing."""
 Evaluate = Callable[[np.ndarray], dict[str, np.ndarray]]
-"""The entries of `evaluate()`, of the elapsed steps of each env."""
+"""Computes the entries of `evaluate()` from the elapsed steps of each env."""
 
 
 def no_success(elapsed: np.ndarray) -> dict[str, np.ndarray]:
@@ -45,13 +45,13 @@ def no_success(elapsed: np.ndarray) -> dict[str, np.ndarray]:
 
 
 class ScriptedWorker:
-    """Takes what `Supervisor` takes, after what its scene is."""
+    """Takes `Supervisor`'s arguments, after those that define its scene."""
 
     pid = None
     load_pending = False
     vitals = ProcessMemory()
     goes_back = True
-    """Whether it comes to the recorded states that it is asked for; they look as it does where it stands."""
+    """Whether a restore succeeds; the restored state looks like the current one."""
 
     def __init__(
         self,
@@ -82,10 +82,10 @@ class ScriptedWorker:
         self._requests.put(request)
 
     def interrupt(self) -> None:
-        """It is never at anything."""
+        """Does nothing: it is never busy."""
 
     def reset_deaths(self) -> None:
-        """It never dies."""
+        """Does nothing: it never dies."""
 
     def replace(self) -> None:
         for request in self._first_requests():
@@ -136,7 +136,7 @@ class ScriptedWorker:
             self._draw(request)
 
     def _step(self) -> None:
-        # Every body moves on by a centimetre.
+        # Every body moves by a centimetre.
         moved = self._lived[-1].poses + np.array([0.01, 0, 0, 0, 0, 0, 0], np.float32)
         action = np.zeros((self._task.num_envs, len(self._task.actions)), np.float32)
         self._send(replace(self._at(moved, self._lived[-1].elapsed_steps + 1), action=action), ())
@@ -168,8 +168,8 @@ class ScriptedWorker:
 def scripted(
     num_envs: int, evaluate: Evaluate = no_success, info: CameraInfo | None = None
 ) -> Callable[..., Supervisor]:
-    """For `Session`'s ``make_worker``: the table scene with so many envs and one camera."""
+    """A ``make_worker`` for `Session`: the table scene with `num_envs` envs and one camera."""
     geometry, poses = table_scene(num_envs)
-    # No file of it is there to be followed.
+    # There is no file to watch.
     task = replace(description(geometry, (info or camera(),)), file=None, source_files=(), source={})
     return partial(ScriptedWorker, task, poses, evaluate)  # type: ignore[return-value]

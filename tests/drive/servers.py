@@ -20,7 +20,7 @@ from workbench.task.description import TaskOptions
 
 @pytest.fixture
 def server() -> Iterator[viser.ViserServer]:
-    """A real server on a free port of this machine, without a page."""
+    """A real viser server on a free port, without a page."""
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     yield server
     server.stop()
@@ -28,13 +28,13 @@ def server() -> Iterator[viser.ViserServer]:
 
 @pytest.fixture
 def live_page(server: viser.ViserServer, clock: Clock) -> Live:
-    """The live page, with a hand on it."""
+    """The live page, operated by the test."""
     return Live(server, clock)
 
 
 @pytest.fixture(scope="module")
 def open_live() -> Iterator[Live]:
-    """A live page, made once for a file whose tests leave nothing arranged."""
+    """A live page shared by the tests of a file; they must not change its layout."""
     live = Live(viser.ViserServer(host="127.0.0.1", port=0, verbose=False))
     yield live
     live.server.stop()
@@ -42,7 +42,7 @@ def open_live() -> Iterator[Live]:
 
 @pytest.fixture
 def gated_server() -> Iterator[GatedServer]:
-    """A door on a free port, with a token."""
+    """A gated server on a free port, with a token."""
     gated_server = open_server(ServerOptions(port=0))
     yield gated_server
     gated_server.close()
@@ -50,7 +50,7 @@ def gated_server() -> Iterator[GatedServer]:
 
 @pytest.fixture
 def panels(server: viser.ViserServer) -> Panels:
-    """What that server shows, and a person's hand on it."""
+    """The controls that `server` shows."""
     return Panels(server)
 
 
@@ -61,7 +61,7 @@ def clock() -> Clock:
 
 @pytest.fixture
 def scripted_session(tmp_path: Path) -> Iterator[Callable[..., Session]]:
-    """Makes sessions on a worker that answers with the table scene; each has loaded it."""
+    """Makes sessions on a `ScriptedWorker` that have loaded the table scene."""
     made: list[Session] = []
 
     def make(num_envs: int, evaluate: Evaluate = no_success, camera: CameraInfo | None = None) -> Session:

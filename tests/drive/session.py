@@ -1,7 +1,7 @@
-"""The one way for tests into a session: open one, do what a page does, see what a page sees.
+"""How tests use a session: open one, do what a page does, see what a page sees.
 
-`live_session` has a real worker on a real task. The worker of `told_session` is the test, which says what a worker would
-say: no process, no renderer. Both give the same `Session`; what looks behind its public methods is here and nowhere else.
+`live_session` has a real worker on a real task. In `fake_worker_session` the test plays the worker and sends its events: no
+process, no renderer. Both give the same `Session`; only this file uses its private names.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def live_session(
     worker: WorkerOptions | None = None,
     **env_kwargs: object,
 ) -> Iterator[Session]:
-    """A session at the first moment of the task, closed afterwards; who opens one asks for the fixture `child_process`.
+    """A session at the first moment of the task, closed afterwards; needs the fixture `child_process`.
 
     Args:
-        draw: with a renderer, for whose shaders every worker takes some seconds.
+        draw: use a renderer, whose shaders take each worker some seconds.
     """
     if not draw:
         env_kwargs = {"render_backend": "none", **env_kwargs}
@@ -71,8 +71,8 @@ def live_session(
         session.close()
 
 
-class ToldWorker:
-    """Takes the place of `Supervisor`: keeps what it is sent."""
+class FakeWorker:
+    """Replaces `Supervisor`: stores the requests that it is sent."""
 
     pid = None
     load_pending = False
@@ -86,7 +86,7 @@ class ToldWorker:
         self.replaced = 0
 
     def start(self) -> None:
-        """The first requests are asked for by `SliderAction.greet`."""
+        """Does nothing: `FakeWorkerSession.greet` returns the first requests."""
 
     def send(self, request: Request) -> None:
         self.sent.append(request)
@@ -95,22 +95,22 @@ class ToldWorker:
         self.replaced += 1
 
     def interrupt(self) -> None:
-        """It is never at anything."""
+        """Does nothing: it is never busy."""
 
     def reset_deaths(self) -> None:
-        """It never dies by itself."""
+        """Does nothing: it never dies by itself."""
 
     def stop(self) -> None:
-        """It has no thread."""
+        """Does nothing: it has no thread."""
 
 
-class Told:
-    """A session, what its worker was asked (`asked`), and what it says (`tell`)."""
+class FakeWorkerSession:
+    """A session whose worker is the test: `asked` returns the worker's requests, `tell` sends its events."""
 
-    def __init__(self, session: Session, worker: ToldWorker) -> None:
+    def __init__(self, session: Session, worker: FakeWorker) -> None:
         self.session, self._worker = session, worker
         self.rescored: list[object] = []
-        """Loads with which the past was to be rescored; no process does it."""
+        """Loads that the session asked to rescore the past with; nothing is rescored."""
         session._past_rescorer.perform = self._rescore
         self._elapsed = np.zeros(0, np.int32)
         self._number = 0
@@ -121,11 +121,11 @@ class Told:
 
     @property
     def replaced(self) -> int:
-        """How often another worker was asked for."""
+        """How often the session asked to replace the worker."""
         return self._worker.replaced
 
     def asked(self, kind: type[Kind]) -> list[Kind]:
-        """All requests of this kind since this was called last, with any kind."""
+        """Requests of this kind since the last call of this method; drops those of other kinds."""
         sent = self._worker.sent[:]
         self._worker.sent.clear()
         return [request for request in sent if isinstance(request, kind)]
@@ -135,7 +135,7 @@ class Told:
             self.rescored.append(effect.load)
 
     def greet(self) -> list[Request]:
-        """What a new worker is sent first."""
+        """The first requests to a new worker."""
         return self._worker.first_requests()
 
     def tell(self, *events: Event) -> None:
@@ -148,10 +148,10 @@ class Told:
     def load(
         self, level: str | None = None, num_envs: int = 3, same_scene: bool = False, **changes: Any
     ) -> None:
-        """The worker says that a version was loaded.
+        """The worker reports that a version was loaded.
 
         Args:
-            level: of its reload; None for the first version, and for one that was brought back.
+            level: reload level; None for the first version and for one that was restored.
             changes: fields of its `TaskDescription`.
         """
         options = changes.pop("options", None)
@@ -175,7 +175,7 @@ class Told:
         self._jump(envs, np.zeros(len(envs), np.int32), **more)
 
     def back(self, envs: tuple[int, ...], source: tuple[int, ...], origin: int, **restored: Any) -> None:
-        """These envs go to where those were at the moment of this serial."""
+        """The envs go to the states of the `source` envs at the moment with serial `origin`."""
         at = moment_at(self.session, origin)
         undoes, success = restored.pop("undoes", None), restored.pop("success", ())
         told = Restored(envs, source, origin, undoes, restored.pop("not_carried", {}), **restored)
@@ -183,11 +183,11 @@ class Told:
         self._jump(envs, elapsed, restored=told, success=success)
 
     def resume(self) -> None:
-        """Another worker goes on at the moment of the last."""
+        """A replacement worker resumes at the last moment."""
         self._jump(range(len(self._elapsed)), self._elapsed, resumed=True)
 
     def play(self, steps: int) -> None:
-        """It was loaded, plays, and took so many steps after a reset of all."""
+        """Load, reset all envs, step, and report that the simulation plays."""
         self.load()
         self.reset()
         self.step(steps)
@@ -204,15 +204,15 @@ class Told:
 
 
 @contextmanager
-def told_session(
+def fake_worker_session(
     recordings: Path,
     task: Any = "push.py",
     num_envs: int = 3,
-    worker: type[ToldWorker] = ToldWorker,
+    worker: type[FakeWorker] = FakeWorker,
     **more: Any,
-) -> Iterator[Told]:
-    """Without a process: see `SliderAction`. `more` as `Session` takes it."""
-    made: list[ToldWorker] = []
+) -> Iterator[FakeWorkerSession]:
+    """A session without a process, see `FakeWorkerSession`. `more` goes to `Session`."""
+    made: list[FakeWorker] = []
 
     def make_worker(*arguments: Any, **named: Any) -> Supervisor:
         made.append(worker(*arguments, **named))
@@ -220,7 +220,7 @@ def told_session(
 
     session = Session(task, TaskOptions(num_envs), recordings=recordings, make_worker=make_worker, **more)
     try:
-        yield Told(session, made[0])
+        yield FakeWorkerSession(session, made[0])
     finally:
         session.close()
 
@@ -239,7 +239,7 @@ def moment(
     evaluate: dict[str, NDArray] | None = None,
     **more: Any,
 ) -> Stepped:
-    """What a worker tells of a step, with poses and actions that tell moments and envs apart."""
+    """The event that a worker sends for a step; poses and actions are different for each moment and env."""
     count = len(elapsed)
     poses = _poses(count).copy()
     poses[..., 0] = np.arange(count)[:, None] + number / 1000
@@ -266,10 +266,10 @@ def _poses(count: int) -> NDArray[np.float32]:
 
 
 def step(session: Session, count: int = 1) -> SessionView:
-    """Control steps of all envs, one by one."""
+    """Step all envs `count` times, one control step at a time."""
     view = session.view()
     for _ in range(count):
-        # Not by what is shown: that changes too when a look at the past ends.
+        # The shown moment also changes when the view returns from the past.
         last = session.view().timeline.last
         session.do(Step())
         view = wait_until(session, lambda view, n=last: view.timeline.last > n, "a step")
@@ -277,29 +277,29 @@ def step(session: Session, count: int = 1) -> SessionView:
 
 
 def start_over(session: Session, seed: int) -> SessionView:
-    """Paused at the first moment of new episodes of all envs, live; the session's seed is this from now on."""
+    """Start new episodes of all envs with this seed, paused and live; the session keeps the seed."""
     session.do(PauseRun())
     before = session.view().timeline.last
     session.do(SetSeed(seed=seed))
 
-    def came(view: SessionView) -> bool:
+    def was_reset(view: SessionView) -> bool:
         if view.playing or view.timeline.last <= before:
             return False
         newest = moment_at(session, view.timeline.last)
-        # By its seed: a reset that was under way comes first.
+        # Compare the seed: a reset that was already in progress arrives first.
         return newest is not None and newest.seeds is not None and newest.seeds[0] == seed
 
-    return wait_until(session, came, "the reset")
+    return wait_until(session, was_reset, "the reset")
 
 
 def save(session: Session, file: Path, text: str) -> SessionView:
-    """Save the file, and wait until this text is what runs."""
+    """Save the file and wait until this text runs."""
     file.write_text(text)
     return runs(session, text)
 
 
 def runs(session: Session, text: str) -> SessionView:
-    """The view as soon as this text is what runs, at rest in its first moment or on."""
+    """Wait until this text runs, paused or playing; return the view."""
 
     def reached(view: SessionView) -> bool:
         return (
@@ -314,37 +314,37 @@ def runs(session: Session, text: str) -> SessionView:
 
 
 def jump(session: Session, ask: Callable[[], object]) -> SessionView:
-    """The view once the jump that `ask` asks for has come."""
+    """The view after the jump that `ask` requests."""
     last = session.view().timeline.last
     ask()
     return wait_until(session, lambda v: v.timeline.last > last, "the jump")
 
 
 def seek(session: Session, serial: int | None) -> None:
-    """Show the moment of this serial; live if None."""
+    """Show the moment with this serial; live if None."""
     session.happen(MomentShown(serial))
 
 
 def seek_by(session: Session, steps: int) -> None:
-    """Press the right arrow so often, or the left one."""
+    """Press the right arrow key `steps` times; the left one if negative."""
     for _ in range(abs(steps)):
         session.do(StepForward() if steps > 0 else StepBack())
 
 
-def heard(session: Session) -> SessionView:
-    """The view once the worker has answered a question, after all that it was sent before."""
+def after_worker_reply(session: Session) -> SessionView:
+    """The view after the worker has handled every earlier request: it has answered an inspection."""
     before = session.view().inspection
     session._worker.send(Inspect(0, ("joints",)))
     return wait_until(session, lambda view: view.inspection is not before, "an answer of the worker")
 
 
 def draw_past(session: Session) -> None:
-    """Draw at once what the shown moment lacks, as it is drawn when a slider stands still."""
+    """Draw the missing pictures of the shown moment now, as happens when a slider comes to rest."""
     session.happen(PastPicturesWanted(session.look(lambda run: run.stands_at)))
 
 
 def stop_watching(session: Session) -> None:
-    """Saves are noticed no more."""
+    """Stop the file watcher."""
     session._watcher.stop()
 
 
@@ -352,7 +352,7 @@ def stop_watching(session: Session) -> None:
 
 
 def wait_until(session: Session, reached: Callable[[SessionView], object], what: str) -> SessionView:
-    """The first snapshot for which `reached` holds."""
+    """The first view for which `reached` holds."""
 
     def seen() -> str:
         view = session.view()
@@ -366,38 +366,38 @@ def wait_until(session: Session, reached: Callable[[SessionView], object], what:
 
 
 def history_of(session: Session) -> History:
-    """All that it keeps of the running scene."""
+    """The session's history of the running scene."""
     past = session.look(lambda run: run.past)
     assert past is not None
     return past.history
 
 
 def moment_at(session: Session, serial: int) -> Moment | None:
-    """What the session keeps of a moment."""
+    """The moment with this serial in the history."""
     past = session.look(lambda run: run.past)
     return None if past is None else past.history.at(serial)
 
 
 def moments_of(session: Session) -> list[Moment]:
-    """All that it keeps, oldest first."""
+    """All moments in the history, oldest first."""
     view = session.view().timeline
     found = (moment_at(session, serial) for serial in range(view.first, view.last + 1))
     return [one for one in found if one is not None]
 
 
 def work_with(session: Session, background: Any) -> None:
-    """Rules are checked and steps are timed by this, in place of a process."""
+    """Check rules and time steps with `background` instead of a process."""
     session._checks = CheckJobs(background, session._happen)
     session._profiles = ProfileJobs(background, session._happen)
 
 
 def background_pid(session: Session) -> int | None:
-    """Of the process that rescores, checks and draws the past."""
+    """Pid of the process that rescores, checks and draws the past."""
     return session._background.pid
 
 
 def moved(view: SessionView) -> set[CameraKey]:
-    """Cameras that are placed otherwise than in the file."""
+    """Cameras whose pose differs from the file's."""
     return {camera.key for camera in view.of(StudioView).cameras if camera.moved}
 
 
@@ -412,7 +412,7 @@ def in_studio(what: Callable[[StudioView], object]) -> Callable[[SessionView], o
 
 
 def rescored(rescorer: Rescorer, *states: str) -> RescoreView:
-    """What a page shows of the judging of recordings once it is in one of these states."""
+    """Wait until rescoring is in one of these states; return its view."""
 
     def wanted() -> RescoreView | None:
         view = rescorer.view

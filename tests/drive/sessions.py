@@ -1,4 +1,4 @@
-"""Fixtures: sessions that tests share, with a real worker on a real task, and with a worker that is the test."""
+"""Fixtures: shared sessions with a real worker on a real task, and sessions whose worker is the test."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.session import Told, live_session, told_session
+from tests.drive.session import FakeWorkerSession, fake_worker_session, live_session
 from workbench.app.session import Session
 
 
@@ -18,7 +18,7 @@ def session(
     task_file: Path,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Session]:
-    """Without a renderer, unless the file says that it ``DRAWS``."""
+    """A session shared by the tests of a file; without a renderer unless the file sets ``DRAWS``."""
     with live_session(
         task_file, tmp_path_factory.mktemp("recordings"), draw=getattr(request.module, "DRAWS", False)
     ) as session:
@@ -26,16 +26,16 @@ def session(
 
 
 @pytest.fixture
-def told(tmp_path: Path) -> Iterator[Told]:
-    """Its worker has said nothing yet."""
-    with told_session(tmp_path / "recordings") as told:
-        told.asked(object)
-        yield told
+def fake(tmp_path: Path) -> Iterator[FakeWorkerSession]:
+    """A session whose worker has sent nothing yet."""
+    with fake_worker_session(tmp_path / "recordings") as fake:
+        fake.asked(object)
+        yield fake
 
 
 @pytest.fixture
-def played(told: Told) -> Told:
+def played(fake: FakeWorkerSession) -> FakeWorkerSession:
     """A reset of three envs and three steps: moments 0 to 3."""
-    told.play(3)
-    told.asked(object)
-    return told
+    fake.play(3)
+    fake.asked(object)
+    return fake

@@ -1,4 +1,4 @@
-"""The Studio tab, used with mouse and keys."""
+"""Operates the Studio tab with mouse and keys."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from tests.drive.waiting import until
 
 WIDTH, HEIGHT = 1080, 640
 VIEW: FloatRect = {"x": 40, "y": 0, "width": WIDTH - 430, "height": HEIGHT - 200}
-"""The 3-D view, less what lies over it."""
+"""The part of the 3-D view that nothing covers."""
 
 
 def choose(page: Page, name: str) -> None:
-    """Among the cameras."""
+    """Choose a camera."""
     page.get_by_label("Camera", exact=True).select_option(label=name)
 
 
 def tool(page: Page, name: str) -> dict:
-    """A pill, found and looked at in one go: the row is replaced when its state changes."""
+    """CSS classes and centre of a tool button, read in one script: the row is replaced when its state changes."""
     found: list[dict] = []
 
     def find() -> bool:
@@ -57,7 +57,7 @@ def view(page: Page) -> NDArray[np.int64]:
 
 
 def end_of_the_left_arrow(page: Page) -> tuple[float, float] | None:
-    """The world's y axis goes to the right in the page: the rightmost of what is as green as the gizmo's arrow."""
+    """The world's y axis points right in the view: the rightmost pixel with the green of the gizmo's arrow."""
     r, g, b = np.moveaxis(view(page), -1, 0)
     ys, xs = np.nonzero((g > 180) & (g - r > 50) & (g - b > 30))
     if not len(xs):
@@ -67,7 +67,7 @@ def end_of_the_left_arrow(page: Page) -> tuple[float, float] | None:
 
 
 def picture(page: Page) -> str:
-    """What the picture shows, as text that can be compared."""
+    """The camera picture as a data URL, to compare."""
     return page.evaluate(
         """() => {
             const image = [...document.querySelectorAll("img[src^='blob:']")].find(i => i.offsetParent);

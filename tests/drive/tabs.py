@@ -1,7 +1,7 @@
-"""Tabs without a browser: they connect as viser's page does, read every byte, and throw it away.
+"""Tabs without a browser: they connect as viser's page does, read every byte and discard it.
 
-Twenty real pages would be twenty times Chromium on two cores. To the server these are the same: the handshake with
-cookie and subprotocol, and the first camera message (before it viser does not count a client as connected).
+Two cores cannot run twenty Chromium pages. To the server these look the same: the handshake with cookie and
+subprotocol, and the first camera message (before it viser does not count a client as connected).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from workbench.page.widgets.visitors import PATH
 
 
 def handshake(url: str) -> tuple[str, dict[str, Any]]:
-    """Address and arguments of `websockets`' clients for the page at the printed `url`."""
+    """Address and arguments for a `websockets` client of the page at the printed `url`."""
     split = urlsplit(url)
     token = parse_qs(split.query).get("token", [""])[0]
     return f"ws://{split.netloc}/", {
@@ -46,7 +46,7 @@ def handshake(url: str) -> tuple[str, dict[str, Any]]:
 
 
 def camera_message(position: Sequence[float] = (3.0, 3.0, 3.0), width: int = 800, fov: float = 0.8) -> bytes:
-    """What a page says when it has drawn itself for the first time: where it looks from, and how large its view is."""
+    """The message that a page sends after its first frame: its viewpoint and the size of its view."""
     message = viser._messages.ViewerCameraMessage(
         wxyz=(1.0, 0.0, 0.0, 0.0),
         position=(position[0], position[1], position[2]),
@@ -69,20 +69,20 @@ def messages_in(frame: bytes) -> list[dict[str, Any]]:
 
 @dataclass
 class Tab:
-    """What one tab has had so far."""
+    """What one tab has received so far."""
 
     frames: int = 0
     megabytes: float = 0.0
     open: bool = False
-    """Connected, and all that there was at that time has come."""
+    """Whether the tab is connected and has received the full page state."""
     commands: dict[str, str] = field(default_factory=dict)
-    """The commands of the palette: the id of each, by its label."""
+    """Id of each palette command, by label."""
     name: str = ""
-    """Name of the page, with which it asks for commands."""
+    """Name of the page, which it sends with commands."""
 
 
 class Tabs:
-    """Any number of tabs, on one thread."""
+    """Any number of tabs on one thread."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -93,7 +93,7 @@ class Tabs:
         self._connections: dict[int, websockets.asyncio.client.ClientConnection] = {}
 
     def open(self, position: Sequence[float] = (3.0, 3.0, 3.0)) -> Tab:
-        """Open one that looks from `position`; it is read until `close`."""
+        """Open a tab that looks from `position`; its messages are read until `close`."""
         tab = Tab()
 
         async def begin() -> None:
@@ -103,7 +103,7 @@ class Tabs:
         return tab
 
     def close(self, tab: Tab) -> None:
-        """Close it as a browser does; returns when that is done."""
+        """Close the tab as a browser does; return when it is closed."""
         task = self._tasks.pop(id(tab))
 
         async def end() -> None:
@@ -113,13 +113,13 @@ class Tabs:
         asyncio.run_coroutine_threadsafe(end(), self._loop).result(timeout=30)
 
     def trigger(self, tab: Tab, label: str) -> None:
-        """Choose this command of the page, as its key or the palette does."""
+        """Trigger this command of the page, as its key or the palette does."""
         message = viser._messages.CommandTriggerMessage(tab.commands[label])
-        said = self._connections[id(tab)].send(msgspec.msgpack.encode(message.as_serializable_dict()))
-        asyncio.run_coroutine_threadsafe(said, self._loop).result(timeout=30)
+        sending = self._connections[id(tab)].send(msgspec.msgpack.encode(message.as_serializable_dict()))
+        asyncio.run_coroutine_threadsafe(sending, self._loop).result(timeout=30)
 
     def do(self, tab: Tab, command: Command) -> dict[str, Any]:
-        """Ask for this command; returns the reply."""
+        """Send this command; return the reply."""
         address, options = handshake(self._url)
         del options["subprotocols"]
         path = f"{address.rstrip('/')}{PATH}?page={tab.name}"
@@ -128,7 +128,7 @@ class Tabs:
             return json.loads(channel.recv(60))
 
     def stop(self) -> None:
-        """Close all that are open."""
+        """Close all open tabs."""
 
         async def end() -> None:
             for task in self._tasks.values():
@@ -174,14 +174,14 @@ def tabs_of(url: str) -> Iterator[Tabs]:
 
 
 def open_deaf_tab(url: str) -> Connection:
-    """A tab that connects, says that it is there, and reads nothing from then on."""
+    """A tab that connects, sends its camera message, and then reads nothing."""
     address, options = handshake(url)
     split = urlsplit(address)
     assert split.hostname is not None and split.port is not None
     small = socket.socket()
     small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     small.connect((split.hostname, split.port))
-    # One frame fills the queue, and then the library stops to read the socket, pings and all.
+    # One frame fills the queue; then the library stops reading the socket, including pings.
     connection = websockets.sync.client.connect(
         address, sock=small, max_queue=1, ping_interval=None, close_timeout=0.1, **options
     )

@@ -1,4 +1,4 @@
-"""Fixtures: task files written for one test, and a process that is restored afterwards."""
+"""Fixtures: task files for one test, and a process whose modules are restored afterwards."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def write(folder: Path) -> Write:
-    """Write a file in the author's folder; with `task=True` after the two imports of any task."""
+    """Write a file in the author's folder; with `task=True` below the two imports that every task has."""
 
     def write_file(name: str, text: str, task: bool = False) -> Path:
         path = folder / name
@@ -40,7 +40,7 @@ def write(folder: Path) -> Write:
 
 @pytest.fixture
 def clean_process() -> Iterator[None]:
-    """Undo what a test loaded: its modules, finders and registrations are the process's."""
+    """Undo what a test loaded: modules, finders and registrations are global to the process."""
     modules, finders, path = dict(sys.modules), list(sys.meta_path), list(sys.path)
     loads = dict(load._loads)
     tables = registered()
@@ -50,7 +50,7 @@ def clean_process() -> Iterator[None]:
             loader = getattr(getattr(sys.modules[name], "__spec__", None), "loader", None)
             if type(loader).__name__ == "_AuthorLoader":
                 del sys.modules[name]
-    # A file of an installed package takes that package's modules away while it is open.
+    # A file of an installed package removes that package's modules while it is open.
     sys.modules.update(
         {name: module for name, module in modules.items() if sys.modules.get(name) is not module}
     )

@@ -21,7 +21,7 @@ STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn
 
 @pytest.fixture(scope="session")
 def chromium_path(child_process: None) -> str:
-    """Path of the Chromium to give to Playwright as ``executable_path``. Without one the test fails."""
+    """Path of Chromium for Playwright's ``executable_path``. Without Chromium the test fails."""
     path = find_chromium()
     if path is None:
         pytest.fail(how_to_get_chromium())
@@ -30,12 +30,12 @@ def chromium_path(child_process: None) -> str:
 
 @pytest.fixture(scope="session")
 def child_process() -> None:
-    """For whatever starts a process: a worker, a reader of recordings, a command, ffmpeg."""
+    """Required by tests that start a process: a worker, a recording reader, a command, ffmpeg."""
 
 
 @pytest.fixture(scope="session")
 def renderer() -> None:
-    """For whatever renders in the tests' process. The device is kept: with the last one go its shaders, 5 s an env."""
+    """Required by tests that render in the test process. Keeps the device: without one the shaders are lost, 5 s an env."""
     from tests.drive.render_device import RENDER_DEVICE
     from workbench.envs.backends import keep_render_device
 
@@ -51,7 +51,7 @@ QUICK = "WORKBENCH_TESTS_ARE_QUICK"
 
 
 def tries(quick: int, whole: int) -> int:
-    """How many examples of a property are tried: fewer of those that take long, where the slow tests are left out."""
+    """Number of hypothesis examples: `quick` where the slow tests are left out, `whole` elsewhere."""
     return quick if QUICK in os.environ else whole
 
 
@@ -70,26 +70,26 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """SAPIEN refuses the renderer while a material is alive that a test without one made: be first."""
+    """Make the renderer first: SAPIEN refuses it while a material from a test without one is alive."""
     if not session.config.getoption("fast") and any(
         item.get_closest_marker("render") for item in session.items
     ):
         from tests.drive.render_device import RENDER_DEVICE
         from workbench.envs.backends import find_renderer, keep_render_device
 
-        if find_renderer() is not None:  # else each test that renders fails, with the reason
+        if find_renderer() is not None:  # without one each test that renders fails with the reason
             keep_render_device(RENDER_DEVICE)
 
 
 class Guard:
-    """Leaves out what is not fast, and fails what starts a process or makes a renderer without the fixture."""
+    """Deselects tests that are not fast, and fails those that start a process or renderer without the fixture."""
 
     def __init__(self) -> None:
         self.running = False
         self.refused: list[str] = []
-        sys.addaudithook(self.heard)
+        sys.addaudithook(self.audit)
 
-    def heard(self, event: str, args: tuple[Any, ...]) -> None:
+    def audit(self, event: str, args: tuple[Any, ...]) -> None:
         if event in STARTS_A_PROCESS:
             self.refuse(f"it starts a process ({event} {args[:2]!r:.200})", "child_process")
 
@@ -102,7 +102,7 @@ class Guard:
             pytest.fail(self.refused[-1])
 
     def check(self) -> None:
-        """For who waits for what a thread was refused."""
+        """Fail now if a thread was refused: what the test waits for will not come."""
         if self.refused:
             pytest.fail(self.refused[0])
 
@@ -137,7 +137,7 @@ class Guard:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self) -> Iterator[None]:
-        """What a thread, or code that catches everything, was refused fails the test as well, and by its reason."""
+        """Fail the test, with the reason, if a refusal was raised in a thread or swallowed by an except."""
         try:
             return (yield)
         finally:

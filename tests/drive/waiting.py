@@ -1,4 +1,4 @@
-"""Waits for what another thread or process does."""
+"""Waits for another thread or process."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Callable
 from typing import TypeVar
 
 T = TypeVar("T")
-PATIENCE = 90.0
-"""Seconds after which what has not come is a failed test."""
+TIMEOUT_SECONDS = 90.0
+"""Timeout after which a wait fails its test."""
 
 interrupts: list[Callable[[], None]] = []
-"""Asked at every look: one that raises ends the wait, where what is waited for can no longer come."""
+"""Called at every poll; one that raises ends the wait early when its result can no longer come."""
 
 
 def until(
     reached: Callable[[], T | None],
     what: str,
-    seconds: float = PATIENCE,
+    seconds: float = TIMEOUT_SECONDS,
     seen: Callable[[], object] | None = None,
 ) -> T:
-    """The first true answer of `reached`; without one in time the test fails and says what `seen` saw."""
+    """Poll `reached` until it is true and return its result; on timeout fail the test with the result of `seen`."""
     deadline, pause = time.monotonic() + seconds, 0.01
     while not (answer := reached()):
         for interrupt in interrupts:
@@ -30,5 +30,5 @@ def until(
                 f"{what} did not come within {seconds:g} s" + (f": {seen()}" if seen else "")
             )
         time.sleep(pause)
-        pause = min(1.2 * pause, 0.1)  # a page that is asked all the time comes to nothing else
+        pause = min(1.2 * pause, 0.1)  # a page that is polled constantly does nothing else
     return answer

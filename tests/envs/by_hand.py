@@ -1,4 +1,4 @@
-"""Bodies that a test builds by hand."""
+"""Builders of boxes and hinged chains for test scenes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def box(env: Any, name: str, half_size: list[float] = BOX, pose: Any = None, kin
 def by_hand(
     env: Any, joints: int, name: str = "chain", scene_idxs: list[int] | None = None, fixed: bool = True
 ) -> Any:
-    """A chain of links that hang from a base, joined by `joints` hinges."""
+    """Build a chain of links below a base, joined by `joints` hinges."""
     builder = env.scene.create_articulation_builder()
     if scene_idxs is not None:
         builder.set_scene_idxs(scene_idxs)

@@ -1,4 +1,4 @@
-"""Two boxes that meet and a chain that swings: what a change of physics shows in."""
+"""A scene that reacts to changed physics settings: two colliding boxes and a swinging chain."""
 
 # ManiSkill annotates vectors and poses as what they become.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false
@@ -23,7 +23,7 @@ def nothing(env: Any) -> None:
 
 
 class Collision(Bare):
-    """Box a slides into box b, which hangs in the way of nothing else; a chain of two hinges swings."""
+    """Box a slides into box b; a chain of two hinges swings freely."""
 
     on_load: Change = staticmethod(nothing)
     on_step: Change = staticmethod(nothing)

@@ -1,4 +1,4 @@
-"""A task batched and stock, after the same reset, with a renderer where one is wanted."""
+"""The same task as a batch and as ManiSkill's single env, both after a reset with `SEED`."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ SEED = 3
 
 
 def batched(task: Any, num_envs: int = 2, render: bool = True, **kwargs: Any) -> Any:
-    """Of an id, or of a class."""
+    """Return a batch of `task`, an env id or a class."""
     env = envs.batched(task, num_envs, render=render, **kwargs)
     env.reset(seed=SEED)
     return env
 
 
 def stock(task: str, **kwargs: Any) -> Any:
-    """ManiSkill's own single env."""
+    """Return ManiSkill's own single CPU env of `task`."""
     env = envs.stock(task, render_backend=RENDER_BACKEND, **kwargs)
     env.reset(seed=SEED)
     return env

@@ -1,4 +1,4 @@
-"""A helper beside a task, which makes the commonest mistake in its place; for ``test_kept_rows``."""
+"""A helper module that redraws the goals of all envs for a task; used by ``test_kept_rows``."""
 
 from __future__ import annotations
 

@@ -27,18 +27,18 @@ class Bare(BaseEnv):
         super().__init__(*args, robot_uids="none", **kwargs)
 
     def env_numbers(self) -> list[int]:
-        """The number in the batch of each of this env's own envs."""
+        """Return the batch index of each of this env's sub-envs."""
         return list(range(self.first_env, self.first_env + self.num_envs))
 
     def get_state_dict(self) -> Any:
-        # BaseEnv's asks the agent, and there is none.
+        # BaseEnv's version reads the agent's state; this task has no agent.
         return self.scene.get_sim_state()
 
     def _get_obs_agent(self) -> dict:
         return {}
 
     def apply(self) -> None:
-        """What a task must do on the GPU after it set state outside `_initialize_episode`."""
+        """Apply and fetch, as the GPU requires after state is set outside `_initialize_episode`."""
         if self.scene.gpu_sim_enabled:
             self.scene._gpu_apply_all()
             self.scene.px.gpu_update_articulation_kinematics()
@@ -50,14 +50,14 @@ def batch_of(task: type[BaseEnv], num_envs: int, **kwargs: Any) -> Any:
 
 
 def single(task: type[BaseEnv], **kwargs: Any) -> Any:
-    """ManiSkill's own env: one, on the CPU."""
+    """Return ManiSkill's own single CPU env of `task`."""
     return task(num_envs=1, sim_backend="physx_cpu", **{**STATE_ONLY, **kwargs})
 
 
 def put_in_same_state(stock: Any, batch: Any, env: int) -> None:
-    """State of env `env` of the batch into the stock env, to the last bit.
+    """Copy the state of the batch's env `env` into the stock env, bit for bit.
 
-    Both sides get the same packed state, since unpacking may round (a root pose is kept by the centre of mass).
+    Both sides unpack the same state, since unpacking may round (PhysX stores a root pose at the centre of mass).
     """
     state = batch.scene.px.systems[env].pack()
     for system in (batch.scene.px.systems[env], stock.scene.px):
@@ -78,14 +78,14 @@ def follow(
     look: Callable[[Any], dict[str, torch.Tensor]] | None = None,
     **kwargs: Any,
 ) -> Any:
-    """Run `task` batched, and every env of it as a stock single env, and compare after each step.
+    """Run `task` as a batch and as stock single envs, and compare each env after every step.
 
     Args:
-        look: numbers of an env, each (N, ...), that must be equal to the last bit. By default the state of
-            every actor and articulation that both have.
+        look: returns the tensors, each (N, ...), that must be equal to the last bit. By default the packed
+            physics state is compared.
 
     Returns:
-        the batch, for further questions.
+        the batch, for further checks.
     """
     batch = batch_of(task, num_envs, **kwargs)
     stocks = [single(task, first_env=env, **kwargs) for env in range(num_envs)]

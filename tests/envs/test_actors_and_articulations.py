@@ -20,7 +20,7 @@ from tests.envs.stock_env import Bare, follow
 
 
 class Table(Bare):
-    """A static slab, a kinematic pusher that moves on every control step, and a box that it pushes."""
+    """A static slab, a kinematic pusher that moves on every control step, and the box that it pushes."""
 
     def _load_scene(self, options: dict) -> None:
         p = torch.tensor([[0.03 * i, 0.02 * i, 0.2 + 0.01 * i] for i in self.env_numbers()])
@@ -35,7 +35,7 @@ class Table(Bare):
         self.apply()
 
 
-def test_dynamic_kinematic_and_static_actors_do_what_they_do_in_a_stock_env() -> None:
+def test_dynamic_kinematic_and_static_actors_move_as_in_a_stock_env() -> None:
     def look(env: Any) -> dict[str, torch.Tensor]:
         return {
             "box": env.box.pose.raw_pose,
@@ -51,7 +51,9 @@ def test_dynamic_kinematic_and_static_actors_do_what_they_do_in_a_stock_env() ->
         "static",
         "kinematic",
     ]
-    assert bool((env.box.pose.p[:, 0] > 0.3).all()), "the pusher never pushed: the test proved nothing"
+    assert bool((env.box.pose.p[:, 0] > 0.3).all()), (
+        "the pusher never reached the box, so the test proved nothing"
+    )
     assert env.slab.pose.raw_pose.shape[-1] == 7
 
 
@@ -74,7 +76,7 @@ MJCF = """<mujoco model="pendulum"><worldbody><body name="cart" pos="0 0 1">
 
 
 class Swinging(Bare):
-    """One articulation, made as `source` says, that starts with a velocity and falls."""
+    """One articulation, built from `source`, that starts with a velocity and falls."""
 
     source = "builder"
     folder = Path()
@@ -126,4 +128,4 @@ def test_articulations_of_every_source_move_as_in_a_stock_env(
     monkeypatch.setattr(Swinging, "source", source)
     monkeypatch.setattr(Swinging, "folder", tmp_path)
     env = follow(Swinging, steps=8, look=joints_and_links)
-    assert float(env.thing.get_qpos().std(dim=0).max()) > 1e-3, "all envs did the same"
+    assert float(env.thing.get_qpos().std(dim=0).max()) > 1e-3, "all envs moved alike"

@@ -1,4 +1,4 @@
-"""What must be downloaded is named with its command; nothing is asked and nothing fetched."""
+"""Missing assets are reported with their download command; nothing prompts and nothing is downloaded."""
 
 # pyright: reportAttributeAccessIssue=false
 
@@ -24,7 +24,7 @@ NOT_HERE = "anymal_c"
 def nothing_is_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for source in assets.DATA_SOURCES.values():
         monkeypatch.setattr(source, "output_dir", tmp_path)
-        # Some keep an absolute path, which wins over any folder.
+        # An absolute target path overrides the patched folder.
         if source.target_path is not None and Path(source.target_path).is_absolute():
             monkeypatch.setattr(source, "target_path", Path(source.target_path).relative_to(ASSET_DIR))
 
@@ -37,7 +37,7 @@ def test_declared_assets_are_named_with_the_command_for_each() -> None:
         assert f"\n  python -m mani_skill.utils.download_asset {name}" in str(caught.value)
 
 
-def test_a_robot_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_robot_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     from mani_skill.agents.robots import ANYmalC
 
     monkeypatch.setattr(ANYmalC, "urdf_path", str(tmp_path / "robots" / "anymal_c" / "urdf" / "anymal.urdf"))
@@ -47,7 +47,7 @@ def test_a_robot_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch, tmp
         assert caught.value.names == (NOT_HERE,)
 
 
-def test_a_path_is_looked_up_the_outermost_download_first(tmp_path: Path) -> None:
+def test_assets_of_a_path_list_the_outermost_download_first(tmp_path: Path) -> None:
     scenes = tmp_path / "scene_datasets" / "replica_cad_dataset"
     assert assets_at(scenes / "configs" / "x.json") == ["ReplicaCAD"]
     # Fetching ReplicaCAD empties its folder, so the other must be fetched after it.
@@ -56,9 +56,7 @@ def test_a_path_is_looked_up_the_outermost_download_first(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("answer", ["0", "1"])
-def test_a_question_and_a_download_become_errors_and_are_given_back(
-    answer: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_prompts_and_downloads_raise_and_are_restored(answer: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MS_SKIP_ASSET_DOWNLOAD_PROMPT", answer)
     before = download_asset.prompt_yes_no, download_asset.download
     with pytest.raises(MissingAssets, match="download_asset ycb"), refuse_downloads("Some"):
@@ -68,7 +66,7 @@ def test_a_question_and_a_download_become_errors_and_are_given_back(
     assert (download_asset.prompt_yes_no, download_asset.download) == before
 
 
-def test_a_file_that_a_download_would_bring_is_looked_up(
+def test_an_error_about_a_downloadable_file_names_its_download(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workbench.envs.assets.ASSET_DIR", tmp_path)
@@ -80,7 +78,7 @@ def test_a_file_that_a_download_would_bring_is_looked_up(
         raise RuntimeError(f"failed to load mesh {missing}.")
 
 
-def test_a_robot_of_the_authors_own_with_a_wrong_path_is_told_so(tmp_path: Path) -> None:
+def test_a_custom_robot_with_a_wrong_path_is_reported_at_its_line(tmp_path: Path) -> None:
     class Arm(Panda):
         uid = "arm_that_is_not_registered"
         urdf_path = str(tmp_path / "arm.urdf")

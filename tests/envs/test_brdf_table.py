@@ -1,4 +1,4 @@
-"""The table of reflections that our cameras are given is the one that SAPIEN computes."""
+"""The BRDF lookup table that our cameras load equals the one that SAPIEN computes."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ FILE = Path(backends.__file__).parent / "brdf_table.npz"
 
 
 @pytest.mark.slow
-def test_it_is_the_one_that_sapien_computes_to_the_bit(tmp_path: Path, renderer: None) -> None:
-    """A shader draws the table. ``WORKBENCH_RENEW=1`` writes it into our file."""
+def test_the_table_equals_sapiens_bit_for_bit(tmp_path: Path, renderer: None) -> None:
+    """A shader renders the table. ``WORKBENCH_RENEW=1`` writes it into our file."""
     for pack in ("minimal", "common"):
         shutil.copytree(SHADERS / pack, tmp_path / pack)
     shader = tmp_path / "minimal" / "composite0.frag"
     text = shader.read_text()
     assert text.count(DRAWN) == 1
-    # What it drew before stays a part of it, or the compiler drops its textures and the renderer misses them.
+    # Keep the stock colour in the sum, or the compiler drops its textures and the renderer fails without them.
     drawn = f"{DRAWN}\n  outColor.rgb = outColor.rgb * 1e-30 + texture(samplerBRDFLUT, inUV).rgb;"
     shader.write_text(text.replace(DRAWN, drawn))
     scene = sapien.Scene(
         [sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device(RENDER_DEVICE))]
     )
     before = sapien.render.get_camera_shader_dir()
-    # Pictures of floats: the last camera of the process may have had bytes.
+    # Float textures: an earlier camera of this process may have set a pack with byte textures.
     set_shader_pack(PREBUILT_SHADER_CONFIGS["default"])
     sapien.render.set_camera_shader_dir(str(tmp_path / "minimal"))
     try:

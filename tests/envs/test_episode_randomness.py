@@ -1,4 +1,4 @@
-"""Random numbers of an episode, and scenes that a reset rebuilds."""
+"""Random numbers of an episode, and resets that rebuild the scene."""
 
 # ManiSkill annotates an env's members as the widest thing they may be, and vectors as tuples.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -18,7 +18,7 @@ from tests.envs.stock_env import Bare, batch_of, single
 
 
 class Drawing(Bare):
-    """Every env builds a box of its own size, and draws again when an episode begins."""
+    """Every env builds a box of a random size, and draws again when an episode begins."""
 
     def _load_scene(self, options: dict) -> None:
         self.sizes = np.asarray(self._batched_episode_rng.uniform(0.02, 0.1, (3,)))
@@ -84,7 +84,7 @@ def test_reconfiguration_freq_rebuilds_when_a_stock_env_does() -> None:
 
 
 @pytest.mark.parametrize("options", [{"reconfigure": True}, {}], ids=["asked for", "due"])
-def test_a_partial_reset_that_would_rebuild_is_refused_in_upstreams_words(options: dict) -> None:
+def test_a_partial_reset_that_would_rebuild_raises_upstreams_error(options: dict) -> None:
     env = batch_of(Drawing, 3, reconfiguration_freq=1)
     with pytest.raises(RuntimeError, match="Cannot do a partial reset and reconfigure"):
         env.reset(options={"env_idx": torch.tensor([1]), **options})

@@ -1,7 +1,7 @@
-"""An env of a batch is ManiSkill's own single CPU env, whatever the batch: to the bit, on task after task.
+"""Each env of a batch equals ManiSkill's own single CPU env bit for bit, whatever the batch size.
 
-Here are the tasks that differ in kind. All ids that ship in mani_skill's wheel are compared by the slow sweep
-(`test_every_task`), and each has its result on the docs page ``task_ids.md``.
+These tasks cover the different kinds. The slow sweep (`test_every_task`) compares all ids that ship in mani_skill's
+wheel; the docs page ``task_ids.md`` lists the results.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from workbench.envs import action_vector as actions
 
 pytestmark = [
     pytest.mark.thorough,
-    # ManiSkill's own tasks break some: `env/test_strict.py` lists them.
+    # Some of ManiSkill's own tasks break rules: `tests/envs/test_strict.py` lists them.
     pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 
@@ -28,12 +28,12 @@ CASES = (
     ("PickCube-v1", 8, 7),
     ("PushCube-v1", 4, 3),
     ("StackCube-v1", 6, 5),
-    ("PegInsertionSide-v1", 4, 2),  # another peg for every seed
+    ("PegInsertionSide-v1", 4, 2),  # a different peg for every seed
     ("TwoRobotPickCube-v1", 4, 3),  # an action for each robot
-    ("TriFingerRotateCubeLevel4-v1", 4, 3),  # three fingers push a cube all the time
-    # a hand, and another object in each env
+    ("TriFingerRotateCubeLevel4-v1", 4, 3),  # three fingers touch the cube all the time
+    # a hand, and a different object in each env
     pytest.param("RotateSingleObjectInHandLevel1-v1", 4, 3, marks=pytest.mark.slow),
-    ("RotateValveLevel1-v1", 4, 3),  # another articulation in each env
+    ("RotateValveLevel1-v1", 4, 3),  # a different articulation in each env
     ("SO100GraspCube-v1", 4, 3),  # controllers that remember their target
     ("MS-CartpoleBalance-v1", 4, 3),  # from MJCF, no contacts
     ("MS-HumanoidRun-v1", 4, 3),  # falls over itself
@@ -48,7 +48,7 @@ def test_an_env_follows_the_stock_single_env(env_id: str, num_envs: int, place: 
     assert comparison.value_difference == 0, comparison
 
 
-def test_a_difference_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_comparison_detects_a_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     def take_over_nearly(stock: Any, *others: Any) -> None:
         take_over(stock, *others)
         stock.agent.robot.set_qpos(stock.agent.robot.get_qpos() + 1e-6)
@@ -58,13 +58,13 @@ def test_a_difference_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     assert comparison.first_difference == 1 and comparison.value_difference > 0
 
 
-# --- alone, and among others ---------------------------------------------------------------------------
+# --- independent of the batch ---------------------------------------------------------------------------
 
 CROWDED = (
     "PickCube-v1",
     "TriFingerRotateCubeLevel4-v1",
     "MS-HumanoidRun-v1",
-    # Nine seconds of building scenes, for what the three above show as well.
+    # Builds scenes for nine seconds and adds nothing to the three above.
     pytest.param("RotateSingleObjectInHandLevel0-v1", marks=pytest.mark.slow),
     pytest.param("SO100GraspCube-v1", marks=pytest.mark.slow),
 )
@@ -72,26 +72,28 @@ SEED = 5
 
 
 @pytest.mark.parametrize("env_id", CROWDED)
-def test_an_env_does_not_depend_on_how_many_there_are_nor_on_its_place_nor_on_its_neighbours(
+def test_an_env_is_independent_of_batch_size_index_and_neighbours(
     env_id: str,
 ) -> None:
     model = batch_of(env_id, 1)
     model.reset(seed=[SEED], options={"reconfigure": True})
     state = model.scene.px.systems[0].pack()  # pyright: ignore[reportAttributeAccessIssue]
     touched: set[bool] = set()
-    ways = [_way_of(env_id, model, state, *where, touched) for where in ((1, 0), (2, 0), (5, 3), (5, 4))]
+    trajectories = [
+        _trajectory(env_id, model, state, *where, touched) for where in ((1, 0), (2, 0), (5, 3), (5, 4))
+    ]
     model.close()
-    assert touched == {True}, "nothing touched: the test proved little"
-    for way in ways[1:]:
-        assert way == ways[0]
+    assert touched == {True}, "no contacts, so the test proved little"
+    for trajectory in trajectories[1:]:
+        assert trajectory == trajectories[0]
 
 
-def _way_of(
+def _trajectory(
     env_id: str, model: BaseEnv, state: bytes, num_envs: int, place: int, touched: set[bool]
 ) -> list[bytes]:
-    """The states of an env that starts as `model` is, while its neighbours do and reset as they like."""
+    """Return the states of an env that starts in `model`'s state, with random actions and a reset of its neighbours."""
     env = batch_of(env_id, num_envs)
-    # Where every seed builds another object, this env has the model's.
+    # Where every seed builds a different object, this env gets the model's.
     seeds = [SEED if i == place else 20 + i for i in range(num_envs)]
     env.reset(seed=seeds, options={"reconfigure": True})
     take_over(env, place, model, 0, state)
@@ -112,7 +114,7 @@ def _way_of(
     return states
 
 
-# --- the same again --------------------------------------------------------------------------------------
+# --- repeatability --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(params=["PickCube-v1", "TriFingerRotateCubeLevel4-v1", "PegInsertionSide-v1"])
@@ -125,18 +127,20 @@ def two_batches(request: pytest.FixtureRequest) -> Iterator[tuple[BaseEnv, BaseE
 
 def test_the_same_seeds_and_actions_give_the_same_bits(two_batches: tuple[BaseEnv, BaseEnv]) -> None:
     first, second = (_episode(batch) for batch in two_batches)
-    assert first == second, "in another env"
-    assert _episode(two_batches[0]) == first, "in the same env, a second time"
+    assert first == second, "in a second batch"
+    assert _episode(two_batches[0]) == first, "in the same batch, a second time"
 
 
 def _episode(batch: BaseEnv) -> list[bytes]:
     rng = np.random.default_rng(3)
     parts = actions.action_parts(batch)
     batch.reset(seed=[5, 6, 7])
-    seen = []
+    trajectory_states = []
     for _ in range(20):
         _, reward, _, _, _ = batch.step(
             actions.to_env_action(batch, parts, actions.random_action(parts, 3, rng))
         )
-        seen += [packed(batch, i) for i in range(3)] + [torch.as_tensor(reward).numpy().tobytes()]
-    return seen
+        trajectory_states += [packed(batch, i) for i in range(3)] + [
+            torch.as_tensor(reward).numpy().tobytes()
+        ]
+    return trajectory_states

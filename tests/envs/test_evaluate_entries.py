@@ -1,4 +1,4 @@
-"""What ``evaluate`` returns, split into columns and the rest; and that ManiSkill passes on the same."""
+"""``evaluate``'s entries are split into per-env columns and others, and match what stock ManiSkill returns."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Chatty:
         (Pose.create_from_pq(p=torch.zeros(N, 3)), "float32", (N, 7)),
     ],
 )
-def test_what_has_a_row_for_each_env_is_a_column(value: Any, dtype: str, shape: tuple[int, ...]) -> None:
+def test_a_value_with_a_row_per_env_is_a_column(value: Any, dtype: str, shape: tuple[int, ...]) -> None:
     columns, others = split_entries({"entry": value, "elapsed_steps": EACH}, N)
     assert (columns["entry"].dtype, columns["entry"].shape) == (np.dtype(dtype), shape)
     assert others == {} and list(columns) == ["entry"]
@@ -69,14 +69,14 @@ def test_what_has_a_row_for_each_env_is_a_column(value: Any, dtype: str, shape: 
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_what_is_no_number_is_a_text_of_the_whole_batch(value: Any, what: str, text: str) -> None:
+def test_other_values_are_one_text_for_the_whole_batch(value: Any, what: str, text: str) -> None:
     columns, others = split_entries({"entry": value}, N)
     entry = others["entry"]
     assert columns == {} and (entry.what, entry.texts, entry.numbers) == (what, (text,), None)
     assert not entry.per_env
 
 
-def test_nested_dicts_are_their_leaves_and_names_stay_apart() -> None:
+def test_nested_dicts_are_flattened_under_unique_names() -> None:
     twice: dict[Any, Any] = {"a": {"b": EACH, 1: None}, "a/b": "also", "": 1, 2: 2, "2": 3}
     twice["self"] = OrderedDict(again=twice)
     columns, others = split_entries(twice, N)
@@ -85,7 +85,7 @@ def test_nested_dicts_are_their_leaves_and_names_stay_apart() -> None:
     assert not set(columns) & set(others)
 
 
-def test_what_is_huge_is_bounded() -> None:
+def test_huge_entries_are_truncated() -> None:
     entries: dict[Any, Any] = {"x" * 10_000: Chatty(), "list": list(range(10**5)), "text": "y" * 10**6}
     _, others = split_entries(entries, N)
     assert max(map(len, others)) <= 200
@@ -97,7 +97,7 @@ def test_what_is_huge_is_bounded() -> None:
     assert len(many) == MAX_ENTRIES and rest["…"].texts == ("7 more",)
 
 
-def test_columns_are_copies_that_the_next_step_does_not_change() -> None:
+def test_columns_are_copies() -> None:
     value, number = EACH.clone(), torch.tensor(1.0)
     columns, others = split_entries({"each": value, "mean": number}, N)
     value += 1
@@ -136,7 +136,7 @@ def same(ours: Any, stock: Any) -> bool:
     return ours == stock or type(ours) is type(stock)
 
 
-def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
+def test_info_equals_stock_maniskills(odd_task: Path) -> None:
     ours: Any = workbench.make(odd_task, 1, **CPU, rules="stop")
     stock: Any = gym.make("OddEntries-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
     for env in (ours, stock):
@@ -152,14 +152,14 @@ def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
 
 
 class OneTruth:
-    """In front of a task: the single truth that a task written for one env returns."""
+    """Mixin whose ``evaluate`` returns a single bool, as a task written for one env does."""
 
     def evaluate(self) -> dict[str, Any]:
         return {"success": torch.tensor(False), "fail": torch.tensor(True)}
 
 
 @pytest.mark.parametrize("rules", ["off", "stop"])
-def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, rules: Any) -> None:
+def test_a_single_bool_of_one_env_is_accepted_as_in_stock(odd_task: Path, rules: Any) -> None:
     task = type("One", (OneTruth, load_task(str(odd_task)).cls), {})
     env = TaskEnv(batched(task, 1, rules=rules, reward_mode="sparse"))
     assert env.reset(seed=0).terminated.tolist() == [True]
@@ -169,18 +169,18 @@ def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, rules: 
     env.close()
 
 
-def test_steps_and_rescoring_give_both_halves(odd_task: Path) -> None:
+def test_steps_and_rescoring_return_columns_and_others(odd_task: Path) -> None:
     env = workbench.make(odd_task, 3, **CPU, reward_mode="dense")
     task = TaskEnv(open_env(env))
     task.reset(seed=0)
     step = task.step(np.zeros((3, 8), np.float32))
-    for told in (step, task.rescore(np.zeros((3, 8), np.float32))):
-        assert told.others["phase"].texts == ("reach",) and told.others["stage"].numbers == 2
-        assert told.others["best"].what == "None" and told.others["words"].texts[2] == "cube 2"
-        progress: Any = told.others["progress"].numbers
-        np.testing.assert_allclose(progress, told.evaluate["away"].mean(), rtol=1e-6)
-        assert told.evaluate["turns"].shape == (3,) and "sometimes" in told.others
-        assert told.others["reward_terms/mean"].numbers is not None
-        assert "reward_terms/all" in told.evaluate and "elapsed_steps" not in told.evaluate
+    for result in (step, task.rescore(np.zeros((3, 8), np.float32))):
+        assert result.others["phase"].texts == ("reach",) and result.others["stage"].numbers == 2
+        assert result.others["best"].what == "None" and result.others["words"].texts[2] == "cube 2"
+        progress: Any = result.others["progress"].numbers
+        np.testing.assert_allclose(progress, result.evaluate["away"].mean(), rtol=1e-6)
+        assert result.evaluate["turns"].shape == (3,) and "sometimes" in result.others
+        assert result.others["reward_terms/mean"].numbers is not None
+        assert "reward_terms/all" in result.evaluate and "elapsed_steps" not in result.evaluate
     assert "turns" in task.step(np.zeros((3, 8), np.float32)).others
     env.close()

@@ -1,7 +1,7 @@
-"""Every task in ManiSkill's registry: it works batched, or an error says what it needs or whose fault it is.
+"""Every task in ManiSkill's registry works batched, or its error names the missing asset or the faulty file.
 
-The sweep over all ids takes minutes and is slow-marked; `tests/sweeps/task_ids.py` makes the docs page of it. Here is what
-can be had in seconds: an id with its cameras, and every fault of ManiSkill's own.
+The sweep over all ids takes minutes and is marked slow; `tests/sweeps/task_ids.py` writes its docs page. Quick tests
+cover one id with cameras and each known fault of ManiSkill's own tasks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def rows_of_the_page() -> dict[str, list[str]]:
-    """The cells of each row by id."""
+    """Return the cells of the page's rows by env id."""
     rows = [
         line[2:-2].split(" | ")
         for line in PAGE.read_text().splitlines()
@@ -32,17 +32,17 @@ def rows_of_the_page() -> dict[str, list[str]]:
     return {cells[0]: cells for cells in rows}
 
 
-def test_a_task_does_all_that_is_promised_with_cameras_on(renderer: None) -> None:
+def test_a_task_passes_the_exercise_with_cameras_on(renderer: None) -> None:
     row = exercise("MS-CartpoleBalance-v1")
     assert row.outcome == "passed" and row.cameras, row
 
 
-def test_a_task_with_a_fault_of_its_own_does_the_rest(renderer: None) -> None:
+def test_a_task_with_an_upstream_fault_does_the_rest(renderer: None) -> None:
     row = exercise("MS-HopperStand-v1")
     assert row.outcome == "upstream" and row.after_restore, row
 
 
-# --- faults of ManiSkill's own --------------------------------------------------------------------------
+# --- faults of ManiSkill's own ----------------------------------------------------------------------
 
 
 # One task for each; the sweep has the others, and DrawSVG-v1 with its hundreds of bodies.
@@ -51,7 +51,7 @@ def test_a_task_with_a_fault_of_its_own_does_the_rest(renderer: None) -> None:
     [fault for fault in FAULTS if fault.ids[0] != "DrawSVG-v1"],
     ids=lambda fault: f"{fault.ids[0]} {fault.stage}",
 )
-def test_a_fault_of_the_task_is_at_the_line_that_is_named(fault: Fault) -> None:
+def test_an_upstream_fault_is_raised_at_its_listed_line(fault: Fault) -> None:
     made = batched(fault.ids[0], 4, rules="off")
     env = TaskEnv(made)
     env.reset(seed=1)
@@ -68,28 +68,30 @@ def test_a_fault_of_the_task_is_at_the_line_that_is_named(fault: Fault) -> None:
     made.close()
 
 
-def test_a_fault_that_upstream_mended_is_found_out(renderer: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_that_upstream_fixed_fails_the_exercise(
+    renderer: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     faulty = FAULTS[0]
-    mended = Fault(
+    fixed = Fault(
         ("MS-CartpoleBalance-v1",), faulty.stage, faulty.file, faulty.line, faulty.why, faulty.upstream
     )
-    # In its globals, since pytest may have imported its module twice.
-    monkeypatch.setitem(exercise.__globals__, "faults_of", lambda env_id: {mended.stage: mended})
+    # Patch the function's globals: pytest may have imported its module twice.
+    monkeypatch.setitem(exercise.__globals__, "faults_of", lambda env_id: {fixed.stage: fixed})
     row = exercise("MS-CartpoleBalance-v1")
-    assert row.outcome == "failed" and "upstream mended" in row.notes[0], row
+    assert row.outcome == "failed" and "upstream fixed" in row.notes[0], row
 
 
-# --- all of them, each in a child process -----------------------------------------------------------------
+# --- all of them, each in a child process -----------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_a_task_that_ends_the_process_is_one_row_and_the_next_is_tried(child_process: None) -> None:
+def test_a_task_that_crashes_its_process_is_one_row_and_the_sweep_continues(child_process: None) -> None:
     crashed, missing = sweep(["No-Such-Task-v1", "PickSingleYCB-v1"])
     assert crashed["outcome"] == "crashed"
     assert (missing["outcome"], missing["notes"]) == ("download", ["ycb"])
 
 
-def test_a_task_that_does_not_come_back_is_one_row(child_process: None) -> None:
+def test_a_task_that_hangs_is_one_row(child_process: None) -> None:
     (row,) = sweep(["PickCube-v1"], limit=0.2)
     assert row["outcome"] == "hung"
 
@@ -97,10 +99,10 @@ def test_a_task_that_does_not_come_back_is_one_row(child_process: None) -> None:
 @pytest.mark.slow
 def test_the_page_has_a_row_for_every_registered_id_and_no_failure(child_process: None) -> None:
     rows = rows_of_the_page()
-    # Asked of a new process: in this one other tests may have loaded copies of ManiSkill's files, whose ids they take.
+    # List the ids in a new process: here other tests may have loaded copies of ManiSkill's files that took over their ids.
     ask = "from tests.sweeps.task_ids import registered_ids; print(*registered_ids(), sep='\\n')"
-    said = subprocess.run([sys.executable, "-c", ask], check=True, capture_output=True, text=True, cwd=ROOT)
-    assert sorted(rows) == said.stdout.split()
+    listed = subprocess.run([sys.executable, "-c", ask], check=True, capture_output=True, text=True, cwd=ROOT)
+    assert sorted(rows) == listed.stdout.split()
     assert {cells[2] for cells in rows.values()} == {"passed", "its own fault", "download"}
     assert {env_id for env_id, cells in rows.items() if cells[2] == "its own fault"} == {
         env_id for fault in FAULTS for env_id in fault.ids
@@ -109,10 +111,10 @@ def test_the_page_has_a_row_for_every_registered_id_and_no_failure(child_process
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_every_registered_id_works_as_the_page_says_and_nothing_is_fetched_for_it(
+def test_every_registered_id_works_as_the_page_says_and_downloads_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # ManiSkill takes this for a yes to every download.
+    # ManiSkill reads this as consent to every download.
     monkeypatch.setenv("MS_SKIP_ASSET_DOWNLOAD_PROMPT", "1")
     rows = list(sweep(registered_ids()))
     outcomes = {row["env_id"]: row["outcome"] for row in rows}
@@ -122,14 +124,14 @@ def test_every_registered_id_works_as_the_page_says_and_nothing_is_fetched_for_i
     ships = [row for row in rows if row["outcome"] != "download"]
     assert all(row["follows"] for row in ships), [row for row in ships if not row["follows"]]
     assert sum(row["like_stock"] == "bit for bit" for row in ships) >= 25
-    told = {
+    on_new_page = {
         cells[0]: cells[2:4]
         for cells in (line[2:-2].split(" | ") for line in page(rows).splitlines()[-len(rows) :])
     }
-    assert {env_id: cells[2:4] for env_id, cells in rows_of_the_page().items()} == told
+    assert {env_id: cells[2:4] for env_id, cells in rows_of_the_page().items()} == on_new_page
     named = {row["env_id"]: row["notes"] for row in rows}
     assert named["PickSingleYCB-v1"] == ["ycb"]
     assert named["UnitreeH1Stand-v1"] == ["unitree_h1"], "a robot"
-    assert named["OpenCabinetDrawer-v1"] == ["partnet_mobility_cabinet"], "a group of many"
-    assert named["ArchitecTHOR_SceneManipulation-v1"] == ["AI2THOR"], "by the file that is not there"
+    assert named["OpenCabinetDrawer-v1"] == ["partnet_mobility_cabinet"], "an asset group"
+    assert named["ArchitecTHOR_SceneManipulation-v1"] == ["AI2THOR"], "found from the missing file's path"
     assert named["ReplicaCADSetTableVal_SceneManipulation-v1"] == ["ReplicaCAD", "ReplicaCADRearrange"]

@@ -1,4 +1,4 @@
-"""The interface of SAPIEN's GPU system, member by member."""
+"""The batched CPU system has every member of SAPIEN's GPU system, or refuses it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workbench.envs.broken_rule import NeedsOneEnv
 
 MEMBERS = sorted(name for name in dir(physx.PhysxGpuSystem) if not name.startswith("_"))
 REFUSED = {"device", "gpu_set_cuda_stream", "set_scene_offset"}
-"""What ManiSkill never uses, and no CPU system has."""
+"""Members that ManiSkill never uses and that no CPU system has."""
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +41,13 @@ def test_every_member_of_the_gpu_system_exists_or_is_refused(px: Any) -> None:
         name for name in MEMBERS if name.startswith("gpu_apply_") and not name.endswith(("force", "torque"))
     ]
     for name in applies:
-        getattr(px, name)(px.cuda_rigid_body_data)  # an index buffer is taken
+        getattr(px, name)(px.cuda_rigid_body_data)  # requires an index buffer
         for fetch in (member for member in MEMBERS if member.startswith("gpu_fetch_")):
             getattr(px, fetch)()
         getattr(px, name)()
 
 
-def test_what_belongs_to_the_whole_batch_is_there(px: Any) -> None:
+def test_members_of_the_whole_batch_cover_all_envs(px: Any) -> None:
     px.timestep = 0.005
     assert [system.timestep for system in px.systems] == pytest.approx([0.005] * 3)
     px.timestep = 0.01
@@ -59,7 +59,7 @@ def test_what_belongs_to_the_whole_batch_is_there(px: Any) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
-def test_of_one_env_the_members_of_its_system_are_there() -> None:
+def test_a_batch_of_one_env_has_the_members_of_its_cpu_system() -> None:
     env = batch_of(Collision, 1)
     env.reset(seed=[0])
     one = env.scene.px
@@ -69,7 +69,7 @@ def test_of_one_env_the_members_of_its_system_are_there() -> None:
         one.step()
     assert len(one.get_contacts()) == len(one.systems[0].get_contacts()) > 0
     one.unpack(state)
-    assert torch.equal(env.a.pose.raw_pose, before), "what is read is the state of now"
+    assert torch.equal(env.a.pose.raw_pose, before), "tensors must show the restored state"
     assert one.raycast([0, 0, 2], [0, 0, -1], 10) is not None
     env.close()
 

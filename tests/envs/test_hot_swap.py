@@ -1,4 +1,4 @@
-"""A running env gets another class, and hooks are tried on it: of what they did nothing is left."""
+"""Hot swap: a running env gets another class, and a rehearsal of hooks leaves no trace on it."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false
 
@@ -29,28 +29,28 @@ class Plain(PUSH_CUBE):
 
 
 class Meddles(Plain):
-    """Whatever it is asked counts, draws and writes; and does as its `way` says."""
+    """``evaluate`` counts, draws and writes a pose; `mode` selects what else it does."""
 
-    way = "writes"
+    mode = "writes"
 
     def evaluate(self) -> dict:
         self.looks += 1
         pose = self.obj.pose.raw_pose.clone()
-        pose[1, 2] += 0.1 * torch.rand(())  # of one env: the others are where they were
+        pose[1, 2] += 0.1 * torch.rand(())  # moves env 1 only
         self.obj.set_pose(Pose.create(pose))
-        if self.way == "applies":
+        if self.mode == "applies":
             self.scene._gpu_apply_all()
             self.scene._gpu_fetch_all()
-        elif self.way == "raises":
+        elif self.mode == "raises":
             raise ZeroDivisionError
-        elif self.way == "is interrupted":
+        elif self.mode == "is interrupted":
             raise KeyboardInterrupt
         return {**super().evaluate(), "looks": torch.full((self.num_envs,), self.looks)}
 
 
-def begun(task: type = Plain) -> Any:
+def after_four_steps(task: type = Plain) -> Any:
     env = batched(
-        task, N, control_mode="pd_joint_target_delta_pos", rules="warn", on_finding=lambda told: None
+        task, N, control_mode="pd_joint_target_delta_pos", rules="warn", on_finding=lambda finding: None
     )
     env.reset(seed=[0, 1, 2])
     for _ in range(4):
@@ -58,7 +58,7 @@ def begun(task: type = Plain) -> Any:
     return env
 
 
-def moment(env: Any) -> tuple[Any, ...]:
+def full_state(env: Any) -> tuple[Any, ...]:
     target = env.agent.get_controller_state()["arm"]["target_qpos"]
     return (
         [system.pack() for system in env.scene.px.systems],
@@ -71,39 +71,39 @@ def moment(env: Any) -> tuple[Any, ...]:
     )
 
 
-@pytest.mark.parametrize("way", ["writes", "applies", "raises", "is interrupted"])
-def test_hooks_are_tried_without_a_trace(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    env = begun()
-    monkeypatch.setattr(Meddles, "way", way)
+@pytest.mark.parametrize("mode", ["writes", "applies", "raises", "is interrupted"])
+def test_a_rehearsal_of_hooks_leaves_no_trace(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = after_four_steps()
+    monkeypatch.setattr(Meddles, "mode", mode)
     put_class(env, Meddles)
-    before, hooks = moment(env), HOOKS[1:] if way == "applies" else HOOKS
+    before, hooks = full_state(env), HOOKS[1:] if mode == "applies" else HOOKS
     for _ in range(2):
-        if way in ("raises", "is interrupted"):
+        if mode in ("raises", "is interrupted"):
             with pytest.raises((ZeroDivisionError, KeyboardInterrupt)):
                 rehearse_hooks(env, hooks)
         else:
             assert rehearse_hooks(env, hooks) == {}
-        after = moment(env)
-        if way == "applies":  # what was stepped or applied comes out of a snapshot
+        after = full_state(env)
+        if mode == "applies":  # applied state is restored from a snapshot, which rounds
             np.testing.assert_allclose(after[1], before[1], atol=1e-5)
             assert after[2:] == before[2:]
         else:
             assert after == before
-    there = env.obj.pose.raw_pose + 0.1
-    env.obj.set_pose(Pose.create(there))
-    assert torch.equal(env.obj.pose.raw_pose, there), "all envs are written to, as between resets"
+    raised = env.obj.pose.raw_pose + 0.1
+    env.obj.set_pose(Pose.create(raised))
+    assert torch.equal(env.obj.pose.raw_pose, raised), "a write must reach all envs again, as between resets"
     env.close()
 
 
-def test_another_class_goes_on_from_the_same_moment_with_the_same_rules() -> None:
-    env, still = begun(), begun()
-    before = moment(env)
+def test_another_class_continues_from_the_same_state_with_the_same_rules() -> None:
+    env, reference = after_four_steps(), after_four_steps()
+    before = full_state(env)
     put_class(env, type("Edited", (Plain,), {"evaluate": lambda self: {"success": self.elapsed_steps > 4}}))
-    assert moment(env) == before
+    assert full_state(env) == before
     action = np.full((N, 8), -0.4, np.float32)
     *_, info = env.step(action)
-    still.step(action)
-    assert info["success"].tolist() == [True] * N and moment(env)[:5] == moment(still)[:5]
-    assert env.broken_rules.degree("rows-lost") == still.broken_rules.degree("rows-lost") == "warn"
+    reference.step(action)
+    assert info["success"].tolist() == [True] * N and full_state(env)[:5] == full_state(reference)[:5]
+    assert env.broken_rules.degree("rows-lost") == reference.broken_rules.degree("rows-lost") == "warn"
     env.close()
-    still.close()
+    reference.close()

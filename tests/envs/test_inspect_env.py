@@ -1,4 +1,4 @@
-"""What the inspectors read, against SAPIEN's own objects and ManiSkill's own tensors."""
+"""The inspectors' values equal those of SAPIEN's objects and ManiSkill's tensors."""
 
 # ManiSkill annotates an env's members as the widest thing they may be.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -41,7 +41,7 @@ def pick() -> TaskEnv:
     return opened("PickCube-v1")
 
 
-def test_joints_are_those_of_sapien(pick: TaskEnv) -> None:
+def test_joints_equal_sapiens(pick: TaskEnv) -> None:
     robots = pick.env.agent.robot
     for env in range(3):
         own = maniskill_private.objects_of(robots)[env]
@@ -57,7 +57,7 @@ def test_joints_are_those_of_sapien(pick: TaskEnv) -> None:
     )
 
 
-def test_contacts_add_up_to_those_of_sapien(pick: TaskEnv) -> None:
+def test_contacts_add_up_to_sapiens(pick: TaskEnv) -> None:
     for env in range(3):
         own: dict[frozenset[str], np.ndarray] = {}
         for contact in batched_system(pick.env.scene).systems[env].get_contacts():
@@ -80,7 +80,7 @@ def test_contacts_add_up_to_those_of_sapien(pick: TaskEnv) -> None:
     assert sign * cube.force[2] == pytest.approx(weight, rel=0.05)
 
 
-def test_a_flat_observation_is_taken_apart_under_the_names_it_was_made_of(pick: TaskEnv) -> None:
+def test_a_flat_observation_is_split_under_its_original_names(pick: TaskEnv) -> None:
     for env in (0, 2):
         read = by_name(inspect_env(pick, env, ["observation"]).observation)
         assert (
@@ -92,7 +92,7 @@ def test_a_flat_observation_is_taken_apart_under_the_names_it_was_made_of(pick: 
         assert read["extra/is_grasped"].shape == (1,)
 
 
-def test_the_state_dict_is_taken_apart_by_what_its_numbers_are(pick: TaskEnv) -> None:
+def test_the_state_dict_is_split_into_named_quantities(pick: TaskEnv) -> None:
     state = pick.env.get_state_dict()
     read = by_name(inspect_env(pick, 1, ["state"]).state)
     np.testing.assert_array_equal(read["actors/cube/p"], state["actors"]["cube"][1, :3])
@@ -100,19 +100,19 @@ def test_the_state_dict_is_taken_apart_by_what_its_numbers_are(pick: TaskEnv) ->
     np.testing.assert_array_equal(read["articulations/panda/qvel"], state["articulations"]["panda"][1, -9:])
 
 
-def test_looking_does_not_change_how_the_episode_goes_on() -> None:
+def test_inspecting_does_not_change_the_episode() -> None:
     class Counting(PICK_CUBE):
-        """Its hooks draw random numbers and count, as some tasks' do."""
+        """Hooks draw random numbers and count their calls, as some tasks' do."""
 
-        asked = 0
+        calls = 0
 
         def evaluate(self) -> dict:
-            self.asked += 1
+            self.calls += 1
             return super().evaluate()
 
         def _get_obs_extra(self, info: dict) -> dict:
             noise = torch.rand(self.num_envs, 1)
-            count = torch.full((self.num_envs, 1), float(self.asked))
+            count = torch.full((self.num_envs, 1), float(self.calls))
             return {**super()._get_obs_extra(info), "noise": noise, "count": count}
 
     ends = []
@@ -130,7 +130,7 @@ def test_looking_does_not_change_how_the_episode_goes_on() -> None:
         np.testing.assert_array_equal(plain, looked)
 
 
-def test_a_section_that_the_author_broke_does_not_take_the_others_along() -> None:
+def test_a_section_whose_hook_raises_leaves_the_others() -> None:
     class Broken(PICK_CUBE):
         def get_state_dict(self) -> Any:
             if getattr(self, "broken", False):

@@ -1,4 +1,4 @@
-"""What a partial reset does to rows of other envs in what a task keeps on itself: found, with the assignment's line."""
+"""A partial reset that rewrites other envs' rows in a task's attributes is reported at the assignment's line."""
 
 # pyright: reportAttributeAccessIssue=false
 
@@ -39,16 +39,16 @@ def task_with(initializes: Reset, **members: Any) -> type[BaseEnv]:
 
 
 def found_in(task: type[BaseEnv], rules: Any = "warn", resets: int = 1) -> list[Finding]:
-    """What is told of a reset, a step and partial resets of env 1."""
-    told: list[Finding] = []
-    env = batched(task, N, rules=rules, on_finding=told.append, obs_mode="none")
+    """Return the findings of a reset, a step and partial resets of env 1."""
+    reported: list[Finding] = []
+    env = batched(task, N, rules=rules, on_finding=reported.append, obs_mode="none")
     try:
         env.reset(seed=[0, 1, 2])
         env.step(ACTION)
         for _ in range(resets):
             env.reset(options={"env_idx": torch.tensor([1])})
         rows = list(env.broken_rules.rows)
-        assert [row.message for row in rows] == [row.message for row in told]
+        assert [row.message for row in rows] == [row.message for row in reported]
         return rows
     finally:
         env.close()
@@ -87,7 +87,7 @@ def in_another_file(self: Any, env_idx: torch.Tensor) -> None:
 
 @dataclass
 class Memory:
-    """An object of the author's."""
+    """An object of the author's that holds tensors."""
 
     target: torch.Tensor | None = None
     deeper: dict[str, Any] = field(default_factory=dict)
@@ -117,7 +117,7 @@ def _set_goal(self: Any, goal: torch.Tensor) -> None:
     self._kept_goal = goal  # the fault
 
 
-def of_a_pose(self: Any, env_idx: torch.Tensor) -> None:
+def in_a_pose(self: Any, env_idx: torch.Tensor) -> None:
     self.target_pose = Pose.create_from_pq(torch.rand((self.num_envs, 3)))  # the fault
 
 
@@ -125,7 +125,7 @@ def in_a_plain_list(self: Any, env_idx: torch.Tensor) -> None:
     self.stages = [torch.rand(()).item() for _ in range(self.num_envs)]  # the fault
 
 
-def put_right_and_spoiled_again(self: Any, env_idx: torch.Tensor) -> None:
+def restored_and_overwritten(self: Any, env_idx: torch.Tensor) -> None:
     if not hasattr(self, "target"):
         self.target = torch.zeros(self.num_envs)
     kept = self.target
@@ -134,7 +134,7 @@ def put_right_and_spoiled_again(self: Any, env_idx: torch.Tensor) -> None:
     self.target = torch.rand(self.num_envs)  # the fault
 
 
-WAYS = [
+MISTAKES = [
     (whole_tensor, "self.target is"),
     (in_place, "self.target is"),
     (value_from_a_helper, "self.target is"),
@@ -143,14 +143,14 @@ WAYS = [
     (one_tensor_an_env, "self.targets[i] is"),
     (numpy_in_place, "self.target is"),
     (by_a_property, "self._kept_goal is"),
-    (of_a_pose, "self.target_pose is"),
+    (in_a_pose, "self.target_pose is"),
     (in_a_plain_list, "self.stages is"),
-    (put_right_and_spoiled_again, "self.target is"),
+    (restored_and_overwritten, "self.target is"),
 ]
 
 
-@pytest.mark.parametrize(("reset", "named"), WAYS, ids=[reset.__name__ for reset, _ in WAYS])
-def test_rows_of_other_envs_that_are_changed_are_told_at_the_assignment(reset: Reset, named: str) -> None:
+@pytest.mark.parametrize(("reset", "named"), MISTAKES, ids=[reset.__name__ for reset, _ in MISTAKES])
+def test_changed_rows_of_other_envs_are_reported_at_the_assignment(reset: Reset, named: str) -> None:
     task = task_with(reset, goal=property(lambda self: self._kept_goal, _set_goal))
     (finding,) = found_in(task, rules=None)
     assert finding.rule == "rows-rewritten" and finding.degree == "warn"
@@ -167,8 +167,8 @@ def shrinks_in_a_list(self: Any, env_idx: torch.Tensor) -> None:
 
 
 @pytest.mark.parametrize("reset", [shrinks, shrinks_in_a_list])
-def test_rows_of_other_envs_that_are_lost_stop_at_the_assignment(reset: Reset) -> None:
-    with pytest.raises(BrokenRule, match="a row for each of the 1 envs that are being reset") as caught:
+def test_lost_rows_of_other_envs_stop_at_the_assignment(reset: Reset) -> None:
+    with pytest.raises(BrokenRule, match="now has rows for only 1 of") as caught:
         found_in(task_with(reset), rules=None)
     assert caught.value.rule == "rows-lost" and caught.value.place is not None
     assert "# the fault" in linecache.getline(*caught.value.place[:2])
@@ -183,19 +183,19 @@ def draws_before(self: Any, seed: Any = None, options: Any = None) -> Any:
 
 
 def draws_after(self: Any, seed: Any = None, options: Any = None) -> Any:
-    made = PICK_CUBE.reset(self, seed=seed, options=options)
+    result = PICK_CUBE.reset(self, seed=seed, options=options)
     self.target = torch.rand((self.num_envs, 2))  # the fault
-    return made
+    return result
 
 
 @pytest.mark.parametrize("reset", [draws_before, draws_after])
-def test_a_reset_of_the_tasks_own_is_looked_at_too(reset: Callable[..., Any]) -> None:
+def test_a_task_that_overrides_reset_is_checked_too(reset: Callable[..., Any]) -> None:
     task = type("Draws", (PICK_CUBE,), {"reset": reset})
     (finding,) = found_in(task)
     assert finding.rule == "rows-rewritten" and is_at_fault(finding), finding
 
 
-# --- what is no mistake ------------------------------------------------------------------------------
+# --- no mistake ------------------------------------------------------------------------------
 
 
 def writes_its_rows(self: Any, env_idx: torch.Tensor) -> None:
@@ -207,7 +207,7 @@ def writes_its_rows(self: Any, env_idx: torch.Tensor) -> None:
         self.stages[i] = "reach"
 
 
-def makes_the_same_anew(self: Any, env_idx: torch.Tensor) -> None:
+def assigns_equal_values(self: Any, env_idx: torch.Tensor) -> None:
     self.distance = (self.cube.pose.p - self.goal_site.pose.p).norm(dim=1) * 0 + 1
     self.unknown = torch.full((self.num_envs,), torch.nan)
     self.names = np.array(["a"] * self.num_envs)
@@ -215,7 +215,7 @@ def makes_the_same_anew(self: Any, env_idx: torch.Tensor) -> None:
     self.stages = [float("0.5"), float("nan"), "a"]
 
 
-def puts_it_right(self: Any, env_idx: torch.Tensor) -> None:
+def restores_other_rows(self: Any, env_idx: torch.Tensor) -> None:
     kept = getattr(self, "target", torch.zeros(self.num_envs))
     self.target = torch.rand(self.num_envs)
     others = torch.ones(self.num_envs, dtype=torch.bool)
@@ -226,16 +226,18 @@ def puts_it_right(self: Any, env_idx: torch.Tensor) -> None:
 def counts_for_the_batch(self: Any, env_idx: torch.Tensor) -> None:
     self.resets = getattr(self, "resets", 0) + 1
     self.last_drawn = torch.rand(7)
-    # With a row for each env at first, and for none of them from then on.
+    # One row per env in the first resets, then a length unrelated to the batch.
     self.queue = torch.rand(self.num_envs if self.resets < 3 else 7)
 
 
-@pytest.mark.parametrize("reset", [writes_its_rows, makes_the_same_anew, puts_it_right, counts_for_the_batch])
-def test_what_leaves_other_envs_as_they_were_is_not_told(reset: Reset) -> None:
+@pytest.mark.parametrize(
+    "reset", [writes_its_rows, assigns_equal_values, restores_other_rows, counts_for_the_batch]
+)
+def test_unchanged_rows_of_other_envs_are_not_reported(reset: Reset) -> None:
     assert found_in(task_with(reset), resets=2) == []
 
 
-def test_what_evaluate_keeps_for_all_envs_is_not_told() -> None:
+def test_attributes_that_evaluate_sets_for_all_envs_are_not_reported() -> None:
     def evaluate(self: Any) -> dict:
         self.distance = torch.rand(self.num_envs)
         return PICK_CUBE.evaluate(self)
@@ -251,14 +253,14 @@ def test_what_evaluate_keeps_for_all_envs_is_not_told() -> None:
 
 @pytest.fixture
 def traced() -> Iterator[None]:
-    """As under a debugger."""
+    """Install a trace function, as a debugger does."""
     before = sys.gettrace()
     sys.settrace(lambda frame, event, argument: None)
     yield
     sys.settrace(before)
 
 
-def test_a_debuggers_trace_is_left_alone_and_the_line_is_read_off_the_source(traced: None) -> None:
+def test_a_debuggers_trace_stays_and_the_line_comes_from_the_source(traced: None) -> None:
     trace = sys.gettrace()
     (finding,) = found_in(DrawsInMethods)
     assert sys.gettrace() is trace
@@ -283,13 +285,13 @@ def test_a_row_that_the_first_reset_did_not_change_gets_its_line_later() -> None
         self.calls = getattr(self, "calls", 0) + 1
         setattr(self, "targ" + "et", torch.full((self.num_envs,), max(self.calls - 3, 0)))  # the fault
 
-    # The constructor's reset and the first are of all envs; the first partial one changes nothing.
+    # The constructor's reset and the first reset all envs; the first partial reset changes nothing.
     (finding,) = found_in(task_with(reset), resets=3)
     assert finding.count == 2 and is_at_fault(finding), finding
 
 
-def test_the_lines_of_an_edited_task_are_sought_anew() -> None:
-    """As after a reload, which puts another class on the env."""
+def test_the_lines_of_an_edited_task_are_found_again() -> None:
+    """A reload puts another class on the env."""
     env = batched(
         task_with(writes_its_rows), N, rules="warn", on_finding=lambda finding: None, obs_mode="none"
     )
@@ -302,7 +304,7 @@ def test_the_lines_of_an_edited_task_are_sought_anew() -> None:
     env.close()
 
 
-def test_long_resets_are_not_looked_at_line_by_line_to_their_end() -> None:
+def test_line_tracing_of_long_resets_is_bounded() -> None:
     def reset(self: Any, env_idx: torch.Tensor) -> None:
         total = 0
         for i in range(20_000):

@@ -1,4 +1,4 @@
-"""Keyword arguments of a task: described from its constructor, and read from what a person typed."""
+"""A task's keyword arguments are described from its constructor and parsed from typed text."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from workbench.envs.keywords import (
 
 
 class Base:
-    """In the place of ManiSkill's `BaseEnv`."""
+    """Stand-in for ManiSkill's `BaseEnv`."""
 
     SUPPORTED_ROBOTS: Any = ["panda", ("panda", "panda")]
     SUPPORTED_OBS_MODES = ("state", "none", "any_textures")
@@ -90,19 +90,19 @@ def test_types_defaults_and_values_come_from_the_signature() -> None:
         "count": "int",
     }
     assert (found["noise"].value, found["noise"].default) == ("0.5", "0.02")
-    assert (found["count"].value, found["count"].default) == ("7", "7"), "the registration's own"
+    assert (found["count"].value, found["count"].default) == ("7", "7"), "only the registration names it"
     assert found["needed"].value == "2" and found["size"].optional and not found["flag"].optional
     assert found["way"].choices == ('"left"', '"right"') and found["colour"].choices == ('"red"', '"blue"')
     assert found["colour"].value == '"red"' and found["where"].value == "[0.0, 1.0]"
     assert found["made"].fixed and not found["gone"].fixed
 
 
-def test_a_constructor_that_hands_nothing_on_hides_those_of_its_bases() -> None:
+def test_a_constructor_without_kwargs_hides_those_of_its_bases() -> None:
     assert list(own(Closed, Base(), {}, {})) == ["only"]
-    assert own(Base, Base(), {}, {}) == {}, "what ManiSkill itself takes is not the task's own"
+    assert own(Base, Base(), {}, {}) == {}, "ManiSkill's own arguments are not the task's"
 
 
-def test_modes_have_what_the_class_supports_and_the_present_one() -> None:
+def test_modes_offer_what_the_class_supports_and_the_current_one() -> None:
     env = Base()
     env.robot_uids, env.obs_mode = "fetch", "rgb+normal"
     made = describe_keywords(Task, env, {}, {}, Base)
@@ -115,7 +115,7 @@ def test_modes_have_what_the_class_supports_and_the_present_one() -> None:
     assert modes["reward_mode"].value == '"dense"'
 
 
-def test_what_json_says_becomes_what_the_class_takes() -> None:
+def test_json_values_become_the_types_that_the_class_takes() -> None:
     given = {"robot_uids": ["panda", "panda"], "colour": "blue", "noise": 1}
     taken = constructor_arguments(Task, given, Base)
     assert taken == {"robot_uids": ("panda", "panda"), "colour": Colour.BLUE, "noise": 1}
@@ -134,7 +134,7 @@ def test_what_json_says_becomes_what_the_class_takes() -> None:
         (Keyword("a", "choice", '"l"', choices=('"l"', "2")), "2", 2),
     ],
 )
-def test_what_is_typed_is_read(keyword: Keyword, text: str, value: object) -> None:
+def test_typed_text_is_parsed(keyword: Keyword, text: str, value: object) -> None:
     found = read_value(keyword, text)
     assert found == value and type(found) is type(value)
 
@@ -153,7 +153,7 @@ def test_what_is_typed_is_read(keyword: Keyword, text: str, value: object) -> No
         (Keyword("size", "str", '"x"'), "x" * 3000),
     ],
 )
-def test_what_it_cannot_be_is_refused_by_its_name(keyword: Keyword, text: str) -> None:
+def test_an_invalid_text_is_refused_with_the_keywords_name(keyword: Keyword, text: str) -> None:
     with pytest.raises(ValueError, match="^size takes"):
         read_value(keyword, text)
 
@@ -167,7 +167,7 @@ JSON = st.recursive(
 
 
 @given(JSON)
-def test_a_value_in_json_is_read_back(value: Any) -> None:
+def test_a_json_value_survives_a_round_trip(value: Any) -> None:
     text = as_json(value)
     assert text is not None and read_value(Keyword("a", "json", text), text) == value
     assert isinstance(shown(text), str)
@@ -176,7 +176,7 @@ def test_a_value_in_json_is_read_back(value: Any) -> None:
 @given(
     st.text(max_size=50), st.sampled_from(["bool", "int", "float", "str", "choice", "json"]), st.booleans()
 )
-def test_no_text_is_more_than_refused(text: str, kind: Any, optional: bool) -> None:
+def test_any_text_is_parsed_or_raises_value_error(text: str, kind: Any, optional: bool) -> None:
     try:
         value = read_value(Keyword("a", kind, "1", choices=("1",), optional=optional), text)
     except ValueError:

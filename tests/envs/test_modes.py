@@ -1,7 +1,6 @@
-"""Every mode of observation, reward, control and rendering, against ManiSkill's own single CPU env.
+"""Every observation, reward, control and render mode equals ManiSkill's own single CPU env.
 
-Both are put into the same packed state, so what is compared is equal to the last bit and the last pixel
-unless a test says otherwise.
+Both envs unpack the same state, so results are equal to the last bit and the last pixel unless a test sets a tolerance.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -32,15 +31,15 @@ from tests.envs import stock_env
 pytestmark = pytest.mark.thorough
 
 N, ENV = 2, 1
-"""The batch, and the env of it that is compared."""
+"""Batch size, and index of the compared env."""
 SMALL = {"width": 32, "height": 24}
 NO_PICTURES = {"render_backend": "none"}
 CAMERA_TOLERANCE = 2e-7
-"""For camera matrices: stock reads them from SAPIEN, the batched path multiplies poses (max 1.2e-7 measured)."""
+"""Absolute, for camera matrices: stock reads them from SAPIEN, the batch multiplies poses (max 1.2e-7 measured)."""
 
 
 def pair(task: Any = PickCubeEnv, num_envs: int = N, **kwargs: Any) -> tuple[Any, Any]:
-    """The same task batched and stock, unwrapped."""
+    """Return the task as a batch and as ManiSkill's single env, unwrapped."""
     if kwargs.get("render_backend") != "none":
         kwargs["render_backend"] = RENDER_BACKEND
     cls = REGISTERED_ENVS[task].cls if isinstance(task, str) else task
@@ -54,18 +53,18 @@ def put_in_same_state(batch: Any, stock: Any, env: int = ENV, seed: int = 0) -> 
     stock.reset(seed=seed + env)
     for each in (batch, stock):
         for hidden in each._hidden_objects:
-            hidden.show_visual()  # hidden, it stands elsewhere in the batch and where it is in stock
+            hidden.show_visual()  # a batch moves hidden objects far away, stock does not
     stock_env.put_in_same_state(stock, batch, env)
 
 
 def assert_same(batched: Any, single: Any, path: str, env: int = ENV) -> None:
-    """Env `env` of a nest of batched tensors, against the only env of the other."""
+    """Compare env `env` of nested batched tensors with the only env of the others."""
     if isinstance(single, dict):
         assert list(batched) == list(single), path
         for key in single:
             assert_same(batched[key], single[key], f"{path}/{key}", env)
         return
-    # Stock ManiSkill leaves pictures on the GPU that drew them, its state on the CPU.
+    # Stock ManiSkill leaves images on the render GPU and states on the CPU.
     ours, theirs = batched[env], single[0].cpu()
     assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape), path
     computed_from_camera_poses = path.endswith(("extrinsic_cv", "cam2world_gl", "xyzw"))
@@ -114,7 +113,7 @@ def test_observations(obs_mode: str) -> None:
     stock.close()
 
 
-def test_an_observation_that_is_kept_does_not_change_with_the_next_step(renderer: None) -> None:
+def test_the_next_step_does_not_change_a_kept_observation(renderer: None) -> None:
     env = workbench.make("PickCube-v1", N, backend="cpu", obs_mode="rgb+state", sensor_configs=dict(SMALL))
     kept, _ = env.reset(seed=0)
     copied = common.torch_clone_dict(kept)
@@ -135,7 +134,7 @@ def test_rewards(reward_mode: str) -> None:
     batch, stock = pair("PushCube-v1", num_envs=3, reward_mode=reward_mode, **NO_PICTURES)
     put_in_same_state(batch, stock)
     for each, env in ((batch, slice(None)), (stock, slice(ENV, ENV + 1))):
-        # Near the goal, so that the sparse reward is one here and nothing in another env.
+        # Near the goal, so that the sparse reward is 1 in this env and 0 in the other.
         goal = batch.goal_region.pose.p[env].clone()
         goal[:, 0] -= torch.tensor([0.4, 0.0, 0.0])[env]
         goal[:, 2] = batch.obj.pose.p[env][:, 2]
@@ -163,7 +162,7 @@ def test_rewards(reward_mode: str) -> None:
 
 
 def body_frame_configs(panda: Any) -> dict[str, Any]:
-    """Two modes as ManiSkill's GPU inverse kinematics cannot do them: it knows the root's axes only."""
+    """Two modes in body frames, which ManiSkill's GPU inverse kinematics lacks: it supports root axes only."""
     configs = PANDA_CONFIGS(panda)
     configs["pd_ee_delta_pos"]["arm"].frame = "body_translation"
     configs["pd_ee_delta_pose"]["arm"].frame = "body_translation:body_aligned_body_rotation"
@@ -187,7 +186,7 @@ CONTROL_MODES = [
 
 
 def an_action(batch: Any, rng: np.random.Generator) -> np.ndarray:
-    """(N, A) within the mode's bounds; for absolute modes near to where the arm is."""
+    """Draw an action (N, A) within the mode's bounds; absolute modes get targets near the arm."""
     action = rng.uniform(-1, 1, (batch.num_envs, *batch.single_action_space.shape)).astype(np.float32)
     if batch.control_mode in ("pd_joint_pos", "pd_joint_pos_vel"):
         action[:, :7] = batch.agent.robot.get_qpos()[:, :7].numpy() + 0.1 * action[:, :7]
@@ -195,7 +194,7 @@ def an_action(batch: Any, rng: np.random.Generator) -> np.ndarray:
         at = batch.agent.controller.controllers["arm"].ee_pose_at_base
         angles = matrix_to_euler_angles(quaternion_to_matrix(at.q), "XYZ")
         action[:, :6] = torch.hstack([at.p, angles]).numpy() + 0.05 * action[:, :6]
-        if rng.random() < 0.3:  # out of reach: there is no answer, for this env alone
+        if rng.random() < 0.3:  # out of reach: IK has no solution, in this env only
             action[ENV, :3] = 1.9
     return action
 
@@ -206,7 +205,7 @@ def test_control(control_mode: str) -> None:
 
 
 @pytest.mark.parametrize("control_mode", ["pd_ee_delta_pos", "pd_ee_delta_pose"])
-def test_control_along_the_axes_of_the_hand(control_mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_control_in_the_hands_frame(control_mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Panda, "_controller_configs", property(body_frame_configs))
     follow_under_control(control_mode)
 
@@ -223,12 +222,12 @@ def follow_under_control(control_mode: str) -> None:
         stock.step(action[ENV : ENV + 1])
         assert torch.equal(batch.get_state()[ENV], stock.get_state()[0]), f"step {step}"
     moved = (batch.agent.robot.get_qpos() - begin).abs().max(dim=1).values
-    assert (moved > 0.01).all(), "an arm that does not move proves nothing"
+    assert (moved > 0.01).all(), "the arm did not move, so the test proved nothing"
     batch.close()
     stock.close()
 
 
-def test_the_control_mode_may_change_while_it_runs() -> None:
+def test_the_control_mode_can_change_on_a_running_env() -> None:
     batch, stock = pair(**NO_PICTURES)
     put_in_same_state(batch, stock)
     rng = np.random.default_rng(0)
@@ -251,7 +250,7 @@ def test_the_control_mode_may_change_while_it_runs() -> None:
 
 
 class TwoCameras(PickCubeEnv):
-    """A second camera for people; the goal is hidden from the sensors and shown to people."""
+    """Adds a second human render camera; the goal is hidden from sensors and visible to human render cameras."""
 
     @property
     def _default_human_render_camera_configs(self) -> list[CameraConfig]:

@@ -1,4 +1,4 @@
-"""A ManiSkill that nobody has tried: what lacks a private name is named and refused, and the rest works."""
+"""With an untested ManiSkill that lacks a private name, the feature that needs it is refused and the rest works."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def test_the_installed_maniskill_has_all_names() -> None:
     ],
     ids=lambda name: name.owner,
 )
-def test_what_is_not_there_is_noticed(name: PrivateName) -> None:
+def test_a_missing_name_is_detected(name: PrivateName) -> None:
     assert not name.exists()
 
 
 @pytest.fixture
-def looked_for_again() -> Iterator[None]:
+def fresh_name_cache() -> Iterator[None]:
     cached = maniskill_private.moved_names
     cached.cache_clear()
     yield
@@ -54,8 +54,8 @@ def a_task(num_envs: int = 2, **kwargs: object) -> TaskEnv:
     return TaskEnv(make_env(REGISTERED_ENVS["PickCube-v1"].cls, options), None)
 
 
-def test_without_a_name_that_everything_needs_no_task_is_opened(
-    monkeypatch: pytest.MonkeyPatch, looked_for_again: None
+def test_a_missing_essential_name_refuses_to_open_tasks(
+    monkeypatch: pytest.MonkeyPatch, fresh_name_cache: None
 ) -> None:
     monkeypatch.delattr(ArticulationJoint, "_data_index")
     with pytest.raises(BackendUnavailable, match=r"opening a task \(needs ArticulationJoint._data_index\)"):
@@ -63,8 +63,8 @@ def test_without_a_name_that_everything_needs_no_task_is_opened(
 
 
 @pytest.mark.parametrize("feature", FEATURES)
-def test_without_a_feature_the_task_runs(
-    feature: str, monkeypatch: pytest.MonkeyPatch, looked_for_again: None, renderer: None
+def test_a_task_runs_without_a_feature(
+    feature: str, monkeypatch: pytest.MonkeyPatch, fresh_name_cache: None, renderer: None
 ) -> None:
     moved = tuple(name for name in maniskill_private.PRIVATE_NAMES if name.disables == feature)
     monkeypatch.setattr(maniskill_private, "moved_names", lambda: moved)
@@ -104,7 +104,7 @@ def test_without_a_feature_the_task_runs(
 
 
 def test_the_message_names_the_tested_versions(
-    monkeypatch: pytest.MonkeyPatch, looked_for_again: None
+    monkeypatch: pytest.MonkeyPatch, fresh_name_cache: None
 ) -> None:
     monkeypatch.delattr(BaseEnv, "_get_obs_extra")
     monkeypatch.setitem(versions.TESTED, "sapien", ("0.1",))

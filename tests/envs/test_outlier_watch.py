@@ -1,4 +1,4 @@
-"""What the watch calls an outlier and what not, in steps that are made by hand; `session.history.test_outliers` has real ones."""
+"""The outlier watch's verdicts on hand-made steps; `tests/live/history/test_outliers.py` checks real ones."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ def found(watch: OutlierWatch, poses: np.ndarray) -> dict[OutlierKind, list[int]
 
 
 def lowered(poses: np.ndarray, by: float, envs: list[int]) -> np.ndarray:
-    there = poses.copy()
-    there[envs, 3, 2] -= by
-    return there
+    moved = poses.copy()
+    moved[envs, 3, 2] -= by
+    return moved
 
 
-def test_a_drop_is_measured_from_where_the_episode_began() -> None:
+def test_a_drop_is_measured_from_the_episodes_start() -> None:
     watch, poses = watched(3)
     high = lowered(poses, -2.0, [0, 1, 2])
     watch.begin(np.array([True, True, True]), step_of(high))
     lower = lowered(high, 0.8, [1])
     watch.begin(np.array([False, True, False]), step_of(lower))
-    assert found(watch, lower) == {}, "env 1 begins 0.8 m lower: that is no drop"
+    assert found(watch, lower) == {}, "env 1 starts 0.8 m lower, which is not a drop"
     assert found(watch, lowered(high, 0.8, [0, 1, 2])) == {OutlierKind.DROPPED: [0, 2]}
     assert found(watch, lowered(lower, 0.51, [1])) == {OutlierKind.DROPPED: [1]}
 
 
-def test_only_envs_that_begin_are_forgiven_how_they_came_there() -> None:
+def test_only_envs_that_begin_may_jump() -> None:
     watch, poses = watched(3)
     far = poses.copy()
     far[:, 3, 0] += 5.0
     watch.begin(np.array([False, True, False]), step_of(far))
     assert found(watch, far) == {OutlierKind.FAST: [0, 2]}
-    assert found(watch, far) == {}, "and they stand still now"
+    assert found(watch, far) == {}, "the bodies stand still in the second step"
 
 
-def test_the_worst_body_is_named_with_how_bad_it_is() -> None:
+def test_the_worst_body_is_named_with_its_value() -> None:
     watch, poses = watched(2)
-    there = poses.copy()
-    there[1, 2, 1] += 1.5
-    there[1, 3, 0] -= 2.0
-    [sight] = watch.check(step_of(there))
+    moved = poses.copy()
+    moved[1, 2, 1] += 1.5
+    moved[1, 3, 0] -= 2.0
+    [sight] = watch.check(step_of(moved))
     assert (sight.kind, sight.reason(1)) == (OutlierKind.FAST, "cube moved at 40 m/s")
     watch, poses = watched(2)
     high = lowered(poses, -3.0, [0, 1])
@@ -60,20 +60,20 @@ def test_the_worst_body_is_named_with_how_bad_it_is() -> None:
     assert (sight.kind, sight.reason(0)) == (OutlierKind.DROPPED, "cube dropped 0.75 m")
 
 
-def test_under_the_floor_is_so_far_below_the_lowest_that_stands_still() -> None:
+def test_under_the_floor_is_measured_from_the_lowest_still_point() -> None:
     watch, poses = watched(2)
     geometry, _ = table_scene(2)
     floor = lowest_still_point(geometry, poses)
-    there = poses.copy()
+    moved = poses.copy()
     for z, expected in ((floor - 0.19, []), (floor - 0.21, [OutlierKind.UNDER_FLOOR])):
-        there[1, 2, 2] = z
-        watch.begin(np.ones(2, bool), step_of(there))
-        assert list(found(watch, there)) == expected
-    assert [s.reason(1) for s in watch.check(step_of(there))] == ["arm/hand is under the floor"]
+        moved[1, 2, 2] = z
+        watch.begin(np.ones(2, bool), step_of(moved))
+        assert list(found(watch, moved)) == expected
+    assert [s.reason(1) for s in watch.check(step_of(moved))] == ["arm/hand is under the floor"]
 
 
 @pytest.mark.parametrize(
-    ("mode", "reward", "said"),
+    ("mode", "reward", "reason"),
     [
         ("sparse", 1.0, None),
         ("sparse", -1.0, None),
@@ -87,19 +87,19 @@ def test_under_the_floor_is_so_far_below_the_lowest_that_stands_still() -> None:
         ("sparse", np.inf, "the reward is infinite"),
     ],
 )
-def test_a_reward_is_odd_outside_the_range_of_its_mode_or_no_number(
-    mode: str, reward: float, said: str | None
+def test_a_reward_outside_its_modes_range_or_not_finite_is_an_outlier(
+    mode: str, reward: float, reason: str | None
 ) -> None:
     watch, poses = watched(3, mode)
     step = step_of(poses)
     rewards = step.reward.copy()
     rewards[1] = reward
     sights = watch.check(replace(step, reward=rewards))
-    assert [sight.reason(1) for sight in sights] == ([] if said is None else [said])
+    assert [sight.reason(1) for sight in sights] == ([] if reason is None else [reason])
     assert all(np.flatnonzero(sight.envs).tolist() == [1] for sight in sights)
 
 
-def test_numbers_of_evaluate_and_actions_that_are_none_are_named() -> None:
+def test_nan_and_infinite_numbers_of_evaluate_and_actions_are_named() -> None:
     watch, poses = watched(3)
     distance = np.zeros((3, 2), np.float32)
     distance[2, 1] = np.inf
@@ -107,8 +107,8 @@ def test_numbers_of_evaluate_and_actions_that_are_none_are_named() -> None:
     action[0, 3] = np.nan
     flags = {"success": np.zeros(3, bool), "distance": distance, "count": np.zeros(3, np.int64)}
     sights = watch.check(replace(step_of(poses), action=action, evaluate=flags))
-    said = {int(np.flatnonzero(s.envs)[0]): s.reason(int(np.flatnonzero(s.envs)[0])) for s in sights}
-    assert said == {0: "the action is NaN", 2: "distance is infinite"}
+    reasons = {int(np.flatnonzero(s.envs)[0]): s.reason(int(np.flatnonzero(s.envs)[0])) for s in sights}
+    assert reasons == {0: "the action is NaN", 2: "distance is infinite"}
     none = replace(
         step_of(poses), action=np.zeros((3, 0), np.float32), sound_obs=np.array([True, False, True])
     )
@@ -116,7 +116,7 @@ def test_numbers_of_evaluate_and_actions_that_are_none_are_named() -> None:
     assert sight.envs.tolist() == [False, True, False]
 
 
-def test_poses_that_are_lost_are_named_and_bodies_that_were_never_there_are_not() -> None:
+def test_lost_poses_are_named_but_not_those_of_absent_bodies() -> None:
     geometry, poses = table_scene(2)
     poses[0, 2] = np.nan  # env 0 has no hand
     watch = OutlierWatch(geometry, step_of(poses), 0.05, "dense")
@@ -127,7 +127,7 @@ def test_poses_that_are_lost_are_named_and_bodies_that_were_never_there_are_not(
     assert sight.envs.tolist() == [False, True] and sight.reason(1) == "the pose of cube is NaN"
 
 
-def test_the_lowest_still_point_is_the_ground_whichever_way_its_mesh_is_turned() -> None:
+def test_the_lowest_still_point_is_the_ground_for_any_mesh_orientation() -> None:
     geometry, poses = table_scene(1)
     assert lowest_still_point(geometry, poses) == pytest.approx(-0.9205)
     poses[0, 0] = [0, 0, 0.5, 0, 1, 0, 0]  # half a turn about x

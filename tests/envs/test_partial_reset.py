@@ -1,4 +1,4 @@
-"""A reset of some envs leaves the controllers of the others alone, and says whose fault it is when it fails."""
+"""A partial reset leaves the other envs' controllers alone, and its errors name the envs and buffers at fault."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
 
@@ -26,7 +26,7 @@ def made(task: str | type[BaseEnv] = PICK_CUBE, num_envs: int = 4, **kwargs: Any
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("control_mode", ["pd_joint_target_delta_pos", "pd_ee_target_delta_pose"])
-def test_an_env_that_is_not_reset_goes_on_to_the_target_that_it_had(control_mode: str) -> None:
+def test_an_env_that_is_not_reset_keeps_its_target(control_mode: str) -> None:
     env = made(control_mode=control_mode)
     rng = np.random.default_rng(0)
     chosen = [rng.uniform(-1, 1, env.action_space.shape).astype(np.float32) for _ in range(12)]
@@ -43,7 +43,7 @@ def test_an_env_that_is_not_reset_goes_on_to_the_target_that_it_had(control_mode
     env.close()
 
 
-def test_the_first_observation_after_it_shows_that_target_too() -> None:
+def test_the_first_observation_after_a_partial_reset_shows_kept_targets() -> None:
     env = made(control_mode="pd_joint_target_delta_pos", obs_mode="state_dict")
     env.reset(seed=[1, 2, 3, 4])
     for _ in range(5):
@@ -57,7 +57,7 @@ def test_the_first_observation_after_it_shows_that_target_too() -> None:
 
 
 class Starts(Bare):
-    """Where its box begins is drawn by each env's own generator, put into the scene and kept on the task."""
+    """Each env's generator draws the box's start position, which the scene and `start` hold."""
 
     def _load_scene(self, options: dict) -> None:
         builder = self.scene.create_actor_builder()
@@ -98,7 +98,7 @@ def drawn_by_stock(stock: Any, seed: int, resets: int = 1) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("chosen", "are"),
+    ("chosen", "reset_envs"),
     [
         ([2, 0], {0, 2}),
         ([-2, 0], {0, 2}),
@@ -107,22 +107,20 @@ def drawn_by_stock(stock: Any, seed: int, resets: int = 1) -> torch.Tensor:
         (np.array([2, 0]), {0, 2}),
     ],
 )
-def test_each_env_draws_on_as_a_single_one_does_in_whichever_order_they_are_named(
-    starts: Any, stock: Any, chosen: Any, are: set[int]
+def test_reset_envs_draw_like_single_envs_in_any_order(
+    starts: Any, stock: Any, chosen: Any, reset_envs: set[int]
 ) -> None:
     seeds = [5, 6, 7, 8]
     starts.reset(seed=seeds)
     starts.reset(options={"env_idx": chosen})
     for env, seed in enumerate(seeds):
-        expected = drawn_by_stock(stock, seed, resets=2 if env in are else 1)
+        expected = drawn_by_stock(stock, seed, resets=2 if env in reset_envs else 1)
         assert torch.equal(starts.box.pose.p[env], expected), env
         assert torch.equal(starts.start[env], expected), env
 
 
 @pytest.mark.parametrize("seeds", [[40, 41], torch.tensor([40, 41])])
-def test_seeds_for_some_envs_are_theirs_and_the_others_keep_their_own(
-    starts: Any, stock: Any, seeds: Any
-) -> None:
+def test_seeds_for_some_envs_leave_the_other_envs_seeds(starts: Any, stock: Any, seeds: Any) -> None:
     starts.reset(seed=[5, 6, 7, 8])
     starts.reset(seed=seeds, options={"env_idx": torch.tensor([3, 1])})
     assert starts._episode_seed.tolist() == [5, 41, 7, 40]
@@ -133,7 +131,7 @@ def test_seeds_for_some_envs_are_theirs_and_the_others_keep_their_own(
         assert torch.equal(starts.box.pose.p[env], drawn_by_stock(stock, seed, resets=2)), env
 
 
-def test_the_process_draws_on_as_if_seeds_for_some_envs_had_not_been_given(starts: Any) -> None:
+def test_seeds_for_some_envs_leave_the_process_generator_unchanged(starts: Any) -> None:
     starts.reset(seed=[5, 6, 7, 8])
     torch.manual_seed(3)
     expected = torch.rand(2)
@@ -142,12 +140,12 @@ def test_the_process_draws_on_as_if_seeds_for_some_envs_had_not_been_given(start
     assert torch.equal(torch.rand(2), expected)
     drawn = starts.box.pose.p[0, 2].clone()
     torch.manual_seed(40)
-    assert drawn == torch.rand(2)[0], "torch draws from the lowest env's seed"
+    assert drawn == torch.rand(2)[0], "in the reset, torch must draw from the lowest env's seed"
     assert starts._episode_rng is starts._batched_episode_rng[0]
 
 
 @pytest.mark.parametrize("named", [[1, 3], [3, 1]])
-def test_states_that_are_given_go_where_set_state_puts_them_and_observations_as_envs_are_named(
+def test_given_states_are_assigned_as_by_set_state_and_observations_in_env_idx_order(
     named: list[int],
 ) -> None:
     env = batch_of(Starts, 4, obs_mode="state")
@@ -177,7 +175,7 @@ def test_states_that_are_given_go_where_set_state_puts_them_and_observations_as_
         ([0.5], TypeError, "must be integers"),
     ],
 )
-def test_what_is_no_list_of_different_envs_is_refused_and_changes_nothing(
+def test_an_invalid_env_idx_is_refused_and_changes_nothing(
     starts: Any, wrong: Any, error: type[Exception], words: str
 ) -> None:
     starts.reset(seed=[5, 6, 7, 8])
@@ -188,7 +186,7 @@ def test_what_is_no_list_of_different_envs_is_refused_and_changes_nothing(
     assert np.array_equal(starts._batched_episode_rng[0].get_state()[1], states)
 
 
-def test_a_mask_with_a_row_for_each_env_names_those_that_are_true(starts: Any) -> None:
+def test_a_mask_of_all_envs_selects_the_true_ones(starts: Any) -> None:
     starts.reset(seed=[5, 6, 7, 8])
     before = starts.box.pose.raw_pose.clone()
     starts.reset(seed=[1, 2], options={"env_idx": torch.tensor([True, False, True, False])})
@@ -197,7 +195,7 @@ def test_a_mask_with_a_row_for_each_env_names_those_that_are_true(starts: Any) -
 
 
 class ForgetsRows(PICK_CUBE):
-    """Beside what it forgets are a buffer that keeps its rows and one that never had one for each env."""
+    """`start` loses rows in a partial reset; `goals` keeps them, and `corners` never had a row per env."""
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
@@ -211,7 +209,7 @@ class ForgetsRows(PICK_CUBE):
         return super().evaluate() | {"moved": self.cube.pose.p - self.start}
 
 
-def test_an_error_of_a_partial_reset_names_its_envs_and_the_buffers_that_lost_rows() -> None:
+def test_a_failed_partial_reset_names_its_envs_and_the_buffers_that_lost_rows() -> None:
     env = made(ForgetsRows)
     with pytest.raises(Exception) as caught:
         env.reset(options={"env_idx": torch.tensor([1, 2])})
@@ -219,6 +217,6 @@ def test_an_error_of_a_partial_reset_names_its_envs_and_the_buffers_that_lost_ro
     line = text[: text.index("self.start = torch.zeros(len(env_idx), 3)")].count("\n") + 1
     envs, lost = caught.value.__notes__
     assert "[1, 2] of 4" in envs
-    # Of all that has a row for each env only what has fewer now is named.
+    # Only the buffer that lost rows is named, not the others with a row per env.
     assert "self.start: 4 rows" in lost and "2 now" in lost and f"{Path(__file__).name}:{line}" in lost
     env.close()

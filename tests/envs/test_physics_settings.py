@@ -1,4 +1,4 @@
-"""What a task may change about physics: each change does what it does in a stock env, and does something."""
+"""Each physics setting that a task may change has an effect, and the same effect as in a stock env."""
 
 # ManiSkill annotates an env's members as the widest thing they may be, and vectors as tuples.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -54,7 +54,7 @@ def joint_properties(env: Any) -> None:
 
 
 def mass_of_every_body(env: Any) -> None:
-    # One body after the other: how a task gives each env its own mass.
+    # One body at a time, as a task sets a different mass in each env.
     for number, body in zip(env.env_numbers(), env.a._bodies):
         body.mass = 2.0 + number
 
@@ -170,7 +170,7 @@ def test_the_simulation_config_reaches_every_env(change: str, unchanged: torch.T
     env.close()
 
 
-def test_what_the_gpu_refuses_once_it_runs_is_told_at_its_line() -> None:
+def test_settings_that_a_running_gpu_refuses_warn_at_their_line() -> None:
     env = batch_of(Collision, 3)
     for change in (
         lambda: env.a.set_mass(2.0),
@@ -183,8 +183,8 @@ def test_what_the_gpu_refuses_once_it_runs_is_told_at_its_line() -> None:
         lambda: env.b.remove_from_scene(),
         lambda: env.scene.remove_articulation(env.chain),
     ):
-        with pytest.warns(RuleWarning, match="on the GPU this fails") as told:
+        with pytest.warns(RuleWarning, match="on the GPU this fails") as warned:
             change()
-        assert __file__ in {warning.filename for warning in told}
+        assert __file__ in {warning.filename for warning in warned}
     assert env.a.mass.tolist() == [2.0] * 3
     env.close()

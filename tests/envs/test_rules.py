@@ -1,4 +1,4 @@
-"""Degrees of the rules, and what is kept of those that were broken."""
+"""The rules' default degrees, and the list of broken rules."""
 
 # pyright: reportAttributeAccessIssue=false
 
@@ -21,7 +21,7 @@ from workbench.envs.gpu_rules import Finding, degrees_of
 N = 3
 
 
-def test_what_overwrites_other_envs_and_a_success_without_rows_stop_by_themselves() -> None:
+def test_only_writes_to_other_envs_and_missing_rows_stop_by_default() -> None:
     stops = {rule for rule, degree in degrees_of(None).items() if degree == "stop"}
     assert stops == {
         "other-env-written",
@@ -31,7 +31,7 @@ def test_what_overwrites_other_envs_and_a_success_without_rows_stop_by_themselve
     assert {degree for rule, degree in degrees_of(None).items() if rule not in stops} == {"warn"}
 
 
-# --- a rule that warns changes nothing ------------------------------------------------------------------
+# --- a rule that warns changes nothing --------------------------------------------------------------
 
 
 def _raised(env: Any) -> Pose:
@@ -48,15 +48,15 @@ def writes_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
     env.scene.px.cuda_rigid_body_data.torch()[env.cube._body_data_index, 2] += 0.1
 
 
-# --- what is kept -------------------------------------------------------------------------------------------
+# --- the list of broken rules -----------------------------------------------------------------------
 
 
-def a_rule() -> BrokenRules:
+def broken_rules() -> BrokenRules:
     return BrokenRules(degrees_of("warn"), lambda finding: None)
 
 
 def test_a_rule_broken_at_each_step_is_one_row_with_a_count() -> None:
-    rules = a_rule()
+    rules = broken_rules()
     for rules.step in range(5):
         rules.report_breach("not-applied", f"lost in step {rules.step}", None, ("task.py", 7, "lift"))
     (row,) = rules.rows
@@ -65,8 +65,8 @@ def test_a_rule_broken_at_each_step_is_one_row_with_a_count() -> None:
 
 
 def test_steps_are_counted_from_where_the_task_begins() -> None:
-    rules = a_rule()
-    rules.step = 7  # while it was tried
+    rules = broken_rules()
+    rules.step = 7  # steps of the trial before the task begins
     rules.report_breach("not-applied", "lost", None, ("task.py", 7, "lift"))
     rules.begin()
     rules.step += 2
@@ -75,7 +75,7 @@ def test_steps_are_counted_from_where_the_task_begins() -> None:
 
 
 def test_rows_are_bounded_and_the_rest_is_counted() -> None:
-    rules, serial = a_rule(), 0
+    rules, serial = broken_rules(), 0
     for line in range(3 * MAX_PLACES):
         rules.report_breach("not-applied", "lost", None, ("task.py", line, "lift"))
         assert rules.serial > serial
@@ -83,8 +83,8 @@ def test_rows_are_bounded_and_the_rest_is_counted() -> None:
     assert len(rules.rows) == MAX_PLACES and rules.more == 2 * MAX_PLACES
 
 
-def test_what_is_not_broken_again_at_the_same_occasion_leaves() -> None:
-    rules = a_rule()
+def test_after_an_edit_rows_that_are_not_broken_again_are_removed() -> None:
+    rules = broken_rules()
     with rules.during("step"):
         rules.report_breach("not-applied", "lost", None, ("task.py", 7, "lift"))
     with rules.during("reset"):
@@ -92,7 +92,7 @@ def test_what_is_not_broken_again_at_the_same_occasion_leaves() -> None:
     rules.edited(lambda row: ("task.py", (row.line or 0) + 1))
     assert [(row.rule, row.line) for row in rules.rows] == [("not-applied", 8), ("rows-rewritten", 10)]
     with pytest.raises(ZeroDivisionError), rules.during("step"):
-        raise ZeroDivisionError  # a step that was left half done shows nothing
+        raise ZeroDivisionError  # a step that did not finish confirms nothing
     with rules.during("reset", confirms=False):
         pass
     assert len(rules.rows) == 2
@@ -107,7 +107,7 @@ def test_what_is_not_broken_again_at_the_same_occasion_leaves() -> None:
 def test_a_comment_silences_its_line_until_the_file_is_edited(tmp_path: Path) -> None:
     file = tmp_path / "task.py"
     file.write_text("x = 1  # workbench: off[not-applied] the GPU is far\ny = 2\n")
-    rules = a_rule()
+    rules = broken_rules()
     for line in (1, 1, 2):
         rules.report_breach("not-applied", "lost", None, (str(file), line, "lift"))
     assert [(row.line, row.count) for row in rules.rows] == [(2, 1)]
@@ -116,7 +116,7 @@ def test_a_comment_silences_its_line_until_the_file_is_edited(tmp_path: Path) ->
     assert rules.silenced == () and [row.line for row in rules.rows] == [2]
 
 
-def test_of_several_things_lost_at_once_each_is_told() -> None:
+def test_each_of_several_lost_writes_is_reported() -> None:
     def lose(self: Any) -> None:
         self.cube.set_pose(_raised(self))
         self.goal_site.set_pose(_raised(self))
@@ -132,7 +132,7 @@ def test_of_several_things_lost_at_once_each_is_told() -> None:
     ]
 
 
-def test_make_stops_and_warns_by_rule_unless_told_otherwise() -> None:
+def test_make_uses_the_rules_default_degrees_unless_given_one() -> None:
     import workbench
 
     class Lifts(PICK_CUBE):
@@ -146,9 +146,9 @@ def test_make_stops_and_warns_by_rule_unless_told_otherwise() -> None:
 
     env = workbench.make(Lifts, 2, **CPU)
     env.reset(seed=0)
-    with pytest.warns(RuleWarning, match="physics never sees it") as told:
+    with pytest.warns(RuleWarning, match="physics never sees it") as warned:
         env.step(env.action_space.sample())
-    assert [warning.filename for warning in told if warning.category is RuleWarning] == [__file__]
+    assert [warning.filename for warning in warned if warning.category is RuleWarning] == [__file__]
     env.close()
     env = workbench.make(Writes, 2, **CPU)
     env.reset(seed=0)
@@ -158,8 +158,8 @@ def test_make_stops_and_warns_by_rule_unless_told_otherwise() -> None:
     for rules, caught in (("warn", 1), ("off", 0)):
         env = workbench.make(Writes, 2, rules=cast(Any, rules), **CPU)
         env.reset(seed=0)
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             env.reset(options={"env_idx": torch.tensor([1])})
-        assert sum(warning.category is RuleWarning for warning in told) == caught
+        assert sum(warning.category is RuleWarning for warning in warned) == caught
         env.close()

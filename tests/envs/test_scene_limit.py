@@ -1,4 +1,4 @@
-"""More envs than PhysX can have in a process are refused in words, not by the end of the process."""
+"""More envs than PhysX supports in one process raise an error and do not crash the process."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import sapien.physx as physx
 from workbench.envs.cpu_scene import free_thread_keys, require_scenes
 
 
-def test_each_physx_scene_takes_a_key_and_gives_it_back() -> None:
-    first = physx.PhysxCpuSystem()  # what PhysX takes once is taken with it
+def test_each_physx_scene_takes_a_key_and_releases_it() -> None:
+    first = physx.PhysxCpuSystem()  # also takes the keys that PhysX uses once per process
     before = free_thread_keys()
     assert before is not None
     more = [physx.PhysxCpuSystem() for _ in range(5)]
@@ -20,7 +20,7 @@ def test_each_physx_scene_takes_a_key_and_gives_it_back() -> None:
     del first
 
 
-def test_what_fits_is_not_refused_and_one_more_is() -> None:
+def test_only_more_envs_than_fit_are_refused() -> None:
     require_scenes(500)
     with pytest.raises(ValueError, match=r"\d+ are left here") as caught:
         require_scenes(1024)

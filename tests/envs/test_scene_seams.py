@@ -1,5 +1,5 @@
 # pyright: reportArgumentType=false
-"""Every private name of ManiSkill that drawing and pictures rely upon: an upgrade fails here first."""
+"""ManiSkill's private names that drawing and pictures rely on; an incompatible upgrade fails here first."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from workbench.envs import maniskill_private
 
 
 def test_a_config_knows_where_it_was_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Whatever ran an author's hooks in this process before has marked the class: here it begins as ManiSkill has it.
+    # Running an author's hooks patches the class for the rest of the process: restore ManiSkill's own.
     stock = getattr(CameraConfig.__init__, "_workbench_stock", CameraConfig.__init__)
     monkeypatch.setattr(CameraConfig, "__init__", stock)
-    monkeypatch.setattr(sapien_utils, "look_at", sapien_utils.look_at)  # to be put back
+    monkeypatch.setattr(sapien_utils, "look_at", sapien_utils.look_at)  # restored after the test
     maniskill_private.mark_camera_configs()
     maniskill_private.mark_camera_configs()
 

@@ -1,4 +1,4 @@
-"""State columns against what ManiSkill's own RecordEpisode would keep of the same moment."""
+"""State columns equal the state dict and observation that ManiSkill's own RecordEpisode would store."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def test_columns_are_the_state_dict_and_the_observation(obs_mode: str) -> None:
     for group, structs in state.items():
         for name, rows in structs.items():
             np.testing.assert_array_equal(columns[f"state/{group}/{name}"], rows.numpy())
-    seen = {name: column for name, column in columns.items() if name.startswith("obs/")}
-    assert {"obs/agent/qpos", "obs/extra/is_grasped", "obs/extra/tcp_pose"} <= seen.keys()
-    flat = torch.cat([torch.from_numpy(c).reshape(3, -1).float() for c in seen.values()], dim=1)
+    obs_columns = {name: column for name, column in columns.items() if name.startswith("obs/")}
+    assert {"obs/agent/qpos", "obs/extra/is_grasped", "obs/extra/tcp_pose"} <= obs_columns.keys()
+    flat = torch.cat([torch.from_numpy(c).reshape(3, -1).float() for c in obs_columns.values()], dim=1)
     observed: Any = task.obs
     if obs_mode == "state_dict":
         observed = common.flatten_state_dict(observed, use_torch=True)
@@ -42,7 +42,7 @@ def test_columns_are_the_state_dict_and_the_observation(obs_mode: str) -> None:
     task.close()
 
 
-def test_what_the_task_itself_moves_has_no_velocity_whatever_was_written() -> None:
+def test_kinematic_actors_have_zero_velocity_even_after_a_write() -> None:
     task = made("PickCube-v1", rules="off")
     env: Any = task.env
     for actor in (env.goal_site, env.cube):
@@ -57,7 +57,7 @@ def test_what_the_task_itself_moves_has_no_velocity_whatever_was_written() -> No
 
 class Observes(PICK_CUBE):
     evaluated: ClassVar[list[int]] = []
-    """Of the class: what asks for the names leaves an env's own attributes as they were."""
+    """Kept on the class, since reading the names restores the env's own attributes."""
 
     def evaluate(self) -> dict[str, Any]:
         self.evaluated.append(1)
@@ -67,7 +67,7 @@ class Observes(PICK_CUBE):
         return {**super()._get_obs_extra(info), "nothing": torch.zeros((self.num_envs, 0))}
 
 
-def test_the_names_of_a_flat_observation_are_asked_for_once_and_what_is_empty_has_none() -> None:
+def test_names_of_a_flat_observation_are_read_once_and_skip_empty_entries() -> None:
     task = TaskEnv(batched(Observes, 3, obs_mode="state"))
     task.reset(seed=0)
     before = len(Observes.evaluated)
@@ -79,17 +79,17 @@ def test_the_names_of_a_flat_observation_are_asked_for_once_and_what_is_empty_ha
     task.close()
 
 
-class ObservesOtherwise(PICK_CUBE):
+class ObservesOtherNames(PICK_CUBE):
     def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, Any]:
         return {f"{name}_now": value for name, value in super()._get_obs_extra(info).items()}
 
 
-def test_the_names_are_those_of_the_class_that_the_env_has_now() -> None:
-    """As after a reload: as wide an observation, under other names."""
+def test_names_follow_a_new_class_of_the_env() -> None:
+    """After a reload the observation may have the same width and other names."""
     task = TaskEnv(batched(Observes, 3, obs_mode="state"))
     task.reset(seed=0)
     assert "obs/extra/tcp_pose" in read_state_columns(task)
-    put_class(task.env, ObservesOtherwise)
+    put_class(task.env, ObservesOtherNames)
     task.step(None)
     names = read_state_columns(task).keys()
     assert "obs/extra/tcp_pose_now" in names and "obs/extra/tcp_pose" not in names
@@ -97,13 +97,13 @@ def test_the_names_are_those_of_the_class_that_the_env_has_now() -> None:
 
 
 class Remembers(PICK_CUBE):
-    """With a state of its own."""
+    """Adds an entry to the state dict."""
 
     def get_state_dict(self) -> dict[str, Any]:
         return {**super().get_state_dict(), "goals": {"best": torch.arange(3.0)}}
 
 
-def test_a_task_with_a_state_of_its_own_is_asked_for_it() -> None:
+def test_a_tasks_own_state_dict_entries_are_columns() -> None:
     task = TaskEnv(batched(Remembers, 3))
     task.reset(seed=0)
     columns = read_state_columns(task)
@@ -111,24 +111,24 @@ def test_a_task_with_a_state_of_its_own_is_asked_for_it() -> None:
     task.close()
 
 
-def test_what_lies_on_a_device_comes_as_it_is_in_its_order() -> None:
-    """Put together by type on the way; here nothing but the name of the device is a GPU's."""
-    asked = {
+def test_tensors_of_a_device_keep_their_values_and_order() -> None:
+    """Tensors are concatenated by type for the transfer; here only the device's name says GPU."""
+    tensors = {
         "b": torch.arange(12.0).reshape(2, 3, 2),
         "truths": torch.tensor([True, False]),
         "a": torch.tensor([7.0, 8.0]),
         "known": np.array([1, 2]),
         "none": torch.zeros((2, 0)),
     }
-    columns = StateReading(None, asked, {}, 2, torch.device("cuda")).columns()
-    assert list(columns) == list(asked)
-    for name, value in asked.items():
+    columns = StateReading(None, tensors, {}, 2, torch.device("cuda")).columns()
+    assert list(columns) == list(tensors)
+    for name, value in tensors.items():
         column = columns[name]
         assert column.shape == tuple(value.shape) and column.dtype == np.asarray(value).dtype
         np.testing.assert_array_equal(column, np.asarray(value))
 
 
-def test_what_an_env_does_not_have_is_left_out_of_its_states() -> None:
+def test_actors_that_an_env_lacks_are_left_out_of_its_states() -> None:
     columns = {
         "state/actors/mug": np.array([[np.nan] * 13, [0.5] * 13], np.float32),
         "obs/agent/qpos": np.full((2, 2), np.nan),

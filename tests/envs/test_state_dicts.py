@@ -1,4 +1,4 @@
-"""``get_state_dict`` and its kin, for all envs and for some."""
+"""``get_state_dict``, ``set_state_dict`` and their flat forms, for all envs and for some."""
 
 # ManiSkill annotates an env's members as the widest thing they may be, and vectors as tuples.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -18,7 +18,7 @@ from tests.envs.stock_env import batch_of
 
 PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 TOLERANCE = 2e-6
-"""PhysX keeps the root of an articulation by its centre of mass: a pose that is set comes back rounded."""
+"""Absolute. PhysX stores an articulation's root pose at its centre of mass, so a pose comes back rounded."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def move(env: Any, steps: int = 5) -> None:
 
 
 @pytest.mark.parametrize("flat", [False, True], ids=["dict", "vector"])
-def test_a_state_comes_back(env: Any, flat: bool) -> None:
+def test_a_state_survives_a_round_trip(env: Any, flat: bool) -> None:
     state = env.get_state() if flat else env.get_state_dict()
     before = env.get_state().clone()
     move(env)

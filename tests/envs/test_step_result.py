@@ -1,4 +1,4 @@
-"""The memory that a step's result takes, by which the history drops the oldest."""
+"""The memory size of a step result, which bounds the history."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rules: each broken by a hook of a task that really runs, told at its line, and kept by the same hook without the fault."""
+"""Each rule is reported at its line when a hook of a running task breaks it, and not for correct hooks."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportCallIssue=false
@@ -34,11 +34,11 @@ Hook = Callable[..., Any]
 
 
 class Hooked(PICK_CUBE):
-    """A test gives it a hook."""
+    """PickCube; tests patch hooks into it."""
 
 
 def also(name: str, hook: Hook) -> Hook:
-    """PickCube's hook of this name, and then `hook`, which may return something else."""
+    """Return a hook that runs PickCube's `name`, then `hook`, and returns `hook`'s result unless it is None."""
 
     def run(self: Any, *args: Any, **kwargs: Any) -> Any:
         stock = getattr(PICK_CUBE, name)(self, *args, **kwargs)
@@ -49,7 +49,7 @@ def also(name: str, hook: Hook) -> Hook:
 
 
 def build(name: str, hook: Hook, rules: Any = "stop", num_envs: int = N) -> Any:
-    """An env of its own, where the hook runs while it is built, or the rules are others."""
+    """Build a separate env, for hooks that run during construction and for other degrees."""
     return batched(type("HookedOnce", (PICK_CUBE,), {name: also(name, hook)}), num_envs, rules=rules)
 
 
@@ -62,9 +62,9 @@ def strict() -> Iterator[Any]:
 
 @pytest.fixture
 def run(strict: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Hook], None]:
-    """What the workbench does with a task: a reset, steps, a partial reset, another step; with a hook of this name.
+    """Run a reset, steps, a partial reset and another step with `hook` in place, as the workbench would.
 
-    Of one env for all tests: what a hook that raised had written or half applied is not the next episode's.
+    All tests share one env: the next reset discards what a hook that raised had written or half applied.
     """
 
     def run(name: str, hook: Hook) -> None:
@@ -83,8 +83,8 @@ def run(strict: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Hook], N
     return run
 
 
-def told_at(caught: pytest.ExceptionInfo[BaseException]) -> str:
-    """The line that the page would show: the innermost of this file."""
+def line_at(caught: pytest.ExceptionInfo[BaseException]) -> str:
+    """Return the source line that the page would show: the innermost frame of this file."""
     frames = [f for f in traceback.extract_tb(caught.value.__traceback__) if f.filename == __file__]
     return linecache.getline(__file__, frames[-1].lineno or 0)
 
@@ -275,20 +275,22 @@ NO_FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("hook", "fault", "rule", "told"), FAULTS)
-def test_a_broken_rule_is_told_at_its_line(run: Hook, hook: str, fault: Hook, rule: str, told: str) -> None:
-    with pytest.raises(BrokenRule, match=told) as caught:
+@pytest.mark.parametrize(("hook", "fault", "rule", "message"), FAULTS)
+def test_a_broken_rule_is_reported_at_its_line(
+    run: Hook, hook: str, fault: Hook, rule: str, message: str
+) -> None:
+    with pytest.raises(BrokenRule, match=message) as caught:
         run(hook, fault)
     assert caught.value.rule == rule
-    assert "# the fault" in told_at(caught)
+    assert "# the fault" in line_at(caught)
 
 
 @pytest.mark.parametrize(("hook", "does"), NO_FAULTS)
-def test_what_is_no_fault_is_not_told(run: Hook, hook: str, does: Hook) -> None:
+def test_a_correct_hook_is_not_reported(run: Hook, hook: str, does: Hook) -> None:
     run(hook, does)
 
 
-def test_writes_that_are_applied_are_no_fault(run: Hook) -> None:
+def test_applied_writes_are_not_reported(run: Hook) -> None:
     def write(env: Any) -> None:
         for each in (set_pose, set_velocity, set_qpos, set_targets, set_target_of_a_joint, write_the_tensor):
             each(env)
@@ -297,8 +299,8 @@ def test_writes_that_are_applied_are_no_fault(run: Hook) -> None:
     run(BEFORE, write)
 
 
-def test_targets_that_a_controller_sets_between_substeps_are_told(strict: Any) -> None:
-    """On the GPU they are never applied: ManiSkill applies targets before the first substep only."""
+def test_targets_that_a_controller_sets_between_substeps_are_reported(strict: Any) -> None:
+    """The GPU never applies such targets: ManiSkill applies targets before the first substep only."""
     strict.reset(seed=[0, 1, 2])
     controller = strict.agent.controller.controllers["arm"]
     stock = controller.before_simulation_step
@@ -316,30 +318,30 @@ def test_targets_that_a_controller_sets_between_substeps_are_told(strict: Any) -
         controller.before_simulation_step = lambda: controller.set_drive_targets(zero)  # the fault
         with pytest.raises(BrokenRule, match="'panda' in envs 0, 1, 2") as caught:
             strict.step(ACTION)
-        assert "# the fault" in told_at(caught)
+        assert "# the fault" in line_at(caught)
     finally:
         del controller.before_simulation_step
 
 
-def test_a_write_that_a_reset_of_other_envs_applies_is_told_and_without_rules_applied() -> None:
-    for rules, told in (("stop", BrokenRule), ("warn", RuleWarning), ("off", None)):
+def test_a_write_that_a_reset_of_other_envs_applies_is_reported() -> None:
+    for rules, expected in (("stop", BrokenRule), ("warn", RuleWarning), ("off", None)):
         env = batched(PICK_CUBE, N, rules=rules)
         height = env.cube.pose.p[:, 2].clone()
         set_pose(env)
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuleWarning)
-            for again in range(2 if told else 1):
+            for again in range(2 if expected else 1):
                 try:
                     if again:
                         warnings.simplefilter("ignore", RuleWarning)
                     env.reset(options={"env_idx": torch.tensor([1])})
                 except (BrokenRule, RuleWarning) as error:
-                    assert type(error) is told and "'cube' in envs 0, 2" in str(error) and not again
+                    assert type(error) is expected and "'cube' in envs 0, 2" in str(error) and not again
         torch.testing.assert_close(env.cube.pose.p[:, 2] - height, torch.tensor([0.1, 0.0, 0.1]))
         env.close()
 
 
-def test_state_read_between_merged_substeps_is_told_as_between_others(strict: Any) -> None:
+def test_state_read_between_merged_substeps_is_reported_too(strict: Any) -> None:
     strict.reset(seed=[0, 1, 2])
     strict.step(ACTION)
     px = strict.scene.px
@@ -367,7 +369,7 @@ def move_a_wall(env: Any, options: dict) -> None:
         ("_initialize_episode", lambda env, *_: env.scene._gpu_apply_all(), "refused-by-gpu"),
     ],
 )
-def test_what_is_done_wrong_while_it_is_built_is_told(name: str, hook: Hook, rule: str) -> None:
+def test_a_rule_broken_during_construction_is_reported(name: str, hook: Hook, rule: str) -> None:
     with pytest.raises(BrokenRule) as caught:
         build(name, hook)
     assert caught.value.rule == rule
@@ -375,7 +377,7 @@ def test_what_is_done_wrong_while_it_is_built_is_told(name: str, hook: Hook, rul
 
 
 @pytest.mark.parametrize("write", [pose_of_all, qpos_of_all, targets_of_all])
-def test_rows_of_all_envs_in_a_partial_reset_go_to_those_that_are_reset(write: Hook) -> None:
+def test_values_for_all_envs_in_a_partial_reset_reach_only_the_reset_envs(write: Hook) -> None:
     env = build(RESET, write, "off")
     env.reset(seed=[0, 1, 2])
     before = env.get_state()
@@ -384,7 +386,7 @@ def test_rows_of_all_envs_in_a_partial_reset_go_to_those_that_are_reset(write: H
     env.close()
 
 
-def test_a_batch_of_another_size_is_refused_with_both_and_another_fault_is_torchs() -> None:
+def test_a_wrong_row_count_is_named_and_other_shape_errors_stay_torchs() -> None:
     rows = {"qpos": (5, 9)}
 
     def write(self: Any, env_idx: torch.Tensor, options: dict) -> None:
@@ -401,8 +403,8 @@ def test_a_batch_of_another_size_is_refused_with_both_and_another_fault_is_torch
     env.close()
 
 
-def test_sapiens_own_setters_work_where_no_rule_is_checked(strict: Any) -> None:
-    """Also in a process that has a scene with rules."""
+def test_sapiens_own_setters_work_where_rules_are_off(strict: Any) -> None:
+    """Even in a process that has a scene with rules."""
     env = batched(PICK_CUBE, N, rules="off")
     for write in (set_entity_pose, set_body_velocity, set_articulation_qpos, set_joint_target):
         write(env)
@@ -426,24 +428,26 @@ def test_the_list_of_contacts_needs_one_env() -> None:
 
 
 @pytest.mark.parametrize(
-    ("hook", "returns", "told"),
+    ("hook", "returns", "message"),
     [
         ("evaluate", lambda env: {"success": torch.tensor(True)}, "success"),
         ("evaluate", lambda env: {"success": True}, "success"),
-        ("evaluate", lambda env: {"success": torch.ones(N)}, "success"),  # a row each, but no truths
+        ("evaluate", lambda env: {"success": torch.ones(N)}, "success"),  # a row per env, but not bool
         ("compute_normalized_dense_reward", lambda env, **_: torch.zeros((N, 1)), r"\(3, 1\)"),
         ("_get_obs_extra", lambda env, info: {"goal": torch.zeros(4)}, "goal"),
     ],
 )
-def test_returns_without_a_row_for_each_env_are_told(run: Hook, hook: str, returns: Hook, told: str) -> None:
-    with pytest.raises(WrongReturn, match=rf"{hook}\(\).*{told}"):
+def test_returns_without_a_row_for_each_env_are_reported(
+    run: Hook, hook: str, returns: Hook, message: str
+) -> None:
+    with pytest.raises(WrongReturn, match=rf"{hook}\(\).*{message}"):
         run(hook, returns)
 
 
 @pytest.mark.parametrize("rules", ["stop", "off"])
 @pytest.mark.parametrize("hook", ["_initialize_episode", "_after_control_step"])
-def test_an_env_can_be_reset_after_any_of_this(rules: Any, hook: str) -> None:
-    """What the hook that raised had written or half applied is not the next episode's."""
+def test_an_env_can_be_reset_after_a_hook_failed(rules: Any, hook: str) -> None:
+    """The reset discards what the failed hook had written or half applied."""
     failing = ""
 
     def fail(self: Any, *args: Any) -> None:
@@ -465,7 +469,7 @@ def test_an_env_can_be_reset_after_any_of_this(rules: Any, hook: str) -> None:
             env.step(ACTION)
         failing = ""
         env.reset(seed=[0, 1, 2])
-        assert env.cube.pose.p.abs().max() < 0.5, "what was written before it failed"
+        assert env.cube.pose.p.abs().max() < 0.5, "the failed hook's write survived the reset"
         env.step(ACTION)
         assert torch.isfinite(env.get_state()).all()
     env.close()
@@ -474,7 +478,7 @@ def test_an_env_can_be_reset_after_any_of_this(rules: Any, hook: str) -> None:
 # --- degrees ----------------------------------------------------------------------------------------
 
 
-def test_an_env_with_rules_gives_the_same_bits(strict: Any) -> None:
+def test_rules_do_not_change_the_simulation(strict: Any) -> None:
     def run_steps(env: BaseEnv) -> torch.Tensor:
         rng = np.random.default_rng(0)
         env.reset(seed=[0, 1, 2])
@@ -494,7 +498,7 @@ def test_an_env_with_rules_gives_the_same_bits(strict: Any) -> None:
 
 
 @pytest.fixture(scope="module")
-def warned_and_not() -> Iterator[list[Any]]:
+def warn_and_off() -> Iterator[list[Any]]:
     envs = [batched(Hooked, N, rules=rules, on_finding=lambda finding: None) for rules in ("warn", "off")]
     yield envs
     for env in envs:
@@ -502,11 +506,11 @@ def warned_and_not() -> Iterator[list[Any]]:
 
 
 @pytest.mark.parametrize(("hook", "fault"), [(hook, fault) for hook, fault, *_ in FAULTS])
-def test_what_only_warns_goes_on_to_the_same_bits_as_without_rules(
-    warned_and_not: list[Any], hook: str, fault: Hook, monkeypatch: pytest.MonkeyPatch
+def test_after_a_warning_states_equal_those_without_rules(
+    warn_and_off: list[Any], hook: str, fault: Hook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     states = []
-    for env in warned_and_not:
+    for env in warn_and_off:
         monkeypatch.undo()
         renew_physics(env.scene, [*range(N)])
         env.reset(seed=[0, 1, 2])
@@ -522,17 +526,17 @@ def test_what_only_warns_goes_on_to_the_same_bits_as_without_rules(
         states.append(torch.stack(of_env))
         monkeypatch.undo()
     torch.testing.assert_close(states[0], states[1], rtol=0, atol=0, equal_nan=True)
-    assert fault.__name__ in {row.function for row in warned_and_not[0].broken_rules.rows}
+    assert fault.__name__ in {row.function for row in warn_and_off[0].broken_rules.rows}
 
 
-def test_warn_tells_once_with_the_place_and_goes_on() -> None:
+def test_warn_reports_once_at_the_line_and_continues() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         env = build(BEFORE, set_pose, "warn")
         for _ in range(3):
             env.step(ACTION)
-    (told,) = [w for w in caught if w.category is RuleWarning]
-    assert told.filename == __file__ and "# the fault" in linecache.getline(__file__, told.lineno)
+    (warning,) = [w for w in caught if w.category is RuleWarning]
+    assert warning.filename == __file__ and "# the fault" in linecache.getline(__file__, warning.lineno)
     env.close()
 
 
@@ -543,11 +547,11 @@ def test_warn_tells_once_with_the_place_and_goes_on() -> None:
         "StackCube-v1",
         "DrawTriangle-v1",  # applies in _after_control_step
         "MS-HumanoidStand-v1",  # moves its camera before every step
-        "PlugCharger-v1",  # computes its goal pose anew for all envs, the same but for rounding
+        "PlugCharger-v1",  # recomputes its goal pose for all envs, equal except for rounding
         "TwoRobotStackCube-v1",
     ],
 )
-def test_built_in_tasks_that_keep_the_rules_hear_nothing(env_id: str) -> None:
+def test_built_in_tasks_that_keep_the_rules_are_not_reported(env_id: str) -> None:
     env = batched(env_id, N, rules="stop", obs_mode="state")
     env.reset(seed=[0, 1, 2])
     for _ in range(5):
@@ -564,31 +568,31 @@ _ANT = [
     "The pose of 'camera_mount' is set with 4 rows, and 2 are wanted",
 ]
 _ROTATE_VALVE = [
-    "self.rotate_direction is left with a row for each",
-    "self.rest_qpos is left with a row for each",
+    "self.rotate_direction now has rows for only",
+    "self.rest_qpos now has rows for only",
 ]
 UPSTREAM_BREAKS = {
-    # control/ant.py lines 179 and 186: the camera follows the torso of one step ago.
+    # control/ant.py lines 179 and 186: the camera follows the torso's pose of the previous step.
     "MS-AntWalk-v1": _ANT,
     "MS-AntRun-v1": _ANT,
-    # assembly/fmb_assembly.py: in a partial reset it gives a pose of each env.
+    # assembly/fmb_assembly.py: a partial reset sets poses of all envs.
     "FMBAssembly1Easy-v1": ["The pose of 'bridge_grasp' is set with 4 rows, and 2 are wanted"],
-    # dexterity/rotate_valve.py lines 150 and 164: what breaks its partial reset.
+    # dexterity/rotate_valve.py lines 150 and 164, which break its partial reset.
     **{f"RotateValveLevel{level}-v1": _ROTATE_VALVE for level in range(5)},
     # humanoid/humanoid_stand.py line 53: returns info["is_standing"], a bool, as the sparse reward.
     "UnitreeG1Stand-v1": ["compute_sparse_reward() returned a bool tensor"],
-    # tabletop/two_robot_pick_cube.py line 107: of all envs, and the reward of those not reset is measured from it.
+    # tabletop/two_robot_pick_cube.py line 107: overwrites all envs' rows, from which rewards are computed.
     "TwoRobotPickCube-v1": ["self.left_init_qpos is changed in envs 0, 2"],
 }
-"""Of ManiSkill 3.0.1's tasks (``mani_skill/envs/tasks``)."""
+"""Broken rules of ManiSkill 3.0.1's tasks (``mani_skill/envs/tasks``), by env id."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", sorted(REGISTERED_ENVS))
-def test_no_built_in_task_is_told_off_for_nothing(env_id: str) -> None:
-    """What a task raises of itself (a download, a faulty partial reset) it raises without rules too."""
+def test_built_in_tasks_break_only_the_listed_rules(env_id: str) -> None:
+    """A task's own errors (a missing download, a faulty partial reset) occur without rules too."""
 
-    def told(rules: Any) -> tuple[type | None, list[str]]:
+    def run_task(rules: Any) -> tuple[type | None, list[str]]:
         spec, env, error = REGISTERED_ENVS[env_id], None, None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -611,8 +615,8 @@ def test_no_built_in_task_is_told_off_for_nothing(env_id: str) -> None:
                     env.close()
         return error, [str(w.message) for w in caught if w.category is RuleWarning]
 
-    error, messages = told("warn")
-    assert error is None or told("off")[0] is not None
+    error, messages = run_task("warn")
+    assert error is None or run_task("off")[0] is not None
     expected = UPSTREAM_BREAKS.get(env_id, [])
     assert len(messages) == len(expected), messages
     assert all(words in message for words, message in zip(expected, messages, strict=True)), messages

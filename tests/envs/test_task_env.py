@@ -42,15 +42,15 @@ def push() -> Iterator[TaskEnv]:
     env.close()
 
 
-def test_a_reward_that_could_be_learned_from_is_a_number_like_others(push: TaskEnv) -> None:
-    """As of a task that asks a network of torch's."""
+def test_a_reward_with_a_gradient_is_detached(push: TaskEnv) -> None:
+    """A task may compute its reward with a torch network."""
     reward = torch.ones(N, requires_grad=True) * 2
     assert (
         push.result({"success": torch.zeros(N, dtype=torch.bool)}, reward, None).reward.tolist() == [2.0] * N
     )
 
 
-def test_what_a_step_returned_does_not_change_with_the_next(push: TaskEnv) -> None:
+def test_the_next_step_does_not_change_an_earlier_result(push: TaskEnv) -> None:
     push.reset(seed=0)
     step = push.step(np.ones((N, 8), np.float32))
     copies = step.poses.copy(), step.reward.copy(), step.elapsed_steps.copy()
@@ -71,7 +71,7 @@ def test_the_time_limit_truncates(push: TaskEnv) -> None:
     seed=st.integers(0, 2**31 - N - 1),
     steps=st.integers(0, 3),
 )
-def test_a_partial_reset_touches_its_subset_only(
+def test_a_partial_reset_leaves_the_other_envs(
     push: TaskEnv, subset: set[int], seed: int, steps: int
 ) -> None:
     push.reset(seed=7)
@@ -85,7 +85,7 @@ def test_a_partial_reset_touches_its_subset_only(
     assert [int(after.elapsed_steps[i]) for i in others] == [steps] * len(others)
 
 
-def test_in_whichever_order_envs_are_named_each_starts_from_its_own_seed(push: TaskEnv) -> None:
+def test_each_env_gets_its_own_seed_in_any_order_of_envs(push: TaskEnv) -> None:
     push.reset(seed=0)
     ascending = push.reset(seed=[41, 40], env_idx=[0, 2])
     push.reset(seed=0)
@@ -95,38 +95,42 @@ def test_in_whichever_order_envs_are_named_each_starts_from_its_own_seed(push: T
     single = stock("PushCube-v1")
     single.reset(seed=41)
     assert torch.equal(push.env.obj.pose.p[0], single.obj.pose.p[0])
-    # Its first joints come from numpy's generator, of which ManiSkill keeps one for the whole batch.
+    # Joint noise comes from numpy's generator, which ManiSkill shares across the batch.
     assert torch.equal(push.env.agent.robot.qpos[0], single.agent.robot.qpos[0])
     single.close()
 
 
-class DrawsWhenAsked(PUSH_CUBE):
-    """Every look at it draws from all generators and counts."""
+class DrawsInEvaluate(PUSH_CUBE):
+    """``evaluate`` draws from all generators and counts its calls."""
 
-    looks = 0
+    evaluations = 0
 
     def evaluate(self) -> dict:
-        self.looks += 1
+        self.evaluations += 1
         drawn = torch.rand(self.num_envs) + float(np.random.rand() + random.random())
         drawn = drawn + torch.tensor(self._batched_episode_rng.normal(), dtype=torch.float32)
-        return {**super().evaluate(), "drawn": drawn, "looks": torch.full((self.num_envs,), self.looks)}
+        return {
+            **super().evaluate(),
+            "drawn": drawn,
+            "evaluations": torch.full((self.num_envs,), self.evaluations),
+        }
 
 
-def test_judging_the_present_moment_leaves_nothing_behind() -> None:
-    env = TaskEnv(batched(DrawsWhenAsked, 3), 50)
+def test_rescoring_leaves_no_trace() -> None:
+    env = TaskEnv(batched(DrawsInEvaluate, 3), 50)
     env.reset(seed=0)
     env.step(np.zeros((3, 8), np.float32))
     first, again = env.rescore(), env.rescore(np.zeros((3, 8), np.float32))
     assert not first.reward.any() and first.action is None and again.reward.all()
-    for name in ("drawn", "looks"):
+    for name in ("drawn", "evaluations"):
         assert np.array_equal(first.evaluate[name], again.evaluate[name]), name
     assert len({*first.evaluate["drawn"].tolist()}) == 3
     assert np.array_equal(env.step(np.zeros((3, 8), np.float32)).evaluate["drawn"], first.evaluate["drawn"])
     env.close()
 
 
-class TellsOfEach(PUSH_CUBE):
-    """Env 1 succeeds and env 2 fails from the start; of env 0 one part of the observation is lost."""
+class DiffersByEnv(PUSH_CUBE):
+    """Env 1 succeeds and env 2 fails from the start; env 0's observation contains a NaN."""
 
     def evaluate(self) -> dict:
         numbers = torch.arange(self.num_envs)
@@ -139,8 +143,8 @@ class TellsOfEach(PUSH_CUBE):
 
 
 @pytest.mark.parametrize("obs_mode", ["state", "state_dict"])
-def test_what_a_task_says_of_each_env_is_told_of_that_env(obs_mode: str) -> None:
-    env = TaskEnv(batched(TellsOfEach, 4, obs_mode=obs_mode), 50)
+def test_success_failure_and_nan_are_assigned_to_their_env(obs_mode: str) -> None:
+    env = TaskEnv(batched(DiffersByEnv, 4, obs_mode=obs_mode), 50)
     for step in (env.reset(seed=0), env.step(np.zeros((4, 8), np.float32)), env.rescore()):
         assert step.terminated.tolist() == [False, True, True, False]
         assert step.sound_obs is not None and step.sound_obs.tolist() == [False, True, True, True]
@@ -148,7 +152,7 @@ def test_what_a_task_says_of_each_env_is_told_of_that_env(obs_mode: str) -> None
     env.close()
 
 
-def test_a_scene_that_a_reset_builds_anew_is_the_one_that_is_read_and_acted_on() -> None:
+def test_after_a_rebuild_the_new_scene_is_read_and_controlled() -> None:
     env = opened("PushCube-v1", 2, control_mode="pd_joint_pos")
     env.reset(seed=0)
     old, scene = env.parts, env.env.scene
@@ -163,7 +167,7 @@ def test_a_scene_that_a_reset_builds_anew_is_the_one_that_is_read_and_acted_on()
     env.close()
 
 
-def test_a_seed_is_kept_to_where_resets_without_one_draw_their_own() -> None:
+def test_given_seeds_hold_where_resets_without_one_draw_seeds() -> None:
     env = opened("PushCube-v1", 3, enhanced_determinism=True)
     env.reset(seed=0)
     env.reset(seed=[40, 41], env_idx=[2, 1])
@@ -190,7 +194,7 @@ def test_holding_still_holds_still(control_mode: str) -> None:
     env.reset(seed=0)
     robot = env.env.agent.robot
     start = robot.get_qpos().clone()
-    start[:, 7:] = torch.tensor([[0.02], [0.035]])  # a hand that is half open, in each env otherwise
+    start[:, 7:] = torch.tensor([[0.02], [0.035]])  # a half-open hand, differently in each env
     robot.set_qpos(start)
     env.env.scene._gpu_apply_all()
     env.env.scene.px.gpu_update_articulation_kinematics()
@@ -242,13 +246,15 @@ def test_the_reward_is_the_richest_that_the_class_implements() -> None:
     assert default_reward_mode(PUSH_CUBE) == "normalized_dense"
 
 
-def test_a_gpu_is_simulated_on_only_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No test of GPU simulation has passed anywhere: whoever takes it is to know."""
+def test_gpu_simulation_is_used_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    """GPU simulation is untested, so it needs an explicit choice and the message says so."""
     monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: None)
-    taken = {wanted: choose_backend(wanted, render=False).simulation for wanted in get_args(backends.Backend)}
-    assert taken == {"auto": "cpu", "cpu": "cpu", "gpu": "gpu"}
-    told = backends.unused_gpu_text("auto")
-    assert told is not None and "--backend gpu" in told and "passed its tests on no machine" in told
+    chosen = {
+        wanted: choose_backend(wanted, render=False).simulation for wanted in get_args(backends.Backend)
+    }
+    assert chosen == {"auto": "cpu", "cpu": "cpu", "gpu": "gpu"}
+    text = backends.unused_gpu_text("auto")
+    assert text is not None and "--backend gpu" in text and "passed its tests on no machine" in text
     assert backends.unused_gpu_text("cpu") is backends.unused_gpu_text("gpu") is None
     monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: "there is none")
     assert backends.unused_gpu_text("auto") is None
@@ -283,7 +289,7 @@ class OnlyDense(Bare):
         return torch.ones(self.num_envs)
 
 
-def test_what_is_named_goes_before_what_a_task_is_registered_with_and_that_before_its_reward() -> None:
+def test_given_arguments_override_registered_ones_and_those_the_default_reward() -> None:
     def made(registered: dict | None, **named: object) -> Any:
         env = make_env(OnlyDense, EnvOptions(2, "cpu", render=False, kwargs=named), default_kwargs=registered)
         env.close()
@@ -295,6 +301,6 @@ def test_what_is_named_goes_before_what_a_task_is_registered_with_and_that_befor
     assert (both.reward_mode, both.calm, both.num_envs) == ("none", 2, 2)
 
 
-def test_a_process_renders_on_one_device_and_who_asks_for_a_second_is_told_which(renderer: None) -> None:
+def test_a_second_render_device_is_refused_with_the_first_named(renderer: None) -> None:
     with pytest.raises(RuntimeError, match=f"renders on '{RENDER_DEVICE}'"):
         backends.keep_render_device("cpu" if RENDER_DEVICE == "cuda" else "pci:0")

@@ -34,7 +34,7 @@ import workbench
 
 pytestmark = [
     pytest.mark.thorough,
-    # ManiSkill's own tasks break some: `env/test_strict.py` lists them.
+    # Some of ManiSkill's own tasks break rules: `tests/envs/test_strict.py` lists them.
     pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 
@@ -80,7 +80,7 @@ def test_auto_reset_resets_the_envs_that_ended_and_keeps_their_last_observation(
         assert truncated.tolist() == (lengths == 4).tolist()
         assert ("final_info" in info) == bool(done.any())
         if not ended_once:
-            # The same steps without auto-reset: what was seen at the end is kept, the rest goes on.
+            # The same steps without auto-reset give the expected final observations.
             plain_obs, _, _, _, plain_info = plain.step(action)
             final = info["final_observation"] if done.any() else obs
             qpos, plain_qpos = final["agent"]["qpos"], plain_obs["agent"]["qpos"]
@@ -100,8 +100,8 @@ def test_auto_reset_resets_the_envs_that_ended_and_keeps_their_last_observation(
     plain.close()
 
 
-def test_a_goal_that_is_hidden_moves_with_a_partial_reset(renderer: None) -> None:
-    # Hidden, an object stands 99999 m away and its pose is kept aside: a reset has to write there.
+def test_a_hidden_goal_moves_in_a_partial_reset(renderer: None) -> None:
+    # A hidden object stands 99999 m away and its pose is stored separately: a reset must write the stored pose.
     env = ManiSkillVectorEnv(
         made("PickCube-v1", 3, render=True, obs_mode="rgb+state", max_episode_steps=3, **SMALL)
     )
@@ -127,7 +127,7 @@ def record(env: Any, tmp_path: Path, **kwargs: Any) -> Any:
     return RecordEpisode(env, str(tmp_path), trajectory_name="episodes", **{"save_video": False, **kwargs})
 
 
-def test_recorded_episodes_are_what_happened(child_process: None, tmp_path: Path) -> None:
+def test_recorded_episodes_equal_the_steps_taken(child_process: None, tmp_path: Path) -> None:
     env = ManiSkillVectorEnv(record(made(max_episode_steps=5), tmp_path), ignore_terminations=True)
     obs, _ = env.reset(seed=[3, 4, 5, 6])
     seen, actions, states = [obs], [], [env.base_env.get_state_dict()]
@@ -148,7 +148,7 @@ def test_recorded_episodes_are_what_happened(child_process: None, tmp_path: Path
         "max_episode_steps": 5,
     }
     episodes = about["episodes"]
-    # Env 2 first; then the three others after their fifth step, in which env 2 began its second.
+    # Env 2 ends first; the other three end after five steps, in env 2's second episode.
     assert [e["elapsed_steps"] for e in episodes[:4]] == [4, 5, 5, 5]
     assert [e["episode_seed"] for e in episodes[:4]] == [5, 3, 4, 6]
     with h5py.File(tmp_path / "episodes.h5") as file:
@@ -163,8 +163,8 @@ def test_recorded_episodes_are_what_happened(child_process: None, tmp_path: Path
             assert trajectory["truncated"][:].tolist() == [False] * 4 + [True] * (env_of != 2)
 
 
-def test_stock_maniskill_replays_what_was_recorded(child_process: None, tmp_path: Path) -> None:
-    """With ManiSkill's own tool, in its own single CPU env, from the recorded first state."""
+def test_stock_maniskill_replays_recorded_episodes(child_process: None, tmp_path: Path) -> None:
+    """ManiSkill's own tool replays in its single CPU env, from the recorded first state."""
     env = record(made(num_envs=2, max_episode_steps=6), tmp_path)
     env.reset(seed=[3, 4])
     rng = np.random.default_rng(1)
@@ -188,14 +188,14 @@ def test_stock_maniskill_replays_what_was_recorded(child_process: None, tmp_path
             a: Any = ours[name]
             b: Any = stocks[name]
             assert np.array_equal(a["actions"][:], b["actions"][:])
-            # set_state_dict rounds the root pose, so not to the last bit; and the drive targets of the
-            # first state are not recorded.
+            # Not bit for bit: set_state_dict rounds the root pose, and the first state's drive targets
+            # are not recorded.
             np.testing.assert_allclose(a["obs"][1:], b["obs"][1:], atol=2e-3)
             np.testing.assert_allclose(a["rewards"][:], b["rewards"][:], atol=1e-4)
 
 
 def test_substeps_are_filmed(renderer: None, tmp_path: Path) -> None:
-    # The wrapper replaces a hook on the env: substeps may then not be done in a row behind its back.
+    # The wrapper replaces a hook on the env, so substeps must not be merged.
     env = made("MS-CartpoleBalance-v1", 2, render=True, render_mode="rgb_array", **SMALL_HUMAN)
     env = RecordEpisode(
         env, str(tmp_path), save_trajectory=False, max_steps_per_video=100, render_substeps=True
@@ -216,13 +216,13 @@ def test_substeps_are_filmed(renderer: None, tmp_path: Path) -> None:
     env.step(np.zeros((2, 1), np.float32))
     substeps = base._sim_steps_per_control
     assert len(env.render_images) == substeps + 2 and len(angles) == substeps + 2
-    assert substeps < 2 or len(set(angles)) == substeps + 1, "the same moment was filmed several times"
+    assert substeps < 2 or len(set(angles)) == substeps + 1, "several substeps show the same state"
     env.close()
 
 
 def test_cached_resets() -> None:
-    # A number that is no multiple of num_envs ends in an IndexError in stock too: mani_skill 3.0.1 counts
-    # whole batches (cached_reset.py, `_num_cached_resets += self.num_envs`) and keeps fewer.
+    # A multiple of num_envs, since stock raises IndexError for others: mani_skill 3.0.1 counts whole batches
+    # (cached_reset.py, `_num_cached_resets += self.num_envs`) and stores fewer.
     env = CachedResetWrapper(made(), config={"num_resets": 2 * N, "seed": 3})
     cubes = env._cached_resets_env_states["actors"]["cube"]
     assert cubes.shape == (2 * N, 13) and len(torch.unique(cubes[:, 0])) == 2 * N
@@ -244,7 +244,7 @@ def test_cached_resets() -> None:
     vector.close()
 
 
-# --- the others, around one env of ours and around stock's --------------------------------------------
+# --- other wrappers, around a batch of one and around stock's env -----------------------------------
 
 WRAPPERS: dict[str, tuple[str, Any, dict[str, Any]]] = {
     "actions of two robots": ("TwoRobotPickCube-v1", FlattenActionSpaceWrapper, {}),
@@ -268,7 +268,7 @@ def leaves(nest: Any) -> list[np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WRAPPERS)
-def test_a_wrapper_gives_of_one_env_what_it_gives_of_stocks(renderer: None, name: str) -> None:
+def test_a_wrapper_returns_for_one_env_what_it_returns_for_stock(renderer: None, name: str) -> None:
     task, wrap, kwargs = WRAPPERS[name]
     backend = "cpu" if "obs_mode" in kwargs else "none"
     ours = wrap(workbench.make(task, 1, backend="cpu", render_backend=backend, **kwargs))
@@ -284,7 +284,7 @@ def test_a_wrapper_gives_of_one_env_what_it_gives_of_stocks(renderer: None, name
         env.close()
     for mine, theirs in zip(*results, strict=True):
         for a, b in zip(mine, theirs, strict=True):
-            # The last bits of physics differ, and with them an edge in a picture.
+            # The last bits of physics may differ, and so may edge pixels.
             assert a.shape == b.shape and np.mean(~np.isclose(a, b, atol=1e-4, rtol=1e-3)) < 0.02
 
 

@@ -1,7 +1,7 @@
-"""Tasks that are written for ManiSkill's single CPU env: env i of a batch does what that env does, to the bit.
+"""Tasks written for ManiSkill's single CPU env: each env of a batch equals that env bit for bit.
 
-They set and read state while the scene is built, settle and look at links within a reset, move static actors, go behind the
-tensors, change masses, and neither apply nor fetch. A GPU does otherwise, or refuses it: rules warn (`test_strict`).
+They set and read state while the scene is built, step and read links within a reset, move static actors, bypass the
+tensors, change masses, and neither apply nor fetch. A GPU behaves differently or refuses: rules warn (`test_strict`).
 """
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
@@ -98,14 +98,14 @@ class StepsTheEnvInReset(Written):
 
 class StepsAfterReset(Written):
     def reset(self, *args: Any, **kwargs: Any) -> Any:
-        made = super().reset(*args, **kwargs)
+        result = super().reset(*args, **kwargs)
         for _ in range(4):
             self.scene.step()
         self.see(pose=self.falls.pose.raw_pose)
-        return made
+        return result
 
 
-class LooksAtLinksInReset(Written):
+class ReadsLinksInReset(Written):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.chain.set_qpos(self.per_env(env_idx, (0.3, 0.1), (-0.2, 0.1)))
         self.falls.set_pose(Pose.create_from_pq(self.last.pose.p[env_idx]))
@@ -147,9 +147,9 @@ class MovesAStaticActor(Written):
         self.see(wall=self.wall.pose.raw_pose)
 
 
-class GoesBehindTheTensors(Written):
+class WritesPastTheTensors(Written):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        for env, entity in enumerate(self.falls._objs):  # of all envs, also of those that are not being reset
+        for env, entity in enumerate(self.falls._objs):  # all envs, including those that are not being reset
             entity.set_pose(sapien.Pose([0.1 * self.env_numbers()[env], 0, 0.1]))
             self.chain._objs[env].set_qpos(np.array([0.1 * self.env_numbers()[env], 0.2], np.float32))
             self.lies._bodies[env].linear_velocity = [0.1, 0, 0]
@@ -158,7 +158,7 @@ class GoesBehindTheTensors(Written):
         self.see(wall=self.wall.pose.raw_pose)
 
 
-class LooksBehindTheTensors(Written):
+class ReadsPastTheTensors(Written):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.falls.set_pose(self.place(env_idx))
         self.chain.set_qpos(self.per_env(env_idx, (0.3, 0.1), (-0.2, 0.1)))
@@ -190,7 +190,7 @@ class SetsJointsOneByOne(Written):
 
 
 class ChangesWhatIsFixedOnTheGpu(Written):
-    """The same numbers for all envs: ManiSkill's setters take one."""
+    """Sets the same numbers in all envs, since ManiSkill's setters take one value."""
 
     resets = 0
 
@@ -226,20 +226,20 @@ class BuildsInItsFirstReset(Written):
 
 
 class RemovesABody(Written):
-    gone = False
+    removed = False
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        if not self.gone:
+        if not self.removed:
             self.lies.remove_from_scene()
-            self.gone = True
+            self.removed = True
         self.falls.set_pose(self.place(env_idx))
         self.see(falls=self.falls.pose.raw_pose)
 
 
 TASKS = [
     *(ReadsWhileBuilt, WritesWhileBuilt, TargetsWhileBuilt, StepsWhileBuilt, SettlesInReset),
-    *(StepsTheEnvInReset, StepsAfterReset, LooksAtLinksInReset, WritesInEvaluate),
-    *(WritesAndReadsBetweenSubsteps, MovesAStaticActor, GoesBehindTheTensors, LooksBehindTheTensors),
+    *(StepsTheEnvInReset, StepsAfterReset, ReadsLinksInReset, WritesInEvaluate),
+    *(WritesAndReadsBetweenSubsteps, MovesAStaticActor, WritesPastTheTensors, ReadsPastTheTensors),
     *(GivesRowsOfAllEnvs, SetsJointsOneByOne, ChangesWhatIsFixedOnTheGpu, ComputesPassiveForces),
     *(BuildsInItsFirstReset, RemovesABody, ThrowsAFreeChain),
 ]
@@ -247,25 +247,25 @@ TASKS = [
 
 @pytest.mark.parametrize("num_envs", [pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.__name__)
-def test_an_env_of_the_batch_does_what_the_stock_env_does(task: type[Written], num_envs: int) -> None:
-    beside = _Beside(task, num_envs)
-    beside.compare("built")
+def test_an_env_of_the_batch_equals_the_stock_env(task: type[Written], num_envs: int) -> None:
+    pair = _BatchAndStock(task, num_envs)
+    pair.compare("built")
     for episode in range(2):
-        beside.reset()
-        beside.compare(f"reset {episode}")
+        pair.reset()
+        pair.compare(f"reset {episode}")
         for step in range(STEPS):
-            beside.step()
-            beside.compare(f"episode {episode}, step {step}")
+            pair.step()
+            pair.compare(f"episode {episode}, step {step}")
     for chosen in [[1], [0, 2]] if num_envs > 1 else []:
-        beside.reset(chosen)  # the others are in the middle of an episode
-        beside.compare(f"reset of {chosen}", chosen)
+        pair.reset(chosen)  # the other envs are mid-episode
+        pair.compare(f"reset of {chosen}", chosen)
         for step in range(STEPS):
-            beside.step()
-            beside.compare(f"after the reset of {chosen}, step {step}", ())
-    beside.close()
+            pair.step()
+            pair.compare(f"after the reset of {chosen}, step {step}", ())
+    pair.close()
 
 
-class _Beside:
+class _BatchAndStock:
     """A batch, and a stock env for each of its envs."""
 
     def __init__(self, task: type[Written], num_envs: int) -> None:
@@ -285,7 +285,7 @@ class _Beside:
             env.step(None)
 
     def compare(self, when: str, seen_of: Any = None) -> None:
-        """The states of all envs, and what these envs (None: all) have seen."""
+        """Compare the states of all envs, and the values that `see` stored for the envs `seen_of` (None: all)."""
         for env, stock in enumerate(self.stocks):
             assert self.batch.scene.px.systems[env].pack() == stock.scene.px.pack(), (
                 f"{when}: state of env {env}"

@@ -1,4 +1,4 @@
-"""Keyword arguments that ManiSkill refuses are told as the caller's, with what exists instead."""
+"""Keyword arguments that ManiSkill refuses are reported as the caller's error, with the existing names."""
 
 from __future__ import annotations
 
@@ -27,14 +27,16 @@ pytestmark = pytest.mark.usefixtures("renderer")
         ({"sim_config": {"scene_config": {"gravty": [0, 0, 0]}}}, ["scene_config", "gravty", "gravity"]),
     ],
 )
-def test_it_is_named_with_the_nearest_that_exists(given: dict[str, Any], names: list[str]) -> None:
+def test_an_unknown_option_is_named_with_the_nearest_existing_one(
+    given: dict[str, Any], names: list[str]
+) -> None:
     with pytest.raises(WrongOption) as caught:
         workbench.make("PickCube-v1", num_envs=2, **given)
     for name in names:
         assert name in str(caught.value)
 
 
-def test_an_error_of_the_task_itself_stays_the_tasks(tmp_path: Path) -> None:
+def test_an_error_in_the_tasks_constructor_is_reported_as_the_tasks(tmp_path: Path) -> None:
     file = tmp_path / "own.py"
     file.write_text(
         "from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv\n"
@@ -53,7 +55,7 @@ def test_an_error_of_the_task_itself_stays_the_tasks(tmp_path: Path) -> None:
     assert not isinstance(caught.value, WrongOption)
 
 
-def test_a_task_that_names_no_robot_is_told_which_option_names_one(tmp_path: Path) -> None:
+def test_a_task_without_a_robot_is_reported_with_the_option_that_sets_one(tmp_path: Path) -> None:
     file = tmp_path / "nobody.py"
     file.write_text(
         "from mani_skill.envs.sapien_env import BaseEnv\n"

@@ -1,4 +1,4 @@
-"""A scene with cameras on a link, on an actor and beside, and what is seen of it."""
+"""A scene with fixed cameras and cameras mounted on a link and an actor."""
 
 # ManiSkill annotates vectors and poses as what they become.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false
@@ -27,7 +27,7 @@ COLOURS = [[1.0, 0, 0, 1], [0, 1.0, 0, 1], [0, 0, 1.0, 1]]
 
 
 class Watched(Bare):
-    """A coloured wall; cameras on a link, on a moving actor, and beside; a marker that only people see."""
+    """A coloured wall, a fixed camera, cameras on a link and a moving actor, and a marker hidden from sensors."""
 
     def _load_scene(self, options: dict) -> None:
         self.chain = by_hand(self, 2)

@@ -1,4 +1,4 @@
-"""Tasks of which env i sets numbers of its own, for who compares a batch with single envs."""
+"""Tasks that set different numbers in each env, to compare a batch with single envs."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportCallIssue=false
@@ -17,7 +17,7 @@ from tests.envs.stock_env import Bare
 
 
 class Written(Bare):
-    """A box that falls on a floor, one that lies there, a marker, a wall and a chain; env i is given numbers of its own."""
+    """A falling box, a box at rest on the floor, a marker, a wall and a chain; numbers differ by env."""
 
     def _load_scene(self, options: dict) -> None:
         self.floor = box(self, "floor", [3, 3, 0.1], sapien.Pose([0, 0, -0.1]), "static")
@@ -36,14 +36,14 @@ class Written(Bare):
         pass
 
     def see(self, **values: Any) -> None:
-        """Keep numbers, (N, ...) each, to be compared."""
+        """Store values, (N, ...) each, for the comparison."""
         self.seen.update({name: torch.as_tensor(np.asarray(value)) for name, value in values.items()})
 
     def per_env(self, env_idx: torch.Tensor | None, *columns: tuple[float, float]) -> torch.Tensor:
-        """(b, W): for each env its number times the second of each column, plus the first."""
+        """Return (b, W): for each column ``(start, step)`` and env, start + env index * step."""
         numbers = torch.tensor(self.env_numbers(), dtype=torch.float32)
         numbers = numbers if env_idx is None else numbers[env_idx]
-        return torch.stack([start + each * numbers for start, each in columns], dim=1)
+        return torch.stack([start + step * numbers for start, step in columns], dim=1)
 
     def place(self, env_idx: torch.Tensor | None, height: float = 0.1) -> Pose:
         return Pose.create_from_pq(self.per_env(env_idx, (0, 0.02), (0, 0), (height, 0.01)))

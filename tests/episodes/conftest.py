@@ -1,4 +1,4 @@
-"""rerun raises in the tests of its files."""
+"""Rerun raises errors in these tests instead of warning."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import rerun as rr
 
 @pytest.fixture(autouse=True)
 def strict_rerun() -> Iterator[None]:
-    """Without it rerun turns what it refuses into warnings."""
+    """Turn on rerun's strict mode; without it rerun warns about invalid data instead of raising."""
     before = rr.strict_mode()
     rr.set_strict_mode(True)
     yield

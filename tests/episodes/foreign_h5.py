@@ -11,7 +11,7 @@ import numpy as np
 
 
 def write(folder: Path, spoil: Callable[[h5py.Group], None] = lambda group: None) -> Path:
-    """A trajectory of three steps as ManiSkill writes it, less what `spoil` did to it; returns the ``.h5``."""
+    """Write a trajectory of three steps in ManiSkill's format, damaged by `spoil`; returns the ``.h5``."""
     path = folder / "theirs.h5"
     with h5py.File(path, "w") as file:
         group = file.create_group("traj_0")
@@ -20,6 +20,6 @@ def write(folder: Path, spoil: Callable[[h5py.Group], None] = lambda group: None
         group["terminated"] = group["truncated"] = np.zeros(3, bool)
         group["env_states/actors/cube"] = np.zeros((4, 13), np.float32)
         spoil(group)
-    said = {"env_info": {"env_id": "PickCube-v1"}, "episodes": [{"episode_id": 0, "elapsed_steps": 3}]}
-    path.with_suffix(".json").write_text(json.dumps(said))
+    document = {"env_info": {"env_id": "PickCube-v1"}, "episodes": [{"episode_id": 0, "elapsed_steps": 3}]}
+    path.with_suffix(".json").write_text(json.dumps(document))
     return path

@@ -1,4 +1,4 @@
-"""Recordings as the library sees them: descriptions of the real form, beside files that it does not open."""
+"""Recordings for tests of the library: valid ``.json`` files with dummy files that the library does not open."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def jpeg(size: tuple[int, int] = (64, 48), colour: tuple[int, int, int] = (200, 
 
 
 def describe(folder: Path, name: str, **fields: Any) -> Path:
-    """The three files of a recording of ours in `folder`; returns the ``.json``."""
+    """Write the three files of a workbench recording into `folder`; returns the ``.json``."""
     folder.mkdir(parents=True, exist_ok=True)
     described = {
         "format": 1,

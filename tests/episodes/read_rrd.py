@@ -1,8 +1,8 @@
-"""An ``.rrd`` as rerun sees it, entity by entity and component by component: what a test compares with what was put in.
+"""Reads an ``.rrd`` as rerun sees it, by entity and component, so that tests can compare it with the input.
 
-Not through `rerun_table`, which is under test as well. Rerun's own query engine is an extra of 100 MB (datafusion); the
-chunks of a file are plain Arrow tables, though, and a table a component is all that anyone needs here. A file without a
-footer (its writer was killed) is read as far as it goes.
+It does not use `rerun_table`, which is under test too, nor rerun's query engine, which needs an extra of 100 MB
+(datafusion): the chunks of a file are plain Arrow tables, and one table per component is enough here. A file without
+a footer (its writer was killed) is read as far as it goes.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class Column:
 
 
 def read_rrd(path: Path) -> dict[str, dict[str, Column]]:
-    """Everything that the first recording in `path` holds, by entity and then by component.
+    """Read the first recording in `path`, by entity and then by component.
 
-    Components go by rerun's names, for example ``Transform3D:translation``. Where an entity holds a
-    component both static and in time, the rows in time are given.
+    Components have rerun's names, for example ``Transform3D:translation``. Where an entity holds a
+    component both static and in time, the rows in time are returned.
 
     Raises:
         ValueError: `path` holds no recording.
@@ -67,7 +67,7 @@ def read_rrd(path: Path) -> dict[str, dict[str, Column]]:
 
 
 def _rows(column: pa.Array) -> list[Any]:
-    """One entry a row of a column of lists: the row's instances as an array, or None for no value."""
+    """One entry per row of a column of lists: the row's instances as an array, or None for no value."""
     offsets = column.offsets.to_numpy()
     values = _instances(column.values)
     return [
@@ -77,7 +77,7 @@ def _rows(column: pa.Array) -> list[Any]:
 
 
 def _instances(values: pa.Array) -> Any:
-    """An array (n, ...) where Arrow holds plain numbers, else a list of n Python values."""
+    """Return an array (n, ...) where Arrow holds plain numbers, else a list of n Python values."""
     if pa.types.is_fixed_size_list(values.type):
         inner = _instances(values.values[values.offset * values.type.list_size :])
         if isinstance(inner, np.ndarray):

@@ -1,4 +1,4 @@
-"""Calls of the system that are refused: the n-th that changes the disk, alone or with all that follow."""
+"""Makes system calls fail: the n-th call that changes the disk, alone or with all later ones."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ CHANGING = (
     "mkdir",
     "rmdir",
 )
-_BESIDE = ("episode-journals",)
-"""Threads that work at moments of their own."""
+_BACKGROUND_THREADS = ("episode-journals",)
+"""Names of threads that make calls at unpredictable times."""
 
 
 @contextmanager
 def refused(
     at: int = 0, names: tuple[str, ...] = CHANGING, number: int = errno.EIO, then: int = 0
 ) -> Iterator[list[str]]:
-    """Refuse call number `at` (from 1; 0 for none) of these functions of `os`, with the error `number`.
+    """Make call number `at` (from 1; 0 for none) of these functions of `os` fail with the error `number`.
 
-    Gives the calls in their order, each as "rename a.json".
+    Yields the list of calls in their order, each as "rename a.json".
 
     Args:
-        then: the error of all calls that follow; 0 for none.
+        then: the error of all later calls; 0 for none.
     """
     calls: list[str] = []
     opened = io.open
 
     def of(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
         def called(*args: Any, **kwargs: Any) -> Any:
-            if threading.current_thread().name in _BESIDE or (
+            if threading.current_thread().name in _BACKGROUND_THREADS or (
                 real is opened and not _creates(*args, **kwargs)
             ):
                 return real(*args, **kwargs)
@@ -66,7 +66,7 @@ def refused(
 
 
 def _creates(file: object, mode: str = "r", *_: object, **__: object) -> bool:
-    """Whether `io.open` makes a file: it also wraps a descriptor of `os.open`, which is a call of its own."""
+    """Whether `io.open` creates a file. It also wraps descriptors of `os.open`, which is counted as a call itself."""
     return not isinstance(file, int) and "r" not in mode
 
 
@@ -78,11 +78,11 @@ def _path(held: object) -> str:
 
 
 def descriptors() -> list[str]:
-    """What this process has open of files on a disk."""
+    """Paths of the files on disk that this process has open."""
     held = (_path(int(number)) for number in os.listdir("/proc/self/fd"))
     return sorted(path for path in held if path.startswith("/") and not path.startswith(("/dev", "/proc")))
 
 
 def left_open(before: list[str]) -> list[str]:
-    """What is open now and was not then. What is not open any more is another test's, whose thread came to its end."""
+    """Files that are open now and were not before. Files closed meanwhile belong to a thread of an earlier test."""
     return sorted((Counter(descriptors()) - Counter(before)).elements())

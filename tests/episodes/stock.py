@@ -1,4 +1,4 @@
-"""A short episode of a stock ManiSkill task: real physics, and pictures of a fixed and of a mounted camera."""
+"""Short episodes of stock ManiSkill tasks: real physics, and pictures of a fixed and of a mounted camera."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from workbench.episodes.episode import EpisodeInfo
 
 STEPS = 8
 SEED = 3
-SIZE = 96
+SIZE_PIXELS = 96
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """An episode, and what ManiSkill itself said of its cameras at each of the T + 1 states."""
+    """An episode, and ManiSkill's own parameters of its cameras at each of the T + 1 states."""
 
     episode: Made
     extrinsic_cv: dict[str, NDArray[np.float32]]
@@ -35,8 +35,8 @@ class Recorded:
     """Camera name to (T + 1, H, W)."""
 
 
-def record_stock(task: str, size: int = SIZE, steps: int = STEPS, **kwargs: Any) -> Recorded:
-    """`steps` random steps of a stock single env."""
+def record_stock(task: str, size: int = SIZE_PIXELS, steps: int = STEPS, **kwargs: Any) -> Recorded:
+    """Record `steps` random steps of a stock single env."""
     env = gym.make(
         task,
         num_envs=1,

@@ -1,4 +1,4 @@
-"""Folders as ``workbench sweep`` leaves them, without running one."""
+"""Result folders of ``workbench sweep``, made without running a sweep."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROBOTS = ("panda", "fetch", "nix")
 
 
 def sweep_folder(folder: Path) -> SweepResults:
-    """Three weights and three robots, of which the last fails: with more weight more seeds are solved."""
+    """Results of three weights and three robots. The last robot fails; a larger weight solves more seeds."""
     points = list(itertools.product(WEIGHTS, ROBOTS))
     rows: list[SweepEpisode] = []
     for k, (weight, robot) in enumerate(points):

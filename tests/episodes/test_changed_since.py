@@ -1,4 +1,4 @@
-"""What of a task is another than when it was recorded, by name."""
+"""Names of the parts of a task that have changed since it was recorded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ THEN = "import numpy as np\n\nSIZE = 1\n\n\nclass Push:\n    def evaluate(self):
 NOW = THEN.replace("SIZE = 1", "SIZE = 2  # larger").replace("return {}", "return {'success': 1}")
 
 
-def test_what_changed_is_called_by_its_name_and_comments_are_nothing() -> None:
+def test_changed_parts_are_named_and_changed_comments_are_ignored() -> None:
     def since(now: str) -> str:
         return changed_since("push.py", {"push.py": THEN}, "/a/copy.py", {"/a/copy.py": now})
 
@@ -24,7 +24,7 @@ def test_what_changed_is_called_by_its_name_and_comments_are_nothing() -> None:
     assert changed_since(None, {}, "/a/copy.py", {}) == ""
 
 
-def test_the_file_that_a_recording_names_is_read_with_those_beside_it(tmp_path: Path) -> None:
+def test_the_recorded_task_file_is_compared_with_its_neighbour_modules(tmp_path: Path) -> None:
     (tmp_path / "helpers").mkdir()
     file, beside = tmp_path / "push.py", tmp_path / "helpers" / "shapes.py"
     file.write_text(THEN)

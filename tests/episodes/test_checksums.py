@@ -1,4 +1,4 @@
-"""A changed byte in a file of a recording is said, and what the others hold is there."""
+"""A changed byte in a file of a recording is reported, and the other files are still read."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def whole(make_episode: Maker, tmp_path_factory: pytest.TempPathFactory) -> Epis
     places=st.sets(st.floats(0, 1, exclude_max=True), min_size=1, max_size=5),
     bit=st.integers(0, 7),
 )
-def test_changed_bits_are_told_wherever_they_are(
+def test_changed_bits_are_reported_wherever_they_are(
     whole: EpisodeFiles, suffix: str, places: set[float], bit: int
 ) -> None:
     file = whole.json.with_suffix(suffix)
@@ -61,11 +61,11 @@ def test_changed_bits_are_told_wherever_they_are(
         changed[place] ^= 1 << bit
     file.write_bytes(changed)
     try:
-        said = [broken.file for broken in read_episode(whole.json).broken_files]
+        reported = [broken.file for broken in read_episode(whole.json).broken_files]
     except UnreadableRecording as error:
-        said = [file.name for _ in [0] if file.name in str(error) or file.stem in str(error)]
+        reported = [file.name for _ in [0] if file.name in str(error) or file.stem in str(error)]
     try:
-        assert said == [file.name]
+        assert reported == [file.name]
         if suffix == ".json":
             (row,) = scan_folder(file.parent).found.values()
             assert all(facts.problem is not None for facts, _ in read_found(file.parent, row))
@@ -73,7 +73,9 @@ def test_changed_bits_are_told_wherever_they_are(
         file.write_bytes(content)
 
 
-def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, tmp_path: Path) -> None:
+def test_tagging_keeps_the_checksum_valid_and_an_edit_that_removes_it_is_accepted(
+    episode: Made, tmp_path: Path
+) -> None:
     files = episode.write(tmp_path)
     write_into_description(files.json, ("good",), "a note")
     assert read_episode(files.json).broken_files == ()
@@ -86,17 +88,17 @@ def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, t
     assert facts.problem is not None and f"{files.rrd.name} was cut short or changed" in facts.problem
     files.rrd.write_bytes(files.rrd.read_bytes()[:-1])
     flip(files.h5, files.h5.stat().st_size - 100)
-    said = json.loads(files.json.read_bytes())
-    del said["workbench"]["files"][".h5"]
-    files.json.write_text(json.dumps(said))
+    document = json.loads(files.json.read_bytes())
+    del document["workbench"]["files"][".h5"]
+    files.json.write_text(json.dumps(document))
     assert [broken.file for broken in read_episode(files.json).broken_files] == [files.json.name]
-    files.json.write_text(json.dumps({**said, "workbench_checksum": None}))
+    files.json.write_text(json.dumps({**document, "workbench_checksum": None}))
     assert read_episode(files.json).broken_files == ()
     write_into_description(files.json, ("better",), "")
     assert read_episode(files.json).broken_files == ()
 
 
-def test_a_changed_document_gets_no_new_checksum_by_a_tag(episode: Made, tmp_path: Path) -> None:
+def test_tagging_a_changed_document_writes_no_new_checksum(episode: Made, tmp_path: Path) -> None:
     files = episode.write(tmp_path)
     content = files.json.read_bytes().replace(b'"task": "Made-v1"', b'"task": "Fade-v1"')
     files.json.write_bytes(content)

@@ -1,4 +1,4 @@
-"""Rows that are packed and put together again are the rows, and what is no row is refused."""
+"""Rows that are packed and unpacked are unchanged, and invalid rows are refused."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def row(action: Any = (0.0, 0.0), **evaluate: Any) -> EpisodeRow:
 
 
 def through(rows: list[EpisodeRow]) -> dict[str, np.ndarray]:
-    """`rows` packed, and unpacked as columns."""
+    """Pack `rows` and unpack them as columns."""
     packer = BatchPacker()
     contents = [packed(one, packer, 2) for one in rows]
     runs = [np.frombuffer(content, layout_type(layout.text)) for layout, content in contents]
@@ -36,7 +36,7 @@ VALUE = st.sampled_from([np.bool_, np.int64, np.float32, np.float64]).flatmap(
 
 @settings(max_examples=60)
 @given(st.lists(st.dictionaries(st.text(max_size=3), VALUE, max_size=3), min_size=1, max_size=8))
-def test_any_rows_come_back(entries: list[dict[str, np.ndarray]]) -> None:
+def test_any_rows_are_restored(entries: list[dict[str, np.ndarray]]) -> None:
     columns = through(
         [
             row()
@@ -61,7 +61,7 @@ def test_any_rows_come_back(entries: list[dict[str, np.ndarray]]) -> None:
                 assert value.size == kept.size or np.isnan(kept[value.size :]).all()
 
 
-def test_a_batch_is_packed_as_its_envs_are() -> None:
+def test_a_batch_is_packed_like_its_single_envs() -> None:
     rng = np.random.default_rng(0)
     step = StepResult(
         elapsed_steps=np.array([1, 4, 2], np.int32),
@@ -78,7 +78,7 @@ def test_a_batch_is_packed_as_its_envs_are() -> None:
         },
     )
     columns = {
-        "state/actors/cube": rng.random((3, 13, 2), np.float32)[:, :, 0],  # not in one piece
+        "state/actors/cube": rng.random((3, 13, 2), np.float32)[:, :, 0],  # not contiguous
         "state/actors/mug": np.full((3, 13), np.nan, np.float32),
         "obs/agent/qpos": rng.random((3, 9), np.float32),
         "obs/extra/none": np.zeros((3, 0), np.float32),

@@ -1,4 +1,4 @@
-"""The ``.json`` of a recording: what is read of it, what is refused with its path, and what is written."""
+"""The ``.json`` of a recording: which fields are read, which are refused with their path, and what is written."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from workbench.episodes.document import (
 )
 
 
-def said(tmp_path: Path, **fields: Any) -> Document:
+def described(tmp_path: Path, **fields: Any) -> Document:
     return read_document(describe(tmp_path, "a", **fields))
 
 
 def why(document: Document) -> str:
-    with pytest.raises(WrongDocument) as told:
+    with pytest.raises(WrongDocument) as problem:
         document.description()
-    return str(told.value)
+    return str(problem.value)
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def why(document: Document) -> str:
         ("NaN", False, False),
     ],
 )
-def test_whose_it_is_is_told_by_its_keys(
+def test_the_keys_of_a_document_tell_which_program_wrote_it(
     tmp_path: Path, content: str, is_ours: bool, is_maniskill: bool
 ) -> None:
     (tmp_path / "a.json").write_text(content)
@@ -57,9 +57,9 @@ def test_whose_it_is_is_told_by_its_keys(
         ({"control_dt": 10**400}, "number out of range at $.workbench.control_dt"),
     ],
 )
-def test_what_is_of_another_type_is_named_by_its_path(tmp_path: Path, wrong: Any, at: str) -> None:
-    told = why(said(tmp_path, **wrong))
-    assert told.startswith("is not as a recording is described: ") and told.endswith(at), told
+def test_a_field_of_the_wrong_type_is_named_by_its_path(tmp_path: Path, wrong: Any, at: str) -> None:
+    problem = why(described(tmp_path, **wrong))
+    assert problem.startswith("is not as a recording is described: ") and problem.endswith(at), problem
 
 
 @pytest.mark.parametrize(
@@ -72,20 +72,22 @@ def test_what_is_of_another_type_is_named_by_its_path(tmp_path: Path, wrong: Any
         ({}, None),
     ],
 )
-def test_a_seed_of_maniskills_is_where_it_is_said(words: dict[str, Any], seed: int | None) -> None:
+def test_the_seed_of_a_maniskill_episode_is_found_in_each_place_that_may_hold_it(
+    words: dict[str, Any], seed: int | None
+) -> None:
     document = Document({"episodes": [{"episode_id": 1}, {"episode_id": 4, **words}]})
     assert document.episode(0) == EpisodeJson(1)
     assert (document.episode(1).episode_id, document.episode(1).seed) == (4, seed)
 
 
-def test_what_is_no_json_or_too_long_or_no_file_is_said(tmp_path: Path) -> None:
+def test_invalid_json_oversized_files_and_pipes_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     for content in ('{"a": 1', "[" * 100_000, "", b"\xff\xfe\xfa"):
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
         with pytest.raises(WrongDocument, match="is not JSON, or was cut short"):
             read_document(path)
     with path.open("wb") as file:
-        file.truncate(64 << 20)  # with nothing in it: it takes no place on the disk
+        file.truncate(64 << 20)  # sparse: it takes no space on the disk
     with pytest.raises(WrongDocument, match="is not JSON"):
         read_document(path)
     with path.open("ab") as file:
@@ -107,7 +109,7 @@ def test_what_is_no_json_or_too_long_or_no_file_is_said(tmp_path: Path) -> None:
 
 @pytest.fixture
 def moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a recording that was copied into somebody's project, which is not where one looks from."""
+    """The folder of a recording that was copied into another project; the search starts in another folder."""
     folder = tmp_path / "project" / "shared" / "recordings"
     folder.mkdir(parents=True)
     (tmp_path / "elsewhere").mkdir()
@@ -121,7 +123,7 @@ def put(path: Path, text: str = '@register_env("Push-v1")') -> str:
     return str(path)
 
 
-def test_the_longest_end_of_the_path_that_names_the_task_is_found_above_the_recording(moved: Path) -> None:
+def test_the_task_file_with_the_longest_matching_path_above_the_recording_is_found(moved: Path) -> None:
     path = "../../me/code/tasks/push.py"
     assert task_file(path, "Push-v1", moved) is None
     short = put(moved.parent / "push.py")
@@ -133,7 +135,7 @@ def test_the_longest_end_of_the_path_that_names_the_task_is_found_above_the_reco
     beside = put(moved / "push.py")
     assert task_file(path, "Push-v1", moved) == beside
     here = put(Path.cwd() / "tasks" / "push.py")
-    assert task_file(path, "Push-v1", moved) == here, "where one looks from comes first"
+    assert task_file(path, "Push-v1", moved) == here, "the folder where the search starts comes first"
 
 
 # --- checksums -------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""A picture that was encoded is the picture, as far as its format goes."""
+"""Encoded pictures decode to the original, within the precision of their format."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHAPE = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
 
 @settings(max_examples=50)
 @given(SHAPE.flatmap(lambda shape: hnp.arrays(np.int32, shape)))
-def test_ids_come_back_whatever_they_are(ids: np.ndarray) -> None:
+def test_any_ids_are_decoded_exactly(ids: np.ndarray) -> None:
     (found,) = EncodedPictures("segmentation", [encode("segmentation", ids)])
     assert found.dtype == np.int32
     np.testing.assert_array_equal(found, ids)
@@ -27,14 +27,14 @@ def test_ids_come_back_whatever_they_are(ids: np.ndarray) -> None:
 
 @settings(max_examples=50)
 @given(SHAPE.flatmap(lambda shape: hnp.arrays(np.uint16, shape)))
-def test_whole_millimetres_come_back(millimetres: np.ndarray) -> None:
+def test_whole_millimetres_are_decoded_exactly(millimetres: np.ndarray) -> None:
     depth = (millimetres / 1000).astype(np.float32)
     found = EncodedPictures("depth", [encode("depth", depth)])[0]
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, depth)
 
 
-def test_what_is_no_distance_is_nothing_and_the_farthest_stays() -> None:
+def test_invalid_distances_become_zero_and_the_largest_is_kept() -> None:
     depth = np.array([[np.nan, np.inf], [-1.0, 70.0]], dtype=np.float32)
     np.testing.assert_array_equal(
         EncodedPictures("depth", [encode("depth", depth)])[0], np.array([[0, 0], [0, 65.535]], np.float32)
@@ -50,7 +50,7 @@ def test_colour_keeps_rows_and_channels_apart() -> None:
     assert np.abs(found.astype(int) - image).max() < 12
 
 
-def test_a_picture_that_claims_too_many_pixels_or_is_of_another_format_is_refused() -> None:
+def test_a_picture_with_too_many_pixels_or_of_another_format_is_refused() -> None:
     def png(width: int, height: int) -> bytes:
         header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
         chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b""))

@@ -1,4 +1,4 @@
-"""Entries of ``evaluate`` that are no numbers: written where they change, bounded, recovered, and read back."""
+"""Non-numeric entries of ``evaluate``: written where they change, bounded, recovered, and read back."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ Maker = Callable[..., Made]
 Others = Mapping[str, OtherEntry]
 
 
-def said(text: str) -> OtherEntry:
+def text_entry(text: str) -> OtherEntry:
     return OtherEntry("str", (text,))
 
 
 def write(made: Made, folder: Path, others: list[Others], finish: bool = True) -> EpisodeFiles | None:
-    """An episode whose states have these `others`."""
+    """Write an episode whose states have these `others`."""
     writer = made.writer(folder)
     for row, entries in zip(made.rows(), others, strict=True):
         append(writer, dataclasses.replace(row, others=entries))
@@ -44,12 +44,12 @@ def write(made: Made, folder: Path, others: list[Others], finish: bool = True) -
     return None
 
 
-def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
+def test_an_entry_that_changes_too_often_is_named_and_no_longer_stored() -> None:
     writer = TextWriter()
     lines = [
         line
         for state in range(5000)
-        for line in writer.changes(state, {"clock": said(f"{state:050}"), "a": said("x")})
+        for line in writer.changes(state, {"clock": text_entry(f"{state:050}"), "a": text_entry("x")})
     ]
     assert sum(len(line[1]) for line in lines) < MAX_TEXT_BYTES + 400
     tracks = text_tracks(lines)
@@ -58,7 +58,9 @@ def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
     assert tracks["a"] == ((0, TextEntry("str", "x", False, True)),)
 
 
-def test_numbers_texts_and_both_come_back(child_process: None, make_episode: Maker, tmp_path: Path) -> None:
+def test_numbers_texts_and_both_are_read_back(
+    child_process: None, make_episode: Maker, tmp_path: Path
+) -> None:
     number = OtherEntry("float", numbers=np.array(0.5))
     states: list[Others] = [
         {"best": OtherEntry("None", ("None",)), "goal": OtherEntry("list", numbers=np.arange(2))},
@@ -91,7 +93,12 @@ def test_numbers_texts_and_both_come_back(child_process: None, make_episode: Mak
 
 
 def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Path) -> None:
-    write(make_episode(3), tmp_path, [{"phase": said(f"{state // 2}")} for state in range(4)], finish=False)
+    write(
+        make_episode(3),
+        tmp_path,
+        [{"phase": text_entry(f"{state // 2}")} for state in range(4)],
+        finish=False,
+    )
     (files,) = recover(tmp_path)
     episode = read_episode(files.json)
     assert episode.info.recovered
@@ -105,7 +112,7 @@ def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Pat
 
 @settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(states=st.lists(ENTRIES, min_size=3, max_size=3), num_envs=st.integers(1, 3))
-def test_whatever_evaluate_returns_is_recorded(
+def test_any_result_of_evaluate_is_recorded(
     make_episode: Maker, states: list[dict[Any, Any]], num_envs: int
 ) -> None:
     env = num_envs - 1

@@ -1,4 +1,4 @@
-"""An episode comes out of a reader as it is, and one that does not fit together is a sentence."""
+"""An episode from the reader process arrives unchanged; an inconsistent one is an error with a message."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def here(read: EpisodeRead, known: dict | None = None, shapes: SharedShapes | No
     return unpack_episode(crossed(read), fetched, 1, shapes or SharedShapes(), {} if known is None else known)
 
 
-def test_it_is_the_same_on_the_other_side() -> None:
+def test_an_episode_is_equal_after_the_transfer() -> None:
     there = an_episode()
     episode = here(pack_episode(there, None, 1, SentShapes()))
     assert episode.info == there.info and episode.segmentation == there.segmentation
@@ -109,7 +109,7 @@ def test_it_is_the_same_on_the_other_side() -> None:
     np.testing.assert_array_equal(track.rgb[2], PICTURE + 2)
 
 
-def test_a_shape_crosses_once_for_all_episodes_that_share_it() -> None:
+def test_a_shape_is_sent_once_for_all_episodes_that_share_it() -> None:
     sent, shapes, (_, known) = SentShapes(), SharedShapes(), KnownShapes().of(SharedShapes())
     one, other = (pack_episode(an_episode(), None, number, sent) for number in (1, 2))
     assert (len(one.shapes), len(other.shapes)) == (1, 0)
@@ -133,7 +133,7 @@ def of_scene(**changes: Any) -> Callable[[EpisodeRead], EpisodeRead]:
 
 
 def of_first(part: str, field: str = "", **changes: Any) -> Callable[[EpisodeRead], EpisodeRead]:
-    """Of the first camera, shape or visual, or of a field of it."""
+    """Change the first camera, shape or visual, or a field of it."""
 
     def change(read: EpisodeRead) -> EpisodeRead:
         first, *others = getattr(read, part)
@@ -169,13 +169,15 @@ def numbers(*shape: int, kind: str = "f4") -> NDArray:
         (of_first("cameras", pictures={"rgb": T}), "4 frames and 3 pictures"),
     ],
 )
-def test_what_does_not_fit_together_is_said(change: Callable[[EpisodeRead], EpisodeRead], says: str) -> None:
+def test_inconsistent_data_is_refused_with_a_message(
+    change: Callable[[EpisodeRead], EpisodeRead], says: str
+) -> None:
     with pytest.raises(InvalidEpisode, match=says):
         here(change(pack_episode(an_episode(), None, 1, SentShapes())))
 
 
 @pytest.mark.parametrize(("width", "height"), [(0, 4), (6, -1), (5000, 5000)])
-def test_a_camera_of_no_size_or_of_far_too_much_is_said(width: int, height: int) -> None:
+def test_a_camera_with_no_or_an_oversized_resolution_is_refused(width: int, height: int) -> None:
     read = pack_episode(an_episode(), None, 1, SentShapes())
     lens = msgspec.structs.replace(read.cameras[0].camera, width=width, height=height)
     with pytest.raises(InvalidEpisode, match=f"pictures of {width} x {height}"):
@@ -183,7 +185,7 @@ def test_a_camera_of_no_size_or_of_far_too_much_is_said(width: int, height: int)
 
 
 @pytest.mark.parametrize("rows", [numbers(T), np.zeros((), np.float32), np.zeros(T + 1, "S2")])
-def test_a_column_without_a_row_a_state_is_left_out_and_named(rows: NDArray) -> None:
+def test_a_column_of_the_wrong_length_is_left_out_and_named(rows: NDArray) -> None:
     read = of_episode(obs={"odd": rows, "whole": numbers(T + 1, 2)})(
         pack_episode(an_episode(), None, 1, SentShapes())
     )
@@ -202,7 +204,7 @@ def test_a_column_without_a_row_a_state_is_left_out_and_named(rows: NDArray) -> 
         numbers(4, 6, 4, kind="u1"),
     ],
 )
-def test_a_picture_that_is_none_is_said(picture: NDArray | None) -> None:
+def test_an_invalid_picture_is_refused_with_a_message(picture: NDArray | None) -> None:
     read = crossed(pack_episode(an_episode(), None, 1, SentShapes()))
     episode = unpack_episode(read, lambda *_: PictureRead(picture), 1, SharedShapes(), {})
     pictures = episode.cameras[0].rgb

@@ -1,4 +1,4 @@
-"""What is made of an episode to be looked at: films, drawn scenes, sheets of pictures."""
+"""Films, rendered scenes and contact sheets made from an episode."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("child_process")
 
 @pytest.fixture(scope="module")
 def episode(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Episode:
-    """As it is read back from its files."""
+    """An episode read back from its files."""
     return read_episode(recorded.episode.write(tmp_path_factory.mktemp("recordings")).json)
 
 
@@ -42,23 +42,23 @@ def shades(count: int, height: int = 48, width: int = 64) -> list[NDArray[np.uin
 
 
 def film(path: Path) -> tuple[dict[str, Any], list[NDArray[np.uint8]]]:
-    """What a film says of itself, and its frames."""
+    """Return a film's metadata and its frames."""
     read = imageio_ffmpeg.read_frames(str(path))
-    said: Any = next(read)
-    width, height = said["size"]
-    return said, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in read]
+    metadata: Any = next(read)
+    width, height = metadata["size"]
+    return metadata, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in read]
 
 
 def test_a_film_holds_every_frame_in_order_at_its_rate(tmp_path: Path) -> None:
     assert write_mp4(tmp_path / "a.mp4", shades(10), fps=20) == 10
-    said, seen = film(tmp_path / "a.mp4")
-    assert (said["fps"], said["size"], len(seen)) == (20, (64, 48), 10)
+    metadata, seen = film(tmp_path / "a.mp4")
+    assert (metadata["fps"], metadata["size"], len(seen)) == (20, (64, 48), 10)
     for index, frame in enumerate(seen):
         assert abs(float(frame.mean()) - 20 * index) < 3
 
 
-def test_a_full_disk_ends_a_film_with_a_sentence_and_leaves_nothing(tmp_path: Path) -> None:
-    # In a process of its own: the limit on the size of files cannot be taken back by everybody.
+def test_a_full_disk_ends_a_film_with_a_message_and_leaves_no_file(tmp_path: Path) -> None:
+    # In a subprocess: an unprivileged process cannot raise its file size limit again.
     noise = (
         "import numpy as np, sys, pathlib; from workbench.episodes.films import write_mp4\n"
         "rng = np.random.default_rng(0)\n"
@@ -76,7 +76,7 @@ def test_a_full_disk_ends_a_film_with_a_sentence_and_leaves_nothing(tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_state_without_a_picture_shows_the_one_before(episode: Episode) -> None:
+def test_a_state_without_a_picture_shows_the_previous_picture(episode: Episode) -> None:
     camera = camera_of(episode, "base_camera")
     assert len(list(frames(episode, camera))) == episode.length + 1
     every_third = replace(camera, frame=np.array([0, 3, 6]), pose=camera.pose[:3], rgb=_pictures(shades(3)))
@@ -84,8 +84,8 @@ def test_a_state_without_a_picture_shows_the_one_before(episode: Episode) -> Non
     assert seen == [0, 0, 0, 1, 1, 1, 2, 2, 2]
 
 
-def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Episode) -> None:
-    """From the recorded place of a camera the drawn scene and the camera's picture are of the same things."""
+def test_the_recorded_scene_is_rendered_as_the_tasks_own_camera_saw_it(episode: Episode) -> None:
+    """From the recorded pose of a camera, the rendered scene matches the camera's picture."""
     from workbench.pictures.render_recorded import RecordedScene
 
     camera = camera_of(episode, "base_camera")
@@ -94,11 +94,11 @@ def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Ep
     for state in (0, episode.length):
         drawn = _is_coloured(scene.picture(episode.poses[state], camera.pose[state]))
         seen = _is_coloured(camera.rgb[state])
-        # Lights and shine differ; where the table ends and the robot stands before it does not.
+        # Lights and highlights differ; the outlines of table and robot do not.
         assert 0.2 < seen.mean() < 0.8 and (drawn == seen).mean() > 0.96
-    gone = episode.poses[0].copy()
-    gone[:] = np.nan
-    nothing = scene.picture(gone, camera.pose[0])
+    absent = episode.poses[0].copy()
+    absent[:] = np.nan
+    nothing = scene.picture(absent, camera.pose[0])
     assert nothing.std(axis=(0, 1)).max() < 1
 
 
@@ -110,7 +110,7 @@ def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Ep
         FilmEye((0.0, 0.0, -2.0), (0.0, 0.0, 1.0)),
     ],
 )
-def test_an_eye_looks_where_it_is_told(eye: FilmEye) -> None:
+def test_an_eye_looks_at_its_target(eye: FilmEye) -> None:
     w, x, y, z = eye.pose[3:].astype(float)
     assert abs(np.linalg.norm([w, x, y, z]) - 1) < 1e-6
     forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
@@ -118,7 +118,7 @@ def test_an_eye_looks_where_it_is_told(eye: FilmEye) -> None:
     assert np.allclose(forward, wanted / np.linalg.norm(wanted), atol=1e-5)
 
 
-def test_the_usual_eye_has_in_view_what_moves(episode: Episode) -> None:
+def test_the_default_eye_has_moving_bodies_in_view(episode: Episode) -> None:
     eye = default_eye(replace(episode, cameras=[]))
     assert episode.poses is not None
     to = episode.poses[:, :, :3].reshape(-1, 3) - np.array(eye.position)
@@ -143,7 +143,7 @@ def test_a_sheet_shows_every_camera_from_the_first_to_the_last_state(episode: Ep
 
 
 def _is_coloured(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Wood is, robot and floor are grey."""
+    """Whether a pixel is coloured: wood is, robot and floor are grey."""
     return np.ptp(picture.astype(int), axis=2) > 45
 
 

@@ -1,4 +1,4 @@
-"""Stepping into a recording in the live session, with a real worker; and what is opened for a recording."""
+"""Entering a recording's state in the live session with a real worker; and which code is opened for a recording."""
 
 # pyright: reportOptionalMemberAccess=false
 
@@ -61,7 +61,7 @@ def step_with(session: Session, action: np.ndarray) -> SessionView:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("state", [0, 23])
-def test_the_live_env_stands_in_the_recorded_state_and_goes_on_from_there_as_it_did(
+def test_the_live_env_enters_the_recorded_state_and_continues_as_recorded(
     live: Session, run: RecordedRun, state: int
 ) -> None:
     before = live.view().step
@@ -77,7 +77,7 @@ def test_the_live_env_stands_in_the_recorded_state_and_goes_on_from_there_as_it_
         assert view.step.reward[ENV] == run.reward[t]
 
 
-def test_it_is_a_jump_that_undo_takes_back(live: Session, run: RecordedRun) -> None:
+def test_entering_a_state_can_be_undone(live: Session, run: RecordedRun) -> None:
     stood = live.view().step.poses[ENV].copy()
     view = into(live, run.until(10))
     assert view.timeline.undo == "going live of env 1"
@@ -86,12 +86,12 @@ def test_it_is_a_jump_that_undo_takes_back(live: Session, run: RecordedRun) -> N
     view = wait_until(live, lambda v: v.timeline.last > last, "the way back")
     assert np.allclose(view.step.poses[ENV], stood, atol=1e-6, equal_nan=True)
     assert view.timeline.arrived == ""
-    # The same recorded moment again is another arrival.
+    # Entering the same recorded moment again counts as a new jump.
     before = view.timeline.entered
     assert into(live, run.until(10)).timeline.entered == before + 1
 
 
-def test_all_envs_can_go_there(live: Session, run: RecordedRun) -> None:
+def test_all_envs_can_enter_one_recorded_state(live: Session, run: RecordedRun) -> None:
     view = into(live, run.until(15), everywhere=True)
     for env in range(N):
         assert np.array_equal(view.step.poses[env], poses[15], equal_nan=True)
@@ -99,7 +99,7 @@ def test_all_envs_can_go_there(live: Session, run: RecordedRun) -> None:
     assert rows is not None and rows.steps.tolist() == [15] * N and np.isnan(rows.total).all()
 
 
-def test_code_that_raises_on_the_way_leaves_the_envs_where_they_were(live: Session, run: RecordedRun) -> None:
+def test_code_that_raises_while_entering_leaves_the_envs_unchanged(live: Session, run: RecordedRun) -> None:
     view = into(live, run.until(5))
     file = Path(view.task.file or "")
     text = file.read_text()
@@ -118,7 +118,7 @@ def test_code_that_raises_on_the_way_leaves_the_envs_where_they_were(live: Sessi
     assert np.nanmax(np.abs(moved - stood)[..., :3]) < 0.02
 
 
-def test_a_renamed_actor_is_told_and_the_robot_is_where_it_was(live: Session, run: RecordedRun) -> None:
+def test_a_renamed_actor_is_reported_and_the_robot_is_restored(live: Session, run: RecordedRun) -> None:
     view = live.view()
     file = Path(view.task.file or "")
     text = file.read_text()
@@ -126,8 +126,11 @@ def test_a_renamed_actor_is_told_and_the_robot_is_where_it_was(live: Session, ru
     file.write_text(text.replace('name="cube"', 'name="box"'))
     view = wait_until(live, lambda v: "box" in v.task.geometry.body_names, "the new scene")
     view = into(live, run.until(12))
-    told = "; ".join(view.timeline.not_carried)
-    assert "actors/cube: this env has none" in told and "actors/box: the recording has none" in told
+    not_carried = "; ".join(view.timeline.not_carried)
+    assert (
+        "actors/cube: this env has none" in not_carried
+        and "actors/box: the recording has none" in not_carried
+    )
     names = view.task.geometry.body_names
     hand = names.index("panda/panda_hand")
     assert np.allclose(
@@ -148,11 +151,11 @@ def info(file: Path | None, task: str = "WorkbenchPushCube-v1", **more: object) 
     return replace(plain, **more)  # pyright: ignore[reportArgumentType]
 
 
-def test_todays_code_is_the_file_where_it_is_still_there_else_the_id(tmp_path: Path) -> None:
+def test_todays_code_is_the_file_if_it_still_exists_else_the_id(tmp_path: Path) -> None:
     file = TASKS / "push_cube.py"
     assert str(reference_of(info(file))).startswith(f"{file}:")
-    gone = replace(info(file), source_file=str(tmp_path / "gone.py"))
-    assert str(reference_of(gone)) == "WorkbenchPushCube-v1"
+    deleted = replace(info(file), source_file=str(tmp_path / "deleted.py"))
+    assert str(reference_of(deleted)) == "WorkbenchPushCube-v1"
     assert str(reference_of(info(None, "PickCube-v1"))) == "PickCube-v1"
     from importlib.util import find_spec
 
@@ -162,7 +165,7 @@ def test_todays_code_is_the_file_where_it_is_still_there_else_the_id(tmp_path: P
     assert str(reference_of(replace(info(None, "PickCube-v1"), source_file=str(installed)))) == "PickCube-v1"
 
 
-def test_the_recorded_text_is_opened_in_a_folder_that_goes_again(tmp_path: Path) -> None:
+def test_the_recorded_text_is_opened_in_a_temporary_folder(tmp_path: Path) -> None:
     helper = {"helpers/shapes.py": "SIZE = 1\n", "../../outside.py": "x = 1\n"}
     recorded = info(TASKS / "push_cube.py")
     recorded = replace(recorded, source={**recorded.source, **helper}, source_file="push_cube.py")
@@ -177,7 +180,7 @@ def test_the_recorded_text_is_opened_in_a_folder_that_goes_again(tmp_path: Path)
         pass
 
 
-def test_files_beside_the_task_are_there_as_they_are_today_and_outlive_the_folder(
+def test_todays_files_beside_the_task_are_available_and_outlive_the_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     temporary = tmp_path / "temporary"
@@ -189,17 +192,17 @@ def test_files_beside_the_task_are_there_as_they_are_today_and_outlive_the_folde
     (file.parent / "meshes" / "part.obj").write_text("today's")
     (tmp_path / "secret").write_text("")
     above = ("../secret", "meshes/../../secret", str(tmp_path / "secret"))
-    names = ("meshes/part.obj", "meshes/gone.obj", *above)
+    names = ("meshes/part.obj", "meshes/deleted.obj", *above)
     with recorded_source(info(file, side_files=dict.fromkeys(names, "0" * 12))) as reference:
         folder = Path(reference.rpartition(":")[0]).parent
         assert (folder / "meshes" / "part.obj").read_text() == "today's"
         assert {path.name for path in folder.rglob("*")} == {"push_cube.py", "meshes", "part.obj"}
-        assert list(temporary.iterdir()) == [folder], "and nothing beside the folder"
+        assert list(temporary.iterdir()) == [folder], "no other folder was made"
     assert not folder.exists()
     assert (file.parent / "meshes" / "part.obj").read_text() == "today's"
 
 
-def test_its_env_is_made_with_its_own_robot_and_modes() -> None:
+def test_the_env_is_made_with_the_recorded_robot_and_modes() -> None:
     kwargs = {"robot_uids": "panda_wristcam", "obs_mode": "rgb", "num_envs": 64, "sim_backend": "gpu"}
     kwargs |= {"render_device": "cuda:1", "render_mode": "human", "render_backend": "gpu"}
     base = TaskOptions(rules="warn")

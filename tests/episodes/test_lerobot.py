@@ -1,4 +1,4 @@
-"""Recorded episodes as a LeRobot dataset and back. What lerobot itself says of it: tests/sweeps/lerobot_loads.py."""
+"""Recorded episodes as a LeRobot dataset and back. tests/sweeps/lerobot_loads.py loads a dataset with lerobot itself."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def succeeding(episode: Episode) -> Episode:
 
 
 def shorter(episode: Episode, steps: int) -> Episode:
-    """Its first steps."""
+    """The episode's first `steps` steps."""
     return replace(
         episode,
         action=episode.action[:steps],
@@ -67,7 +67,7 @@ def export(folder: Path, *episodes: Episode, options: ExportOptions | None = Non
 @pytest.mark.parametrize(
     "limits", [{}, {"DATA_MB": 0, "VIDEO_MB": 0, "CHUNK_SIZE": 2}], ids=["one", "many files"]
 )
-def test_what_was_exported_is_read_back(
+def test_exported_episodes_are_read_back(
     episode: Episode, limits: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, limit in limits.items():
@@ -90,13 +90,13 @@ def test_what_was_exported_is_read_back(
     np.testing.assert_array_equal(read.action, episode.action)
     np.testing.assert_array_equal(read.reward, episode.reward)
     np.testing.assert_array_equal(read.obs["state"][:-1], episode.obs["agent/qpos"][:-1])
-    assert np.isnan(read.obs["state"][-1]).all(), "the last state was not in it"
+    assert np.isnan(read.obs["state"][-1]).all(), "a LeRobot dataset lacks the last state"
     cameras = {camera.info.name: camera for camera in episode.cameras}
     assert {camera.info.name for camera in read.cameras} == set(cameras)
     for camera in read.cameras:
         of = cameras[camera.info.name]
         assert camera.rgb is not None and of.rgb is not None and len(camera.rgb) == episode.length
-        # Each frame is the picture of its state, and not of the one before or after it.
+        # Each frame is the picture of its own state, not of the state before or after.
         for state in range(episode.length):
             distances = [
                 np.abs(camera.rgb[state].astype(int) - of.rgb[other].astype(int)).mean()
@@ -106,7 +106,7 @@ def test_what_was_exported_is_read_back(
 
 
 @pytest.mark.slow
-def test_the_tables_are_of_the_format(episode: Episode, succeeding: Episode, tmp_path: Path) -> None:
+def test_the_tables_follow_the_format(episode: Episode, succeeding: Episode, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     export(folder, episode, succeeding, options=ExportOptions(instruction="pick it up"))
     info = json.loads((folder / "meta/info.json").read_text())
@@ -135,7 +135,7 @@ def test_the_tables_are_of_the_format(episode: Episode, succeeding: Episode, tmp
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
 
 
-def test_only_successes_are_exported_where_that_is_asked_for(
+def test_only_successes_are_exported_on_request(
     episode: Episode, succeeding: Episode, tmp_path: Path
 ) -> None:
     only = ExportOptions(only_successes=True)
@@ -146,7 +146,7 @@ def test_only_successes_are_exported_where_that_is_asked_for(
     assert not (tmp_path / "none").exists()
 
 
-def test_what_goes_into_it_can_be_chosen(episode: Episode) -> None:
+def test_the_exported_features_can_be_chosen(episode: Episode) -> None:
     frames = frames_of(episode, Choice(state=("extra",), environment=("agent/qpos",), cameras=(), every=3))
     assert frames.names["observation.state"] == ["extra.goal.0", "extra.goal.1", "extra.goal.2"]
     assert frames.columns["observation.environment_state"].shape == (3, 9)
@@ -162,16 +162,14 @@ def test_what_goes_into_it_can_be_chosen(episode: Episode) -> None:
     assert joints.columns["observation.state"].shape == (episode.length, 9)
 
 
-def test_a_lower_rate_has_to_divide_the_steps(episode: Episode, tmp_path: Path) -> None:
+def test_a_lower_rate_must_divide_the_control_rate(episode: Episode, tmp_path: Path) -> None:
     made = export(tmp_path / "set", episode, options=ExportOptions(fps=10))
     assert made.frames == episode.length // 2
     with pytest.raises(ValueError, match="not an integer multiple of 7"):
         export(tmp_path / "other", episode, options=ExportOptions(fps=7))
 
 
-def test_episodes_that_do_not_fit_together_are_said_and_nothing_is_left(
-    episode: Episode, tmp_path: Path
-) -> None:
+def test_incompatible_episodes_are_refused_and_no_file_is_left(episode: Episode, tmp_path: Path) -> None:
     narrow = replace(episode, action=episode.action[:, :2], action_names=episode.action_names[:2])
     with pytest.raises(
         ValueError, match=r"episode 1 does not go into one dataset with episode 0: action has the shape \[2\]"
@@ -187,7 +185,7 @@ def test_episodes_that_do_not_fit_together_are_said_and_nothing_is_left(
     assert len(read_lerobot(tmp_path / "rest", 1).reward) == episode.length
 
 
-def test_a_dataset_is_in_the_library_an_episode_a_row(
+def test_a_dataset_has_one_library_row_per_episode(
     episode: Episode, succeeding: Episode, tmp_path: Path
 ) -> None:
     export(tmp_path / "sets" / "push", episode, succeeding)
@@ -206,7 +204,7 @@ def test_a_dataset_is_in_the_library_an_episode_a_row(
         library.close()
 
 
-def test_a_film_that_is_a_playlist_names_no_other_file(episode: Episode, tmp_path: Path) -> None:
+def test_a_playlist_as_video_reads_no_other_file(episode: Episode, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     export(folder, episode)
     (film, *_) = sorted(folder.glob("videos/**/*.mp4"))
@@ -224,24 +222,24 @@ def test_a_film_that_is_a_playlist_names_no_other_file(episode: Episode, tmp_pat
             pictures[0]
 
 
-def test_what_a_dataset_claims_is_bounded(episode: Episode, tmp_path: Path) -> None:
+def test_claims_of_a_dataset_are_bounded(episode: Episode, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     export(folder, episode)
     info = json.loads((folder / "meta/info.json").read_text())
     camera = next(key for key, feature in info["features"].items() if feature["dtype"] == "video")
 
-    def said(change: dict[str, Any]) -> None:
+    def write_info(change: dict[str, Any]) -> None:
         (folder / "meta/info.json").write_text(json.dumps({**info, **change}))
 
-    # Python's own formatting would write a gigabyte, or say what an object is made of.
+    # Python's own formatting could produce a gigabyte, or reveal attributes of an object.
     for pattern in ("data/{chunk_index:01000000000d}.parquet", "data/{chunk_index.__class__}.parquet"):
-        said({"data_path": pattern})
+        write_info({"data_path": pattern})
         with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
             read_lerobot(folder, 0)
     huge = {**info["features"][camera], "shape": [100_000, 100_000, 3]}
-    said({"features": {**info["features"], camera: huge}})
+    write_info({"features": {**info["features"], camera: huge}})
     with pytest.raises(UnreadableRecording, match="100000 x 100000"):
         read_lerobot(folder, 0)
-    said({})
+    write_info({})
     os.mkfifo(folder / "data" / "chunk-000" / "file-001.parquet")
     assert lerobot_rows(folder)[0].length == episode.length

@@ -1,4 +1,4 @@
-"""A long episode with cameras takes no more memory than a short one, while it happens, when its files are made, and when it is looked at."""
+"""A long episode with cameras takes no more memory than a short one: recorded, written and viewed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.writing.episode_writer import EpisodeWriter
 
 def peak():
-    # Not getrusage, whose peak is that of the parent where this process was forked from a larger one.
+    # Not getrusage: after a fork from a larger process its peak is that of the parent.
     (line,) = [line for line in open("/proc/self/status") if line.startswith("VmHWM")]
     return int(line.split()[1]) / 1024
 
@@ -71,7 +71,7 @@ print(json.dumps(dict(appended=appended, finished=peak(), files=sizes, rrd=str(f
 READER = """
 import json, sys, time
 from pathlib import Path
-import rerun.chunk  # noqa: F401  (not what is measured)
+import rerun.chunk  # noqa: F401  (not measured)
 from workbench.episodes.reader.read_episode import read_episode
 
 def peak():
@@ -99,8 +99,8 @@ def peaks(folder: Path, steps: int) -> dict:
 def test_ten_thousand_steps_at_four_cameras_do_not_grow_the_process(tmp_path: Path) -> None:
     short, long = peaks(tmp_path / "short", 500), peaks(tmp_path / "long", 10_000)
     print(short, long)
-    assert sum(long["files"]) > 100e6, "too little was recorded for this to say anything"
-    assert long["appended"] - short["appended"] < 80, "MB; the recording has hundreds"
+    assert sum(long["files"]) > 100e6, "too little was recorded for a meaningful test"
+    assert long["appended"] - short["appended"] < 80, "MB; the recording has hundreds of MB"
     assert long["finished"] - short["finished"] < 80
     assert verify_rrd(Path(long["rrd"]), timeout=300) is None
     child = subprocess.run(
@@ -108,5 +108,5 @@ def test_ten_thousand_steps_at_four_cameras_do_not_grow_the_process(tmp_path: Pa
     )
     read = json.loads(child.stdout)
     print(read)
-    assert read["opened"] < 100, "most of it are pictures, and nobody has looked at one"
-    assert read["looked"] < 220, "only what was looked at last is kept"
+    assert read["opened"] < 100, "most of it is pictures, and none was viewed yet"
+    assert read["looked"] < 220, "only the last viewed pictures are cached"

@@ -1,4 +1,4 @@
-"""A film, a sheet or a page that is written is there whole or not at all, and takes no other file's place."""
+"""A new film, sheet or page is written completely or not at all, and replaces no other file."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def write(path: Path, content: bytes = b"whole") -> None:
         temporary.write_bytes(content)
 
 
-def there(folder: Path) -> dict[str, bytes]:
+def files_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 @pytest.mark.parametrize("then", [0, errno.EROFS])
 @pytest.mark.parametrize("links", [True, False])
-def test_whatever_call_fails_it_is_whole_or_not_there(
+def test_whatever_call_fails_the_file_is_complete_or_absent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool, then: int
 ) -> None:
     if not links:
@@ -37,23 +37,23 @@ def test_whatever_call_fails_it_is_whole_or_not_there(
     assert {call.split()[0] for call in calls} >= {"mkdir", "fsync", "link" if links else "replace"}
     for at, call in enumerate(calls, 1):
         path, before = tmp_path / str(at) / "a.mp4", descriptors()
-        told = ""
+        problem = ""
         with refused(at, then=then):
             try:
                 write(path)
             except OSError as error:
-                told = str(error.strerror)
+                problem = str(error.strerror)
         assert left_open(before) == [], call
         if path.exists() and (links or not then or path.stat().st_size):
-            assert path.read_bytes() == b"whole" and not told, call
+            assert path.read_bytes() == b"whole" and not problem, call
         else:
-            assert told.startswith(f"Cannot write {path}: "), (call, told)
+            assert problem.startswith(f"Cannot write {path}: "), (call, problem)
         left = list(path.parent.glob("*")) if path.parent.exists() else []
         assert then or call.startswith("unlink") or set(left) <= {path}, call
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_a_file_that_came_meanwhile_is_not_written_over(
+def test_a_file_that_appeared_meanwhile_is_not_overwritten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
 ) -> None:
     if not links:
@@ -63,7 +63,7 @@ def test_a_file_that_came_meanwhile_is_not_written_over(
         with new_file(path) as temporary:
             temporary.write_bytes(b"ours")
             path.write_bytes(b"of another")
-    assert there(tmp_path) == {"a.mp4": b"of another"}
+    assert files_of(tmp_path) == {"a.mp4": b"of another"}
     with pytest.raises(FileExistsError, match="is not written over"):
         write(path)
-    assert there(tmp_path) == {"a.mp4": b"of another"}
+    assert files_of(tmp_path) == {"a.mp4": b"of another"}

@@ -1,4 +1,4 @@
-"""A task whose ``evaluate`` returns more than numbers with a row for each env: played, recorded, read back, rescored, gone into."""
+"""A task whose ``evaluate`` returns more than numbers per env: played, recorded, read back, rescored and restored."""
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
@@ -38,7 +38,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def recordings(file: Path) -> Path:
-    """An episode of each env, by `workbench.Recorder`, which takes steps together."""
+    """An episode of each env, recorded by `workbench.Recorder`, which records the steps of all envs together."""
     folder = file.parent / "recordings"
     env = workbench.Recorder(workbench.make(file, N, **SPEC), folder)
     env.reset(seed=[3, 4, 5])
@@ -55,7 +55,7 @@ def text(entry: OtherEntry | None) -> str | None:
 
 
 def check_recorded(episode: Episode, env: int) -> None:
-    """What the task of these tests returned, of an episode that began with its reset."""
+    """Check the recorded entries of an episode that began with its reset."""
     assert episode.length == STEPS
     others: Any = [episode.other_entries_at(state) for state in range(STEPS + 1)]
     assert [text(each["phase"]) for each in others] == ["reach"] * 2 + ["push"] * 4
@@ -78,7 +78,7 @@ def check_recorded(episode: Episode, env: int) -> None:
     np.testing.assert_allclose(episode.evaluate["half"], away, rtol=1e-2)
     np.testing.assert_array_equal(episode.evaluate["learnt"], away)
     np.testing.assert_array_equal(episode.evaluate["array"], [2] * (STEPS + 1))
-    # Per env in every second state, and of the whole batch in the others.
+    # The value is per env in every second state, and one for the whole batch in the others.
     np.testing.assert_array_equal(episode.evaluate["turns"][1::2], away[1::2])
     assert np.isnan(episode.evaluate["turns"][::2]).all()
     np.testing.assert_array_equal(episode.batch["turns"][::2], episode.batch["progress"][::2])
@@ -86,7 +86,7 @@ def check_recorded(episode: Episode, env: int) -> None:
     assert np.isfinite(episode.batch["reward_terms/mean"][1:]).all()
 
 
-def test_it_is_recorded_and_read_back(recordings: Path) -> None:
+def test_odd_entries_are_recorded_and_read_back(recordings: Path) -> None:
     files = sorted(recordings.glob("*.json"))
     assert len(files) == N
     for path in files:
@@ -97,14 +97,14 @@ def test_it_is_recorded_and_read_back(recordings: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_not_per_env_is_no_difference_when_it_is_rescored(recordings: Path, file: Path) -> None:
+def test_entries_that_are_not_per_env_are_no_difference_when_rescored(recordings: Path, file: Path) -> None:
     verdicts, _ = rescore_all(RescoreOptions((recordings,), num_envs=2))
     assert len(verdicts) == N
     for verdict in verdicts:
         assert (verdict.why_not, verdict.first_difference, verdict.differing) == ("", None, ())
 
 
-def test_a_state_is_gone_into(recordings: Path, file: Path) -> None:
+def test_a_recorded_state_can_be_entered(recordings: Path, file: Path) -> None:
     task = opened(str(file), 2, reward_mode="dense", obs_mode="state")
     run = run_of(read_episode(sorted(recordings.glob("*.json"))[1]), 3)
     step, replay_result = replay_to(task, run, 3, [1])
@@ -120,7 +120,7 @@ def session(file: Path) -> Any:
 
 
 @pytest.mark.slow
-def test_the_page_plays_and_records_it(session: Session, file: Path) -> None:
+def test_the_page_plays_and_records_odd_entries(session: Session, file: Path) -> None:
     def shown(step: StepResult | None) -> bool:
         return step is not None and "best" in step.others and step.others["best"].numbers is not None
 

@@ -1,4 +1,4 @@
-"""How far one recorded state is from another."""
+"""Distance between two recorded states."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from workbench.episodes.recorded_state import state_distance
 
 
-def test_a_state_is_as_far_as_its_furthest_body_and_joint() -> None:
+def test_the_distance_of_states_is_that_of_the_furthest_body_and_joint() -> None:
     cube, arm = np.zeros(13, np.float32), np.zeros(13 + 4, np.float32)
     cube[3] = arm[3] = 1
     was = {"actors/cube": cube, "articulations/arm": arm}
@@ -21,6 +21,6 @@ def test_a_state_is_as_far_as_its_furthest_body_and_joint() -> None:
 
 
 @pytest.mark.parametrize("count", [12, 13, 20])
-def test_the_state_of_a_controller_is_no_pose(count: int) -> None:
+def test_a_controllers_state_is_not_taken_for_a_pose(count: int) -> None:
     name = "controller/arm"
     assert state_distance({name: np.ones(count)}, {name: np.zeros(count)}) == (0, 0)

@@ -1,4 +1,4 @@
-"""Recorded episodes lived through again in running envs, measured against what was recorded."""
+"""Recorded episodes replayed in running envs, compared with the recording."""
 
 # pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false
 
@@ -35,8 +35,8 @@ def recorded(task: OpenedTask) -> Recorded:
     return record(task, STEPS, [31, 7, 5], reaching(STEPS, N))
 
 
-def goes_on_as_recorded(task: OpenedTask, recorded: Recorded, env: int, state: int) -> None:
-    """The same states and rewards under the same actions, to the last bit."""
+def assert_continues_as_recorded(task: OpenedTask, recorded: Recorded, env: int, state: int) -> None:
+    """Assert that the same actions give the same states and rewards, bit for bit."""
     for t in range(state, STEPS):
         step = task.env.step(recorded.steps[t + 1].action)
         now = read_states(task.env.env)
@@ -46,7 +46,7 @@ def goes_on_as_recorded(task: OpenedTask, recorded: Recorded, env: int, state: i
 
 
 @pytest.mark.parametrize("state", [0, 1, 17, STEPS - 3])
-def test_what_follows_a_state_that_was_gone_into_is_what_was_recorded_to_the_last_bit(
+def test_an_env_continues_from_an_entered_state_as_recorded_bit_for_bit(
     task: OpenedTask, recorded: Recorded, state: int
 ) -> None:
     run, env = recorded.run(1), 1
@@ -55,12 +55,12 @@ def test_what_follows_a_state_that_was_gone_into_is_what_was_recorded_to_the_las
     assert replay_result.missed == {} and not replay_result.start_differs
     assert step.elapsed_steps[env] == state and task.env.episode_seeds[env] == 7
     for name, values in recorded.steps[state].evaluate.items():
-        # The terms of a reward are those of an action, and none was made now.
+        # Reward terms belong to an action, and no action was taken.
         assert name.startswith("reward_terms/") or np.array_equal(step.evaluate[name][env], values[env]), name
-    goes_on_as_recorded(task, recorded, env, state)
+    assert_continues_as_recorded(task, recorded, env, state)
 
 
-def test_the_envs_beside_it_go_on_as_if_nothing_had_happened(task: OpenedTask, recorded: Recorded) -> None:
+def test_the_other_envs_continue_undisturbed(task: OpenedTask, recorded: Recorded) -> None:
     def run(steps: int, disturb: bool) -> list[dict[str, np.ndarray]]:
         rng, states = np.random.default_rng(3), []
         record(task, 25, [1, 2, 3], reaching(25, N))
@@ -78,7 +78,7 @@ def test_the_envs_beside_it_go_on_as_if_nothing_had_happened(task: OpenedTask, r
     assert not np.array_equal(plain[0]["articulations/panda"][1], disturbed[0]["articulations/panda"][1])
 
 
-def test_all_envs_can_stand_in_one_state_and_go_on_alike(task: OpenedTask, recorded: Recorded) -> None:
+def test_all_envs_can_enter_one_state_and_continue_equally(task: OpenedTask, recorded: Recorded) -> None:
     _, replay_result = replay_to(task, recorded.run(2), 30, range(N))
     assert replay_result.metres == 0
     for t in range(30, STEPS):
@@ -90,17 +90,17 @@ def test_all_envs_can_stand_in_one_state_and_go_on_alike(task: OpenedTask, recor
             assert np.array_equal(rows[env], recorded.states[STEPS][name][2])
 
 
-def test_an_episode_of_a_reset_of_all_envs_begins_where_it_began(task: OpenedTask) -> None:
-    # Its seed alone does not say: numbers were drawn for all three at once.
+def test_an_episode_that_began_with_a_reset_of_all_envs_starts_equally(task: OpenedTask) -> None:
+    # The seed alone is not enough: random numbers were drawn for all three envs at once.
     recorded = record(task, STEPS, None, reaching(STEPS, N))
     _, replay_result = replay_to(task, recorded.run(2), 20, [0])
     assert replay_result.start_differs and replay_result.metres == 0 and replay_result.way == "re-simulated"
 
 
-def test_states_that_part_from_the_record_are_put_back_on_it(task: OpenedTask, recorded: Recorded) -> None:
+def test_states_that_drift_from_the_record_are_reset_to_it(task: OpenedTask, recorded: Recorded) -> None:
     run = recorded.run(1)
     states = {name: rows.copy() for name, rows in run.env_states.items()}
-    states["actors/cube"][12:, 0] += 0.05  # as if somebody had pushed it
+    states["actors/cube"][12:, 0] += 0.05  # as if the cube had been pushed
     step, replay_result = replay_to(task, replace(run, env_states=states), 20, [1])
     assert replay_result.way == "corrected" and 1 <= replay_result.corrected <= 8
     assert replay_result.metres is not None and replay_result.metres < 1e-4
@@ -108,7 +108,7 @@ def test_states_that_part_from_the_record_are_put_back_on_it(task: OpenedTask, r
     assert state_distance(now, {n: rows[20] for n, rows in states.items()})[0] < 1e-4
 
 
-def test_actions_that_do_not_fit_are_said_and_the_state_is_put_there(
+def test_actions_of_the_wrong_shape_are_reported_and_the_state_is_set(
     task: OpenedTask, recorded: Recorded
 ) -> None:
     run = recorded.run(1)
@@ -119,14 +119,14 @@ def test_actions_that_do_not_fit_are_said_and_the_state_is_put_there(
     robot = task.env.env.agent.robot
     targets = task.env.env.scene.px.cuda_articulation_target_qpos.torch()[1]
     assert np.allclose(targets[: robot.max_dof], robot.get_qpos()[1], atol=1e-6)
-    # It stays where it is, and does not run to where it stood before.
+    # The robot stays in this state and does not move to its previous drive target.
     task.env.step(None)
     now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
     assert state_distance(now, run.state(25))[1] < 0.05
 
 
 def test_a_seed_begins_the_same_episode_in_every_env_of_a_batch(task: OpenedTask) -> None:
-    # The robot's first joints too, which ManiSkill draws from env 0's generator.
+    # This includes the robot's initial joint noise, which ManiSkill draws from env 0's generator.
     task.env.reset(seed=[4], env_idx=[0])
     first = {name: rows[0].copy() for name, rows in read_states(task.env.env).items()}
     task.env.step(np.zeros((N, 8), np.float32))
@@ -136,7 +136,7 @@ def test_a_seed_begins_the_same_episode_in_every_env_of_a_batch(task: OpenedTask
         assert np.array_equal(first[name], again[name]), name
 
 
-def test_what_the_task_raises_on_the_way_is_its_own_line(tmp_path: Path) -> None:
+def test_an_error_of_the_task_during_replay_has_its_own_line(tmp_path: Path) -> None:
     text = (TASKS / "push_cube.py").read_text()
     file = tmp_path / "push_cube.py"
     line = "    def evaluate(self)"

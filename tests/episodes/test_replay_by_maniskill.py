@@ -1,4 +1,4 @@
-"""ManiSkill's own ``replay_trajectory``, on its stock env, takes our recordings: by states, and by actions."""
+"""ManiSkill's own ``replay_trajectory`` replays our recordings on its stock env, by states and by actions."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 def replayed(path: Path, *arguments: str) -> Episode:
-    """What ``--save-traj`` wrote."""
+    """The episode that ``--save-traj`` wrote."""
     command = [sys.executable, "-m", "mani_skill.trajectory.replay_trajectory", "--traj-path", str(path)]
     options = ["--save-traj", "--record-rewards", "--reward-mode", "normalized_dense", *arguments]
     done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=300)
@@ -51,7 +51,7 @@ def replayed(path: Path, *arguments: str) -> Episode:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["--use-env-states", "--use-first-env-state"])
-def test_a_replay_ends_in_success_and_is_the_episode_again(recorded: Path, mode: str) -> None:
+def test_a_replay_succeeds_and_equals_the_episode(recorded: Path, mode: str) -> None:
     ours, again = read_episode(recorded), replayed(recorded, mode)
     assert again.info.seed == ours.info.seed
     np.testing.assert_array_equal(again.action, ours.action)

@@ -1,4 +1,4 @@
-"""Files beside a task that are no Python: which are named, and what is said of them later."""
+"""Non-Python files next to a task: which are recorded, and how later changes are reported."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def task(tmp_path: Path) -> Path:
     return tmp_path / "task.py"
 
 
-def test_what_the_text_names_is_named_and_what_that_names_in_turn(task: Path) -> None:
+def test_files_named_in_the_task_and_in_those_files_are_recorded(task: Path) -> None:
     found = side_files(str(task), {str(task): TEXT})
     assert {"meshes/part.obj", "robots/arm.urdf", "robots/visual/hand.stl", "shapes/piece_0.ply"} <= set(
         found
@@ -51,22 +51,22 @@ def test_what_the_text_names_is_named_and_what_that_names_in_turn(task: Path) ->
     assert side_files(str(task), {str(task): "not python ("}) == {}
 
 
-def test_what_has_changed_or_gone_since_is_said(task: Path) -> None:
+def test_changed_and_missing_side_files_are_reported(task: Path) -> None:
     text = "load('meshes/part.obj', 'notes.txt')"
     recorded = side_files(str(task), {str(task): text})
     assert list(recorded) == ["meshes/part.obj", "notes.txt"]
     assert "which the recording does not hold: they are as then." in side_files_text(str(task), recorded)
     (task.parent / "meshes/part.obj").write_text("v 9 9 9 9")
     (task.parent / "notes.txt").unlink()
-    said = side_files_text(str(task), recorded)
-    assert "meshes/part.obj has changed since; notes.txt is missing." in said
-    assert "is missing" in side_files_text("task.py", recorded), "read where the task is not"
+    message = side_files_text(str(task), recorded)
+    assert "meshes/part.obj has changed since; notes.txt is missing." in message
+    assert "is missing" in side_files_text("task.py", recorded), "the task's folder is not the current one"
     assert "is missing" in side_files_text(str(task), {"../../etc/hostname": "0" * 12})
     assert side_files_text(str(task), {}) == ""
 
 
-def test_a_file_outside_is_not_said_to_be_as_then(task: Path) -> None:
-    """Whoever shares a recording learns nothing of the files of whoever opens it."""
+def test_a_file_outside_the_folder_is_not_compared(task: Path) -> None:
+    """A shared recording reveals nothing about the files of the person who opens it."""
     outside = task.parent.parent / "outside.txt"
     outside.write_text("mine")
     try:
@@ -77,7 +77,7 @@ def test_a_file_outside_is_not_said_to_be_as_then(task: Path) -> None:
         outside.unlink()
 
 
-def test_a_recording_that_was_copied_elsewhere_finds_its_task_where_one_looks_from(
+def test_a_copied_recording_finds_its_task_from_the_search_folder(
     make_episode: Callable[..., Made], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     task, copy = tmp_path / "project" / "tasks" / "push.py", tmp_path / "copy"

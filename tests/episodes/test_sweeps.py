@@ -1,4 +1,4 @@
-"""The results of a sweep as a file: read as they were written, and harmless where somebody else wrote them."""
+"""The results file of a sweep: read as written, and harmless where another program wrote it."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ RESULTS = SweepResults(
 )
 
 
-def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
+def test_results_are_read_back_as_written(tmp_path: Path) -> None:
     write_results(tmp_path / "results.parquet", RESULTS)
     assert clean_results(read_results(tmp_path / "results.parquet")) == RESULTS
     assert [file.name for file in tmp_path.iterdir()] == ["results.parquet"]
 
 
-def test_points_are_summed_up_the_best_first() -> None:
+def test_points_are_summarised_best_first() -> None:
     best, failed = replace(RESULTS, points=RESULTS.points[::1]).summaries()
     assert (best.index, best.episodes, best.solved, best.solved_at_end, best.mean_return) == (0, 2, 1, 0, 2.0)
     assert best.means == {"reward_terms/reach": 0.5} and best.rate == 0.5
@@ -50,7 +50,7 @@ def test_points_are_summed_up_the_best_first() -> None:
 
 @pytest.mark.parametrize(
     ("successes", "count", "low", "high"),
-    # Of Wilson's formula, as statsmodels' proportion_confint gives it.
+    # Expected values from statsmodels' proportion_confint (Wilson).
     [(0, 10, 0.0, 0.2775), (5, 10, 0.2366, 0.7634), (10, 10, 0.7225, 1.0), (90, 100, 0.8256, 0.9448)],
 )
 def test_the_interval_is_wilsons(successes: int, count: int, low: float, high: float) -> None:
@@ -58,7 +58,7 @@ def test_the_interval_is_wilsons(successes: int, count: int, low: float, high: f
 
 
 def rewritten(path: Path, about: object = None, **columns: Sequence[object]) -> Path:
-    """The file with other columns, or another description."""
+    """Write the file again with other columns, or another description."""
     write_results(path, RESULTS)
     table = pq.read_table(path)
     for name, values in columns.items():
@@ -78,7 +78,7 @@ def test_a_path_that_leaves_the_folder_is_dropped(recording: str, tmp_path: Path
     assert [row.recording for row in clean_results(read_results(file)).episodes] == ["", "a/b.rrd", ""]
 
 
-def test_rows_of_no_point_and_numbers_that_are_none_are_left_out(tmp_path: Path) -> None:
+def test_rows_of_unknown_points_and_invalid_numbers_are_left_out(tmp_path: Path) -> None:
     file = rewritten(tmp_path / "r.parquet", point=[99, 0, -1], **{"return": [1.0, math.inf, math.nan]})
     cleaned = clean_results(read_results(file))
     assert [(row.seed, row.total_reward) for row in cleaned.episodes] == [(1, None)]
@@ -94,7 +94,7 @@ def test_rows_of_no_point_and_numbers_that_are_none_are_left_out(tmp_path: Path)
         {"format": 1, "task": "t", "actions": "a", "seeds": "x", "points": [{"a": "1"}]},
     ],
 )
-def test_what_is_no_sweep_is_refused(about: object, tmp_path: Path) -> None:
+def test_a_file_that_is_no_sweep_is_refused(about: object, tmp_path: Path) -> None:
     with pytest.raises(NoSweep):
         clean_results(read_results(rewritten(tmp_path / "r.parquet", about)))
 

@@ -1,4 +1,4 @@
-"""Tags and notes are what a person typed: whatever fails while they are written, those of before are there."""
+"""Tags and notes: whatever fails while they are written, the old or the new ones are intact."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from tests.episodes.refused_calls import descriptors, refused
 from workbench.episodes.document import read_notes, write_into_description, write_notes
 
 
-def of_ours(folder: Path) -> tuple[Path, Callable[[], None]]:
+def our_recording(folder: Path) -> tuple[Path, Callable[[], None]]:
     path = describe(folder, "a", id="a1", tags=["old"], note="typed before")
     return path, lambda: write_into_description(path, ("new",), "typed now")
 
 
-def of_others(folder: Path) -> tuple[Path, Callable[[], None]]:
+def foreign_recording(folder: Path) -> tuple[Path, Callable[[], None]]:
     path = folder / "demo.notes"
     folder.mkdir(exist_ok=True)
     write_notes(path, "traj_0", ("old",), "typed before")
     return path, lambda: write_notes(path, "traj_1", ("new",), "typed now")
 
 
-KINDS = pytest.mark.parametrize("begin", [of_ours, of_others])
+KINDS = pytest.mark.parametrize("begin", [our_recording, foreign_recording])
 
 
 @KINDS
@@ -43,17 +43,17 @@ def test_a_call_that_fails_leaves_the_old_content_or_the_new(
     for at, call in enumerate(calls, 1):
         path, write = begin(tmp_path / str(at))
         opened, beside = descriptors(), sorted(os.listdir(path.parent))
-        told = False
+        failed = False
         with refused(at, then=then):
             try:
                 write()
             except OSError as error:
-                told = True
+                failed = True
                 assert error.errno == errno.EIO, call
-        assert path.read_bytes() == (before if told else after), call
-        assert told or not call.startswith(("open", "fsync", "replace")), call
+        assert path.read_bytes() == (before if failed else after), call
+        assert failed or not call.startswith(("open", "fsync", "replace")), call
         assert descriptors() == opened, call
-        # Where nothing can be removed any more, the half-made file stays beside it.
+        # Where removing fails too, the partial file stays.
         assert then or sorted(os.listdir(path.parent)) == beside, call
 
 
@@ -73,7 +73,7 @@ def test_notes_of_one_trajectory_leave_those_of_the_others(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("content", ["", "{", "[1]", '{"mine": 1}', '{"workbench_notes": {"traj_0": 5}}'])
-def test_notes_that_cannot_be_read_are_not_written_over(tmp_path: Path, content: str) -> None:
+def test_unreadable_notes_are_not_overwritten(tmp_path: Path, content: str) -> None:
     path = tmp_path / "demo.notes"
     path.write_text(content)
     assert read_notes(path) == {}

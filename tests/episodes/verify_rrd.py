@@ -1,4 +1,4 @@
-"""Rerun's own verdict on a file."""
+"""Lets rerun verify an ``.rrd``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from workbench.episodes.rerun.viewer import quiet_environment, rerun_command
 
 
 def verify_rrd(path: Path, timeout: float = 60.0) -> str | None:
-    """Let rerun judge the file at `path`: None where it is well, else what rerun said against it.
+    """Let rerun verify the file at `path`; returns None if it is valid, else rerun's error text.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -1,16 +1,15 @@
-"""Makes a set of golden recordings with this version: python tests/golden/make.py v2
+"""Make a set of golden recordings with this version: python tests/golden/make.py v2
 
-By hand, and once a format: a set stays as the version of its day wrote it, and later versions have to read it, so a set
-that is there is written over only with --over. All is made below /tmp/golden, whose path is in none of the files, and
-takes half a minute.
+Run by hand, once per file format: later versions must read a set as the version of its time wrote it, so an existing set
+is overwritten only with --over. Files are made below /tmp/golden, a path that none of them contains, in half a minute.
 
     cameras      64x48 colour, depth and segmentation, and a success
     several      a task of several modules
     tagged       with tags and a note
-    damaged      three: a cut .rrd, an .h5 with one bit turned, both
-    unfinished   .writing/ of a process that was killed
-    recovered    the same, after the next start has made the episode of it
-    expected.json    what reading each of them gives
+    damaged      three episodes: a truncated .rrd, an .h5 with one flipped bit, both
+    unfinished   .writing/ of a killed process
+    recovered    the same after the next start has recovered the episode
+    expected.json    the expected values of each episode
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ PLACE = Path("/tmp/golden")
 
 
 def expected_of(episode: Episode) -> dict[str, Any]:
-    """What reading it gives, down to the last bit of every column; of colours, which JPEG readers round, the mean."""
+    """Return the values that reading must give: a digest of every column, and the mean of colours, which JPEG decoders round."""
     info = episode.info
     return {
         "task": info.task,
@@ -84,7 +83,7 @@ def _columns(episode: Episode) -> Iterator[tuple[str, NDArray]]:
 
 
 def _digest(values: NDArray) -> str:
-    # Every NaN is one NaN, and -0 is 0: neither is told apart by what reads it.
+    # Normalize NaN payloads and -0, which readers do not distinguish.
     values = np.asarray(values)
     if values.dtype.kind == "f":
         values = np.where(np.isnan(values), values.dtype.type(np.nan), values) + values.dtype.type(0)
@@ -97,35 +96,35 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("set", help="name of the set, such as v2")
-    parser.add_argument("--over", action="store_true", help="write over a set that is there")
-    asked = parser.parse_args()
-    target = GOLDEN / asked.set
-    if target.exists() and not asked.over:
-        sys.exit(f"{target} is there: it is what a version of its day wrote. --over writes over it")
+    parser.add_argument("--over", action="store_true", help="overwrite an existing set")
+    options = parser.parse_args()
+    target = GOLDEN / options.set
+    if target.exists() and not options.over:
+        sys.exit(f"{target} exists and must stay as its version wrote it. To overwrite it, add --over")
     shutil.rmtree(PLACE, ignore_errors=True)
     shutil.copytree(GOLDEN / "tasks", PLACE / "tasks", ignore=shutil.ignore_patterns("__pycache__"))
-    made = PLACE / asked.set
-    record(made / "cameras", "push/push.py", "act", "--seed", "5")
-    record(made / "several", "several/task.py", "act", "--seed", "6", "--no-pictures")
-    record(made / "tagged", "push/push.py", "act", "--seed", "7", "--no-pictures")
-    tag(made / "tagged")
-    record(made / "damaged", "push/push.py", "act", "--seed", "8", "--no-pictures", "--episodes", "3")
-    expected = {"damaged": read_folder(made / "damaged")}
-    damage(made / "damaged")
-    kill_while_recording(made / "unfinished")
-    shutil.copytree(made / "unfinished", made / "recovered")
-    assert len(recover_confined(made / "recovered")) == 1
+    folder = PLACE / options.set
+    record(folder / "cameras", "push/push.py", "act", "--seed", "5")
+    record(folder / "several", "several/task.py", "act", "--seed", "6", "--no-pictures")
+    record(folder / "tagged", "push/push.py", "act", "--seed", "7", "--no-pictures")
+    tag(folder / "tagged")
+    record(folder / "damaged", "push/push.py", "act", "--seed", "8", "--no-pictures", "--episodes", "3")
+    expected = {"damaged": read_folder(folder / "damaged")}
+    damage(folder / "damaged")
+    kill_while_recording(folder / "unfinished")
+    shutil.copytree(folder / "unfinished", folder / "recovered")
+    assert len(recover_confined(folder / "recovered")) == 1
     for kind in ("cameras", "several", "tagged", "recovered"):
-        expected[kind] = read_folder(made / kind)
-    (made / "expected.json").write_text(json.dumps(expected, indent=1) + "\n")
+        expected[kind] = read_folder(folder / kind)
+    (folder / "expected.json").write_text(json.dumps(expected, indent=1) + "\n")
     shutil.rmtree(target, ignore_errors=True)
-    shutil.copytree(made, target)
+    shutil.copytree(folder, target)
     size = sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
     print(f"{target}: {size} bytes")
 
 
 def read_folder(folder: Path) -> dict[str, Any]:
-    """By the names of the files."""
+    """Return the expected values of a folder's episodes, by file name."""
     return {path.stem: expected_of(read_episode(path)) for path in sorted(folder.glob("*.json"))}
 
 
@@ -159,12 +158,12 @@ def damage(folder: Path) -> None:
 
 
 def kill_while_recording(folder: Path) -> None:
-    """Its policy waits for ever at the seventh step, by when all before are in the journal."""
+    """Kill a recording whose policy waits forever at the seventh step; all steps before it are in the journal."""
     arguments = ("--seed", "9", "--no-pictures", "--episodes", "1")
     process = subprocess.Popen(command(folder, "push/push.py", "act_and_wait", *arguments), cwd=PLACE)
     while not (PLACE / "waiting").exists():
         time.sleep(0.1)
-    time.sleep(3.0)  # many times as long as a row may wait
+    time.sleep(3.0)  # many times the delay after which a row is written
     process.kill()
     process.wait()
 

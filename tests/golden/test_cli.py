@@ -1,6 +1,6 @@
-"""How wrong calls of each command end, and the shape of what is written for programs, held against the files in ``cli/``.
+"""Wrong calls of each command are refused, and the shape of machine-readable files equals the files in ``cli/``.
 
-Where a shape is meant to change, WORKBENCH_RENEW=1 writes the files again; read the difference before it is committed:
+After an intended change of a shape, WORKBENCH_RENEW=1 rewrites the files; read the diff before committing it:
 
     WORKBENCH_RENEW=1 .venv/bin/python -m pytest tests/golden/test_cli.py
 """
@@ -131,16 +131,17 @@ WRONG_CALLS = {
     "view": ["view gone.rrd", "view push.py", "view empty"],
     "help": ["help camera", "help sliders", "help nonsense"],
 }
-"""By command. All are refused before anything is done, but for those of `ENDS`."""
+"""Wrong calls by command. All are refused before anything is done, except those of `ENDS`."""
 ENDS = {
     "record broken.py --no-pictures --episodes 1": Exit.FAILED,
     "rescore made": Exit.NOT_TRUSTED,
 }
+"""Exit codes of the calls that start before they fail."""
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a task, one that raises, recordings from elsewhere and an empty folder."""
+    """A folder with a task, a task that raises, foreign recordings and an empty folder."""
     folder = tmp_path_factory.mktemp("place")
     for file in (GOLDEN / "tasks" / "push").iterdir():
         if file.is_file():
@@ -156,7 +157,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def plain_terminal(monkeypatch: pytest.MonkeyPatch, place: Path) -> None:
-    """A hundred columns, no colours, no screen, the same folder; and a page that is opened all the same ends no tests."""
+    """Run with 100 columns, no colours, no display and the current folder `place`; opening a page fails the test."""
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("NO_COLOR", "1")
     for name in ("FORCE_COLOR", "DISPLAY", "WAYLAND_DISPLAY"):
@@ -170,15 +171,15 @@ def plain_terminal(monkeypatch: pytest.MonkeyPatch, place: Path) -> None:
 
 
 def run(capsys: pytest.CaptureFixture[str], call: str) -> tuple[int, str]:
-    """Exit code, and all that was printed."""
+    """Return the exit code and the printed text."""
     with pytest.raises(SystemExit) as ended:
         main.main(shlex.split(call))
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out + told.err
+    printed = capsys.readouterr()
+    return int(ended.value.code or 0), printed.out + printed.err
 
 
-def holds(name: str, text: str) -> None:
-    """`text` is the one that is kept under this name, or becomes it."""
+def assert_unchanged(name: str, text: str) -> None:
+    """Assert that `text` equals the file `name`; with WORKBENCH_RENEW, write the file."""
     path = SHAPES / name
     if os.environ.get("WORKBENCH_RENEW"):
         path.write_text(text + "\n")
@@ -186,7 +187,7 @@ def holds(name: str, text: str) -> None:
 
 
 def shape(value: Any) -> Any:
-    """The same with types in place of values; of a list, the shapes that are in it."""
+    """Replace values by their types, and a list by its distinct shapes."""
     if isinstance(value, dict):
         return {key: shape(entry) for key, entry in value.items()}
     if isinstance(value, list):
@@ -199,21 +200,21 @@ def shape(value: Any) -> Any:
 @pytest.mark.parametrize("command", WRONG_CALLS)
 def test_a_wrong_call_is_refused_with_a_message(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     for call in WRONG_CALLS[command]:
-        code, said = run(capsys, call)
-        assert code == ENDS.get(call, Exit.REFUSED), (call, said)
-        assert said.strip() and "workbench/cli" not in said, (call, said)
+        code, printed = run(capsys, call)
+        assert code == ENDS.get(call, Exit.REFUSED), (call, printed)
+        assert printed.strip() and "workbench/cli" not in printed, (call, printed)
 
 
 @pytest.mark.usefixtures("child_process", "renderer")
-def test_what_is_written_for_programs_keeps_its_shape(capsys: pytest.CaptureFixture[str]) -> None:
-    """The table of rescore, and what a recording says of itself."""
+def test_machine_readable_files_keep_their_shape(capsys: pytest.CaptureFixture[str]) -> None:
+    """Covers rescore's table and a recording's metadata."""
     code, _ = run(capsys, "record push.py --episodes 1 --max-steps 2 --no-pictures --out new")
     assert code == Exit.DONE
     (path,) = Path("new").glob("*.json")
-    # With nightly builds the distribution has another name.
+    # Nightly builds have another distribution name.
     text = path.read_text().replace('"mani_skill-nightly"', '"mani_skill"')
-    holds("recording.json", json.dumps(shape(json.loads(text)), indent=1))
+    assert_unchanged("recording.json", json.dumps(shape(json.loads(text)), indent=1))
     code, _ = run(capsys, "rescore new --task push.py --json-file table.json --csv-file table.csv")
     assert code == Exit.DONE
-    holds("rescore.json", json.dumps(shape(json.loads(Path("table.json").read_text())), indent=1))
-    holds("rescore.csv", Path("table.csv").read_text().splitlines()[0])
+    assert_unchanged("rescore.json", json.dumps(shape(json.loads(Path("table.json").read_text())), indent=1))
+    assert_unchanged("rescore.csv", Path("table.csv").read_text().splitlines()[0])

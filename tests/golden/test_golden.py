@@ -1,4 +1,4 @@
-"""What a version of its day recorded: this one lists it, reads it to the last bit, judges it as it was, goes on live from it."""
+"""This version lists recordings of older versions, reads them to the last bit, rescores them equally and continues them live."""
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
@@ -26,18 +26,18 @@ from workbench.library.folder import Library
 from workbench.live.commands import Step
 from workbench.live.events import ActionTold
 
-# Recordings are read, recovered and gone into in processes of their own; one is recorded in this one, which asks for a renderer.
+# Recordings are read, recovered and entered in child processes; one is recorded in this process, which needs a renderer.
 pytestmark = pytest.mark.usefixtures("child_process", "renderer")
 
 SETS = sorted(path.name for path in GOLDEN.glob("v*"))
 KINDS = ("cameras", "several", "tagged", "recovered", "damaged")
-METRES = 1e-4
-"""What README calls another place; to the last bit it is the same only on the processor that recorded it."""
+TOLERANCE_METRES = 1e-4
+"""README's tolerance for equal places; results are equal to the last bit only on the CPU model that recorded them."""
 
 
 @pytest.fixture(scope="module", params=SETS)
 def place(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of one set, beside the tasks that it names."""
+    """A copy of one set, next to the tasks that it names."""
     folder = tmp_path_factory.mktemp("golden")
     shutil.copytree(GOLDEN / "tasks", folder / "tasks", ignore=shutil.ignore_patterns("__pycache__"))
     return Path(shutil.copytree(GOLDEN / request.param, folder / request.param))
@@ -49,20 +49,20 @@ def expected(place: Path) -> dict[str, Any]:
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """A command, in this process."""
+    """Run a command in this process; return its exit code, stdout and stderr."""
     with pytest.raises(SystemExit) as ended:
         main([str(argument) for argument in arguments])
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out, told.err
+    printed = capsys.readouterr()
+    return int(ended.value.code or 0), printed.out, printed.err
 
 
-def test_they_are_small() -> None:
+def test_golden_recordings_are_small() -> None:
     assert SETS
     size = sum(path.stat().st_size for name in SETS for path in (GOLDEN / name).rglob("*") if path.is_file())
     assert size < 2_000_000
 
 
-def test_the_library_lists_them(place: Path, expected: dict[str, Any]) -> None:
+def test_the_library_lists_golden_recordings(place: Path, expected: dict[str, Any]) -> None:
     library = Library(place)
     library.refresh()
     rows = {row.name: row for row in library.view().rows}
@@ -79,18 +79,18 @@ def test_the_library_lists_them(place: Path, expected: dict[str, Any]) -> None:
             assert row.recovered is (kind == "recovered")
             assert row.tags == (("good", "slips") if kind == "tagged" else ())
             assert row.note == ("the box turns a little" if kind == "tagged" else "")
-            # The library looks at lengths alone: the turned bit is found by who opens the file.
+            # The library checks only lengths: opening the file finds the flipped bit.
             assert bool(row.problem) is (kind == "damaged" and name not in not_cut(place))
     assert pictured == {f"cameras/{name}" for name in expected["cameras"]}
 
 
 def not_cut(place: Path) -> list[str]:
-    """Of the damaged, those whose .rrd is as long as it was."""
+    """Return the damaged episodes whose .rrd has its full length."""
     return [path.stem for path in (place / "damaged").glob("*.rrd") if path.stat().st_size != 30_000]
 
 
 @pytest.mark.parametrize("kind", ["cameras", "several", "tagged", "recovered"])
-def test_they_are_read_to_the_last_bit(place: Path, expected: dict[str, Any], kind: str) -> None:
+def test_golden_recordings_are_read_to_the_last_bit(place: Path, expected: dict[str, Any], kind: str) -> None:
     assert_as_expected(read_folder(place / kind), expected[kind])
 
 
@@ -103,7 +103,7 @@ def assert_as_expected(found: dict[str, Any], expected: dict[str, Any]) -> None:
             np.testing.assert_allclose(found[name]["colour"][camera], means, atol=0.5)
 
 
-def test_of_a_damaged_one_the_file_is_named_and_the_rest_is_read(
+def test_a_damaged_recordings_file_is_named_and_the_rest_is_read(
     place: Path, expected: dict[str, Any]
 ) -> None:
     cut, turned, both = sorted((place / "damaged").glob("*.json"))
@@ -115,21 +115,21 @@ def test_of_a_damaged_one_the_file_is_named_and_the_rest_is_read(
         episode = read_episode(path)
         assert [broken_files.file for broken_files in episode.broken_files] == [f"{path.stem}{broken}"]
         columns = whole[path.stem]["columns"]
-        left = {name: digest for name, digest in columns.items() if not name.startswith(lost)}
-        assert len(left) < len(columns) and expected_of(episode)["columns"] == left
+        remaining = {name: digest for name, digest in columns.items() if not name.startswith(lost)}
+        assert len(remaining) < len(columns) and expected_of(episode)["columns"] == remaining
     with pytest.raises(UnreadableRecording, match=rf"{both.stem}\.rrd was cut.* {both.stem}\.h5 was cut"):
         read_episode(both)
 
 
 @pytest.mark.slow
-def test_they_are_judged_as_they_were(
+def test_golden_recordings_are_rescored_as_recorded(
     place: Path, expected: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """They come from another installation, so their code is run where that is said, and else not."""
+    """The recordings are foreign, so their code runs only with --trust."""
     table = tmp_path / "table.json"
     code, _, err = run(capsys, "rescore", place, "--json-file", table)
     assert code == Exit.NOT_TRUSTED and "push.py" in err and not table.exists()
-    # One of them is damaged.
+    # One recording is damaged.
     assert run(capsys, "rescore", place, "--json-file", table, "--trust")[0] == Exit.FAILED
     rows = {row["episode"]: row for row in json.loads(table.read_text())}
     everything = {name: (kind, facts) for kind in KINDS for name, facts in expected[kind].items()}
@@ -141,21 +141,23 @@ def test_they_are_judged_as_they_were(
                 kind == "damaged" and f"{name}.h5" in row["not_judged"] and f"{name}.rrd" in row["not_judged"]
             )
             continue
-        # PhysX on another processor rounds otherwise, by up to a micrometre over these steps.
+        # On another CPU, PhysX rounds differently, by up to a micrometre over these steps.
         assert row["largest_reward_change"] < 1e-4
         assert row["other_entries"] in ("", "pushed") and not row["first_state_put_in"]
         assert row["success_now"] == row["success_before"] == (None if kind == "recovered" else 8)
         assert row["return_now"] == pytest.approx(sum(facts["reward"]), rel=1e-5)
         assert bool(row["not_carried"]) is (kind == "damaged")
-        assert row["drift_metres"] is None if name in not_cut(place) else row["drift_metres"] < METRES
+        assert (
+            row["drift_metres"] is None if name in not_cut(place) else row["drift_metres"] < TOLERANCE_METRES
+        )
     assert sum(bool(row["not_judged"]) for row in rows.values()) == 1
 
 
 @pytest.mark.parametrize("kind", ["several", "cameras"])
-def test_they_are_judged_by_the_text_that_they_hold(
+def test_golden_recordings_can_be_rescored_with_their_recorded_source(
     place: Path, tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also where the task is another today: its reward is halved."""
+    """The task on disk differs from the recorded one: its reward is halved."""
     shutil.copytree(place, tmp_path / place.name)
     shutil.copytree(place.parent / "tasks", tmp_path / "tasks")
     for file in (tmp_path / "tasks/push/push.py", tmp_path / "tasks/several/judging.py"):
@@ -173,7 +175,7 @@ def test_they_are_judged_by_the_text_that_they_hold(
         assert row["return_now"] == pytest.approx(row["return_before"] / (2 if halved else 1), rel=1e-5)
 
 
-def test_an_unfinished_one_is_mended_by_the_next_that_records_there(
+def test_the_next_recording_in_a_folder_recovers_an_unfinished_one(
     place: Path, expected: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = Path(shutil.copytree(place / "unfinished", tmp_path / "unfinished"))
@@ -191,7 +193,7 @@ def test_an_unfinished_one_is_mended_by_the_next_that_records_there(
     assert len(found) == 1 and len(list(folder.glob("*.json"))) == 2
 
 
-# --- going on live ---------------------------------------------------------------------------------------
+# --- continuing live --------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -205,35 +207,35 @@ def opened(task: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ses
     with live_session(task, tmp_path_factory.mktemp("recordings")) as session:
         session.change(selected_env=1)
         session.change(action_source="sliders")
-        # The recorded episodes end with success: what is seen after their last step would at times be the next episode.
+        # The recorded episodes end with success; without this, the next episode could start after their last step.
         session.change(episode_end="continue")
         yield session
 
 
-def goes_on_as_recorded(session: Session, path: Path, state: int) -> None:
-    """From the recorded `state` in env 1 to its end, by the recorded actions."""
+def assert_continues_as_recorded(session: Session, path: Path, state: int) -> None:
+    """Continue from the recorded `state` in env 1 to the episode's end with the recorded actions, and compare."""
     episode = read_episode(path)
     entered = session.enter_recording(run_of(episode, state))
     view = wait_until(session, lambda v: v.timeline.entered == entered, "the state")
     assert view.timeline.not_carried == () and view.step.elapsed_steps[1] == state
-    # By its seed and its actions: where these lead elsewhere the recorded state is put in, which is no proof of them.
+    # The state must be reached by replaying the actions; restoring the recorded state would prove nothing.
     assert "its actions were replayed" in view.timeline.arrived or state == 0
     assert "put" not in view.timeline.arrived
     assert_close(view.step.poses[1], episode.poses[state])
     for t in range(state, episode.length):
         last = view.timeline.last
-        told = tuple(float(x) for x in episode.action[t])
-        session.happen(ActionTold(tuple(range(len(told))), told))
+        action = tuple(float(x) for x in episode.action[t])
+        session.happen(ActionTold(tuple(range(len(action))), action))
         session.do(Step())
         view = wait_until(session, lambda v, last=last: v.timeline.last > last, "a step")
         assert_close(view.step.poses[1], episode.poses[t + 1])
-        assert view.step.reward[1] == pytest.approx(episode.reward[t], abs=METRES / 0.02)
+        assert view.step.reward[1] == pytest.approx(episode.reward[t], abs=TOLERANCE_METRES / 0.02)
         assert bool(view.step.evaluate["success"][1]) == bool(episode.evaluate["success"][t + 1])
 
 
 def assert_close(poses: np.ndarray, recorded: np.ndarray) -> None:
-    np.testing.assert_allclose(poses[:, :3], recorded[:, :3], atol=METRES)
-    np.testing.assert_allclose(np.abs((poses[:, 3:] * recorded[:, 3:]).sum(1)), 1, atol=METRES)
+    np.testing.assert_allclose(poses[:, :3], recorded[:, :3], atol=TOLERANCE_METRES)
+    np.testing.assert_allclose(np.abs((poses[:, 3:] * recorded[:, 3:]).sum(1)), 1, atol=TOLERANCE_METRES)
 
 
 @pytest.mark.parametrize(
@@ -244,14 +246,14 @@ def assert_close(poses: np.ndarray, recorded: np.ndarray) -> None:
         ("recovered", 4),
     ],
 )
-def test_one_goes_on_live_from_them(live: Session, place: Path, kind: str, state: int) -> None:
+def test_a_golden_recording_continues_live(live: Session, place: Path, kind: str, state: int) -> None:
     (path,) = (place / kind).glob("*.json")
-    goes_on_as_recorded(live, path, state)
+    assert_continues_as_recorded(live, path, state)
 
 
-def test_one_goes_on_live_in_a_task_of_several_modules(
+def test_a_golden_recording_continues_live_in_a_task_of_several_modules(
     place: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     (path,) = (place / "several").glob("*.json")
     with opened(place.parent / "tasks" / "several" / "task.py", tmp_path_factory) as session:
-        goes_on_as_recorded(session, path, 4)
+        assert_continues_as_recorded(session, path, 4)

@@ -1,4 +1,4 @@
-"""Each check runs on the batched CPU, where every machine can say that the check itself works, and on the GPU where there is one."""
+"""Each check runs on the batched CPU, which validates the check itself on every machine, and on a GPU if present."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Simulation = Literal["cpu", "gpu"]
 
 @pytest.fixture(params=["cpu", pytest.param("gpu", marks=pytest.mark.gpu)], scope="session")
 def simulation(request: pytest.FixtureRequest) -> Simulation:
-    """The backend that is looked at; what it gives is held against the batched CPU."""
+    """The backend under test; its results are compared with the batched CPU."""
     if request.param == "gpu" and (reason := why_no_gpu_simulation()) is not None:
         pytest.skip(f"no GPU simulation: {reason}")
     return request.param
@@ -22,25 +22,25 @@ def simulation(request: pytest.FixtureRequest) -> Simulation:
 
 @pytest.fixture(scope="session")
 def renderer() -> str:
-    """What ManiSkill takes as ``render_backend`` here."""
+    """ManiSkill's ``render_backend`` for this machine."""
     found = find_renderer()
     if found is None:
         pytest.skip("no renderer: SAPIEN finds no Vulkan device")
     return found.render_backend
 
 
-Told = Callable[[str], None]
-_TOLD: list[str] = []
+SummaryLine = Callable[[str], None]
+_SUMMARY_LINES: list[str] = []
 
 
 @pytest.fixture
-def told() -> Told:
-    """Takes a line for the end of the run: a rate that is worth knowing and nothing to fail by."""
-    return _TOLD.append
+def summary_line() -> SummaryLine:
+    """Return a function that adds a line with a rate to the summary at the end of the run."""
+    return _SUMMARY_LINES.append
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    if _TOLD:
+    if _SUMMARY_LINES:
         terminalreporter.section("rates")
-        for line in _TOLD:
+        for line in _SUMMARY_LINES:
             terminalreporter.line(line)

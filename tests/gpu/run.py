@@ -1,6 +1,6 @@
-"""``make test-gpu``: a virtual environment that has CUDA, PhysX's GPU library, and the checks of this folder.
+"""``make test-gpu``: install a virtual environment with CUDA and PhysX's GPU library, and run this folder's checks.
 
-Only the standard library is imported: it runs before anything is installed.
+Imports only the standard library, since it runs before anything is installed.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ ROOT = Path(__file__).parents[2]
 VENV = ROOT / ".venv-gpu"
 PYTHON = VENV / "bin" / "python"
 HOME = VENV / "home"
-"""Where SAPIEN looks for PhysX's GPU library while the checks run, so that nobody's own folder is written to."""
-MINUTES = 8
-FETCH_SECONDS = 120
+"""HOME during the checks: SAPIEN stores PhysX's GPU library there and not in the user's own home."""
+TIMEOUT_MINUTES = 8
+DOWNLOAD_TIMEOUT_SECONDS = 120
 TEST_PACKAGES = ("pytest", "pytest-timeout")
 
 
@@ -33,14 +33,12 @@ def main() -> None:
         "--wheels", type=Path, help="install from the wheels in this folder, without a network"
     )
     parser.add_argument(
-        "--physx-gpu", type=Path, help="PhysX's GPU library, libPhysXGpu_64.so, where it cannot be fetched"
+        "--physx-gpu", type=Path, help="PhysX's GPU library, libPhysXGpu_64.so, if it cannot be downloaded"
     )
     parser.add_argument(
-        "--fetch", action="store_true", help="only fill --wheels, on a machine with a network"
+        "--fetch", action="store_true", help="only fill the --wheels folder, on a machine with a network"
     )
-    parser.add_argument(
-        "--for-python", default="3.12", help="the Python that the wheels are for, with --fetch"
-    )
+    parser.add_argument("--for-python", default="3.12", help="with --fetch: Python version of the wheels")
     options, pytest_arguments = parser.parse_known_args()
     if options.fetch:
         fetch(options.wheels, options.for_python)
@@ -54,22 +52,32 @@ def main() -> None:
     command = [str(PYTHON), "-m", "pytest", "-m", "gpu", "-v", "-rs", "--timeout", "150", "tests/gpu"]
     environment = {**os.environ, "HOME": str(HOME), "MS_ASSET_DIR": str(assets())}
     done = subprocess.run(
-        ["timeout", "--signal=INT", "--kill-after=20", str(60 * MINUTES), *command, *pytest_arguments],
+        [
+            "timeout",
+            "--signal=INT",
+            "--kill-after=20",
+            str(60 * TIMEOUT_MINUTES),
+            *command,
+            *pytest_arguments,
+        ],
         cwd=ROOT,
         env=environment,
     )
     if done.returncode in (124, 137):
-        print(f"The checks did not end within {MINUTES} minutes; what is above holds.", file=sys.stderr)
+        print(
+            f"The checks did not end within {TIMEOUT_MINUTES} minutes; the results above are valid.",
+            file=sys.stderr,
+        )
     sys.exit(done.returncode)
 
 
 def install(wheels: Path | None) -> None:
-    """What the workbench and its checks need, in a virtual environment of their own; torch is this Python's if it has CUDA."""
+    """Install the workbench and its checks' requirements into `VENV`; use this Python's torch if it has CUDA."""
     own_torch = torch_has_cuda(sys.executable)
     if not PYTHON.exists():
         venv.create(VENV, with_pip=True)
     found = sorted(VENV.glob("lib/python*/site-packages"))
-    # Behind the environment's own: system_site_packages would not do where this Python is a virtual environment itself.
+    # Appended after VENV's own packages; system_site_packages fails if this Python is itself a virtual environment.
     behind = [path for path in sys.path if path.endswith("-packages")] if own_torch else []
     (found[0] / "workbench.pth").write_text("\n".join([str(ROOT), *behind, ""]))
     where = []
@@ -77,7 +85,7 @@ def install(wheels: Path | None) -> None:
         files = sorted(wheels.glob("*.whl"))
         if not files:
             sys.exit(
-                f"There is no wheel in {wheels}: make gpu-wheels WHEELS=DIR fills a folder, where there is a network."
+                f"There is no wheel in {wheels}: fill it with make gpu-wheels WHEELS=DIR on a machine with a network."
             )
         print(f"{wheels}: {len(files)} wheels, {sum(file.stat().st_size for file in files) / 1e6:.0f} MB")
         where = ["--no-index", "--find-links", str(wheels)]
@@ -102,36 +110,36 @@ def torch_has_cuda(python: str) -> bool:
 
 
 def place_physx(library: Path | None) -> None:
-    """PhysX's GPU library where SAPIEN looks for it; without one the checks of simulation skip and say so."""
+    """Put PhysX's GPU library where SAPIEN looks for it; without it the simulation checks are skipped with a reason."""
     version = output("import sapien.physx as p; print(p.version())")
     here = HOME / ".sapien" / "physx" / version / "libPhysXGpu_64.so"
     theirs = Path.home() / here.relative_to(HOME)
     if library is not None and not library.is_file():
-        sys.exit(f"{library} is no file: PHYSX_GPU names libPhysXGpu_64.so of PhysX {version}.")
+        sys.exit(f"{library} is no file: PHYSX_GPU must name libPhysXGpu_64.so of PhysX {version}.")
     here.parent.mkdir(parents=True, exist_ok=True)
     if source := library or (theirs if theirs.exists() else None):
-        # Beside it first: a copy that was cut short would be taken for the library.
+        # Copy to a temporary name first: a truncated copy would be taken for the library.
         shutil.copyfile(source, here.with_suffix(".part"))
         here.with_suffix(".part").replace(here)
     elif not here.exists():
-        print("Fetching PhysX's GPU library, as SAPIEN does.", flush=True)
+        print("Downloading PhysX's GPU library, as SAPIEN does.", flush=True)
         try:
             subprocess.run(
                 [str(PYTHON), "-c", "import sapien.physx as p; p.enable_gpu()"],
                 env={**os.environ, "HOME": str(HOME)},
-                timeout=FETCH_SECONDS,
+                timeout=DOWNLOAD_TIMEOUT_SECONDS,
                 check=True,
                 capture_output=True,
             )
         except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
             print(
-                f"It could not be fetched, so the checks of simulation skip; those of pictures run. Where there is no "
-                f"network, name it: PHYSX_GPU=FILE, the libPhysXGpu_64.so of PhysX {version}."
+                f"The download failed: simulation checks are skipped, picture checks run. Without a network, "
+                f"set PHYSX_GPU=FILE to the libPhysXGpu_64.so of PhysX {version}."
             )
 
 
 def assets() -> Path:
-    """Where ManiSkill keeps what was downloaded: the person's own folder, though HOME is another."""
+    """Return ManiSkill's folder of downloads: the user's own, although the checks run with another HOME."""
     return Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
 
 
@@ -142,7 +150,7 @@ def output(code: str) -> str:
 
 
 def fetch(folder: Path | None, python: str) -> None:
-    """Fill a folder with the wheels of what `requirements` need, in the tested versions, but for torch and CUDA."""
+    """Fill a folder with the wheels of all `requirements` in the tested versions, except torch and CUDA."""
     if folder is None:
         sys.exit("--fetch needs --wheels, the folder to fill")
     folder.mkdir(parents=True, exist_ok=True)
@@ -167,7 +175,7 @@ def fetch(folder: Path | None, python: str) -> None:
     for platform in [*platforms, "manylinux2014_x86_64", "manylinux1_x86_64"]:
         command += ["--platform", platform]
     if subprocess.run([*command, *wanted]).returncode:
-        sys.exit("Not every wheel could be fetched.")
+        sys.exit("Not every wheel could be downloaded.")
     size = sum(file.stat().st_size for file in folder.glob("*.whl"))
     print(
         f"{folder}: {len(wanted)} wheels for Python {python}, {size / 1e6:.0f} MB. torch is not among them."
@@ -175,7 +183,7 @@ def fetch(folder: Path | None, python: str) -> None:
 
 
 def needed() -> set[str]:
-    """Names of all that is installed here for `requirements`, but for torch and what only torch needs."""
+    """Return the installed packages that `requirements` need, except torch and what only torch needs."""
     from importlib.metadata import PackageNotFoundError, requires
 
     def name_of(requirement: str) -> str:
@@ -192,7 +200,7 @@ def needed() -> set[str]:
         try:
             further = requires(name) or []
         except PackageNotFoundError:
-            continue  # of another platform, or of an extra
+            continue  # for another platform, or of an extra
         found.add(name)
         queue += [name_of(each) for each in further if "extra ==" not in each]
     return found

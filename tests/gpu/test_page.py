@@ -1,4 +1,4 @@
-"""What the page rests on: a worker plays the task and draws its pictures. Its rates are printed, not judged."""
+"""The page's basis: a worker plays the task and renders pictures. Rates are printed, not tested."""
 
 # pyright: reportOptionalMemberAccess=false
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import wait_until
-from tests.gpu.conftest import Simulation, Told
+from tests.gpu.conftest import Simulation, SummaryLine
 from workbench.app.session import Session
 from workbench.live.commands import PlayRun
 from workbench.live.events import PagesCounted
@@ -32,7 +32,9 @@ def session(simulation: Simulation, renderer: str, tmp_path: Path) -> Iterator[S
 
 
 @pytest.mark.slow
-def test_it_plays_with_pictures(session: Session, simulation: Simulation, told: Told) -> None:
+def test_a_session_plays_with_pictures(
+    session: Session, simulation: Simulation, summary_line: SummaryLine
+) -> None:
     assert ("gpu" in session.view().task.backend) == (simulation == "gpu")
     session.happen(PagesCounted(1))
     session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),))
@@ -52,7 +54,7 @@ def test_it_plays_with_pictures(session: Session, simulation: Simulation, told: 
     )
     took = time.monotonic() - begun
     assert view.problem is None
-    told(
+    summary_line(
         f"{simulation}: {(view.step_serial - first.step_serial) / took:.0f} control steps/s of {N} envs, "
-        f"{(view.pictures_serial - first.pictures_serial) / took:.1f} pictures/s beside them"
+        f"{(view.pictures_serial - first.pictures_serial) / took:.1f} pictures/s at the same time"
     )

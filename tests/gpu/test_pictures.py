@@ -1,4 +1,4 @@
-"""Pictures: what the GPU draws is what the batched CPU draws of the same state, and a pose that was not applied is in both."""
+"""Pictures drawn by the GPU agree with those drawn by the batched CPU in the same state, even before a pose is applied."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalSubscript=false
@@ -29,32 +29,35 @@ pytestmark = pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.Rule
 
 @pytest.fixture(scope="module")
 def pushes(simulation: Simulation, renderer: str) -> Iterator[tuple[Any, Any]]:
-    """PushCube on the backend that is looked at, and on the batched CPU, in one state."""
+    """Yield PushCube on the backend under test and on the batched CPU."""
 
     def opened(backend: Simulation) -> Any:
         kwargs = {"obs_mode": MODE, "render_backend": renderer}
         return make_env(PushCubeEnv, EnvOptions(N, backend, kwargs=kwargs))
 
-    looked_at, rescore = opened(simulation), opened("cpu")
-    yield looked_at, rescore
-    looked_at.close()
+    under_test, rescore = opened(simulation), opened("cpu")
+    yield under_test, rescore
+    under_test.close()
     rescore.close()
 
 
 @pytest.fixture
 def in_one_state(pushes: tuple[Any, Any]) -> tuple[Any, Any]:
-    looked_at, rescore = pushes
+    under_test, rescore = pushes
     rescore.reset(seed=[3, 4])
-    looked_at.reset(seed=[3, 4])
+    under_test.reset(seed=[3, 4])
     state = rescore.get_state_dict()
-    looked_at.set_state_dict(
-        {kind: {name: row.to(looked_at.device) for name, row in rows.items()} for kind, rows in state.items()}
+    under_test.set_state_dict(
+        {
+            kind: {name: row.to(under_test.device) for name, row in rows.items()}
+            for kind, rows in state.items()
+        }
     )
     for env in pushes:
         env.scene._gpu_apply_all()
         env.scene.px.gpu_update_articulation_kinematics()
         env.scene._gpu_fetch_all()
-    return looked_at, rescore
+    return under_test, rescore
 
 
 def seen(env: Any) -> dict[str, np.ndarray]:
@@ -76,7 +79,7 @@ def test_the_same_state_gives_the_same_picture(in_one_state: tuple[Any, Any]) ->
         assert here[picture].shape == there[picture].shape and here[picture].dtype == there[picture].dtype
     name_of = np.vectorize(lambda number, table: table.get(number, "-"), otypes=[object])
     same = name_of(here["segmentation"], names[env]) == name_of(there["segmentation"], names[rescore])
-    assert same.mean() > 0.99, "edges may fall on the other side of a pixel, no more"
+    assert same.mean() > 0.99, "only edge pixels may differ"
     inside = same[..., 0]
     np.testing.assert_allclose(
         np.median(np.abs(here["depth"][inside].astype(int) - there["depth"][inside].astype(int))), 0, atol=2
@@ -84,7 +87,7 @@ def test_the_same_state_gives_the_same_picture(in_one_state: tuple[Any, Any]) ->
     assert np.abs(here["rgb"].astype(int) - there["rgb"].astype(int)).mean() < 8
 
 
-def test_the_page_s_picture_of_an_env_is_what_the_env_observes(in_one_state: tuple[Any, Any]) -> None:
+def test_the_pages_picture_equals_the_envs_observation(in_one_state: tuple[Any, Any]) -> None:
     env, _ = in_one_state
     observed = seen(env)
     for number in range(N):
@@ -93,7 +96,7 @@ def test_the_page_s_picture_of_an_env_is_what_the_env_observes(in_one_state: tup
         np.testing.assert_array_equal(picture.rgb, observed["rgb"][number])
 
 
-def test_a_pose_that_was_set_and_not_applied_is_in_the_picture(in_one_state: tuple[Any, Any]) -> None:
+def test_an_unapplied_pose_is_in_the_picture(in_one_state: tuple[Any, Any]) -> None:
     counted = []
     for env in in_one_state:
         before = cube_pixels(env, seen(env)["segmentation"])
@@ -110,7 +113,7 @@ def test_a_pose_that_was_set_and_not_applied_is_in_the_picture(in_one_state: tup
 
 
 @pytest.mark.gpu
-def test_cpu_simulation_is_drawn_by_the_gpu(renderer: str) -> None:
+def test_cpu_simulation_is_rendered_on_the_gpu(renderer: str) -> None:
     env = make_env(PushCubeEnv, EnvOptions(N, "cpu", kwargs={"obs_mode": "rgb"}))
     assert renderer == "gpu" and env.backend.render_backend == "sapien_cuda"
     obs, _ = env.reset(seed=0)

@@ -1,4 +1,4 @@
-"""Plans by rollouts: the same code on GPU simulation as on the batched CPU."""
+"""Planning by rollouts runs the same code on GPU simulation and on the batched CPU."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from tests.gpu.conftest import Simulation
 
 pytestmark = pytest.mark.thorough
 
-MADE = {"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
+ENV_KWARGS = {"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
 
 
 @pytest.mark.slow
-def test_a_plan_earns_at_least_what_holding_still_earns_and_is_followed(simulation: Simulation) -> None:
-    env = workbench.make("PushCube-v1", 2, backend=simulation, **MADE)  # type: ignore[arg-type]
+def test_a_plan_earns_at_least_as_much_as_holding_still(simulation: Simulation) -> None:
+    env = workbench.make("PushCube-v1", 2, backend=simulation, **ENV_KWARGS)  # type: ignore[arg-type]
     rollouts = 64 if simulation == "gpu" else 16
     planner = workbench.Planner(env, rollouts=rollouts)
     env.reset(seed=0)

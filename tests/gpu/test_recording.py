@@ -1,4 +1,4 @@
-"""A recording of GPU simulation holds what the env said, and is read like any other."""
+"""A recording of GPU simulation holds the env's values and is read like any other."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalSubscript=false
 # pyright: reportOptionalMemberAccess=false
@@ -17,15 +17,15 @@ from workbench.episodes.reader.read_episode import read_episode
 
 
 def test_every_step_and_reward_is_in_the_file(tmp_path: Path, simulation: Simulation) -> None:
-    made = workbench.make(
+    env = workbench.make(
         "PushCube-v1", 3, backend=simulation, obs_mode="state", render_backend="none", max_episode_steps=5
     )
-    env: Any = ManiSkillVectorEnv(workbench.Recorder(made, tmp_path), ignore_terminations=True)
+    env: Any = ManiSkillVectorEnv(workbench.Recorder(env, tmp_path), ignore_terminations=True)
     env.reset(seed=[7, 8, 9])
-    rewards, cubes = [], [made.unwrapped.obj.pose.p.cpu().numpy()]
+    rewards, cubes = [], [env.unwrapped.obj.pose.p.cpu().numpy()]
     for _ in range(4):
         rewards.append(env.step(env.action_space.sample())[1].cpu().numpy())
-        cubes.append(made.unwrapped.obj.pose.p.cpu().numpy().copy())
+        cubes.append(env.unwrapped.obj.pose.p.cpu().numpy().copy())
     env.close()
     episodes = {e.info.env_index: e for e in map(read_episode, tmp_path.glob("*.json"))}
     assert sorted(episodes) == [0, 1, 2]

@@ -38,10 +38,10 @@ def opened(task: str, simulation: Simulation, **kwargs: Any) -> TaskEnv:
 
 @pytest.fixture(scope="module")
 def picks(simulation: Simulation) -> Iterator[tuple[TaskEnv, TaskEnv]]:
-    """PickCube on the backend that is looked at, and on the batched CPU."""
-    looked_at, rescore = opened("PickCube-v1", simulation), opened("PickCube-v1", "cpu")
-    yield looked_at, rescore
-    looked_at.close()
+    """Yield PickCube on the backend under test and on the batched CPU."""
+    under_test, rescore = opened("PickCube-v1", simulation), opened("PickCube-v1", "cpu")
+    yield under_test, rescore
+    under_test.close()
     rescore.close()
 
 
@@ -53,11 +53,11 @@ def played(env: TaskEnv, steps: int, seed: int = 0) -> Any:
 
 
 def on_cpu(state: Any) -> Any:
-    """ManiSkill's state dict, on the CPU."""
+    """Return ManiSkill's state dict with its tensors on the CPU."""
     return {k: on_cpu(v) if isinstance(v, dict) else v.cpu() for k, v in state.items()}
 
 
-def test_it_opens_with_the_bodies_actions_and_observations_of_the_cpu(
+def test_bodies_actions_and_observations_equal_the_cpus(
     picks: tuple[TaskEnv, TaskEnv], simulation: Simulation
 ) -> None:
     env, rescore = picks
@@ -69,14 +69,14 @@ def test_it_opens_with_the_bodies_actions_and_observations_of_the_cpu(
     assert env.control_dt == rescore.control_dt
 
 
-def test_a_seeded_reset_is_the_same_each_time(picks: tuple[TaskEnv, TaskEnv]) -> None:
+def test_a_seeded_reset_is_repeatable(picks: tuple[TaskEnv, TaskEnv]) -> None:
     env, _ = picks
     first = env.reset(seed=SEEDS)
     played(env, 3)
     again = env.reset(seed=SEEDS)
     np.testing.assert_allclose(again.poses, first.poses, atol=1e-5)
     assert env.episode_seeds.tolist() == SEEDS and not again.elapsed_steps.any()
-    assert np.isfinite(again.poses).all() and (np.ptp(again.poses, axis=0) > 1e-3).any(), "envs differ"
+    assert np.isfinite(again.poses).all() and (np.ptp(again.poses, axis=0) > 1e-3).any(), "envs must differ"
 
 
 def test_a_partial_reset_leaves_the_other_envs(picks: tuple[TaskEnv, TaskEnv]) -> None:
@@ -90,7 +90,7 @@ def test_a_partial_reset_leaves_the_other_envs(picks: tuple[TaskEnv, TaskEnv]) -
     assert env.episode_seeds.tolist() == [40, 7, 42, 43]
 
 
-def test_a_partial_reset_begins_the_episode_of_its_seed(picks: tuple[TaskEnv, TaskEnv]) -> None:
+def test_a_partial_reset_starts_the_episode_of_its_seed(picks: tuple[TaskEnv, TaskEnv]) -> None:
     env, _ = picks
     env.reset(seed=SEEDS)
     played(env, 2)
@@ -100,7 +100,7 @@ def test_a_partial_reset_begins_the_episode_of_its_seed(picks: tuple[TaskEnv, Ta
 
 
 def test_steps_from_one_state_agree_with_the_cpu(picks: tuple[TaskEnv, TaskEnv]) -> None:
-    """Two solvers differ in the last digits; a pose that was mixed up or never applied differs in the first."""
+    """The two solvers differ in the last digits; a mixed-up or unapplied pose would differ in the first."""
     env, rescore = picks
     rescore.reset(seed=SEEDS)
     env.reset(seed=SEEDS)
@@ -112,12 +112,12 @@ def test_steps_from_one_state_agree_with_the_cpu(picks: tuple[TaskEnv, TaskEnv])
         here, there = env.step(action), rescore.step(action)
     np.testing.assert_allclose(here.poses[..., :3], there.poses[..., :3], atol=0.01)  # pyright: ignore
     turned = np.abs((here.poses[..., 3:] * there.poses[..., 3:]).sum(-1))  # pyright: ignore
-    assert turned.min() > 0.995, "quaternions, up to their sign"
+    assert turned.min() > 0.995, "orientations must agree (q and -q are the same)"
     np.testing.assert_allclose(here.reward, there.reward, atol=0.05)  # pyright: ignore
     assert here.elapsed_steps.tolist() == there.elapsed_steps.tolist()  # pyright: ignore
 
 
-def test_a_snapshot_brings_chosen_envs_back_and_leaves_the_others(picks: tuple[TaskEnv, TaskEnv]) -> None:
+def test_a_snapshot_restores_the_chosen_envs_and_leaves_the_others(picks: tuple[TaskEnv, TaskEnv]) -> None:
     env, _ = picks
     env.reset(seed=SEEDS)
     played(env, 2)
@@ -133,7 +133,7 @@ def test_a_snapshot_brings_chosen_envs_back_and_leaves_the_others(picks: tuple[T
     assert env.env.elapsed_steps.tolist() == [2, 7, 2, 7]
 
 
-def test_what_follows_a_restore_is_what_followed_before(picks: tuple[TaskEnv, TaskEnv]) -> None:
+def test_steps_after_a_restore_repeat_the_earlier_ones(picks: tuple[TaskEnv, TaskEnv]) -> None:
     env, _ = picks
     env.reset(seed=SEEDS)
     played(env, 2)
@@ -141,12 +141,12 @@ def test_what_follows_a_restore_is_what_followed_before(picks: tuple[TaskEnv, Ta
     first = played(env, 5, seed=2)
     restore_snapshot(env.env, snapshot)
     again = played(env, 5, seed=2)
-    # What PhysX keeps beside the state (contacts) may be lost: centimetres would be a state that is not carried.
+    # PhysX's contact cache may be lost, which costs millimetres; state that is not carried would cost centimetres.
     np.testing.assert_allclose(again.poses[..., :3], first.poses[..., :3], atol=0.005)
 
 
 @pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
-def test_a_pose_that_was_set_and_not_applied_is_read_and_not_simulated(
+def test_an_unapplied_pose_behaves_as_on_the_cpu(
     picks: tuple[TaskEnv, TaskEnv],
 ) -> None:
     seen = []
@@ -174,12 +174,12 @@ def test_an_applied_pose_is_simulated(picks: tuple[TaskEnv, TaskEnv]) -> None:
         env.env.scene._gpu_fetch_all()
         env.step(actions.hold_action(env.parts, N))
         fallen = raised[:, 2] - env.env.cube.pose.p[:, 2]
-        assert bool(((fallen > 0) & (fallen < 0.05)).all()), "it falls from where it was put"
+        assert bool(((fallen > 0) & (fallen < 0.05)).all()), "the cube must fall from where it was put"
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("task", TASKS)
-def test_a_task_runs_through_ten_steps(task: str, simulation: Simulation) -> None:
+def test_a_task_runs_for_ten_steps(task: str, simulation: Simulation) -> None:
     try:
         env = opened(task, simulation)
     except MissingAssets as exc:
@@ -191,7 +191,7 @@ def test_a_task_runs_through_ten_steps(task: str, simulation: Simulation) -> Non
     env.close()
 
 
-def test_contacts_on_a_gpu_are_refused_in_one_sentence(
+def test_contacts_on_a_gpu_are_refused_with_a_reason(
     picks: tuple[TaskEnv, TaskEnv], simulation: Simulation
 ) -> None:
     env, _ = picks

@@ -1,4 +1,4 @@
-"""Jobs on a real Ray cluster of two nodes, which are processes of this machine on its loopback address."""
+"""Jobs on a real Ray cluster with two nodes, both processes of this machine on its loopback address."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ class Far(PushCubeEnv):
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """A cluster of two nodes with a core each."""
+    """Address of a cluster with two nodes of one core each."""
     from ray.cluster_utils import Cluster as TwoNodes
 
     patch = pytest.MonkeyPatch()
-    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # a socket's path is short
+    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # socket paths must be short
     patch.setenv("RAY_TMPDIR", folder)
     patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     patch.setattr("ray._private.ray_constants.ENABLE_RAY_CLUSTER", False)
@@ -74,7 +74,7 @@ def address() -> Iterator[str]:
 
 @pytest.fixture
 def task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A task with a module and an asset beside it, in a folder below the current one."""
+    """A task with a module and an asset beside it, in a subfolder of the current folder."""
     folder = tmp_path / "mine"
     (folder / "assets").mkdir(parents=True)
     (folder / "far.py").write_text(TASK)
@@ -105,7 +105,7 @@ def bits(recorded: Recorded) -> dict[int, bytes]:
     return {one.seed: one.path.with_suffix(".h5").read_bytes() for one in recorded.written}
 
 
-def workers_of_ray() -> list[psutil.Process]:
+def ray_workers() -> list[psutil.Process]:
     """Processes of actors that run a job."""
     return [
         one
@@ -115,7 +115,7 @@ def workers_of_ray() -> list[psutil.Process]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_episodes_have_the_same_bits_as_in_this_process_and_name_the_files_here(
+def test_episodes_equal_local_ones_bit_for_bit_and_name_the_local_files(
     workers: int, address: str, task: Path
 ) -> None:
     here = record(wanted("here"))
@@ -129,7 +129,7 @@ def test_episodes_have_the_same_bits_as_in_this_process_and_name_the_files_here(
     assert len(list(Path("there").iterdir())) == 24
 
 
-def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(
+def test_a_killed_worker_loses_and_duplicates_no_episode(
     address: str, task: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     here = bits(record(wanted("here")))
@@ -138,7 +138,7 @@ def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(
     def kill(progress: Any) -> None:
         nonlocal killed
         if progress.over is not None and killed < 2:
-            for process in workers_of_ray()[:1]:
+            for process in ray_workers()[:1]:
                 os.kill(process.pid, signal.SIGKILL)
                 killed += 1
 
@@ -147,11 +147,11 @@ def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(
     ids = [read_episode(path).info.id for path in Path("there").glob("*.rrd")]
     assert len(ids) == len(set(ids)) == 8
     assert not (Path("there") / ".writing").exists()
-    # Standard output is for results, as JSON for one; Ray would print there.
+    # Standard output is reserved for results such as JSON; Ray must not print there.
     assert not capfd.readouterr().out
 
 
-def test_a_job_that_was_stopped_leaves_whole_episodes_and_goes_on(address: str, task: Path) -> None:
+def test_a_stopped_job_leaves_complete_episodes_and_is_resumed(address: str, task: Path) -> None:
     here, asked = bits(record(wanted("here"))), wanted("there")
     over = threading.Event()
 
@@ -180,7 +180,7 @@ def test_a_job_that_was_stopped_leaves_whole_episodes_and_goes_on(address: str, 
     assert bits(second) == here and len(list(Path("there").glob("*.json"))) == 8
 
 
-def test_seeds_that_fail_are_told_with_the_line_here_and_the_others_are_kept(
+def test_failed_seeds_are_reported_with_the_local_line_and_the_others_are_kept(
     address: str, task: Path
 ) -> None:
     (task.parent / "beside.py").write_text("FAILS_BELOW = -0.05\n")
@@ -193,14 +193,14 @@ def test_seeds_that_fail_are_told_with_the_line_here_and_the_others_are_kept(
     assert "workbench-job" not in problem.traceback
 
 
-def test_items_are_done_once_also_where_a_worker_dies(address: str, tmp_path: Path) -> None:
+def test_items_are_done_once_even_if_a_worker_dies(address: str, tmp_path: Path) -> None:
     run = Run(Setup("killed once", 4, folder=tmp_path), range(9), chunk=3, tries=3, goes_on=True)
-    told: list[str] = []
-    run.by(Cluster(address, 2, on_death=told.append))
-    assert len(told) == 1 and told[0].startswith("a worker that squares has ended (")
+    reports: list[str] = []
+    run.run_with(Cluster(address, 2, on_death=reports.append))
+    assert len(reports) == 1 and reports[0].startswith("a worker that squares has ended (")
     assert run.squares() == {number: number**2 for number in range(9)} and not run.failures
     pids = {result.pid for result in run.results.values()}
-    # What the dead one had done may have died with it.
+    # Finished items of the dead worker may be lost with it.
     assert os.getpid() not in pids and pids - {int((tmp_path / "killed").read_text())}
 
 
@@ -210,13 +210,13 @@ def test_other_versions_are_refused_and_named(
     here = seam.versions_here()
     monkeypatch.setattr(seam, "versions_here", lambda: {**here, "torch": "1.0"})
     with pytest.raises(PoolError, match=re.escape(f"has torch {here['torch']}, and the submitting side 1.0")):
-        Run(Setup(folder=tmp_path), range(8)).by(Cluster(address, 1))
+        Run(Setup(folder=tmp_path), range(8)).run_with(Cluster(address, 1))
 
 
 def test_a_folder_that_a_machine_does_not_see_is_refused(
     address: str, task: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # As on a machine that has a folder of this name of its own.
+    # Simulates a machine with its own folder of this name.
     monkeypatch.setattr(Path, "touch", lambda path: None)
     with pytest.raises(
         PoolError, match="does not see the folder .*there of this machine: give one that all machines"

@@ -1,4 +1,4 @@
-"""A cluster that a job starts for itself, and addresses where there is none."""
+"""A local cluster started by a job, and addresses without a cluster."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ except NoCluster as error:
 
 @pytest.fixture
 def ray_folder() -> Iterator[str]:
-    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # a socket's path is short
+    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # socket paths must be short
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
 
@@ -64,7 +64,7 @@ def run(script: str, tmp_path: Path, ray_folder: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_it_can_be_reached_from_this_machine_with_a_token_only_and_ends_with_the_job(
+def test_a_local_cluster_needs_a_token_is_local_only_and_ends_with_the_job(
     tmp_path: Path, ray_folder: str
 ) -> None:
     while_it_runs, after = run(STARTS, tmp_path, ray_folder)
@@ -73,13 +73,13 @@ def test_it_can_be_reached_from_this_machine_with_a_token_only_and_ends_with_the
     assert after == "0"
 
 
-def test_an_address_where_nothing_answers_is_said(tmp_path: Path, ray_folder: str) -> None:
-    (said,) = run(FINDS_NONE, tmp_path, ray_folder)
-    assert said.startswith("no Ray cluster answers at 127.0.0.1:1 ") and "`ray start --head`" in said
+def test_an_address_without_a_cluster_is_reported(tmp_path: Path, ray_folder: str) -> None:
+    (message,) = run(FINDS_NONE, tmp_path, ray_folder)
+    assert message.startswith("no Ray cluster answers at 127.0.0.1:1 ") and "`ray start --head`" in message
 
 
 @pytest.mark.slow
-def test_ctrl_c_keeps_what_is_over_and_ends_the_cluster(tmp_path: Path, ray_folder: str) -> None:
+def test_ctrl_c_keeps_finished_episodes_and_ends_the_cluster(tmp_path: Path, ray_folder: str) -> None:
     command = [
         *(
             sys.executable,
@@ -117,12 +117,12 @@ def test_ctrl_c_keeps_what_is_over_and_ends_the_cluster(tmp_path: Path, ray_fold
         120,
     )
     family = psutil.Process(process.pid).children(recursive=True)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does it
-    said, errors = process.communicate(timeout=90)
+    os.killpg(process.pid, signal.SIGINT)  # a terminal signals the process group too
+    stdout, errors = process.communicate(timeout=90)
     assert process.returncode == 130 and "interrupted" in errors and "Traceback" not in errors
     written = sorted((tmp_path / "out").glob("*.json"))
-    listed = {Path(line.split(".rrd")[0] + ".json") for line in said.splitlines()[:-1]}
-    # Reports of the last ones may have been on their way when the cluster ended.
+    listed = {Path(line.split(".rrd")[0] + ".json") for line in stdout.splitlines()[:-1]}
+    # The reports of the last episodes may be lost when the cluster ends.
     assert len(listed) > 20 and listed <= set(written) and len(written) - len(listed) < 10
     assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])
     _, alive = psutil.wait_procs(family, timeout=20)
@@ -138,7 +138,7 @@ def named(process: psutil.Process) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("daemon", ["raylet", "gcs_server"])
-def test_a_cluster_that_dies_ends_the_command_with_a_sentence_and_keeps_what_is_recorded(
+def test_a_dead_cluster_ends_the_command_with_a_message_and_keeps_recorded_episodes(
     daemon: str, tmp_path: Path, ray_folder: str
 ) -> None:
     out = tmp_path / "out"
@@ -158,11 +158,11 @@ def test_a_cluster_that_dies_ends_the_command_with_a_sentence_and_keeps_what_is_
     family = psutil.Process(started.pid).children(recursive=True)
     (victim,) = [process for process in family if named(process) == daemon]
     victim.kill()
-    _, said = started.communicate(timeout=55)  # after 60 s Ray would end it from native code
-    assert started.returncode == 1 and "Traceback" not in said and "core_worker" not in said, said
-    assert "Ray" in said and "--job" in said, said
+    _, stderr = started.communicate(timeout=55)  # after 60 s Ray would end it from native code
+    assert started.returncode == 1 and "Traceback" not in stderr and "core_worker" not in stderr, stderr
+    assert "Ray" in stderr and "--job" in stderr, stderr
     kept = [path.stem for path in out.glob("*.json")]
     assert kept and all((out / f"{stem}{suffix}").exists() for stem in kept for suffix in (".rrd", ".h5"))
-    # Its agents look for it a while.
+    # The cluster's agents search for the dead head node for a while.
     _, alive = psutil.wait_procs(family, timeout=100)
     assert not alive

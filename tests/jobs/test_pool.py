@@ -1,4 +1,4 @@
-"""Work over numbered items: the same results whoever does them, each of them once, and nothing lost without a word."""
+"""Work on numbered items: equal results on any executor, each item done once, and every loss reported."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ child_process = pytest.mark.usefixtures("child_process")
 @child_process
 @pytest.mark.parametrize("executor", EXECUTORS)
 @pytest.mark.parametrize("chunk", [1, 4])
-def test_each_item_is_done_once_with_the_same_result_whoever_does_it(
+def test_each_item_is_done_once_with_equal_results_on_any_executor(
     executor: Executor, chunk: int, tmp_path: Path
 ) -> None:
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     folder.mkdir()
     numbers = [*range(10), 12, 20]
-    done = Run(Setup(folder=folder), numbers, chunk=chunk).by(executor)
+    done = Run(Setup(folder=folder), numbers, chunk=chunk).run_with(executor)
     assert sorted(done.results) == numbers and done.steps == len(numbers)
     assert done.results[3] == Squared(3, 9, folder / "3", done.results[3].pid)
-    # Each keeps what it has opened.
+    # Each worker opens its task only once.
     assert len(done.updates) == (3 if executor is EXECUTORS[2].values[0] else 1)
     pids = {result.pid for result in done.results.values()}
     assert pids == {os.getpid()} if isinstance(executor, ThisProcess) else os.getpid() not in pids
@@ -65,22 +65,22 @@ def test_each_item_is_done_once_with_the_same_result_whoever_does_it(
 
 @child_process
 @pytest.mark.parametrize("executor", EXECUTORS)
-def test_what_is_not_wanted_any_more_is_left_out_and_all_before_it_is_done(
+def test_items_above_a_lowered_limit_are_skipped_and_all_below_are_done(
     executor: Executor, tmp_path: Path
 ) -> None:
     def enough(run: Run, number: int) -> None:
         if number == 5:
             run.scheduler.lower(8)
 
-    done = Run(Setup(folder=tmp_path), range(10**6), on_result=enough, chunk=3).by(executor)
+    done = Run(Setup(folder=tmp_path), range(10**6), on_result=enough, chunk=3).run_with(executor)
     assert set(range(8)) <= set(done.results)
-    # One that was begun meanwhile may come.
+    # Items that were already started may still be finished.
     assert len(done.results) < 100
 
 
 @child_process
 @pytest.mark.parametrize("executor", EXECUTORS)
-def test_what_was_stopped_is_resumed_with_what_is_left(executor: Executor, tmp_path: Path) -> None:
+def test_a_stopped_job_is_resumed_with_the_remaining_items(executor: Executor, tmp_path: Path) -> None:
     asked = False
 
     def now(run: Run, number: int) -> None:
@@ -90,12 +90,12 @@ def test_what_was_stopped_is_resumed_with_what_is_left(executor: Executor, tmp_p
     kept: dict[int, Squared] = {}
     first = Run(Setup(folder=tmp_path), range(400), stop=lambda: asked, on_result=now, chunk=3)
     first.scheduler.go_on({}, kept.__setitem__)
-    first.by(executor)
+    first.run_with(executor)
     assert 5 <= len(kept) < 400 and kept == first.results
     rest = Run(Setup(folder=tmp_path), range(400), chunk=3)
     more: dict[int, Squared] = {}
     rest.scheduler.go_on(kept, more.__setitem__)
-    rest.by(executor)
+    rest.run_with(executor)
     assert not kept.keys() & more.keys() and rest.steps == len(more)
     assert rest.squares() == {number: number**2 for number in range(400)}
 
@@ -117,39 +117,39 @@ def fails(how: str, says: str, error: type[Exception] = PoolError) -> Any:
         fails("another's", "a process that squares sent the result of an item that it does not have"),
     ],
 )
-def test_a_process_that_fails_ends_the_job_and_the_others_finish_what_they_have_begun(
+def test_a_failing_process_ends_the_job_and_the_others_finish_their_started_items(
     how: str, says: str, error: type[Exception], tmp_path: Path
 ) -> None:
-    # The last that is dealt, so that the other process has all that is before it.
+    # Item 7 is dealt last, so the other process has all items before it.
     run = Run(Setup(how, 7, folder=tmp_path), range(8))
     with pytest.raises(error, match=says) as raised:
-        run.by(Processes(2))
+        run.run_with(Processes(2))
     if isinstance(raised.value, TaskError):
         assert raised.value.problem == PROBLEM
     begun = {int(path.name.removeprefix(BEGUN)) for path in tmp_path.glob(f"{BEGUN}*")}
-    # The other may have got one that it had not begun.
+    # The other process may have received an item that it had not started.
     assert set(run.results) == begun - {7} and 6 <= len(run.results) <= 7
     assert not any(psutil.pid_exists(result.pid) for result in run.results.values())
 
 
 @child_process
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_killed_process_is_replaced_and_its_chunk_done_again(workers: int, tmp_path: Path) -> None:
+def test_a_killed_process_is_replaced_and_its_chunk_retried(workers: int, tmp_path: Path) -> None:
     run = Run(Setup("killed once", 4, folder=tmp_path), range(9), chunk=3, tries=3, goes_on=True)
-    told: list[str] = []
-    run.by(Processes(workers, told.append))
-    assert told == ["a process that squares was killed by SIGKILL; its unfinished items are dealt again"]
+    reports: list[str] = []
+    run.run_with(Processes(workers, reports.append))
+    assert reports == ["a process that squares was killed by SIGKILL; its unfinished items are dealt again"]
     assert run.squares() == {number: number**2 for number in range(9)} and not run.failures
     assert len({result.pid for result in run.results.values()}) > 1
 
 
 @child_process
 @pytest.mark.parametrize(("how", "stage"), [("task", "step"), ("killed", "worker")])
-def test_what_fails_each_time_is_told_at_the_end_and_all_else_is_done(
+def test_items_that_fail_on_each_try_are_reported_at_the_end_and_the_others_are_done(
     how: str, stage: str, tmp_path: Path
 ) -> None:
     run = Run(Setup(how, 4, folder=tmp_path), range(9), chunk=3, tries=2, goes_on=True)
-    run.by(Processes(2))
+    run.run_with(Processes(2))
     assert sorted(run.results) == [0, 1, 2, 3, 5, 6, 7, 8]
     (failure,) = run.failures
     assert (failure.numbers, failure.problem.stage) == ((4,), stage)
@@ -157,23 +157,23 @@ def test_what_fails_each_time_is_told_at_the_end_and_all_else_is_done(
 
 @child_process
 @pytest.mark.parametrize("executor", EXECUTORS)
-def test_a_task_that_cannot_be_loaded_is_said_once(executor: Executor, tmp_path: Path) -> None:
+def test_a_task_that_cannot_be_loaded_is_reported_once(executor: Executor, tmp_path: Path) -> None:
     run = Run(Setup("cannot be loaded", folder=tmp_path), range(8), tries=3, goes_on=True)
     with pytest.raises(TaskError, match="it broke") as raised:
-        run.by(executor)
+        run.run_with(executor)
     assert raised.value.problem == PROBLEM and not run.results
 
 
 @child_process
-def test_who_does_not_want_to_wait_ends_processes_that_hang(tmp_path: Path) -> None:
+def test_a_second_interrupt_ends_processes_that_hang(tmp_path: Path) -> None:
     def twice() -> bool:
         if (tmp_path / "hangs").exists():
-            raise KeyboardInterrupt  # as the second Ctrl-C does
+            raise KeyboardInterrupt  # like the second Ctrl-C
         return False
 
     run = Run(Setup("hangs", 3, folder=tmp_path), range(10**6), stop=twice)
     with pytest.raises(KeyboardInterrupt):
-        run.by(Processes(2))
+        run.run_with(Processes(2))
     pids = {int(line.split()[2]) for line in run.updates}
     assert len(pids) >= 1
     until(lambda: not any(map(psutil.pid_exists, pids)), "their end")
@@ -181,20 +181,20 @@ def test_who_does_not_want_to_wait_ends_processes_that_hang(tmp_path: Path) -> N
 
 @child_process
 @pytest.mark.parametrize("how", ["hangs", "half a message"])
-def test_a_process_that_does_not_stop_is_not_waited_for_for_ever(
+def test_a_process_that_does_not_stop_is_waited_for_only_a_limited_time(
     how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workbench.jobs.local_processes._END_SECONDS", 0.2)
     run = Run(Setup(how, 0, folder=tmp_path), range(8), stop=lambda: (tmp_path / "hangs").exists())
     with pytest.raises(PoolError, match="that squares did not end in time"):
-        run.by(Processes(1))
+        run.run_with(Processes(1))
 
 
 # --- dealing, without processes --------------------------------------------------------------------------
 
 
-class Told:
-    """A deal of numbers, and what came of it."""
+class SchedulerProbe:
+    """A scheduler of numbers that stores results and failures."""
 
     def __init__(self, numbers: Iterable[int], known: Mapping[int, int] | None = None, **how: Any) -> None:
         self.results: dict[int, int] = {}
@@ -210,82 +210,82 @@ def problem(line: int) -> TaskError:
     return TaskError(Problem("step", f"it broke at {line}", "task.py", line, "", ""))
 
 
-def test_chunks_are_the_same_whatever_is_known_of_them() -> None:
-    told = Told([*range(7), 9], known={0: 0, 1: 1, 2: 2, 4: 4}, chunk=3)
-    dealt = [told.scheduler.next("a"), told.scheduler.next("b"), told.scheduler.next("a")]
+def test_chunks_are_the_same_whatever_results_are_known() -> None:
+    probe = SchedulerProbe([*range(7), 9], known={0: 0, 1: 1, 2: 2, 4: 4}, chunk=3)
+    dealt = [probe.scheduler.next("a"), probe.scheduler.next("b"), probe.scheduler.next("a")]
     assert dealt == [
         Chunk((3, 4, 5), frozenset({3, 5}), again=True),
         Chunk((6,), frozenset({6}), again=True),
         Chunk((9,), frozenset({9}), again=True),
     ]
-    assert told.scheduler.next("a") is None and told.results == {0: 0, 1: 1, 2: 2, 4: 4}
+    assert probe.scheduler.next("a") is None and probe.results == {0: 0, 1: 1, 2: 2, 4: 4}
 
 
-def test_a_chunk_of_a_dead_worker_comes_again_after_the_others_without_what_it_gave() -> None:
-    told = Told(range(6), chunk=2)
-    assert told.scheduler.next("a") == Chunk((0, 1), frozenset({0, 1}))
-    told.scheduler.result("a", 1, 1)
-    told.scheduler.died("a", "was killed", -9)
-    later = [told.scheduler.next("b") for _ in range(3)]
+def test_a_chunk_of_a_dead_worker_is_dealt_again_last_without_its_finished_items() -> None:
+    probe = SchedulerProbe(range(6), chunk=2)
+    assert probe.scheduler.next("a") == Chunk((0, 1), frozenset({0, 1}))
+    probe.scheduler.result("a", 1, 1)
+    probe.scheduler.died("a", "was killed", -9)
+    later = [probe.scheduler.next("b") for _ in range(3)]
     assert [chunk and chunk.numbers for chunk in later] == [(2, 3), (4, 5), (0, 1)]
     assert later[2] == Chunk((0, 1), frozenset({0}), again=True)
     with pytest.raises(PoolError, match="that it does not have"):
-        told.scheduler.result("b", 1, 1)
+        probe.scheduler.result("b", 1, 1)
 
 
-def test_the_items_of_a_chunk_that_failed_are_tried_one_by_one_before_all_others() -> None:
-    told = Told(range(9), chunk=3)
-    told.scheduler.next("a")
-    told.scheduler.result("a", 1, 1)
-    told.scheduler.failed("a", problem(7))
-    dealt = [told.scheduler.next("b") for _ in range(3)]
+def test_items_of_a_failed_chunk_are_retried_one_by_one_before_all_others() -> None:
+    probe = SchedulerProbe(range(9), chunk=3)
+    probe.scheduler.next("a")
+    probe.scheduler.result("a", 1, 1)
+    probe.scheduler.failed("a", problem(7))
+    dealt = [probe.scheduler.next("b") for _ in range(3)]
     assert dealt == [
         Chunk((0,), frozenset({0}), again=True),
         Chunk((2,), frozenset({2}), again=True),
         Chunk((3, 4, 5), frozenset({3, 4, 5})),
     ]
-    assert not told.failures
+    assert not probe.failures
 
 
 @pytest.mark.parametrize(("before", "most"), [(0, MAX_ALIKE_FIRST), (1, MAX_ALIKE_LATER)])
-def test_chunks_that_fail_alike_end_the_job_the_first_ones_soonest(before: int, most: int) -> None:
-    told = Told(range(100))
+def test_equal_failures_end_the_job_and_sooner_at_its_beginning(before: int, most: int) -> None:
+    probe = SchedulerProbe(range(100))
     for number in range(before):
-        told.scheduler.next(number)
-        told.scheduler.result(number, number, 0)
+        probe.scheduler.next(number)
+        probe.scheduler.result(number, number, 0)
     for number in range(before, before + most - 1):
-        assert told.scheduler.next(number) is not None
-        told.scheduler.failed(number, problem(7))
-    assert told.scheduler.next("last") is not None
+        assert probe.scheduler.next(number) is not None
+        probe.scheduler.failed(number, problem(7))
+    assert probe.scheduler.next("last") is not None
     with pytest.raises(TaskError, match="it broke at 7"):
-        told.scheduler.failed("last", problem(7))
-    assert len(told.failures) == most
+        probe.scheduler.failed("last", problem(7))
+    assert len(probe.failures) == most
 
 
-def test_failures_at_different_places_or_between_results_do_not() -> None:
-    told = Told(range(100))
+def test_failures_at_different_places_or_between_results_do_not_end_the_job() -> None:
+    probe = SchedulerProbe(range(100))
     for number in range(2 * MAX_ALIKE_FIRST - 2):
-        told.scheduler.next(number)
-        told.scheduler.failed(number, problem(number % 2))
+        probe.scheduler.next(number)
+        probe.scheduler.failed(number, problem(number % 2))
     for number in range(20, 20 + 3 * MAX_ALIKE_LATER):
-        chunk = told.scheduler.next(number)
+        chunk = probe.scheduler.next(number)
         if number % 2:
-            told.scheduler.failed(number, problem(1))
+            probe.scheduler.failed(number, problem(1))
         else:
             assert chunk is not None
-            told.scheduler.result(number, chunk.numbers[0], 0)
-    assert told.scheduler.count_left(99) == 100 - (2 * MAX_ALIKE_FIRST - 2) - 3 * MAX_ALIKE_LATER
+            probe.scheduler.result(number, chunk.numbers[0], 0)
+    assert probe.scheduler.count_left(99) == 100 - (2 * MAX_ALIKE_FIRST - 2) - 3 * MAX_ALIKE_LATER
 
 
 @given(total=st.integers(1, 200), count=st.integers(1, 40), chunk=st.integers(1, 9))
-def test_shards_are_all_chunks_once_and_of_one_size(total: int, count: int, chunk: int) -> None:
+def test_shards_cover_all_chunks_once_and_are_of_equal_size(total: int, count: int, chunk: int) -> None:
     found: list[int] = []
     sizes = set()
     for index in range(1, count + 1):
-        told = Told(range(total), chunk=chunk)
-        told.scheduler.take_part(Shard(index, count))
+        probe = SchedulerProbe(range(total), chunk=chunk)
+        probe.scheduler.take_part(Shard(index, count))
         taken = 0
-        while (one := told.scheduler.next("a")) is not None:
+        while (one := probe.scheduler.next("a")) is not None:
             found += one.numbers
             taken += 1
         sizes.add(taken)
@@ -294,14 +294,14 @@ def test_shards_are_all_chunks_once_and_of_one_size(total: int, count: int, chun
 
 
 @pytest.mark.parametrize("text", ["0/4", "5/4", "1", "a/b", "-1/3", "1/0", " 1/2", "1/2/3", "١/٢"])
-def test_a_text_that_is_no_shard_is_refused(text: str) -> None:
+def test_an_invalid_shard_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="--shard takes a part of a whole"):
         parse_shard(text)
     assert str(parse_shard("3/64")) == "3/64"
 
 
 @pytest.mark.parametrize(("stage", "begun"), [("reset", MAX_ALIKE_FIRST), ("build", 1)])
-def test_a_group_that_fails_alike_is_given_up_and_the_others_go_on(stage: str, begun: int) -> None:
+def test_a_group_with_equal_failures_is_abandoned_and_the_others_continue(stage: str, begun: int) -> None:
     results: list[int] = []
     failures: list[Failure] = []
     scheduler: Scheduler[int, None] = Scheduler(

@@ -1,4 +1,4 @@
-"""Results of a job in a file: it goes on where it was, for this very job, and parts are put together."""
+"""The job file: a job is resumed from it, only the same job accepts it, and parts are merged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ JOB = JobKey("square", {"command": "square", "seeds": "9"}, b"")
 def run(
     path: Path, shard: Shard = WHOLE, job: JobKey = JOB, stop_after: int = 99
 ) -> tuple[dict[int, int], list[int]]:
-    """Results of the squares of nine numbers, and which were made."""
+    """Run a job that squares nine numbers; returns the results, and the numbers computed in this run."""
     made: list[int] = []
     results: dict[int, int] = {}
 
@@ -44,7 +44,7 @@ def run(
     return results, made
 
 
-def test_a_job_goes_on_after_what_is_done(tmp_path: Path) -> None:
+def test_a_job_is_resumed_after_its_finished_items(tmp_path: Path) -> None:
     _, first = run(tmp_path / "a.job", stop_after=5)
     assert 5 <= len(first) < 9
     results, second = run(tmp_path / "a.job")
@@ -52,7 +52,7 @@ def test_a_job_goes_on_after_what_is_done(tmp_path: Path) -> None:
     assert run(tmp_path / "a.job") == (results, [])
 
 
-def test_parts_are_the_whole(tmp_path: Path) -> None:
+def test_merged_parts_equal_the_whole(tmp_path: Path) -> None:
     parts = [tmp_path / f"{index}.job" for index in (1, 2, 3)]
     for index, path in enumerate(parts, 1):
         run(path, Shard(index, 3))
@@ -62,7 +62,7 @@ def test_parts_are_the_whole(tmp_path: Path) -> None:
     assert run(tmp_path / "whole.job") == ({n: n * n for n in range(9)}, [])
 
 
-def test_another_job_is_refused_with_what_differs(tmp_path: Path) -> None:
+def test_another_job_is_refused_with_the_differences(tmp_path: Path) -> None:
     run(tmp_path / "a.job")
     other = replace(JOB, about={"command": "square", "seeds": "10", "rules": "off"})
     with pytest.raises(
@@ -88,7 +88,9 @@ def _folder(path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [_text, _other_database, _folder])
-def test_what_is_no_job_file_is_refused_and_left_alone(make: Callable[[Path], None], tmp_path: Path) -> None:
+def test_a_file_that_is_no_job_file_is_refused_and_unchanged(
+    make: Callable[[Path], None], tmp_path: Path
+) -> None:
     path = tmp_path / "a.job"
     make(path)
     before = path.read_bytes() if path.is_file() else b""
@@ -124,7 +126,9 @@ def place(tmp_path: Path) -> Place:
     return Place(task, policy)
 
 
-def test_the_same_job_may_run_elsewhere_with_another_number_of_workers(place: Place, tmp_path: Path) -> None:
+def test_the_same_job_may_run_in_another_folder_with_another_number_of_workers(
+    place: Place, tmp_path: Path
+) -> None:
     moved = tmp_path / "moved"
     moved.mkdir()
     for name in ("mine.py", "beside.py", "act.npy"):
@@ -142,12 +146,12 @@ def test_the_same_job_may_run_elsewhere_with_another_number_of_workers(place: Pl
         {"options": TaskOptions(2, seed=1)},
     ],
 )
-def test_what_the_results_depend_on_makes_another_job(other: dict[str, Any], place: Place) -> None:
+def test_options_that_affect_the_results_make_another_job(other: dict[str, Any], place: Place) -> None:
     assert place.job(**other).about != place.job().about
 
 
 @pytest.mark.parametrize("name", ["mine.py", "beside.py", "act.npy"])
-def test_so_do_the_texts_of_task_and_policy(name: str, place: Place, tmp_path: Path) -> None:
+def test_changed_texts_of_task_or_policy_make_another_job(name: str, place: Place, tmp_path: Path) -> None:
     before = place.job().about
     (tmp_path / name).write_text("import beside  # changed\n")
     assert place.job().about != before

@@ -1,4 +1,4 @@
-"""What workers send arrives where the chunks are dealt: every type of result and progress, through a real socket."""
+"""Every type of result and progress that workers send reaches the scheduler unchanged, through a real socket."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ KINDS = (
 
 
 class SocketQueue(WorkerQueue):
-    """Of a worker at the other end of a socket."""
+    """The queue of a worker at the other end of a socket."""
 
     def __init__(self, line: MessageSocket) -> None:
         self._line = line
@@ -53,10 +53,12 @@ class SocketQueue(WorkerQueue):
 
 
 def sent(kind: Any, value: Any) -> list[Any]:
-    """What the scheduler gets of a result and an update."""
+    """Send a result and an update; returns what the scheduler receives."""
     ours, theirs = (MessageSocket(end, MESSAGES) for end in socket.socketpair())
-    came: list[Any] = []
-    scheduler: Scheduler[Any, Any] = Scheduler([0], lambda number, result: came.append(result), came.append)
+    received: list[Any] = []
+    scheduler: Scheduler[Any, Any] = Scheduler(
+        [0], lambda number, result: received.append(result), received.append
+    )
     listener = Listener("a worker", Work(print, None, kind, kind, "x"), scheduler, print)
     scheduler.next("worker")
     queue = SocketQueue(theirs)
@@ -65,7 +67,7 @@ def sent(kind: Any, value: Any) -> list[Any]:
             send(value)
             message = ours.receive(5)
             assert message is not None and listener.take("worker", message) == "goes on"
-    return came
+    return received
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
@@ -78,7 +80,7 @@ def test_each_result_arrives_as_it_was_sent(kind: type, data: st.DataObject) -> 
         assert same(one, value)
 
 
-def test_a_number_of_numpy_s_is_a_number_and_what_is_of_another_type_is_refused_where_it_is_made() -> None:
+def test_numpy_numbers_are_accepted_and_wrong_types_are_refused_by_the_sender() -> None:
     seen = Seen(tried=np.int64(3), size=np.float32(0.5), numbers=(np.float64(2.0),))  # type: ignore[arg-type]
     (row,) = as_sent(RuleResult("runs", "kept", seen=(seen,))).seen
     assert (row.tried, row.size, row.numbers) == (3, 0.5, (2.0,)) and type(row.tried) is int

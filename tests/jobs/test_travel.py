@@ -1,4 +1,4 @@
-"""The author's files on their way to other machines, and names of them on the way back."""
+"""Transfer of the author's files to other machines, and translation of their paths in results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workbench.jobs.worker_files import TooMuch, files_below, pack_worker_files,
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with a task in a folder of its own."""
+    """The folder of a task, in the current folder."""
     mine = tmp_path / "here" / "mine"
     for name in ("task.py", "beside.py", "assets/cup/cup.urdf", "assets/cup/cup.glb", ".git/config", "venv/pyvenv.cfg",
                  "other/pyvenv.cfg", "other/lib.py", "__pycache__/task.pyc", "recordings/old.rrd", ".hidden"):  # fmt: skip
@@ -29,12 +29,12 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return mine
 
 
-def test_what_is_hidden_made_by_others_or_a_link_stays(place: Path) -> None:
+def test_hidden_files_generated_files_and_links_are_not_sent(place: Path) -> None:
     found = [file.relative_to(place).as_posix() for file in files_below(place)]
     assert found == ["beside.py", "task.py", "assets/cup/cup.glb", "assets/cup/cup.urdf"]
 
 
-def test_what_is_named_from_the_current_folder_is_found_there_too(
+def test_paths_relative_to_the_current_folder_also_work_on_the_worker(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     worker_files = pack_worker_files([place, place / "assets"], [Path("demo.npy"), place / "task.py"])
@@ -57,7 +57,7 @@ class Thing:
     more: dict[str, tuple[str, ...]]
 
 
-def test_paths_are_replaced_wherever_they_stand_but_in_bytes_and_arrays() -> None:
+def test_paths_are_replaced_everywhere_except_in_bytes_and_arrays() -> None:
     thing = Thing(Path("/a/b/c.py"), "at /a/b/c.py:3", np.zeros(2), b"/a/b", {"/a/b/c": ("/a/x", "/a/b")})
     there = relocated(thing, {"/a/b": "/far", "/a": "/near"})
     assert (there.path, there.text, there.raw) == (Path("/far/c.py"), "at /far/c.py:3", b"/a/b")
@@ -65,7 +65,7 @@ def test_paths_are_replaced_wherever_they_stand_but_in_bytes_and_arrays() -> Non
     assert relocated(thing, {}) is thing
 
 
-def test_a_job_needs_the_folder_of_its_task_and_what_acts(place: Path) -> None:
+def test_a_job_needs_the_files_of_its_task_and_its_policy(place: Path) -> None:
     needed = needed_by("mine/task.py:Task", "policy/act.py:act")
     assert [folder.resolve() for folder in needed.folders] == [place, place.parent / "policy"]
     needed = needed_by("mine/task.py", "demo.npy")
@@ -76,7 +76,9 @@ def test_a_job_needs_the_folder_of_its_task_and_what_acts(place: Path) -> None:
     )
 
 
-def test_too_much_is_refused_with_what_is_large(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_much_data_is_refused_with_the_largest_files(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(travel, "MAX_BYTES", 2 << 20)
     (place / "huge.bin").write_bytes(bytes(5 << 20))
     with pytest.raises(TooMuch, match=r"are 5 MB, and at most 2 MB are sent.*huge\.bin \(5 MB\)"):

@@ -1,4 +1,4 @@
-"""What the processes of a pool do in tests: no task, and each way to go wrong."""
+"""Work for the processes of a pool in tests: without a task, and with each way to fail."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ PROBLEM = Problem("step", "it broke", "task.py", 3, "1 / 0", "Traceback")
 
 
 BEGUN = "begun-"
-"""And its number: a file for each item that was begun."""
+"""Prefix of a marker file per started item; the item's number follows."""
 
 
 @dataclass(frozen=True)
 class Setup:
     how: str = ""
     at: int = -1
-    """The item with which that happens."""
+    """The item at which the failure `how` happens."""
     folder: Path = field(kw_only=True)
 
 
@@ -38,7 +38,7 @@ class Squared:
 
 
 def square(setup: Setup, queue: ItemQueue) -> None:
-    """The items of a chunk one after another."""
+    """Square the items of each chunk in order."""
     if setup.how == "cannot be loaded":
         raise TaskError(PROBLEM)
     queue.send_update(f"opened in {os.getpid()} on {','.join(map(str, sorted(os.sched_getaffinity(0))))}")
@@ -66,7 +66,7 @@ def go_wrong(setup: Setup, queue: ItemQueue) -> None:
     elif setup.how == "no UTF-8":
         raise FileNotFoundError("there is no " + os.fsdecode(b"caf\xe9"))
     elif setup.how == "bug":
-        raise KeyError("nobody expects it")
+        raise KeyError("unexpected")
     elif setup.how == "garbage":
         os.write(int(sys.argv[2]), b"\x00\x00\x00\x05hello")
     elif setup.how == "endless":
@@ -90,12 +90,12 @@ def go_wrong(setup: Setup, queue: ItemQueue) -> None:
 
 
 def forget(setup: Setup, queue: ItemQueue) -> None:
-    """Ends with an item that it says nothing of."""
+    """End without sending the results of a chunk."""
     queue.next()
 
 
 class Run:
-    """A job, and what was heard of it."""
+    """A job, with the results, updates and failures that it reported."""
 
     def __init__(
         self,
@@ -113,21 +113,23 @@ class Run:
         self._on_result = on_result
         if how.pop("goes_on", False):
             how["on_failure"] = self.failures.append
-        self.scheduler: Scheduler[Squared, str | int] = Scheduler(numbers, self.over, self.hear, stop, **how)
+        self.scheduler: Scheduler[Squared, str | int] = Scheduler(
+            numbers, self.take_result, self.take_update, stop, **how
+        )
         self.work = Work(run, setup, Squared, str | int, "that squares")
 
-    def over(self, number: int, result: Squared) -> None:
+    def take_result(self, number: int, result: Squared) -> None:
         assert number not in self.results
         self.results[number] = result
         self._on_result(self, number)
 
-    def hear(self, update: str | int) -> None:
+    def take_update(self, update: str | int) -> None:
         if isinstance(update, int):
             self.steps += update
         else:
             self.updates.append(update)
 
-    def by(self, executor: Executor) -> Run:
+    def run_with(self, executor: Executor) -> Run:
         executor.run(self.work, self.scheduler)
         return self
 

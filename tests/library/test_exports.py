@@ -1,4 +1,4 @@
-"""Exports beside the recordings that they were made of."""
+"""Exports in the same folder as their source recordings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workbench.library.panel import LibraryPanel
 
 
 @pytest.mark.usefixtures("child_process")
-def test_an_export_is_no_further_recording_and_shows_what_its_recording_shows(
+def test_an_export_counts_as_no_new_recording_and_shows_its_sources_facts(
     tmp_path: Path, panels: Panels
 ) -> None:
     write(tmp_path, made(10, success_from=7, seed=1))
@@ -34,8 +34,8 @@ def test_an_export_is_no_further_recording_and_shows_what_its_recording_shows(
     assert all(len(alike) == 1 for alike in by_steps.values()) and by_steps[10] != by_steps[6]
     panel = LibraryPanel(panels.server, library, lambda ids: None)
     panel.draw()
-    said = re.sub(r"<[^>]*>", " ", panels.html("wb-library-pills"))
-    assert re.findall(r"(all|no success|success) (\d+)", said) == [
+    text = re.sub(r"<[^>]*>", " ", panels.html("wb-library-pills"))
+    assert re.findall(r"(all|no success|success) (\d+)", text) == [
         ("all", "2"),
         ("success", "1"),
         ("no success", "1"),

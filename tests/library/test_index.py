@@ -1,4 +1,4 @@
-"""The index is a cache: what is wrong with it is thrown away, what is only held by another process is not."""
+"""The index is a cache: a damaged index is discarded, one locked by another process is not."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def keep(index: LibraryIndex, *keys: str) -> None:
     index.store([(found(key), [(Facts(kind="workbench"), os.fsencode(key))]) for key in keys])
 
 
-def test_an_index_that_another_process_holds_is_left_as_it_is(folder: Path) -> None:
+def test_an_index_locked_by_another_process_is_not_changed(folder: Path) -> None:
     index = LibraryIndex(folder)
     keep(index, "a", "b")
     path = index_path(folder)
@@ -45,7 +45,7 @@ def test_an_index_that_another_process_holds_is_left_as_it_is(folder: Path) -> N
     index.close()
 
 
-def test_what_was_read_again_takes_the_place_of_what_was_kept_and_what_is_gone_goes(folder: Path) -> None:
+def test_reread_recordings_replace_their_entries_and_deleted_ones_are_removed(folder: Path) -> None:
     index = LibraryIndex(folder)
     keep(index, "a", "b", "c")
     facts = Facts(kind="workbench")

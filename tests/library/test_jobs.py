@@ -1,4 +1,4 @@
-"""How far a job is that records into a folder, in the library of that folder."""
+"""Progress of jobs that record into a folder, shown in the library of that folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from workbench.record.job import RecordProgress
 RUNS = JobStatus("record", "my_task.py", 40, 100, rate=2.0)
 
 
-def test_a_job_is_seen_while_it_runs_and_a_while_after(tmp_path: Path) -> None:
+def test_a_job_is_listed_while_it_runs_and_for_an_hour_after(tmp_path: Path) -> None:
     now = 1e9
     file = StatusFile(tmp_path, lambda: now)
     file.write(RUNS)
@@ -39,23 +39,23 @@ def test_a_job_is_seen_while_it_runs_and_a_while_after(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_the_rate_of_a_job_that_goes_on_is_that_of_this_run(
+def test_the_rate_of_a_resumed_job_counts_only_this_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = SimpleNamespace(monotonic=lambda: now)
     monkeypatch.setattr("workbench.cli.run_by.time", clock)
-    with status_in_folder(JobArguments(), "record", "my_task.py", tmp_path, 100, str) as told:
-        tell = told.with_status(lambda progress: None)
+    with status_in_folder(JobArguments(), "record", "my_task.py", tmp_path, 100, str) as status_file:
+        report = status_file.with_status(lambda progress: None)
         now = 50.0
-        tell(RecordProgress(80, 0, done=80.0, was_there=True))
+        report(RecordProgress(80, 0, done=80.0, was_there=True))
         now = 55.0
-        tell(RecordProgress(90, 0, done=90.0))
-        told.end("stopped")
+        report(RecordProgress(90, 0, done=90.0))
+        status_file.end("stopped")
     (status,) = read_jobs(tmp_path, time.time())
     assert (status.done, status.rate) == (90, 2.0)
 
 
-def test_jobs_of_folders_below_are_seen_with_their_place(tmp_path: Path, child_process: None) -> None:
+def test_jobs_of_subfolders_are_listed_with_their_path(tmp_path: Path, child_process: None) -> None:
     below = tmp_path / "parts" / "1"
     below.mkdir(parents=True)
     describe(below, "one", id="one")
@@ -72,7 +72,7 @@ def test_jobs_of_folders_below_are_seen_with_their_place(tmp_path: Path, child_p
         library.close()
 
 
-def test_it_is_written_once_a_second_and_its_end_at_once(tmp_path: Path) -> None:
+def test_progress_is_written_once_a_second_and_the_end_at_once(tmp_path: Path) -> None:
     now = 1e9
     file = StatusFile(tmp_path, lambda: now)
     for done in range(5):
@@ -82,7 +82,7 @@ def test_it_is_written_once_a_second_and_its_end_at_once(tmp_path: Path) -> None
     assert read_jobs(tmp_path, now)[0].state == "stopped"
 
 
-def test_a_job_that_goes_on_replaces_its_last_word_and_no_other(tmp_path: Path) -> None:
+def test_a_resumed_job_replaces_only_its_own_last_status(tmp_path: Path) -> None:
     now = time.time()
     for status in (
         replace(RUNS, state="stopped"),
@@ -97,14 +97,14 @@ def test_a_job_that_goes_on_replaces_its_last_word_and_no_other(tmp_path: Path) 
         ("my_task.py", "1/2", "done"),
         ("other.py", "", "done"),
         ("my_task.py", "", "running"),
-    }, "another may be under way"
+    }, "another job may still run"
 
 
 @given(content=st.binary(max_size=200) | st.builds(lambda value: msgspec.json.encode(value), st.dictionaries(
     st.sampled_from(["command", "task", "done", "total", "state", "failures", "written_at", "rate"]),
     st.none() | st.integers() | st.text() | st.floats(allow_nan=False, allow_infinity=False) | st.lists(st.integers()),
 )))  # fmt: skip
-def test_a_file_that_is_anything_else_is_passed_over_or_read_as_data(content: bytes) -> None:
+def test_any_other_file_is_ignored_or_read_as_data(content: bytes) -> None:
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
@@ -113,7 +113,7 @@ def test_a_file_that_is_anything_else_is_passed_over_or_read_as_data(content: by
             assert isinstance(status, JobStatus)
 
 
-def test_what_is_written_in_it_is_text_on_the_page(tmp_path: Path) -> None:
+def test_the_content_of_a_status_is_shown_as_text(tmp_path: Path) -> None:
     bad = "<script>alert(1)</script>"
     failure = JobFailure(bad, 2, bad, f"  {bad}\n\x1b[31m")
     StatusFile(tmp_path).write(JobStatus(bad, bad, 1, 2, failures=(failure,)))

@@ -58,7 +58,7 @@ def library(tmp_path: Path) -> Iterator[Library]:
 
 
 def read(folder: Path) -> list[LibraryRow]:
-    """As somebody who opens it anew sees it."""
+    """The rows of a newly opened library."""
     library = Library(folder)
     library.refresh()
     library.close()
@@ -66,16 +66,16 @@ def read(folder: Path) -> list[LibraryRow]:
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    """All files that a person sees."""
+    """The content of all files in the folder, by relative path."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
     }
 
 
-# --- what rows say --------------------------------------------------------------------------------------
+# --- content of rows ------------------------------------------------------------------------------------
 
 
-def test_what_the_writer_wrote_is_a_row_and_is_read_as_before_when_it_has_tags(
+def test_a_written_recording_is_a_row_and_reads_the_same_after_tagging(
     tmp_path: Path, library: Library, make_episode: Callable[..., Made]
 ) -> None:
     made = make_episode(5, reward=np.full(5, 0.5, np.float32), evaluate={"success": np.arange(6) >= 4})
@@ -130,7 +130,7 @@ def test_a_trajectory_with_pictures_has_a_thumbnail(
 
 
 @pytest.mark.parametrize(
-    ("files", "said"),
+    ("files", "problem"),
     [
         ({"x.json": b'{"workbench": {"task": '}, "x.json is not JSON, or was cut short."),
         ({"x.rrd": b""}, "x.rrd is not a recording that rerun can read"),
@@ -142,16 +142,14 @@ def test_a_trajectory_with_pictures_has_a_thumbnail(
         ({"x.json": b'{"workbench": {"task": "A-v1"}}', "x.h5": b""}, "x.rrd is missing."),
     ],
 )
-def test_files_that_are_broken_are_rows_that_say_so(
-    tmp_path: Path, files: dict[str, bytes], said: str
-) -> None:
+def test_broken_files_are_rows_with_a_message(tmp_path: Path, files: dict[str, bytes], problem: str) -> None:
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
     (row,) = read(tmp_path)
-    assert row.problem is not None and said in row.problem
+    assert row.problem is not None and problem in row.problem
 
 
-def test_what_is_no_recording_is_no_row(tmp_path: Path) -> None:
+def test_other_files_are_no_rows(tmp_path: Path) -> None:
     (tmp_path / "package.json").write_text('{"name": "x"}')
     (tmp_path / "lonely.notes").write_text("{}")
     (tmp_path / "notes.txt").write_text("x")
@@ -161,7 +159,7 @@ def test_what_is_no_recording_is_no_row(tmp_path: Path) -> None:
     assert read(tmp_path) == []
 
 
-def test_names_of_files_that_are_no_text_can_be_shown_and_deleted(tmp_path: Path, library: Library) -> None:
+def test_recordings_with_non_utf_8_names_can_be_shown_and_deleted(tmp_path: Path, library: Library) -> None:
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
     describe(folder, os.fsdecode(b"a\xff\n"), id="aaaa")
     for _ in range(2):
@@ -202,24 +200,24 @@ def is_wrong(name: str, value: Any) -> bool:
 
 @settings(max_examples=60)
 @given(st.fixed_dictionaries({}, optional=dict.fromkeys(_TYPES, _anything)))
-def test_whatever_a_description_says_there_is_one_row_that_the_index_can_hold(fields: dict) -> None:
+def test_any_description_gives_one_row_that_the_index_can_store(fields: dict) -> None:
     with tempfile.TemporaryDirectory() as name:
         describe(Path(name), "a", **fields)
         ((facts, picture),) = read_found(Path(name), scan_folder(Path(name)).found["a"])
     wrong = {key for key, value in fields.items() if is_wrong(key, value)}
-    said = re.search(
+    named = re.search(
         r"a\.json is not as a recording is described: .* at \$\.workbench\.(\w+)", facts.problem or ""
     )
     assert facts.kind == "workbench"
-    assert said[1] in wrong if wrong and said else (facts.problem is None and not wrong)
+    assert named[1] in wrong if wrong and named else (facts.problem is None and not wrong)
     assert clean_facts(msgspec.msgpack.decode(msgspec.msgpack.encode(facts), type=Facts)) == facts
     assert picture is None or picture[:2] == b"\xff\xd8"
 
 
-# --- keeping up -----------------------------------------------------------------------------------------
+# --- following changes ----------------------------------------------------------------------------------
 
 
-def test_only_what_changed_is_read_again(
+def test_only_changed_recordings_are_read_again(
     tmp_path: Path, library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in "abc":
@@ -246,13 +244,13 @@ def test_only_what_changed_is_read_again(
     assert [(row.name, row.note) for row in library.view().rows] == [("a", "a"), ("b", "changed")]
     read_keys.clear()
     assert [row.note for row in read(tmp_path)] == ["a", "changed"]
-    assert read_keys == []  # from the index
+    assert read_keys == []  # all rows come from the index
 
 
 @pytest.mark.parametrize(
     "damage", ["deleted", "garbage", "cut", "another program's", "rows of another version"]
 )
-def test_an_index_that_is_wrong_is_made_anew(tmp_path: Path, damage: str) -> None:
+def test_a_damaged_index_is_rebuilt(tmp_path: Path, damage: str) -> None:
     for k in range(30):
         describe(tmp_path, f"r{k:02}", seed=k)
     good = read(tmp_path)
@@ -279,7 +277,7 @@ def test_an_index_that_is_wrong_is_made_anew(tmp_path: Path, damage: str) -> Non
     library.close()
 
 
-def test_an_index_that_came_with_the_folder_is_left_alone(tmp_path: Path) -> None:
+def test_an_index_copied_with_the_folder_is_ignored(tmp_path: Path) -> None:
     folder, mine = tmp_path / "recordings", tmp_path / "another program's.sqlite"
     describe(folder, "a")
     with sqlite3.connect(mine) as database:
@@ -294,7 +292,7 @@ def test_an_index_that_came_with_the_folder_is_left_alone(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
+def test_the_table_follows_changes_of_the_folder(tmp_path: Path) -> None:
     folder = tmp_path / "later"
     library = Library(folder)
     library.watch()
@@ -324,7 +322,7 @@ def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
 # --- tags and notes ---------------------------------------------------------------------------------------
 
 
-def test_tags_and_note_go_where_the_recording_goes_and_nothing_else_of_it_changes(
+def test_tags_and_note_move_with_the_recording_and_change_nothing_else(
     tmp_path: Path, library: Library
 ) -> None:
     path = describe(tmp_path, "a", id="a1", tags=["old"])
@@ -341,7 +339,7 @@ def test_tags_and_note_go_where_the_recording_goes_and_nothing_else_of_it_change
         "note": "slips at the end",
     }
     assert after == before
-    # Moved elsewhere, under another name, without the index: they are there.
+    # Moved to another folder, renamed and without the index, the recording still has them.
     for suffix in (".json", ".h5", ".rrd"):
         (tmp_path / "elsewhere").mkdir(exist_ok=True)
         os.rename(path.with_suffix(suffix), tmp_path / "elsewhere" / f"renamed{suffix}")
@@ -349,7 +347,7 @@ def test_tags_and_note_go_where_the_recording_goes_and_nothing_else_of_it_change
     assert (moved.id, moved.tags, moved.note) == ("a1", ("good", "demo"), "slips at the end")
 
 
-def test_files_of_others_are_not_written_into(tmp_path: Path, maniskill: Path, library: Library) -> None:
+def test_foreign_files_are_not_modified(tmp_path: Path, maniskill: Path, library: Library) -> None:
     shutil.copytree(maniskill, tmp_path, dirs_exist_ok=True)
     before = tree(tmp_path)
     library.refresh()
@@ -370,7 +368,7 @@ def test_files_of_others_are_not_written_into(tmp_path: Path, maniskill: Path, l
 # --- deleting ---------------------------------------------------------------------------------------------
 
 
-def test_deleting_takes_all_files_and_can_be_taken_back(tmp_path: Path, library: Library) -> None:
+def test_deleting_moves_all_files_and_can_be_undone(tmp_path: Path, library: Library) -> None:
     for name in ("a", "b", "sub/c"):
         path = tmp_path / name
         describe(path.parent, path.name, id=path.name * 4)
@@ -388,7 +386,7 @@ def test_deleting_takes_all_files_and_can_be_taken_back(tmp_path: Path, library:
     library.delete(["aaaa"])
     library.delete(["bbbb"])
     library.undo_delete()
-    assert [row.name for row in library.view().rows] == ["b", "sub/c"], "the last one first"
+    assert [row.name for row in library.view().rows] == ["b", "sub/c"], "the last deletion is undone first"
 
 
 def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
@@ -407,7 +405,7 @@ def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
     assert library.view().rows == () and library.view().trash.files == 3
 
 
-def test_a_note_that_cannot_be_kept_is_an_error_and_nothing_is_half_written(
+def test_a_note_that_cannot_be_saved_is_an_error_and_leaves_no_partial_file(
     tmp_path: Path, library: Library
 ) -> None:
     describe(tmp_path, "a", id="a1")
@@ -421,8 +419,8 @@ def test_a_note_that_cannot_be_kept_is_an_error_and_nothing_is_half_written(
         library.set_tags(["a1", "zz"], add=["x"])
 
 
-def test_a_scan_that_is_asked_for_is_made_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not when its time comes, which here is in an hour."""
+def test_a_requested_scan_is_made_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next scheduled scan would be in an hour."""
     for name in ("SCAN_SECONDS", "MAX_PAUSE_SECONDS"):
         monkeypatch.setattr(f"workbench.library.folder.{name}", 3600.0)
     library = Library(tmp_path)

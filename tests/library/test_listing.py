@@ -1,4 +1,4 @@
-"""The library's list as a value: what each command makes of it, over rows that come and go."""
+"""The library's list as a state machine: the effect of each command, with rows that appear and disappear."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ ROWS: Rows = tuple(
 
 
 def after(commands: Iterable[Command], rows: Rows = ROWS) -> Listing:
-    """The list after these."""
+    """The list after these commands."""
     listed = LibraryList()
     for command in commands:
         listed = apply(make_listing(listed, rows), command)
@@ -61,26 +61,26 @@ def without(*ids: str) -> Rows:
     return tuple(row for row in ROWS if row.id not in ids)
 
 
-def test_the_cursor_goes_on_from_the_place_of_a_row_that_is_gone() -> None:
+def test_the_cursor_continues_from_the_place_of_a_deleted_row() -> None:
     listed = after([PressRow(id="r4")])
     there = make_listing(listed.list, without("r4"))
     assert there.selected == () and there.list.cursor is None
     assert make_listing(apply(there, NextRow()), there.library).selected == ("r5",)
 
 
-def test_an_arrow_without_a_cursor_begins_on_the_page_that_is_shown() -> None:
+def test_an_arrow_key_without_a_cursor_starts_on_the_shown_page() -> None:
     assert after([NextRows(), NextRow()]).selected == (f"r{ROWS_PER_PAGE}",)
     assert after([NextRows(), NextRows(), PreviousRows(), NextRow()]).selected == ("r0",)
 
 
-def test_what_a_filter_hid_is_not_selected_when_it_is_shown_again() -> None:
+def test_rows_hidden_by_a_filter_are_not_selected_when_shown_again() -> None:
     chosen = [SelectAllRows(), FilterRows(outcome="no success")]
     assert len(after(chosen).selected) == len(after(chosen).rows) == len(ROWS) // 2
     shown = after([*chosen, ClearRowFilter()])
     assert len(shown.rows) == len(ROWS) and len(shown.selected) == len(ROWS) // 2
 
 
-def test_the_filter_of_a_task_goes_with_its_last_recording() -> None:
+def test_the_filter_of_a_task_is_removed_with_its_last_recording() -> None:
     listed = after([FilterTask(task="pick")])
     assert {row.task for row in listed.rows} == {"pick"}
     rest = tuple(row for row in ROWS if row.task != "pick")
@@ -104,14 +104,16 @@ libraries = st.sampled_from([ROWS, without("r1", "r2"), tuple(row for row in ROW
 
 
 @given(st.lists(st.tuples(commands, libraries), max_size=30))
-def test_whatever_is_pressed_only_what_is_listed_is_selected(happened: list[tuple[Command, Rows]]) -> None:
+def test_any_commands_select_only_listed_rows(happened: list[tuple[Command, Rows]]) -> None:
     listed, before = LibraryList(), None
     for command, rows in happened:
         before = make_listing(listed, rows, before)
         listed = apply(before, command)
         there = make_listing(listed, rows, before)
         again = make_listing(listed, rows)
-        assert (there.rows, there.list) == (again.rows, again.list), "nothing of an older moment"
+        assert (there.rows, there.list) == (again.rows, again.list), (
+            "the list must not depend on an older one"
+        )
         shown = {row.id for row in there.rows}
         assert there.list.selected == set(there.selected) <= shown
         assert there.list.cursor is None or there.list.cursor in shown

@@ -1,4 +1,4 @@
-"""The table's HTML and what its rows and pills do, on real files without a browser."""
+"""The table's HTML and the effects of its rows and pills, on real files without a browser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Literal
 
 import pytest
 
-from tests.drive.panels import Clock, Panels, told_so_far
+from tests.drive.panels import Clock, Panels, messages_sent
 from tests.drive.waiting import until
 from tests.episodes.library_files import describe
 from workbench.library.commands import (
@@ -61,20 +61,20 @@ def library(child_process: None, tmp_path: Path) -> Iterator[Library]:
     library.close()
 
 
-class Told:
-    """What the host of the panel was told."""
+class Host:
+    """Records the recordings that the panel asks its host to open."""
 
     def __init__(self) -> None:
         self.opened: list[tuple[str, ...]] = []
 
 
 @pytest.fixture
-def told() -> Told:
-    return Told()
+def host() -> Host:
+    return Host()
 
 
 class Table:
-    """The library on a page, with a hand on it."""
+    """The library on a page, with methods to operate it."""
 
     def __init__(self, panel: LibraryPanel, panels: Panels, clock: Clock) -> None:
         self.panel, self.panels, self.clock = panel, panels, clock
@@ -84,7 +84,7 @@ class Table:
         self.panel.draw()
 
     def ask(self, command: Command) -> None:
-        """Press the part of the table that does this."""
+        """Press the part of the table that sends this command."""
         self.panels.ask(command)
         self.draw()
 
@@ -97,7 +97,7 @@ class Table:
         self.draw()
 
     def numbers(self) -> dict[str, int]:
-        """Of the rows that are shown, by id, in their order."""
+        """Row numbers of the shown rows by id, in their order."""
         rows = re.findall(
             r'<tbody data-row="(\d+)".*?wb-library-name">(\w+)<', self.panels.html("wb-library"), re.DOTALL
         )
@@ -116,7 +116,7 @@ class Table:
         return [ids[int(number)] for number in marks]
 
     def pictures(self) -> int:
-        """How many rows show one."""
+        """Number of rows that show a thumbnail."""
         return self.panels.html("wb-library").count("<img")
 
     def selected(self) -> tuple[str, ...]:
@@ -124,8 +124,8 @@ class Table:
 
 
 @pytest.fixture
-def table(panels: Panels, library: Library, told: Told, clock: Clock) -> Iterator[Table]:
-    panel = LibraryPanel(panels.server, library, told.opened.append)
+def table(panels: Panels, library: Library, host: Host, clock: Clock) -> Iterator[Table]:
+    panel = LibraryPanel(panels.server, library, host.opened.append)
 
     def do(command: Command, visitor: Visitor) -> None:
         if isinstance(command, CloseDialog):
@@ -144,7 +144,7 @@ def newest(first: int, last: int) -> list[str]:
     return [f"id{k:02}" for k in range(COUNT - 1, -1, -1)][first:last]
 
 
-def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
+def test_pages_sorting_and_filters_work_by_press(table: Table) -> None:
     assert table.shown() == newest(0, ROWS_PER_PAGE)
     table.ask(NextRows())
     assert table.shown() == newest(ROWS_PER_PAGE, COUNT)
@@ -160,7 +160,7 @@ def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
     assert table.shown() == [] and "nothing has this" in table.panels.html("wb-library")
 
 
-def test_rows_of_another_version_than_the_open_one_are_marked_as_soon_as_it_is_another(
+def test_rows_of_other_versions_are_marked_as_soon_as_the_open_version_changes(
     panels: Panels, library: Library, clock: Clock
 ) -> None:
     (recorded,) = {(row.task, row.source_hash) for row in library.view().rows}
@@ -174,9 +174,9 @@ def test_rows_of_another_version_than_the_open_one_are_marked_as_soon_as_it_is_a
     assert panels.html("wb-library").count("another version") == ROWS_PER_PAGE
 
 
-def test_another_search_filter_or_order_begins_on_the_first_page(table: Table) -> None:
+def test_a_new_search_filter_or_order_starts_on_the_first_page(table: Table) -> None:
     for arrange in (
-        lambda: table.look_for("r"),  # all of them have it
+        lambda: table.look_for("r"),  # all rows match
         lambda: table.look_for(""),
         lambda: table.ask(FilterRows(outcome="all")),
         lambda: table.ask(SortRows(column="seed")),
@@ -188,7 +188,7 @@ def test_another_search_filter_or_order_begins_on_the_first_page(table: Table) -
         assert len(table.shown()) == ROWS_PER_PAGE
 
 
-def test_the_recordings_of_one_task_are_listed_until_it_has_none_or_all_are_wanted_again(
+def test_a_task_filter_stays_until_it_has_no_recordings_or_is_cleared(
     table: Table, library: Library, tmp_path: Path
 ) -> None:
     assert not table.panels.shows("Task")
@@ -217,7 +217,7 @@ def test_the_recordings_of_one_task_are_listed_until_it_has_none_or_all_are_want
     assert len(table.shown()) == ROWS_PER_PAGE and table.panels.field("Task").value == "all tasks"
 
 
-def test_all_selects_what_is_listed_and_leaves_the_filter(table: Table) -> None:
+def test_all_selects_the_listed_rows_and_keeps_the_filter(table: Table) -> None:
     table.ask(FilterRows(outcome="no success"))
     failed = table.shown()
     table.press_row(failed[0])
@@ -227,8 +227,8 @@ def test_all_selects_what_is_listed_and_leaves_the_filter(table: Table) -> None:
     assert table.selected() == () and table.shown() == failed
 
 
-def test_what_cannot_be_read_is_not_opened_and_says_why(
-    table: Table, library: Library, told: Told, tmp_path: Path
+def test_an_unreadable_recording_is_not_opened_and_shows_the_reason(
+    table: Table, library: Library, host: Host, tmp_path: Path
 ) -> None:
     (tmp_path / "cut.rrd").write_bytes(b"RRF2 and nothing more")
     library.refresh()
@@ -237,11 +237,11 @@ def test_what_cannot_be_read_is_not_opened_and_says_why(
     (damaged,) = (row for row in library.view().rows if row.problem)
     table.panel.select([damaged.id])
     table.key(OpenSelected())
-    assert told.opened == []
+    assert host.opened == []
 
 
-def test_of_a_damaged_recording_what_is_left_is_opened(
-    table: Table, library: Library, told: Told, tmp_path: Path
+def test_the_intact_part_of_a_damaged_recording_is_opened(
+    table: Table, library: Library, host: Host, tmp_path: Path
 ) -> None:
     for file in (Path(__file__).parents[1] / "golden/v1/damaged").glob("*seed0008*"):
         shutil.copy(file, tmp_path)
@@ -251,10 +251,10 @@ def test_of_a_damaged_recording_what_is_left_is_opened(
     (damaged,) = (row for row in library.view().rows if row.problem)
     table.panel.select([damaged.id])
     table.key(OpenSelected())
-    assert told.opened == [(damaged.id,)]
+    assert host.opened == [(damaged.id,)]
 
 
-def test_rows_are_selected_as_in_a_list_of_files(table: Table, told: Told) -> None:
+def test_rows_are_selected_like_files_in_a_file_manager(table: Table, host: Host) -> None:
     ids = newest(0, 9)
     table.press_row(ids[2])
     assert table.selected() == (ids[2],) and table.marked() == [ids[2]]
@@ -268,10 +268,10 @@ def test_rows_are_selected_as_in_a_list_of_files(table: Table, told: Told) -> No
     table.press_row(ids[0])
     assert table.selected() == (ids[0],)
     table.ask(OpenRow(id=ids[1]))
-    assert told.opened == [(ids[1],)] and table.selected() == (ids[1],)
+    assert host.opened == [(ids[1],)] and table.selected() == (ids[1],)
 
 
-def test_keys_walk_over_the_pages(table: Table) -> None:
+def test_keys_move_the_cursor_across_pages(table: Table) -> None:
     table.key(NextRow())
     assert table.selected() == (newest(0, 1)[0],)
     for _ in range(ROWS_PER_PAGE):
@@ -284,7 +284,9 @@ def test_keys_walk_over_the_pages(table: Table) -> None:
     assert table.selected() == tuple(newest(ROWS_PER_PAGE - 2, ROWS_PER_PAGE + 1))
 
 
-def test_what_is_no_longer_listed_is_no_longer_selected(table: Table, library: Library, told: Told) -> None:
+def test_rows_that_are_no_longer_listed_are_no_longer_selected(
+    table: Table, library: Library, host: Host
+) -> None:
     table.key(SelectAllRows())
     assert len(table.selected()) == COUNT
     table.ask(FilterRows(outcome="success"))
@@ -294,7 +296,7 @@ def test_what_is_no_longer_listed_is_no_longer_selected(table: Table, library: L
     assert len(table.selected()) == (COUNT + 1) // 2 - 3
 
 
-def test_a_press_on_a_row_that_has_moved_selects_that_row_and_one_that_is_gone_selects_nothing(
+def test_a_press_on_a_moved_row_selects_it_and_on_a_deleted_row_selects_nothing(
     table: Table, library: Library, tmp_path: Path
 ) -> None:
     wanted = newest(3, 4)[0]
@@ -308,7 +310,7 @@ def test_a_press_on_a_row_that_has_moved_selects_that_row_and_one_that_is_gone_s
     assert table.selected() == (wanted,)
 
 
-def test_buttons_are_there_for_as_many_as_they_take(table: Table, told: Told) -> None:
+def test_buttons_are_shown_for_valid_numbers_of_selected_rows(table: Table, host: Host) -> None:
     rescored: list[tuple[str, ...]] = []
     table.panel.add_action(Action("Rescore", RescoreSelected(), "With today's code", rescored.append))
     table.draw()
@@ -321,10 +323,10 @@ def test_buttons_are_there_for_as_many_as_they_take(table: Table, told: Told) ->
     assert rescored == [tuple(ids)]
     table.press_row(ids[4], "ctrl")
     table.ask(OpenSelected())
-    assert told.opened == [tuple(ids[:4])]
+    assert host.opened == [tuple(ids[:4])]
 
 
-def test_tags_note_and_deletion_are_asked_for_and_done(
+def test_tags_note_and_deletion_work_through_their_dialogs(
     table: Table, library: Library, tmp_path: Path
 ) -> None:
     first, second = newest(0, 2)
@@ -361,7 +363,7 @@ def test_tags_note_and_deletion_are_asked_for_and_done(
     assert "In the trash" not in table.panels.html()
 
 
-def test_a_disk_that_hangs_holds_neither_the_table_nor_what_is_pressed_in_it(
+def test_a_hanging_disk_blocks_neither_the_table_nor_its_commands(
     table: Table, library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     goes_on, read, set_note = threading.Event(), library.thumbnails, library.set_note
@@ -380,7 +382,7 @@ def test_a_disk_that_hangs_holds_neither_the_table_nor_what_is_pressed_in_it(
     monkeypatch.setattr(library, "set_note", note)
     table.ask(SortRows(column="seed"))
     assert table.shown()[:3] == ["id00", "id01", "id02"]
-    assert table.pictures() == COUNT - 10, "those that were shown before"
+    assert table.pictures() == COUNT - 10, "thumbnails of the rows that were shown before"
     assert "no picture" not in table.panels.html("wb-library")
     for id, text in (("id00", "first"), ("id01", "second")):
         table.press_row(id)
@@ -394,7 +396,7 @@ def test_a_disk_that_hangs_holds_neither_the_table_nor_what_is_pressed_in_it(
     until(lambda: table.draw() or table.pictures() == ROWS_PER_PAGE, "the pictures")
 
 
-def test_only_the_first_answer_counts(table: Table, library: Library) -> None:
+def test_only_the_first_answer_to_a_dialog_counts(table: Table, library: Library) -> None:
     table.press_row(newest(0, 1)[0])
     table.ask(DeleteSelected())
     for _ in range(3):
@@ -407,27 +409,27 @@ def test_only_the_first_answer_counts(table: Table, library: Library) -> None:
     assert not table.panels.presses(UndoDelete())
 
 
-def test_an_edit_that_is_not_possible_any_more_says_why(
+def test_an_edit_that_is_no_longer_possible_shows_the_reason(
     table: Table, library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = table.panels.client
     monkeypatch.setattr(table.panels.server, "get_clients", lambda: {client.client_id: client})
-    gone = newest(0, 1)[0]
-    table.press_row(gone)
+    deleted = newest(0, 1)[0]
+    table.press_row(deleted)
     table.ask(NoteSelected())
-    library.delete([gone])
+    library.delete([deleted])
     table.panels.ask(AnswerDialog())
     until(lambda: "not in the library any more" in " ".join(client.notices), "the reason")
 
 
-def test_a_table_that_has_not_changed_is_not_sent_again(table: Table, library: Library) -> None:
+def test_an_unchanged_table_is_not_sent_again(table: Table, library: Library) -> None:
     table.press_row(newest(0, 1)[0])
     library.refresh()
-    before = told_so_far(table.panels.server)
+    before = messages_sent(table.panels.server)
     table.draw()
-    assert told_so_far(table.panels.server) == before
+    assert messages_sent(table.panels.server) == before
     shown = [html.content for html in table.panels.htmls()]
     table.press_row(newest(1, 2)[0])
     now = [html.content for html in table.panels.htmls()]
     (marks,) = (new for old, new in zip(shown, now, strict=True) if new != old)
-    assert marks.startswith("<style"), "which are selected, and not the table"
+    assert marks.startswith("<style"), "only the style of the selection is sent, not the table"

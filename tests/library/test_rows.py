@@ -67,7 +67,7 @@ def test_every_word_must_be_found(words: str, found: str) -> None:
         ("task", "dbcae", "bcade"),
     ],
 )
-def test_rows_without_a_value_come_last_either_way_and_ties_newest_first(
+def test_rows_without_a_value_sort_last_in_both_orders_and_ties_newest_first(
     column: Column, up: str, down: str
 ) -> None:
     assert ids(ordered(ROWS, column, False)) == up
@@ -96,7 +96,7 @@ def test_no_row_is_lost_by_sorting(facts: list[dict[str, Any]], column: Column, 
         cells(one, OpenVersion(one.task, "aa"), NOW)
 
 
-def test_another_version_of_the_source_than_the_open_tasks_is_marked() -> None:
+def test_rows_of_another_source_version_than_the_open_task_are_marked() -> None:
     rows = [
         row("a", source_hash="old0123456789", written=1.0),
         row("b", source_hash="of a bug, and newest", written=3.0),
@@ -104,14 +104,14 @@ def test_another_version_of_the_source_than_the_open_tasks_is_marked() -> None:
         row("d", source_hash="older", written=0.5, task="Pick-v1"),
         row("e"),
     ]
-    said = [cells(one, OpenVersion(rows[0].task, "as it is now"), NOW) for one in rows]
-    assert [one["other_version"] for one in said] == [True, True, False, False, False]
-    assert [one["version"] for one in said] == ["old0123", "of a bu", "as it i", "older", ""]
+    shown = [cells(one, OpenVersion(rows[0].task, "as it is now"), NOW) for one in rows]
+    assert [one["other_version"] for one in shown] == [True, True, False, False, False]
+    assert [one["version"] for one in shown] == ["old0123", "of a bu", "as it i", "older", ""]
     assert not any(cells(one, None, NOW)["other_version"] for one in rows)
 
 
 @pytest.mark.parametrize(
-    ("facts", "said"),
+    ("facts", "outcome"),
     [
         ({"length": 12}, "no"),
         ({"length": 50, "max_episode_steps": 50}, "no"),
@@ -120,11 +120,11 @@ def test_another_version_of_the_source_than_the_open_tasks_is_marked() -> None:
         ({"length": 12, "max_episode_steps": 50, "success_once": True}, "once"),
     ],
 )
-def test_an_episode_that_was_cut_off_is_not_said_to_have_failed(facts: dict[str, Any], said: str) -> None:
-    assert cells(row("a", success=False, **facts), None, NOW)["outcome"] == said
+def test_an_episode_that_was_stopped_is_not_shown_as_failed(facts: dict[str, Any], outcome: str) -> None:
+    assert cells(row("a", success=False, **facts), None, NOW)["outcome"] == outcome
 
 
-def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted() -> None:
+def test_a_nan_return_is_shown_and_sorts_last_in_both_orders() -> None:
     kept = clean_facts(row("n", total_reward=float("nan")))
     lost = row("n", total_reward=kept.total_reward)
     assert kept == clean_facts(replace(kept, total_reward=float("nan")))

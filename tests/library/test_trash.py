@@ -1,4 +1,4 @@
-"""Deleting moves all files of a recording or none, whatever call fails, and taking it back does too."""
+"""Deleting and restoring move all files of a recording or none, whatever call fails."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from workbench.library.trash import (
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """All that lies below `folder`, folders left out."""
+    """The content of all files below `folder`, by path."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -29,7 +29,7 @@ def outside(folder: Path) -> dict[str, bytes]:
 
 
 def recording(folder: Path, name: str, suffixes: tuple[str, ...] = (".json", ".h5", ".rrd")) -> list[Path]:
-    """Its files, the one that makes it first; each holds its own name."""
+    """Write the files of a recording, main file first; each contains its own name."""
     paths = [folder / f"{name}{suffix}" for suffix in suffixes]
     for path in paths:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,7 +37,7 @@ def recording(folder: Path, name: str, suffixes: tuple[str, ...] = (".json", ".h
     return paths
 
 
-def test_what_lies_in_the_trash_is_counted_by_deletion_file_and_byte(tmp_path: Path) -> None:
+def test_the_trash_is_counted_in_deletions_files_and_bytes(tmp_path: Path) -> None:
     assert read_trash(tmp_path) == Trash()
     recordings = [recording(tmp_path, name) for name in ("a", "sub/b")]
     size = sum(len(content) for content in files(tmp_path).values())
@@ -47,7 +47,7 @@ def test_what_lies_in_the_trash_is_counted_by_deletion_file_and_byte(tmp_path: P
     (tmp_path / TRASH / "no deletion").write_text("?")
     (tmp_path / TRASH / "link").symlink_to(tmp_path)
     assert read_trash(tmp_path) == Trash((first, second), files=6, size=size)
-    assert move_to_trash(tmp_path, recordings) is None, "nothing is there any more"
+    assert move_to_trash(tmp_path, recordings) is None, "the files are already moved"
     assert read_trash(tmp_path).batches == (first, second)
     assert restore_from_trash(tmp_path, second) == ("sub/b.h5", "sub/b.rrd", "sub/b.json")
     assert read_trash(tmp_path).batches == (first,)
@@ -57,7 +57,7 @@ def test_what_lies_in_the_trash_is_counted_by_deletion_file_and_byte(tmp_path: P
         restore_from_trash(tmp_path, "link")
 
 
-def test_links_are_moved_as_links_and_what_is_back_already_is_not_written_over(tmp_path: Path) -> None:
+def test_links_are_moved_as_links_and_restoring_overwrites_nothing(tmp_path: Path) -> None:
     paths = recording(tmp_path, "a")
     paths[2].unlink()
     paths[2].symlink_to(tmp_path / "gone")
@@ -72,7 +72,7 @@ def test_links_are_moved_as_links_and_what_is_back_already_is_not_written_over(t
     assert paths[2].is_symlink() and outside(tmp_path) == {"a.json": b"a.json", "a.h5": b"a.h5"}
 
 
-def test_a_trash_that_leads_elsewhere_is_left_alone(tmp_path: Path) -> None:
+def test_a_trash_that_is_a_link_to_another_folder_is_not_touched(tmp_path: Path) -> None:
     folder, elsewhere = tmp_path / "folder", tmp_path / "elsewhere"
     paths = recording(folder, "a")
     recording(elsewhere / "batch", "b")
@@ -87,8 +87,8 @@ def test_a_trash_that_leads_elsewhere_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("then", [0, errno.EROFS])
-def test_whatever_call_fails_no_recording_is_in_two_places_half(tmp_path: Path, then: int) -> None:
-    """What could not even be moved back is where the error says."""
+def test_whatever_call_fails_no_recording_is_split_over_two_places(tmp_path: Path, then: int) -> None:
+    """If moving back fails too, the error names where the files are."""
 
     def two(folder: Path) -> list[list[Path]]:
         return [recording(folder, "sub/a"), recording(folder, "b", (".json", ".h5", ".rrd", ".notes"))]
@@ -101,24 +101,27 @@ def test_whatever_call_fails_no_recording_is_in_two_places_half(tmp_path: Path, 
     for at, call in enumerate(calls, 1):
         folder = tmp_path / str(at)
         both = two(folder)
-        told = ""
+        problem = ""
         with refused(at, then=then):
             try:
                 move_to_trash(folder, both)
             except TrashError as error:
-                told = str(error)
-        there = outside(folder)
-        assert told or there == {}, call
+                problem = str(error)
+        left = outside(folder)
+        assert problem or left == {}, call
         for paths in both:
             moved = [path for path in paths if not path.exists()]
             if len(moved) not in (0, len(paths)):
-                assert then and all(f"{path} is {folder / TRASH}" in told for path in moved), (call, told)
+                assert then and all(f"{path} is {folder / TRASH}" in problem for path in moved), (
+                    call,
+                    problem,
+                )
         for batch in read_trash(folder).batches:
             restore_from_trash(folder, batch)
         assert outside(folder) == before, call
 
 
-def test_what_comes_from_elsewhere_is_no_deletion(tmp_path: Path) -> None:
+def test_foreign_content_of_the_trash_is_no_deletion(tmp_path: Path) -> None:
     outer = tmp_path / "outer"
     paths = recording(tmp_path / "folder", "a")
     recording(outer, "b")

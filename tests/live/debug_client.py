@@ -1,4 +1,4 @@
-"""A debugger, as an editor has one: the Debug Adapter Protocol over a socket."""
+"""A debugger client like an editor's: the Debug Adapter Protocol over a socket."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-PATIENCE = 30.0
+TIMEOUT_SECONDS = 30.0
 
 
 class DebugClient:
-    """Attaches to a worker that listens on this machine."""
+    """Attaches to a worker that listens on localhost."""
 
     def __init__(self, port: int) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
+        self._socket = socket.create_connection(("127.0.0.1", port), timeout=TIMEOUT_SECONDS)
         self._file = self._socket.makefile("rb")
         self._number = 0
         self._events: list[dict[str, Any]] = []
@@ -25,29 +25,29 @@ class DebugClient:
         self._attach = attach
 
     def begin(self) -> None:
-        """The breakpoints are set: go on."""
+        """Report that all breakpoints are set, so that the worker continues."""
         self.ask("configurationDone")
         self._response(self._attach)
 
     def stop_at(self, file: Path, *lines: int) -> list[bool]:
-        """Set the breakpoints of a file; whether each was taken."""
+        """Set the breakpoints of a file; return whether each was accepted."""
         set_ = self.ask(
             "setBreakpoints", source={"path": str(file)}, breakpoints=[{"line": line} for line in lines]
         )
         return [each["verified"] for each in set_["breakpoints"]]
 
     def stopped_at(self) -> tuple[int, str, int]:
-        """Wait until the worker stops; the thread, and file and line of its innermost frame."""
+        """Wait until the worker stops; return the thread, and file and line of its innermost frame."""
         thread = self.event("stopped")["threadId"]
         frame = self.ask("stackTrace", threadId=thread, levels=1)["stackFrames"][0]
         return thread, frame["source"]["path"], frame["line"]
 
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """Ask, and wait for the answer."""
+        """Send a request and wait for its response."""
         return self._response(self._send(command, **arguments))
 
     def event(self, name: str) -> dict[str, Any]:
-        """The next event of this kind that was not taken yet."""
+        """The next event of this kind that was not returned yet."""
         while True:
             for event in self._events:
                 if event["event"] == name:
@@ -61,13 +61,13 @@ class DebugClient:
 
     def _send(self, command: str, **arguments: Any) -> int:
         self._number += 1
-        said = {"seq": self._number, "type": "request", "command": command, "arguments": arguments}
-        body = json.dumps(said).encode()
+        message = {"seq": self._number, "type": "request", "command": command, "arguments": arguments}
+        body = json.dumps(message).encode()
         self._socket.sendall(b"Content-Length: %d\r\n\r\n%s" % (len(body), body))
         return self._number
 
     def _response(self, number: int) -> dict[str, Any]:
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT_SECONDS
         while time.monotonic() < deadline:
             message = self._read()
             if message["type"] == "response" and message["request_seq"] == number:

@@ -1,4 +1,4 @@
-"""A task that does, in the hook that one names, whatever can be done to a process."""
+"""A task that harms its process in a chosen way, in a chosen hook."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def hazard(place):
 
 
 """
-# As literals: code that imports pickle may reach anything, and a change to it is never patched in.
+# Literals: code that imports pickle can reach anything, so a change to it is never applied as a patch.
 _NOTHING: Any = np.zeros(0)
 _MISFIT = Stepped(StepResult(_NOTHING, _NOTHING, _NOTHING, _NOTHING, {}, _NOTHING), _NOTHING)
 for _place, _message in (("@WRONG@", pack(("dict", None, {}))), ("@MISFIT@", pack_message(_MISFIT))):
@@ -147,13 +147,13 @@ def line_of(file: Path, code: str) -> int:
 
 
 def write_task(folder: Path) -> Path:
-    """``tasks/minimal.py`` with a hazard in each hook; all is well until `provoke`."""
+    """``tasks/minimal.py`` with a hazard in each hook; none acts until `provoke`."""
     file = Path(shutil.copy(TASKS / "minimal.py", folder / "risky.py"))
     text = file.read_text()
     for place, line in _HOOKS.items():
         assert text.count(line) == 1
         text = text.replace(line, f'        hazard("{place}")\n{line}')
-    # What the scene is built of: an `edit` of it cannot be put on the envs that are there.
+    # Part of the scene: an `edit` of it rebuilds the envs.
     text = text.replace('        hazard("build")\n', '        hazard("build")\n        assert VERSION >= 0\n')
     reward = "\n    def compute_sparse_reward(self, obs, action, info):\n"
     reward += '        hazard("reward")\n        return super().compute_sparse_reward(obs, action, info)\n'
@@ -165,27 +165,27 @@ def write_task(folder: Path) -> Path:
 
 
 def provocation(file: Path) -> Path:
-    """What makes it happen, as long as it is there."""
+    """The file whose existence triggers the hazard."""
     return file.with_name("hazard")
 
 
 def provoke(file: Path, place: str, what: str) -> None:
-    """From now on `what` happens in the hook `place`."""
+    """Make the hazard `what` happen in the hook `place` from now on."""
     provocation(file).write_text(f"{place} {what}")
 
 
 def calm(file: Path) -> None:
-    """All is well again."""
+    """Stop the hazard."""
     provocation(file).unlink(missing_ok=True)
 
 
 def provoked(file: Path) -> bool:
-    """Whether it has happened, or goes on."""
+    """Whether the hazard has started."""
     return file.with_name("provoked").exists()
 
 
 def edit(file: Path) -> None:
-    """Save a new version that does the same, for which all envs are built anew."""
+    """Save a new version with the same behaviour that rebuilds all envs."""
     text = file.read_text()
     number = int(re.findall(r"^VERSION = (\d+)$", text, flags=re.MULTILINE)[0])
     file.write_text(text.replace(f"\nVERSION = {number}\n", f"\nVERSION = {number + 1}\n"))

@@ -1,4 +1,4 @@
-"""A policy that solves PickCube-v1: for ``obs_mode="state"`` and ``control_mode="pd_ee_delta_pos"``, a unit is 0.1 m."""
+"""A policy that solves PickCube-v1 with ``obs_mode="state"`` and ``control_mode="pd_ee_delta_pos"`` (1 is 0.1 m)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A task whose ``evaluate`` returns all that ManiSkill passes on, and what changes its type from step to step."""
+"""A task whose ``evaluate`` returns every type that ManiSkill passes on, and types that change between steps."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class OddEntriesEnv(PushCubeEnv):
 
 
 def write_task(folder: Path) -> Path:
-    """The task as a file in `folder`."""
+    """Write the task as a file in `folder`."""
     file = folder / "odd_entries.py"
     file.write_text(TEXT)
     return file

@@ -1,4 +1,4 @@
-"""Episodes recorded in memory from envs that run in this process, as a recording would hold them."""
+"""Episodes recorded in memory from envs in this process, with the contents of a recording."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ States = dict[str, np.ndarray]
 
 
 def opened(task: str, num_envs: int = 3, **kwargs: object) -> OpenedTask:
-    """Without a renderer: nothing here looks at pictures."""
+    """Open the task without a renderer: no test here needs pictures."""
     return open_task(task, TaskOptions(num_envs, "cpu", 0, {"render_backend": "none", **kwargs}))
 
 
 @dataclass
 class Recorded:
-    """What every env of a batch lived through: T steps and T + 1 states."""
+    """The trajectory of every env of a batch: T steps and T + 1 states."""
 
     steps: list[StepResult]
     states: list[States]
@@ -44,7 +44,7 @@ class Recorded:
 
 
 def _entry(step: StepResult, name: str, env: int) -> np.ndarray:
-    """NaN where a state lacks it: the terms of a reward in the first."""
+    """The entry's value, NaN where a state lacks it: reward terms in the first state."""
     return np.asarray(step.evaluate[name][env]) if name in step.evaluate else np.array(np.nan)
 
 
@@ -54,7 +54,7 @@ def record(
     seeds: list[int] | None = None,
     act: Callable[[int], np.ndarray] | None = None,
 ) -> Recorded:
-    """Reset every env by itself with its seed (or all at once with 0, 1 ... if None), and make steps."""
+    """Reset each env with its seed (all at once with 0, 1 ... if None), then step."""
     env, rng = task.env, np.random.default_rng(0)
     if seeds is None:
         first = env.reset(0)
@@ -70,7 +70,7 @@ def record(
 
 
 def reaching(steps: int, num_envs: int) -> Callable[[int], np.ndarray]:
-    """Actions of a Panda's joints that press its hand down to the table, and then wander: contacts on the way."""
+    """Joint actions that press a Panda's hand onto the table and then move randomly, to make contacts."""
     rng = np.random.default_rng(1)
     down = np.array([0.0, 1.0, 0.0, 0.2, 0.0, 0.6, 0.0, -1.0], np.float32)
     noise = rng.uniform(-0.3, 0.3, (steps, num_envs, 8)).astype(np.float32)

@@ -1,6 +1,6 @@
-"""A worker process that has no task, so that it begins in half a second: what a test asks of it, it does to its server.
+"""A worker process without a task, which starts in half a second and does what a test asks of it.
 
-All else is the real thing: how it begins, its keeper, its pulse, its signals and its line. Started as `worker_start` is.
+Everything else is real: start-up, keeper, heartbeat, signals and connection. Started like `worker_start`.
 """
 
 from __future__ import annotations
@@ -69,24 +69,24 @@ class SmallWorker:
         self.line.send_bytes(pack_message(Loading(text)))
 
     def loaded(self, _: str) -> None:
-        # Here: it takes more than a second, and nearly no worker needs it.
+        # Imported here: it takes more than a second, and few workers need it.
         from tests.drive.scenes import description, step_of, table_scene
 
         geometry, poses = table_scene(1)
         self.line.send_bytes(pack_message(Loaded(description(geometry, ()), step_of(poses), {})))
 
     def work(self, seconds: str) -> None:
-        """Python that lasts so long, and that an interrupt leaves."""
+        """Python code that takes this long and that an interrupt stops."""
         self.heartbeat.begin("stepping")
         self._pass_time(float(seconds))
 
     def work_on(self, seconds: str) -> None:
-        """Python that no interrupt leaves."""
+        """Python code that no interrupt stops."""
         signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)
         self.work(seconds)
 
     def without_handlers(self, seconds: str) -> None:
-        """As at the end of the interpreter, which takes them down."""
+        """Run without signal handlers, as at interpreter shutdown."""
         faulthandler.unregister(STACK_SIGNAL)
         self.work(seconds)
 
@@ -101,13 +101,13 @@ class SmallWorker:
         self._pass_time(float(seconds))
 
     def last_steps(self, count: str) -> None:
-        """All at once, and then the kernel ends it."""
+        """Send all steps at once; then the kernel kills the process."""
         for number in range(int(count)):
             self.line.send_bytes(pack_message(Loading(f"step {number}")))
         os.kill(os.getpid(), signal.SIGKILL)
 
     def chatter(self, _: str) -> None:
-        """As fast as it can, in messages of which the end often comes apart."""
+        """Send as fast as possible, in messages whose end often arrives separately."""
         number = 0
         while True:
             number += 1

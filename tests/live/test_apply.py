@@ -1,4 +1,4 @@
-"""Whatever happens in whatever order: a state is what its events make it, can be shown, and a refusal changes nothing."""
+"""Any events in any order: the state depends only on its events, can be shown, and a refusal changes nothing."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ COMMANDS = st.one_of(
     st.builds(Seek, step=st.integers(-3, 20), episode_only=st.booleans()),
 ).map(Asked)  # fmt: skip
 DRAW = object()
-"""Pictures are wanted of what is shown."""
+"""Stands for a request for pictures of the shown moment."""
 EVENTS = st.one_of(
     COMMANDS,
     st.builds(loaded, LEVELS, st.sampled_from(["one", "two"])),
@@ -113,7 +113,7 @@ EVENTS = st.one_of(
 
 
 def plain(value: object) -> Any:
-    """What can be compared: all but the stores, of which the history is one."""
+    """The comparable part of a value: everything but stores such as the history."""
     if isinstance(value, np.ndarray):
         return repr(value.tolist())
     if is_dataclass(value) and not isinstance(value, type):
@@ -158,7 +158,7 @@ def after(events: list[Any]) -> tuple[State, list[object]]:
 
 @settings(max_examples=200)
 @given(st.lists(EVENTS, max_size=30))
-def test_the_same_events_give_the_same_state_and_the_same_to_do(events: list[Any]) -> None:
+def test_the_same_events_give_the_same_state_and_effects(events: list[Any]) -> None:
     (state, effects), (again, effects_again) = after(events), after(events)
     assert plain(state) == plain(again)
     assert plain(effects) == plain(effects_again)
@@ -166,7 +166,7 @@ def test_the_same_events_give_the_same_state_and_the_same_to_do(events: list[Any
 
 @settings(max_examples=100)
 @given(st.lists(EVENTS, max_size=30))
-def test_loads_of_the_file_are_numbered_in_the_order_in_which_they_are_asked_for(events: list[Any]) -> None:
+def test_loads_of_the_file_are_numbered_in_request_order(events: list[Any]) -> None:
     loads = [
         one.request for one in after(events)[1] if isinstance(one, Send) and isinstance(one.request, Load)
     ]
@@ -178,7 +178,7 @@ def state_after(*events: Any) -> State:
     return after(list(events))[0]
 
 
-def test_what_takes_long_ends_in_a_pause_or_goes_on_playing() -> None:
+def test_after_long_work_the_session_is_paused_or_plays_on() -> None:
     busy = Status(False, 0.0, 0.0, activity="building the scene")
     for playing, state in ((False, "paused"), (True, "running")):
         assert state_after(loaded(None, "one"), busy).run.state == "loading"
@@ -187,27 +187,27 @@ def test_what_takes_long_ends_in_a_pause_or_goes_on_playing() -> None:
     assert state_after(loaded(None, "one"), stopped, Status(True, 1.0, 1.0)).run.state == "stopped"
 
 
-def test_a_status_from_before_a_press_does_not_undo_the_press() -> None:
+def test_an_outdated_status_does_not_undo_a_press() -> None:
     playing = loaded(None, "one"), Asked(PlayRun()), Status(True, 1.0, 1.0, handled=1)
     pressed = *playing, Asked(PauseRun()), Status(True, 1.0, 1.0, handled=1)
     assert state_after(*playing).run.playing and not state_after(*pressed).run.playing
-    # From then on the worker may begin by itself, as when a policy's file was mended.
+    # Later the worker may start playing itself, for example when a policy's file was fixed.
     assert state_after(*pressed, Status(True, 1.0, 1.0, handled=2)).run.playing
 
 
-def test_before_the_first_env_comes_the_last_and_after_the_last_the_first() -> None:
+def test_previous_and_next_env_wrap_around() -> None:
     there = loaded(None, "one")
     assert state_after(there, Asked(PreviousEnv())).run.env == ENVS - 1
     assert state_after(there, Asked(PreviousEnv()), Asked(NextEnv())).run.env == 0
 
 
-def test_a_file_that_was_saved_stays_unloaded_although_the_version_before_fails_meanwhile() -> None:
+def test_a_saved_file_stays_stale_when_the_running_version_fails_meanwhile() -> None:
     fails = TaskFailed(PROBLEM, kept=True, at_run=True)
     assert not state_after(loaded(None, "one"), fails).run.stale
     assert state_after(loaded(None, "one"), FileSaved(), fails).run.stale
 
 
-def test_a_reading_comes_at_once_and_the_next_after_a_while() -> None:
+def test_the_first_reading_is_immediate_and_the_next_is_delayed() -> None:
     state = state_after(loaded(None, "one"), PagesCounted(1), stepped(0, (0, 1, 2)))
     state, (soon,) = apply(state, ReadingChosen(("joints",)), Now(100.0, 0.0))
     assert soon == Later(0.0, ReadingDue())

@@ -19,7 +19,7 @@ from workbench.live.commands import ReloadFile
 
 
 def edited(text: str, hook: str, line: str) -> tuple[str, int]:
-    """`text` with `line` put first into the body of method `hook`; and the number of that line."""
+    """`text` with `line` inserted at the start of method `hook`; and the number of that line."""
     lines = text.splitlines()
     start = next(i for i, code in enumerate(lines) if code.strip().startswith(f"def {hook}("))
     body = start
@@ -77,7 +77,7 @@ BROKEN = [
 @pytest.mark.parametrize(
     ("hook", "line", "stage", "says"), BROKEN, ids=[f"{b[0]}-{b[1][:12]}" for b in BROKEN]
 )
-def test_a_hook_that_is_wrong_is_shown_with_its_line_and_the_last_good_version_runs_on(
+def test_a_broken_hook_is_shown_with_its_line_and_the_last_good_version_runs_on(
     session: Session, task_file: Path, good: str, hook: str, line: str, stage: str, says: str
 ) -> None:
     before = session.view().task_serial
@@ -109,7 +109,7 @@ def test_a_file_that_does_not_import_is_shown_with_its_line(
     assert line is None or view.problem.line == line
 
 
-def test_a_module_beside_the_task_is_followed_too(session: Session, task_file: Path, good: str) -> None:
+def test_a_module_next_to_the_task_is_followed_too(session: Session, task_file: Path, good: str) -> None:
     beside = task_file.parent / "beside.py"
     beside.write_text("SHIFT = 1\n")
     before = session.view().task_serial
@@ -124,7 +124,7 @@ def test_a_module_beside_the_task_is_followed_too(session: Session, task_file: P
     assert (view.problem.file, view.problem.line) == (str(beside), 1)
 
 
-def test_a_file_that_becomes_a_link_to_itself_ends_no_worker(
+def test_a_file_that_becomes_a_link_to_itself_kills_no_worker(
     session: Session, task_file: Path, good: str
 ) -> None:
     before, worker = session.view(), session.worker_pid
@@ -139,7 +139,7 @@ def test_a_file_that_becomes_a_link_to_itself_ends_no_worker(
     assert view.task.source_hash == before.task.source_hash and session.worker_pid == worker
 
 
-def test_a_worker_that_is_killed_comes_back_with_the_last_good_version(
+def test_a_killed_worker_is_replaced_with_the_last_good_version(
     session: Session, task_file: Path, good: str
 ) -> None:
     before = session.view()
@@ -152,9 +152,7 @@ def test_a_worker_that_is_killed_comes_back_with_the_last_good_version(
     wait_until(session, lambda v: v.problem is None, "the banner's end")
 
 
-def test_a_file_that_is_mended_gets_past_a_worker_that_hangs(
-    session: Session, task_file: Path, good: str
-) -> None:
+def test_a_fixed_file_replaces_a_worker_that_hangs(session: Session, task_file: Path, good: str) -> None:
     before = session.view().task_serial
     text, _ = edited(good, "evaluate", "while True: pass")
     task_file.write_text(text)

@@ -1,4 +1,4 @@
-"""What each thing that a worker says, and each wish of a page, means for what is seen."""
+"""How each event of a worker and each command of a page changes the view."""
 
 # The views are of a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.drive.scenes import problem
-from tests.drive.session import DEATH, Told, ToldWorker, told_session
+from tests.drive.session import DEATH, FakeWorker, FakeWorkerSession, fake_worker_session
 from tests.drive.waiting import until
 from workbench.envs.camera_data import Picture
 from workbench.envs.gpu_rules import Finding
@@ -45,7 +45,7 @@ from workbench.task.description import TaskOptions
 from workbench.task.reference import RecordedTask
 
 EYE = CameraRequest("eye", "sensor")
-GONE_WRONG = Finding("r", "warn", "m", None, None, "", "", 1, 0)
+FINDING = Finding("r", "warn", "m", None, None, "", "", 1, 0)
 
 
 def pictures(env: int, number: int = 0) -> Pictures:
@@ -53,37 +53,37 @@ def pictures(env: int, number: int = 0) -> Pictures:
     return Pictures((Picture("eye", "sensor", env, np.zeros(7, np.float32), rgb),), 12.0, number)
 
 
-def asked_load(told: Told) -> Load:
-    """What the next save asks for."""
-    told.asked(object)
-    told.session.do(ReloadFile())
-    (load,) = told.asked(Load)
+def asked_load(fake: FakeWorkerSession) -> Load:
+    """The load that the next save requests."""
+    fake.asked(object)
+    fake.session.do(ReloadFile())
+    (load,) = fake.asked(Load)
     return load
 
 
-def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on(told: Told) -> None:
-    assert told.view.state == "starting" and told.view.curves is None and told.session.env_rows() is None
-    told.tell(Loading("importing"))
-    assert (told.view.state, told.view.activity) == ("loading", "importing")
-    told.play(3)
-    view = told.view
+def test_moments_are_shown_only_once_a_task_is_loaded(fake: FakeWorkerSession) -> None:
+    assert fake.view.state == "starting" and fake.view.curves is None and fake.session.env_rows() is None
+    fake.tell(Loading("importing"))
+    assert (fake.view.state, fake.view.activity) == ("loading", "importing")
+    fake.play(3)
+    view = fake.view
     assert (view.state, view.activity, view.playing, view.steps_per_second) == ("running", "", True, 20.0)
     assert (view.timeline.last, view.step_serial, view.timeline.moments) == (3, 3, 4)
     assert view.step.elapsed_steps.tolist() == [3, 3, 3] and view.curves.serial == 3
 
 
-def test_the_selected_env_is_one_that_there_is_as_soon_as_it_is_known(told: Told) -> None:
-    told.session.change(selected_env=2**40, speed=2.0)
-    told.load()
-    assert (told.view.selected_env, told.view.settings.speed) == (2, 2.0)
-    told.session.change(selected_env=-5)
-    assert told.view.selected_env == 0
+def test_the_selected_env_is_limited_to_the_envs_that_exist(fake: FakeWorkerSession) -> None:
+    fake.session.change(selected_env=2**40, speed=2.0)
+    fake.load()
+    assert (fake.view.selected_env, fake.view.settings.speed) == (2, 2.0)
+    fake.session.change(selected_env=-5)
+    assert fake.view.selected_env == 0
 
 
-def test_curves_are_of_the_selected_env_and_count_control_steps(played: Told) -> None:
+def test_curves_are_of_the_selected_env_and_count_control_steps(played: FakeWorkerSession) -> None:
     played.reset()
     first = played.view.curves
-    assert played.view.curves is first, "nothing is made for a look"
+    assert played.view.curves is first, "reading the view computes nothing"
     played.step()
     played.session.change(selected_env=1)
     now = played.view.curves
@@ -91,7 +91,9 @@ def test_curves_are_of_the_selected_env_and_count_control_steps(played: Told) ->
 
 
 @pytest.mark.parametrize("level", ["same", "patched", "cameras"])
-def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes(played: Told, level: str) -> None:
+def test_a_version_with_the_same_scene_keeps_the_past_and_the_meshes(
+    played: FakeWorkerSession, level: str
+) -> None:
     played.session.change(selected_env=2)
     before = played.view
     played.load(level, source_hash="b")
@@ -103,7 +105,7 @@ def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes(played
     assert len(played.rescored) == (level == "patched")
 
 
-def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_shown(played: Told) -> None:
+def test_a_new_scene_starts_a_new_past_and_shows_nothing_of_the_old_one(played: FakeWorkerSession) -> None:
     session = played.session
     session.change(selected_env=2, cameras=(EYE,))
     played.load("patched", source_hash="b")
@@ -114,7 +116,7 @@ def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_show
     session.happen(MomentShown(1))
     session.happen(MomentShown(None))
     told = np.ones((3, 2), np.float32)
-    played.tell(pictures(2), SliderAction(told), Inspection(2, 3), RulesBroken((GONE_WRONG,)))
+    played.tell(pictures(2), SliderAction(told), Inspection(2, 3), RulesBroken((FINDING,)))
     played.tell(CameraFailed(EYE.key, "no shader"))
     before = played.view
     assert (
@@ -135,15 +137,15 @@ def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_show
     assert (after.timeline.first, after.timeline.moments) == (4, 1) and after.curves.serial == 0
 
 
-def test_what_was_odd_while_playing_goes_with_the_version_and_comes_back_if_that_is_odd_too(
-    played: Told,
+def test_findings_while_playing_disappear_with_their_version_unless_the_next_has_them_too(
+    played: FakeWorkerSession,
 ) -> None:
     odd = (1.0, np.nan, 1.0)
     played.step(reward=odd)
     (found,) = played.view.odd
     assert (found.rule, found.count, found.first_step) == ("reward-finite", 1, 3)
-    played.tell(RulesBroken((GONE_WRONG,)))
-    assert played.view.played == (GONE_WRONG, found)
+    played.tell(RulesBroken((FINDING,)))
+    assert played.view.played == (FINDING, found)
     played.load("same")
     assert played.view.odd == (found,)
     played.load("patched", source_hash="b")
@@ -157,7 +159,9 @@ def test_what_was_odd_while_playing_goes_with_the_version_and_comes_back_if_that
 # --- failures --------------------------------------------------------------------------------------------
 
 
-def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it(played: Told) -> None:
+def test_the_last_good_version_is_restored_with_its_past_and_the_cause_of_death(
+    played: FakeWorkerSession,
+) -> None:
     played.session.do(PlayRun())
     played.die()
     view = played.view
@@ -168,28 +172,28 @@ def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it(
     played.reset()
     after = played.view
     assert after.timeline.moments == 5 and after.stale and after.state == "paused"
-    assert after.problem == view.problem, "the reset that a new scene begins with mends nothing"
+    assert after.problem == view.problem, "the first reset of a new scene does not clear the problem"
     played.step()
     assert played.view.problem is None
     played.load(source_hash="b")
     assert played.view.timeline.moments == 0
 
 
-def test_what_failed_while_running_stands_until_a_step_follows_and_each_time_anew(played: Told) -> None:
+def test_each_failure_while_running_is_shown_until_the_next_step(played: FakeWorkerSession) -> None:
     for _ in range(2):
         before = played.view
         played.tell(Status(True, 20.0, 1.0), TaskFailed(problem(), kept=True, at_run=True))
         view = played.view
         assert (view.state, view.playing, view.stale, view.refused) == ("paused", False, False, None)
         assert view.problem_at_run and view.problem_serial > before.problem_serial
-        assert len(view.loads) == 1, "it is no load"
+        assert len(view.loads) == 1, "a failure is not a load"
         played.step()
         assert played.view.problem is None and not played.view.problem_at_run
 
 
 @pytest.mark.parametrize("paused", [False, True])
-def test_a_mended_policy_plays_on_although_the_task_was_loaded_anew_before_its_file_is_read(
-    played: Told, tmp_path: Path, paused: bool
+def test_a_fixed_policy_plays_on_even_if_the_task_is_reloaded_before_the_policy_is_read(
+    played: FakeWorkerSession, tmp_path: Path, paused: bool
 ) -> None:
     # Both the task's watcher and the policy's notice the save, in either order.
     policy = tmp_path / "policy.py"
@@ -208,8 +212,8 @@ def test_a_mended_policy_plays_on_although_the_task_was_loaded_anew_before_its_f
     assert asked == [ReadPolicyAgain(play=not paused)]
 
 
-def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before_runs_on(
-    played: Told,
+def test_a_failed_load_shows_its_problem_while_the_last_version_runs_on(
+    played: FakeWorkerSession,
 ) -> None:
     played.tell(Loading("importing"), TaskFailed(problem(), kept=True))
     played.step()
@@ -219,23 +223,23 @@ def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before
     assert not played.view.stale and played.view.problem is None and played.view.refused is None
 
 
-def test_a_worker_that_could_load_nothing_waits_with_the_problem_and_one_too_many_stops_it(
-    told: Told,
+def test_a_worker_with_nothing_to_load_keeps_the_problem_and_too_many_deaths_stop_it(
+    fake: FakeWorkerSession,
 ) -> None:
-    told.session.do(PlayRun())
-    told.greet()
-    told.die()
-    (settings,) = told.greet()
-    assert isinstance(settings, Settings) and told.view.state == "error", (
-        "nothing to load, and it does not play"
+    fake.session.do(PlayRun())
+    fake.greet()
+    fake.die()
+    (settings,) = fake.greet()
+    assert isinstance(settings, Settings) and fake.view.state == "error", (
+        "there is nothing to load, and it does not play"
     )
-    told.die(replace(DEATH, end=End.ASKED))
-    assert told.view.problem is not None
-    told.die(replace(DEATH, gives_up=True))
-    assert told.view.state == "stopped" and told.view.activity == ""
+    fake.die(replace(DEATH, end=End.ASKED))
+    assert fake.view.problem is not None
+    fake.die(replace(DEATH, gives_up=True))
+    assert fake.view.state == "stopped" and fake.view.activity == ""
 
 
-def test_every_load_is_remembered_also_one_that_was_refused(played: Told) -> None:
+def test_every_load_is_listed_including_refused_ones(played: FakeWorkerSession) -> None:
     for number in range(30):
         played.tell(Loading("importing"), TaskFailed(problem(f"NameError: {number}"), kept=True))
     loads = played.view.loads
@@ -244,7 +248,7 @@ def test_every_load_is_remembered_also_one_that_was_refused(played: Told) -> Non
     assert [load.level for load in played.view.loads[:2]] == ["patched", None]
 
 
-def test_a_camera_that_cannot_be_drawn_is_not_asked_for_until_it_is_ticked_again(played: Told) -> None:
+def test_a_failed_camera_is_not_requested_until_it_is_ticked_again(played: FakeWorkerSession) -> None:
     other = CameraRequest("hand", "sensor")
     played.session.happen(PagesCounted(1))
     played.session.change(cameras=(EYE, other))
@@ -259,14 +263,14 @@ def test_a_camera_that_cannot_be_drawn_is_not_asked_for_until_it_is_ticked_again
         (settings,) = played.asked(Settings)
         assert settings.cameras == sent and not played.view.failed_cameras
     played.die(replace(DEATH, doing="drawing"))
-    assert played.view.failed_cameras.keys() == {EYE.key, other.key}, "the next worker would die of it too"
+    assert played.view.failed_cameras.keys() == {EYE.key, other.key}, "a new worker would crash on it too"
 
 
-# --- what is chosen ----------------------------------------------------------------------------------------
+# --- selections ----------------------------------------------------------------------------------------
 
 
-def test_pictures_are_those_of_the_env_that_is_looked_at_and_of_the_moment_that_is_shown(
-    played: Told,
+def test_pictures_are_of_the_selected_env_and_the_shown_moment(
+    played: FakeWorkerSession,
 ) -> None:
     played.session.change(cameras=(EYE,))
     played.tell(pictures(0, number=3))
@@ -286,10 +290,12 @@ def test_pictures_are_those_of_the_env_that_is_looked_at_and_of_the_moment_that_
     played.session.happen(PagesCounted(1))
     played.session.happen(PagesCounted(2))
     played.session.happen(PagesCounted(0))
-    assert [settings.cameras for settings in played.asked(Settings)] == [(EYE,), ()], "for no page none"
+    assert [settings.cameras for settings in played.asked(Settings)] == [(EYE,), ()], (
+        "no pictures without a page"
+    )
 
 
-def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_for(tmp_path: Path) -> None:
+def test_the_version_that_ran_is_restored_even_if_another_class_was_requested(tmp_path: Path) -> None:
     file = str(tmp_path / "push.py")
     found = {
         "file": file,
@@ -298,98 +304,98 @@ def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_fo
         "chosen": "One",
         "others": ("Two",),
     }
-    with told_session(tmp_path, file) as told:
-        told.load(**found)
+    with fake_worker_session(tmp_path, file) as fake:
+        fake.load(**found)
         with pytest.raises(Refused):
-            told.session.do(ChooseClass(name="Nobody"))
-        assert told.asked(Load) == [] and told.view.choices == ("One", "Two")
-        told.session.do(SetSeed(seed=7))
-        told.session.do(ChooseClass(name="Two"))
-        (load,) = told.asked(Load)
-        assert load.task == f"{file}:Two" and load.options.seed == 7 and told.view.choices == ("Two", "One")
-        again = told.session.look(Run.running_load)
+            fake.session.do(ChooseClass(name="Nobody"))
+        assert fake.asked(Load) == [] and fake.view.choices == ("One", "Two")
+        fake.session.do(SetSeed(seed=7))
+        fake.session.do(ChooseClass(name="Two"))
+        (load,) = fake.asked(Load)
+        assert load.task == f"{file}:Two" and load.options.seed == 7 and fake.view.choices == ("Two", "One")
+        again = fake.session.look(Run.running_load)
         assert again is not None and (again.task, again.source) == (f"{file}:One", {file: "text"})
-        told.tell(Loading("", load.number))
-        told.die()
-        told.greet()
-        told.load(**found)
-        assert told.view.choices == ("Two", "One"), "it is still what saves bring in"
-        assert asked_load(told).task == f"{file}:Two"
-        told.load("rebuilt", **found, in_place_of="Two")
-        assert asked_load(told).task == f"{file}:One"
+        fake.tell(Loading("", load.number))
+        fake.die()
+        fake.greet()
+        fake.load(**found)
+        assert fake.view.choices == ("Two", "One"), "saves still load the requested class"
+        assert asked_load(fake).task == f"{file}:Two"
+        fake.load("rebuilt", **found, in_place_of="Two")
+        assert asked_load(fake).task == f"{file}:One"
 
 
-def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved(tmp_path: Path) -> None:
+def test_a_file_named_by_a_recording_is_the_agreed_version_until_it_is_saved(tmp_path: Path) -> None:
     file = tmp_path / "push.py"
     file.write_text("text")
     agreed = RecordedTask("Push-v1", str(file), "Push", {str(file): "text"})
-    with told_session(tmp_path, agreed) as told:
-        assert asked_load(told).task is agreed
+    with fake_worker_session(tmp_path, agreed) as fake:
+        assert asked_load(fake).task is agreed
         file.write_text("other")
-        (load,) = until(lambda: told.asked(Load), "the load of what was saved")
-        assert load.task == f"{file}:Push" and told.view.stale
+        (load,) = until(lambda: fake.asked(Load), "the load of what was saved")
+        assert load.task == f"{file}:Push" and fake.view.stale
 
 
-def test_of_two_who_choose_at_once_the_last_message_has_what_both_chose(tmp_path: Path) -> None:
+def test_after_two_concurrent_choices_the_last_message_contains_both(tmp_path: Path) -> None:
     sent: list[Settings] = []
-    other = threading.Thread(target=lambda: told.session.change(episode_end="continue"))
+    other = threading.Thread(target=lambda: fake.session.change(episode_end="continue"))
 
-    class Overtaken(ToldWorker):
+    class Overtaken(FakeWorker):
         def send(self, request: Request) -> None:
             if isinstance(request, Settings):
                 if request.speed == 2.0 and not other.ident:
                     other.start()
-                    other.join(timeout=0.3)  # as long as the other may take to come in between
+                    other.join(timeout=0.3)  # time for the other to overtake
                 sent.append(request)
 
-    with told_session(tmp_path, worker=Overtaken) as told:
-        told.session.change(speed=2.0)
+    with fake_worker_session(tmp_path, worker=Overtaken) as fake:
+        fake.session.change(speed=2.0)
         other.join()
         assert (sent[-1].speed, sent[-1].episode_end) == (2.0, "continue")
 
 
-def test_files_of_the_task_are_known_and_no_others(tmp_path: Path) -> None:
+def test_only_files_of_the_task_are_known(tmp_path: Path) -> None:
     task, beside, outside = (tmp_path / name for name in ("lab/push.py", "lab/helper.py", "secret.py"))
     task.parent.mkdir()
     for file in (task, beside, outside):
         file.write_text("")
-    with told_session(tmp_path, str(task)) as told:
-        knows = told.session.knows_file
+    with fake_worker_session(tmp_path, str(task)) as fake:
+        knows = fake.session.knows_file
         assert knows(str(task)) and knows(str(beside)) and not knows(str(outside))
         assert not knows(str(task.parent / ".." / "secret.py")) and not knows("/etc/passwd")
         assert not knows(str(task.parent / "gone.py"))
-        told.session.change(action_source="policy", policy=f"{outside}:act")
+        fake.session.change(action_source="policy", policy=f"{outside}:act")
         assert knows(str(outside)), "its policy"
 
 
 # --- readings of an env ----------------------------------------------------------------------------------
 
 
-def test_what_is_looked_at_is_read_once_for_each_step_and_again_when_the_answer_has_come(told: Told) -> None:
-    told.play(2)
-    told.session.happen(ReadingChosen(("joints",)))
-    told.step()
-    assert told.asked(Inspect) == [], "no page is open"
-    told.session.happen(PagesCounted(1))
-    (asked,) = until(lambda: told.asked(Inspect), "a reading")
+def test_a_reading_is_requested_once_per_step_and_again_after_its_answer(fake: FakeWorkerSession) -> None:
+    fake.play(2)
+    fake.session.happen(ReadingChosen(("joints",)))
+    fake.step()
+    assert fake.asked(Inspect) == [], "no page is open"
+    fake.session.happen(PagesCounted(1))
+    (asked,) = until(lambda: fake.asked(Inspect), "a reading")
     assert (asked.env, asked.sections) == (0, ("joints",))
-    told.step(5)
+    fake.step(5)
     time.sleep(2 * READ_PERIOD_SECONDS)
-    assert told.asked(Inspect) == [], "a busy worker gets no queue of questions"
-    told.tell(Inspection(0, 3))
-    assert len(until(lambda: told.asked(Inspect), "the reading of the newest step")) == 1
-    told.tell(Inspection(0, 8))
+    assert fake.asked(Inspect) == [], "questions do not queue up at a busy worker"
+    fake.tell(Inspection(0, 3))
+    assert len(until(lambda: fake.asked(Inspect), "the reading of the newest step")) == 1
+    fake.tell(Inspection(0, 8))
     time.sleep(2 * READ_PERIOD_SECONDS)
-    assert told.asked(Inspect) == [], "nothing is new"
-    told.session.change(selected_env=1)
-    (asked,) = until(lambda: told.asked(Inspect), "another env")
-    told.load("rebuilt")
-    assert len(until(lambda: told.asked(Inspect), "another scene, although the last was not answered")) == 1
-    told.session.happen(ReadingChosen(()))
-    told.tell(Inspection(1, 0))
-    told.step()
+    assert fake.asked(Inspect) == [], "nothing has changed"
+    fake.session.change(selected_env=1)
+    (asked,) = until(lambda: fake.asked(Inspect), "another env")
+    fake.load("rebuilt")
+    assert len(until(lambda: fake.asked(Inspect), "another scene, although the last was not answered")) == 1
+    fake.session.happen(ReadingChosen(()))
+    fake.tell(Inspection(1, 0))
+    fake.step()
     time.sleep(2 * READ_PERIOD_SECONDS)
-    assert told.asked(Inspect) == []
+    assert fake.asked(Inspect) == []
 
 
 # --- options of the envs -----------------------------------------------------------------------------------
@@ -397,21 +403,23 @@ def test_what_is_looked_at_is_read_once_for_each_step_and_again_when_the_answer_
 FIRST, MORE = TaskOptions(3), TaskOptions(4, env_kwargs={"size": 2})
 
 
-def test_options_are_in_effect_when_a_load_has_taken_them(played: Told) -> None:
+def test_options_take_effect_once_a_load_succeeds_with_them(played: FakeWorkerSession) -> None:
     played.session.happen(OptionsApplied(MORE))
     (load,) = played.asked(Load)
     assert load.options == MORE and played.view.options == FIRST
     again = played.session.look(Run.running_load)
-    assert again is not None and again.options == FIRST, "the version that ran is brought back as it ran"
+    assert again is not None and again.options == FIRST, "the version that ran is restored with its options"
     played.load("same", options=FIRST)
-    assert played.view.options == FIRST and asked_load(played).options == MORE, "it was under way before"
+    assert played.view.options == FIRST and asked_load(played).options == MORE, (
+        "that load was already in progress"
+    )
     played.load("rebuilt", num_envs=4, options=MORE)
     assert played.view.options == MORE and asked_load(played).options == MORE
 
 
 @pytest.mark.parametrize("kills", [False, True])
-def test_options_with_which_the_task_fails_are_dropped_and_the_file_is_not_to_blame(
-    played: Told, kills: bool
+def test_options_that_make_the_task_fail_are_dropped_and_not_blamed_on_the_file(
+    played: FakeWorkerSession, kills: bool
 ) -> None:
     played.session.happen(OptionsApplied(MORE))
     (load,) = played.asked(Load)
@@ -424,12 +432,12 @@ def test_options_with_which_the_task_fails_are_dropped_and_the_file_is_not_to_bl
         assert played.view.state == "running" and not played.view.stale
     assert played.view.problem is not None
     assert (played.view.options, played.view.options_refused) == (FIRST, MORE)
-    assert asked_load(played).options == FIRST, "the next save does not fail for them"
+    assert asked_load(played).options == FIRST, "they do not make the next save fail"
     played.session.happen(OptionsApplied(FIRST))
     assert played.view.options_refused is None
 
 
-def test_a_task_that_never_ran_keeps_the_options_that_a_person_chose_last(told: Told) -> None:
-    told.session.happen(OptionsApplied(MORE))
-    told.tell(TaskFailed(problem(), kept=False, options=MORE))
-    assert told.view.options == MORE and asked_load(told).options == MORE
+def test_a_task_that_never_ran_keeps_the_options_that_were_chosen_last(fake: FakeWorkerSession) -> None:
+    fake.session.happen(OptionsApplied(MORE))
+    fake.tell(TaskFailed(problem(), kept=False, options=MORE))
+    assert fake.view.options == MORE and asked_load(fake).options == MORE

@@ -1,4 +1,4 @@
-"""A task in a package, opened by its module's name: followed like a file, and imported by nobody but the worker."""
+"""A task in a package, opened by module name: followed like a file, and imported only by the worker."""
 
 # pyright: reportOptionalMemberAccess=false
 
@@ -22,7 +22,7 @@ PLAIN = {"render_backend": "none"}
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with a package in it, and files with the names of libraries beside that."""
+    """A folder with a package, and next to it files named like libraries."""
     folder = tmp_path_factory.mktemp("project").resolve()
     package = folder / "lab_with_tasks"
     (package / "tasks").mkdir(parents=True)

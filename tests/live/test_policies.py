@@ -1,4 +1,4 @@
-"""Policies to choose from: when they are listed, that the list follows the folder, and what is kept for the next run."""
+"""The list of policies: when it is read, how it follows the folder, and what is kept for the next run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.session import Told
+from tests.drive.session import FakeWorkerSession
 from tests.drive.waiting import until
 from workbench.live import policies
 from workbench.live.commands import ChooseActions, SetPolicy
@@ -21,7 +21,7 @@ from workbench.task.description import TaskOptions
 ACT = "def act(obs):\n    pass\n"
 
 
-def test_they_are_listed_while_a_page_is_open_and_policies_act() -> None:
+def test_policies_are_listed_while_a_page_is_open_and_policies_act() -> None:
     run = first_run("push.py", TaskOptions(), 1, Settings(action_source="policy"))
     folder = Path.cwd()
     known, effects = apply(KnownPolicies(), FileSaved(), run)
@@ -41,7 +41,7 @@ def test_they_are_listed_while_a_page_is_open_and_policies_act() -> None:
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder in which the command was started; requested before `told`."""
+    """The working directory of the command; must be requested before `fake`."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     monkeypatch.setattr(policies, "LIST_SECONDS", 0.02)
     here = tmp_path / "here"
@@ -50,22 +50,22 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return here
 
 
-def test_the_list_follows_the_folder_and_one_that_acts_is_kept(here: Path, told: Told) -> None:
+def test_the_list_follows_the_folder_and_a_used_policy_is_kept(here: Path, fake: FakeWorkerSession) -> None:
     def listed(*wanted: str) -> None:
-        until(lambda: told.view.known_policies == wanted, f"{wanted}", seen=lambda: told.view.known_policies)
+        until(lambda: fake.view.known_policies == wanted, f"{wanted}", seen=lambda: fake.view.known_policies)
 
     (here / "b.py").write_text(ACT)
-    told.session.happen(PagesCounted(1))
-    told.session.do(ChooseActions(source="policy"))
+    fake.session.happen(PagesCounted(1))
+    fake.session.do(ChooseActions(source="policy"))
     listed("b.py:act")
     (here / "a.py").write_text(ACT)
     listed("a.py:act", "b.py:act")
-    told.session.do(SetPolicy(policy="b.py:act"))
+    fake.session.do(SetPolicy(policy="b.py:act"))
     listed("b.py:act", "a.py:act")
     assert used_policies(here) == ("b.py:act",)
-    told.session.do(SetPolicy(policy="not_there.py:act"))
+    fake.session.do(SetPolicy(policy="not_there.py:act"))
     (here / "c.py").write_text(ACT)
     listed("b.py:act", "a.py:act", "c.py:act")
-    assert used_policies(here) == ("b.py:act",), "one that is not there is not kept"
+    assert used_policies(here) == ("b.py:act",), "a missing policy is not kept"
     (here / "b.py").unlink()
     listed("a.py:act", "c.py:act")

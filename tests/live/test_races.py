@@ -1,4 +1,4 @@
-"""What several do at once in a session, and what fails once: each counts, and costs nothing else."""
+"""Concurrent commands all count, and a single failure affects nothing else."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.session import ToldWorker, told_session
+from tests.drive.session import FakeWorker, fake_worker_session
 from tests.drive.waiting import until
 from workbench.live.commands import PauseRun, ResetAll, Step
 from workbench.live.messages import Play, Request, Reset, Settings, SingleStep
@@ -15,8 +15,8 @@ from workbench.live.timeline_commands import Seek
 from workbench.machine.processes.watched_thread import listen, stop_listening
 
 
-class FailsOnce(ToldWorker):
-    """Cannot take one request of a kind."""
+class FailsOnce(FakeWorker):
+    """Fails on the first request of one kind."""
 
     fails: type[Request] | None = None
 
@@ -27,93 +27,93 @@ class FailsOnce(ToldWorker):
         super().send(request)
 
 
-def test_an_effect_that_fails_once_is_told_and_costs_nothing_else(tmp_path: Path) -> None:
+def test_an_effect_that_fails_once_is_reported_and_affects_nothing_else(tmp_path: Path) -> None:
     said: list[str] = []
     listen(said.append)
     try:
-        with told_session(tmp_path, worker=FailsOnce) as told:
-            worker = told.session._worker
+        with fake_worker_session(tmp_path, worker=FailsOnce) as fake:
+            worker = fake.session._worker
             assert isinstance(worker, FailsOnce)
-            told.play(2)
-            told.asked(object)
+            fake.play(2)
+            fake.asked(object)
             worker.fails = SingleStep
             with pytest.raises(OSError, match="no more memory"):
-                told.session.do(Step())
-            assert not told.view.playing, "it pauses first"
-            told.session.do(Step())
-            assert len(told.asked(SingleStep)) == 1
-            told.session.do(ResetAll())
-            assert len(told.asked(Reset)) == 1
-            # What follows from what a worker says ends neither the worker nor what else follows.
+                fake.session.do(Step())
+            assert not fake.view.playing, "it pauses first"
+            fake.session.do(Step())
+            assert len(fake.asked(SingleStep)) == 1
+            fake.session.do(ResetAll())
+            assert len(fake.asked(Reset)) == 1
+            # A failed effect of a worker's event ends neither the worker nor the other effects.
             assert said == []
             worker.fails = Settings
-            told.load("rebuilt")
+            fake.load("rebuilt")
             assert len(said) == 1 and "no more memory" in said[0]
-            assert told.view.task_serial == 2 and told.replaced == 0
-            told.step()
-            assert told.view.problem is None
+            assert fake.view.task_serial == 2 and fake.replaced == 0
+            fake.step()
+            assert fake.view.problem is None
     finally:
         stop_listening(said.append)
 
 
-def test_presses_of_two_pages_at_once_count_once_each(tmp_path: Path) -> None:
-    with told_session(tmp_path) as told:
-        told.play(2)
-        told.asked(object)
+def test_concurrent_presses_on_two_pages_each_count_once(tmp_path: Path) -> None:
+    with fake_worker_session(tmp_path) as fake:
+        fake.play(2)
+        fake.asked(object)
 
         def press(page: str) -> None:
             for _ in range(100):
-                told.session.do(Step(), page)
+                fake.session.do(Step(), page)
 
         pages = [threading.Thread(target=press, args=(page,)) for page in ("one", "other")]
         for page in pages:
             page.start()
         for page in pages:
             page.join()
-        assert len(told.asked(SingleStep)) == 200
+        assert len(fake.asked(SingleStep)) == 200
 
 
-def test_a_slider_that_is_dragged_on_one_page_swallows_no_key_of_another(tmp_path: Path) -> None:
-    with told_session(tmp_path) as told:
-        told.play(5)
-        told.asked(object)
+def test_a_slider_dragged_on_one_page_does_not_swallow_keys_of_another(tmp_path: Path) -> None:
+    with fake_worker_session(tmp_path) as fake:
+        fake.play(5)
+        fake.asked(object)
         ends = threading.Event()
 
         def drag() -> None:
             while not ends.is_set():
                 for step in range(5):
-                    told.session.do(Seek(step=step), "one")
+                    fake.session.do(Seek(step=step), "one")
 
         dragging = threading.Thread(target=drag, daemon=True)
         dragging.start()
         for _ in range(50):
-            told.session.do(Step(), "other")
+            fake.session.do(Step(), "other")
         ends.set()
         dragging.join()
-        assert len(told.asked(SingleStep)) == 50
+        assert len(fake.asked(SingleStep)) == 50
 
 
-def test_a_worker_that_tells_steps_as_fast_as_it_can_does_not_hold_up_a_press(tmp_path: Path) -> None:
-    with told_session(tmp_path) as told:
-        told.play(1)
+def test_a_worker_that_floods_steps_does_not_delay_a_press(tmp_path: Path) -> None:
+    with fake_worker_session(tmp_path) as fake:
+        fake.play(1)
         ends = threading.Event()
 
         def flood() -> None:
             while not ends.is_set():
-                told.step()
+                fake.step()
 
         flooding = threading.Thread(target=flood, daemon=True)
         flooding.start()
-        until(lambda: told.view.timeline.last > 100, "the flood")
-        told.asked(object)
+        until(lambda: fake.view.timeline.last > 100, "the flood")
+        fake.asked(object)
         taken = threading.Event()
 
         def press() -> None:
-            told.session.do(PauseRun())
+            fake.session.do(PauseRun())
             taken.set()
 
         threading.Thread(target=press, daemon=True).start()
         assert taken.wait(5) and flooding.is_alive()
-        until(lambda: any(not play.playing for play in told.asked(Play)), "the pause")
+        until(lambda: any(not play.playing for play in fake.asked(Play)), "the pause")
         ends.set()
         flooding.join()

@@ -1,4 +1,4 @@
-"""A version that was refused or taken out of the file leaves nothing behind, whatever its code did to the process."""
+"""A refused or removed version leaves nothing behind, whatever its code did to the process."""
 
 # The fixture hands over a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
@@ -34,7 +34,7 @@ def good(task_file: Path) -> str:
 
 @pytest.fixture(scope="module")
 def expected(good: str, session: Session) -> SessionView:
-    """What seed 0 gives in a session that has seen nothing else."""
+    """The view of seed 0 in a fresh session."""
     return played(session)
 
 
@@ -60,7 +60,7 @@ def refused(session: Session, task_file: Path, text: str) -> SessionView:
         return view.problem is not None and view.problem_serial > before.problem_serial
 
     wait_until(session, reached, "the refusal")
-    # Its first moment comes after it.
+    # Its first moment arrives after the version.
     return wait_until(
         session,
         lambda v: v.state == "paused" and v.timeline.last > before.timeline.last,
@@ -89,7 +89,7 @@ MISCHIEF = {
 
 
 @pytest.mark.parametrize("what", MISCHIEF)
-def test_what_a_refused_version_did_is_gone(
+def test_effects_of_a_refused_version_are_gone(
     mended: Session, task_file: Path, good: str, expected: SessionView, what: str
 ) -> None:
     before = played(mended)
@@ -97,7 +97,7 @@ def test_what_a_refused_version_did_is_gone(
     view = refused(mended, task_file, bad)
     line = bad[: bad.index("raise ValueError('enough')")].count("\n") + 1
     assert view.stale and (view.problem.file, view.problem.line) == (str(task_file), line)
-    # The last good version is there again, at the same moment (links are placed by their joints, in float32), and goes on.
+    # The last good version is restored at the same moment (float32 link poses, from the joints) and runs on.
     np.testing.assert_allclose(view.step.poses, before.step.poses, atol=1e-5)
     np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
     np.testing.assert_array_equal(step(mended).step.elapsed_steps, before.step.elapsed_steps + 1)
@@ -112,7 +112,7 @@ def test_what_a_refused_version_did_is_gone(
     ],
     ids=["a setting", "a class", "a thread"],
 )
-def test_what_a_version_set_that_ran_goes_with_its_line(
+def test_global_settings_of_a_version_disappear_with_their_line(
     mended: Session, task_file: Path, good: str, lines: tuple[str, ...]
 ) -> None:
     before = save(mended, task_file, at_import(good, *lines))
@@ -123,14 +123,17 @@ def test_what_a_version_set_that_ran_goes_with_its_line(
     np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
 
 
-LATE = {"a raise": ("pass", False), "a default type": ("torch.set_default_dtype(torch.float64)", True)}
+LATE_FAILURES = {
+    "a raise": ("pass", False),
+    "a default type": ("torch.set_default_dtype(torch.float64)", True),
+}
 
 
 @pytest.mark.parametrize("what", [pytest.param("a raise", marks=pytest.mark.slow), "a default type"])
-def test_after_a_failure_while_it_runs_a_reset_and_steps_are_those_of_a_clean_process(
+def test_after_a_failure_at_run_time_a_reset_and_steps_equal_those_of_a_clean_process(
     mended: Session, task_file: Path, good: str, expected: SessionView, what: str
 ) -> None:
-    did, replaced = LATE[what]
+    did, replaced = LATE_FAILURES[what]
     bad = in_evaluate(
         good, "if self.elapsed_steps.max() > 3:", f"    {did}", "    raise RuntimeError('late')"
     )
@@ -156,7 +159,7 @@ def test_after_a_failure_while_it_runs_a_reset_and_steps_are_those_of_a_clean_pr
 
 
 @pytest.mark.parametrize("text", ["# to be written\n", "def broken(:\n"])
-def test_a_file_of_which_nothing_ran_costs_no_process(
+def test_a_file_of_which_no_code_ran_costs_no_process(
     mended: Session, task_file: Path, good: str, text: str
 ) -> None:
     worker = mended.worker_pid

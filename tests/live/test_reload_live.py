@@ -1,4 +1,4 @@
-"""Saves of every kind under a running session: what comes in, how, and what stays."""
+"""Saves of every kind under a running session: what is loaded, at which level, and what stays."""
 
 # The fixture hands over a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import heard, runs, save, wait_until
+from tests.drive.session import after_worker_reply, runs, save, wait_until
 from workbench.app.session import Session
 from workbench.live.commands import ChooseClass, PauseRun, PlayRun, RebuildScene, ReloadFile, Step
 from workbench.live.events import EnvsReset
@@ -50,18 +50,18 @@ def reward_plus(good: str, number: float) -> str:
 
 
 def played(session: Session, steps: int) -> SessionView:
-    """The view after some steps of the player, paused."""
+    """The view, paused, after playing some steps."""
     session.change(speed=8.0)
     session.do(PlayRun())
     count = session.view().curves.serial
     wait_until(session, lambda v: v.curves.serial >= count + steps, "some steps")
     session.do(PauseRun())
     wait_until(session, lambda v: not v.playing and v.state == "paused", "the pause")
-    # What the worker sends after it has paused comes before its answer.
-    return heard(session)
+    # Events that the worker sends after pausing arrive before its answer.
+    return after_worker_reply(session)
 
 
-def test_a_patch_keeps_moment_past_and_selection_and_shows_new_numbers_while_paused(
+def test_a_patch_keeps_moment_past_and_selection_and_updates_the_numbers_while_paused(
     session: Session, task_file: Path, good: str
 ) -> None:
     session.change(selected_env=1)
@@ -88,7 +88,7 @@ def test_playing_goes_on_through_a_patch(session: Session, task_file: Path, good
     wait_until(session, lambda v: v.step_serial > view.step_serial + 3 and v.state == "running", "more steps")
 
 
-def test_a_rebuilt_scene_begins_a_new_past_at_the_same_moment(
+def test_a_rebuilt_scene_starts_a_new_past_at_the_same_moment(
     session: Session, task_file: Path, good: str
 ) -> None:
     before = played(session, 4)
@@ -98,7 +98,7 @@ def test_a_rebuilt_scene_begins_a_new_past_at_the_same_moment(
     np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
 
 
-def test_edited_cameras_come_in_without_a_new_scene(session: Session, task_file: Path, good: str) -> None:
+def test_edited_cameras_are_applied_without_a_new_scene(session: Session, task_file: Path, good: str) -> None:
     before = session.view()
     view = save(session, task_file, good.replace("width=128, height=128", "width=96, height=64"))
     assert view.reload.level == "cameras"
@@ -107,7 +107,7 @@ def test_edited_cameras_come_in_without_a_new_scene(session: Session, task_file:
     assert (camera.width, camera.height) == (96, 64)
 
 
-def test_a_level_can_be_asked_for_without_a_change(session: Session, good: str) -> None:
+def test_a_level_can_be_requested_without_a_change(session: Session, good: str) -> None:
     before = session.view()
     session.do(RebuildScene())
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the load")
@@ -120,7 +120,7 @@ def test_a_level_can_be_asked_for_without_a_change(session: Session, good: str) 
 # --- editors -------------------------------------------------------------------------------------------
 
 
-def test_an_editor_that_writes_beside_and_renames_is_followed(
+def test_an_editor_that_writes_a_temporary_file_and_renames_is_followed(
     session: Session, task_file: Path, good: str
 ) -> None:
     for number in (5, 6):
@@ -130,7 +130,7 @@ def test_an_editor_that_writes_beside_and_renames_is_followed(
         assert runs(session, task_file.read_text()).reload.level == "patched"
 
 
-def test_of_several_saves_in_50_ms_the_last_wins(session: Session, task_file: Path, good: str) -> None:
+def test_the_last_of_several_saves_in_50_ms_wins(session: Session, task_file: Path, good: str) -> None:
     loads = session.view().task_serial
     for number in range(10, 20):
         task_file.write_text(reward_plus(good, number))
@@ -142,7 +142,7 @@ def test_of_several_saves_in_50_ms_the_last_wins(session: Session, task_file: Pa
 def test_a_save_while_a_reload_runs_wins(session: Session, task_file: Path, good: str) -> None:
     red = good.replace("base_color=[0.05,", "base_color=[0.7,")
     task_file.write_text(red)
-    # Or it is over, where nobody looked meanwhile.
+    # Or the reload is over already.
     wait_until(
         session,
         lambda v: v.activity.startswith("building") or red in v.task.source.values(),
@@ -153,7 +153,7 @@ def test_a_save_while_a_reload_runs_wins(session: Session, task_file: Path, good
     view = runs(session, last)
     session.do(ReloadFile())
     view = wait_until(session, lambda v: v.task_serial > view.task_serial, "another load")
-    assert view.task.source[str(task_file)] == last, "the older one came after it"
+    assert view.task.source[str(task_file)] == last, "the older save overwrote it"
 
 
 def test_a_file_that_is_deleted_and_brought_back_is_followed(
@@ -165,7 +165,7 @@ def test_a_file_that_is_deleted_and_brought_back_is_followed(
     assert save(session, task_file, reward_plus(good, 23)).reload.level == "patched"
 
 
-def test_other_line_ends_are_no_change_and_an_edit_in_such_a_file_is_one(
+def test_other_line_endings_are_not_a_change_but_an_edit_among_them_is(
     session: Session, task_file: Path, good: str
 ) -> None:
     before = session.view().task_serial
@@ -179,7 +179,7 @@ def test_other_line_ends_are_no_change_and_an_edit_in_such_a_file_is_one(
 # --- several tasks ---------------------------------------------------------------------------------------
 
 
-def test_of_two_tasks_in_a_file_one_can_be_chosen_and_stays_chosen(
+def test_one_of_two_tasks_in_a_file_can_be_chosen_and_stays_chosen(
     session: Session, task_file: Path, good: str
 ) -> None:
     view = save(session, task_file, good + SECOND_TASK)

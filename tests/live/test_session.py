@@ -1,4 +1,4 @@
-"""A page's wishes, carried out by a real worker on the example task."""
+"""Commands of a page, executed by a real worker on the example task."""
 
 # The fixture hands over a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false
@@ -13,7 +13,14 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from tests.drive.session import Told, heard, live_session, start_over, step, wait_until
+from tests.drive.session import (
+    FakeWorkerSession,
+    after_worker_reply,
+    live_session,
+    start_over,
+    step,
+    wait_until,
+)
 from workbench.app.session import Session
 from workbench.live.commands import PauseRun, PlayRun, Step
 from workbench.live.events import ActionTold, EnvsReset, PagesCounted
@@ -52,8 +59,8 @@ def test_a_single_step_ends_playing(session: Session) -> None:
     wait_until(session, lambda v: v.step.elapsed_steps.max() >= 3 and v.state == "running", "playing")
     session.do(Step())
     serials = []
-    for _ in range(20):  # a worker that played on would take some ten steps meanwhile
-        serials.append(heard(session).step_serial)
+    for _ in range(20):  # a worker that played on would make about ten steps
+        serials.append(after_worker_reply(session).step_serial)
     session.change(speed=1.0)
     assert len(set(serials)) == 1 and session.view().state == "paused"
 
@@ -69,12 +76,12 @@ def test_resetting_one_env_leaves_the_other(session: Session) -> None:
     assert not np.array_equal(after.poses[1], before.poses[1], equal_nan=True)
 
 
-def test_a_slider_moves_one_joint_of_one_env_from_the_targets_that_the_robot_has(
+def test_a_slider_moves_one_joint_of_one_env_from_its_current_targets(
     child_process: None, tmp_path: Path
 ) -> None:
     with live_session("PushCube-v1", tmp_path, control_mode="pd_joint_pos") as session:
         session.change(action_source="sliders")
-        start = told(session)
+        start = slider_values(session)
         assert np.allclose(start[:, :7], session.view().step.qpos[:, :7], atol=1e-5), (
             "not the middle of the limits"
         )
@@ -89,15 +96,17 @@ def test_a_slider_moves_one_joint_of_one_env_from_the_targets_that_the_robot_has
         session.change(action_source="random")
         acted = step(session).step.action
         session.change(action_source="sliders")
-        assert np.allclose(told(session, lambda v: not np.array_equal(v.told, moved)), acted)
+        assert np.allclose(slider_values(session, lambda v: not np.array_equal(v.told, moved)), acted)
         session.happen(EnvsReset((0,)))
-        after = told(session, lambda v: v.step.elapsed_steps[0] == 0 and not np.array_equal(v.told, acted))
+        after = slider_values(
+            session, lambda v: v.step.elapsed_steps[0] == 0 and not np.array_equal(v.told, acted)
+        )
         assert np.allclose(after[0, :7], session.view().step.qpos[0, :7], atol=1e-5)
         assert np.allclose(after[1], acted[1]), "env 1 was not reset"
 
 
-def told(session: Session, reached: Callable[[SessionView], bool] = lambda view: True) -> np.ndarray:
-    """(N, A) what the sliders show."""
+def slider_values(session: Session, reached: Callable[[SessionView], bool] = lambda view: True) -> np.ndarray:
+    """(N, A) values of the sliders."""
     view = wait_until(session, lambda v: v.told is not None and reached(v), "what the robots are told")
     assert view.told is not None
     return view.told
@@ -125,7 +134,7 @@ def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, t
         ("def act(obs):\n    return None\n", "missing", "no function missing", None),
     ],
 )
-def test_a_policy_that_fails_says_so_and_the_session_goes_on(
+def test_a_failing_policy_is_reported_and_the_session_goes_on(
     session: Session, tmp_path, text: str, reference: str, says: str, line: int | None
 ) -> None:
     settle(session)
@@ -137,12 +146,12 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
     assert view.problem.stage == "policy" and says in view.problem.message
     assert (view.problem.file, view.problem.line) == (None if line is None else str(policy), line)
-    # No other action takes its place: whoever plays or steps hears the same.
+    # No other action replaces it: each Play or Step reports the same problem.
     for again in (lambda: session.do(PlayRun()), lambda: session.do(Step())):
-        said = session.view().problem_serial
+        serial = session.view().problem_serial
         again()
         view = wait_until(
-            session, lambda v, n=said: v.problem_serial > n and not v.playing, "the problem again"
+            session, lambda v, n=serial: v.problem_serial > n and not v.playing, "the problem again"
         )
         assert says in view.problem.message and not view.step.elapsed_steps.any()
     session.change(action_source="random")
@@ -160,9 +169,7 @@ POLICIES = {
 }
 
 
-def test_what_a_policy_returns_for_several_robots_and_is_no_action_is_named(
-    tmp_path: Path, child_process: None
-) -> None:
+def test_an_invalid_action_for_several_robots_is_reported(tmp_path: Path, child_process: None) -> None:
     policy = tmp_path / "policy.py"
     text = "import numpy as np, torch\n"
     text += "".join(f"def {name}(obs): return {returned}\n" for name, (returned, _) in POLICIES.items())
@@ -186,16 +193,14 @@ def test_what_a_policy_returns_for_several_robots_and_is_no_action_is_named(
         assert view.step.action.tolist() == [[0.0] * 8 + [1.0] * 8] * 2
 
 
-def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
-    session: Session, tmp_path: Path
-) -> None:
+def test_a_saved_policy_is_loaded_and_a_fixed_one_plays_on(session: Session, tmp_path: Path) -> None:
     settle(session)
     policy, text = tmp_path / "policy.py", "def act(obs):\n    return obs[:, :8] * 0 + {}\n"
     policy.write_text(text.format("0.50"))
     session.change(action_source="policy", policy=f"{policy}:act")
     session.do(PlayRun())
     wait_until(session, lambda v: v.step.action is not None and np.allclose(v.step.action, 0.5), "its action")
-    # Of the same length and in the same second as the one before.
+    # Same length, and saved in the same second as the last version.
     for action in ("0.25", "0.75"):
         policy.write_text(text.format(action))
         wait_until(session, lambda v, a=float(action): np.allclose(v.step.action, a), "the new one's action")
@@ -206,7 +211,7 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
     policy.write_text(text.format("0.10"))
     view = wait_until(session, lambda v: v.playing and np.allclose(v.step.action, 0.1), "the mended one")
     assert view.problem is None
-    # Somebody who has paused is left alone.
+    # After a pause by the user it does not play.
     session.do(PauseRun())
     wait_until(session, lambda v: not v.playing, "the pause")
     policy.write_text(text.format("0.30 +"))
@@ -218,9 +223,7 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
     assert not view.playing and view.problem is None
 
 
-def test_a_policy_is_looked_for_beside_the_task_too_and_taken_when_it_is_mended(
-    session: Session, task_file
-) -> None:
+def test_a_policy_next_to_the_task_is_found_and_loaded_once_fixed(session: Session, task_file) -> None:
     settle(session)
     session.change(action_source="policy", policy="pol.py:act")
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
@@ -233,14 +236,14 @@ def test_a_policy_is_looked_for_beside_the_task_too_and_taken_when_it_is_mended(
 
 
 @pytest.mark.slow
-def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session: Session) -> None:
+def test_pictures_are_of_the_selected_env_and_only_while_they_are_shown(session: Session) -> None:
     settle(session)
     sensor = next(c for c in session.view().task.cameras if c.kind == "sensor")
     wanted = CameraRequest(sensor.name, "sensor", ("rgb", "depth", "segmentation"))
     session.change(cameras=(wanted,))
     session.do(Step())
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 1, "a step")
-    assert not session.view().pictures, "nobody looks yet"
+    assert not session.view().pictures, "no picture is shown yet"
     session.happen(PagesCounted(1))
     session.change(selected_env=1)
     view = wait_until(session, lambda v: bool(v.pictures), "a picture")
@@ -253,14 +256,14 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     session.change(selected_env=0)
     session.do(Step())
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 2, "another step")
-    assert not session.view().pictures, "nobody looks any more"
+    assert not session.view().pictures, "pictures are no longer shown"
     session.change(cameras=())
 
 
-def test_a_recording_that_waited_for_the_task_is_gone_into_once(told: Told) -> None:
-    told.session.enter_recording(cast(Any, "a run"))
-    assert told.asked(EnterRecording) == []
-    told.load()
-    assert [request.env_idx for request in told.asked(EnterRecording)] == [(0,)]
-    told.load(level="rebuilt")
-    assert told.asked(EnterRecording) == []
+def test_a_pending_recording_is_entered_once(fake: FakeWorkerSession) -> None:
+    fake.session.enter_recording(cast(Any, "a run"))
+    assert fake.asked(EnterRecording) == []
+    fake.load()
+    assert [request.env_idx for request in fake.asked(EnterRecording)] == [(0,)]
+    fake.load(level="rebuilt")
+    assert fake.asked(EnterRecording) == []

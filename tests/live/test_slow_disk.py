@@ -1,4 +1,4 @@
-"""A disk that hangs keeps what needs it, and nothing else."""
+"""A hung disk blocks only the work that needs it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.session import Told, told_session
+from tests.drive.session import FakeWorkerSession, fake_worker_session
 from tests.drive.waiting import until
 from workbench.app import session
 from workbench.live.commands import Step
@@ -22,25 +22,25 @@ from workbench.task.watch import SourceWatcher
 
 @pytest.fixture
 def disk() -> Iterator[threading.Event]:
-    """It goes on when this is set."""
+    """The disk hangs until this event is set."""
     disk = threading.Event()
     yield disk
     disk.set()
 
 
-def answers(told: Told) -> bool:
-    """Whether a press on Step reaches the worker, and what comes of it the page."""
-    told.asked(object)
-    told.session.do(Step())
-    told.step()
-    return len(told.asked(SingleStep)) == 1 and told.view.timeline.last > 0
+def answers(fake: FakeWorkerSession) -> bool:
+    """Whether a press on Step reaches the worker, and its result the page."""
+    fake.asked(object)
+    fake.session.do(Step())
+    fake.step()
+    return len(fake.asked(SingleStep)) == 1 and fake.view.timeline.last > 0
 
 
-def test_files_that_cannot_be_watched_keep_neither_a_step_nor_the_end(
+def test_files_that_cannot_be_watched_block_neither_a_step_nor_the_exit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
 ) -> None:
-    with told_session(tmp_path, task=str(tmp_path / "push.py")) as told:
-        told.play(2)
+    with fake_worker_session(tmp_path, task=str(tmp_path / "push.py")) as fake:
+        fake.play(2)
         hangs = threading.Event()
 
         def follow(self: SourceWatcher, *_: object) -> None:
@@ -48,21 +48,21 @@ def test_files_that_cannot_be_watched_keep_neither_a_step_nor_the_end(
             disk.wait(60)
 
         monkeypatch.setattr(SourceWatcher, "follow", follow)
-        told.load("patched", source_files=(str(tmp_path / "push.py"),))
+        fake.load("patched", source_files=(str(tmp_path / "push.py"),))
         assert hangs.wait(60)
-        assert answers(told)
+        assert answers(fake)
         problem = Problem("import", "SyntaxError", str(tmp_path / "module.py"), 1, None, "")
-        told.tell(TaskFailed(problem, kept=True))
-        assert told.view.problem == problem and answers(told)
+        fake.tell(TaskFailed(problem, kept=True))
+        assert fake.view.problem == problem and answers(fake)
 
 
-def test_a_disk_that_hangs_as_a_version_comes_keeps_no_step(
+def test_a_disk_that_hangs_during_a_load_blocks_no_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
 ) -> None:
-    """After a save, and after the death of a worker, it is looked whether the files are still those of the version."""
+    """After a save and after a worker's death, the files are compared with those of the version."""
     file = str(tmp_path / "push.py")
-    with told_session(tmp_path, task=file) as told:
-        told.play(2)
+    with fake_worker_session(tmp_path, task=file) as fake:
+        fake.play(2)
         hangs = threading.Event()
 
         def read(path: str) -> str:
@@ -71,24 +71,24 @@ def test_a_disk_that_hangs_as_a_version_comes_keeps_no_step(
             return ""
 
         monkeypatch.setattr(session, "read_source", read)
-        for happens in (lambda: None, told.die):
+        for happens in (lambda: None, fake.die):
             happens()
             worker = threading.Thread(
-                target=lambda: told.load("patched", source={file: "x = 1"}), daemon=True
+                target=lambda: fake.load("patched", source={file: "x = 1"}), daemon=True
             )
             worker.start()
             assert hangs.wait(60)
-            assert answers(told)
+            assert answers(fake)
             worker.join(20)
-            assert not worker.is_alive() and answers(told), "what the worker says next is taken"
+            assert not worker.is_alive() and answers(fake), "the worker's next event is handled"
 
 
-def test_a_recording_that_cannot_be_written_keeps_no_step(
+def test_a_recording_that_cannot_be_written_blocks_no_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
 ) -> None:
-    with told_session(tmp_path / "kept") as told:
-        told.play(0)
-        told.session.happen(RecordingWanted((0,)))
+    with fake_worker_session(tmp_path / "kept") as fake:
+        fake.play(0)
+        fake.session.happen(RecordingWanted((0,)))
         hangs = threading.Event()
         write = os.pwrite
 
@@ -98,15 +98,15 @@ def test_a_recording_that_cannot_be_written_keeps_no_step(
             return write(*what)  # type: ignore[arg-type]
 
         monkeypatch.setattr(os, "pwrite", pwrite)
-        told.reset((0,))
-        told.step(3)
+        fake.reset((0,))
+        fake.step(3)
         assert hangs.wait(60)
-        assert answers(told) and told.view.of(RecordingStatus).active
-        told.session.do(StopRecording())
-        assert answers(told)
+        assert answers(fake) and fake.view.of(RecordingStatus).active
+        fake.session.do(StopRecording())
+        assert answers(fake)
         disk.set()
         until(
-            lambda: told.view.of(RecordingStatus).episodes_written == 1,
+            lambda: fake.view.of(RecordingStatus).episodes_written == 1,
             "the episode",
-            seen=lambda: told.view.of(RecordingStatus),
+            seen=lambda: fake.view.of(RecordingStatus),
         )

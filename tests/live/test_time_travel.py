@@ -1,4 +1,4 @@
-"""Looking at the past and going on from it, with a real worker on the example task."""
+"""Showing the past and continuing from it, with a real worker on the example task."""
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalSubscript=false
 # pyright: reportAttributeAccessIssue=false
@@ -29,7 +29,7 @@ def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> It
 
 
 def fresh(session: Session) -> int:
-    """Paused at the first moment of episodes of seed 0, live; its serial."""
+    """Pause at the first moment of seed 0's episodes, live; return the moment's serial."""
     session.do(PauseRun())
     session.change(episode_end="reset")
     session.change(action_source="sliders")
@@ -44,11 +44,11 @@ def poses(session: Session, serial: int) -> np.ndarray:
 
 
 def is_close(poses: np.ndarray, others: np.ndarray) -> bool:
-    """Equal but for the last bits: PhysX works out the links anew from root and joints."""
+    """Equal except for the last bits: PhysX recomputes the links from root and joints."""
     return np.allclose(poses, others, rtol=0, atol=1e-6, equal_nan=True)
 
 
-def test_scrubbing_shows_what_was(session: Session) -> None:
+def test_scrubbing_shows_past_moments(session: Session) -> None:
     start = fresh(session)
     step(session, 5)
     for serial in (*range(start, start + 6), *range(start + 5, start - 1, -1)):
@@ -61,7 +61,7 @@ def test_scrubbing_shows_what_was(session: Session) -> None:
     assert session.view().timeline.shown is None and session.view().timeline.last == start + 5
 
 
-def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session) -> None:
+def test_a_branch_repeats_the_past_to_the_last_bit(session: Session) -> None:
     start = fresh(session)
     step(session, 8)
     branches = []
@@ -75,11 +75,11 @@ def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session)
         branches.append(np.stack([poses(session, serial) for serial in range(last - 4, last + 1)]))
     assert np.array_equal(branches[0], branches[1], equal_nan=True)
     first_run = np.stack([poses(session, serial) for serial in range(start + 4, start + 9)])
-    # Though PhysX does not give out its contacts: the steps up to the moment were made again.
+    # PhysX does not expose its contacts, so the steps up to the moment are replayed.
     assert np.array_equal(branches[0], first_run, equal_nan=True)
 
 
-def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
+def test_the_abandoned_future_can_be_returned_to(session: Session) -> None:
     start = fresh(session)
     step(session, 6)
     left = session.view().step
@@ -92,7 +92,7 @@ def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
     assert view.step.elapsed_steps.tolist() == [6] * N
 
 
-def test_a_reset_can_be_taken_back_and_the_one_before_it_too(session: Session) -> None:
+def test_resets_can_be_undone_one_after_another(session: Session) -> None:
     fresh(session)
     step(session, 3)
     first = session.view().step
@@ -107,7 +107,7 @@ def test_a_reset_can_be_taken_back_and_the_one_before_it_too(session: Session) -
     assert view.step.elapsed_steps.tolist() == [3, 3, 5]
 
 
-def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session: Session) -> None:
+def test_a_moment_without_an_action_has_its_recorded_reward_or_none(session: Session) -> None:
     start = fresh(session)
     begin = session.view().timeline.last_tick
     assert np.isnan(session.view().step.reward).all()
@@ -119,14 +119,14 @@ def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session
     assert np.array_equal(view.step.reward, rewards[1])
     assert not view.timeline.not_carried
     strip = session.look(lambda run: run.strip(begin, view.timeline.last_tick))
-    # A strip is of control steps: the reset and the going back after them are none.
+    # A strip contains control steps, not the reset and the jump back after them.
     assert np.array_equal(strip.reward[1:], [reward[0] for reward in rewards])
     session.happen(MomentShown(start + 2))
     assert not jump(session, lambda: session.do(ContinueFromHere(scope="into all"))).timeline.not_carried
 
 
 @pytest.mark.slow
-def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
+def test_going_back_ends_a_recording(session: Session) -> None:
     start = fresh(session)
     written = session.view().of(RecordingStatus).episodes_written
     step(session, 1)
@@ -139,17 +139,19 @@ def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written == written + 1, "the file")
     assert view.of(RecordingStatus).active and view.of(RecordingStatus).problem is None
     step(session, 1)
-    assert session.view().of(RecordingStatus).steps == 0, "what was not begun by a reset is not recorded"
+    assert session.view().of(RecordingStatus).steps == 0, (
+        "an episode that did not start with a reset is not recorded"
+    )
     session.do(StopRecording())
 
 
 @pytest.mark.slow
-def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None:
+def test_a_moment_without_a_picture_is_drawn_in_its_past_state(session: Session) -> None:
     start = fresh(session)
     view = step(session, 12)
     human = next(c for c in view.task.cameras if c.kind == "human")
     wanted = CameraRequest(human.name, "human", ("rgb",))
-    # Else what comes first after a jump is a fast one.
+    # Otherwise the first picture after a jump is a fast one.
     session.change(cameras=(wanted,), pictures="exact")
     session.happen(PagesCounted(1))
     key = ("human", human.name)
@@ -160,9 +162,9 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     then = wait_until(session, lambda v: key in v.pictures, "the picture of the past").pictures[key]
     assert not session.view().timeline.wants_pictures
     live = session.view().timeline.last
-    assert live == start + 12, "drawing is no step"
-    assert np.abs(then.rgb.astype(int) - now.rgb).mean() > 0.5, "the arm stood elsewhere"
-    # The same moment, gone back to, looks the same.
+    assert live == start + 12, "drawing makes no step"
+    assert np.abs(then.rgb.astype(int) - now.rgb).mean() > 0.5, "the arm was in another pose"
+    # After going back, the moment looks the same.
     last = session.view().timeline.last
     session.do(ContinueFromHere(scope="all"))
     wait_until(session, lambda v: v.timeline.last > last and v.timeline.shown is None, "the jump")
@@ -174,7 +176,7 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
 
 
 @pytest.mark.slow
-def test_the_episodes_go_on_as_they_stand_with_a_worker_that_takes_over(session: Session) -> None:
+def test_episodes_continue_unchanged_with_a_replacement_worker(session: Session) -> None:
     fresh(session)
     step(session, 4)
     before, rows = session.view(), session.env_rows()

@@ -1,4 +1,4 @@
-"""The moment that is shown, what is asked of the worker for it, and what a going back is told to put."""
+"""The shown moment, the requests to the worker for it, and the requests of a jump back."""
 
 # The views are of a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.drive.session import Told, camera, draw_past, seek, seek_by, told_session
+from tests.drive.session import FakeWorkerSession, camera, draw_past, fake_worker_session, seek, seek_by
 from tests.drive.waiting import until
 from workbench.envs.camera_data import CameraKind, Picture
 from workbench.live.commands import PlayRun, ResetAll, Step
@@ -32,20 +32,20 @@ def picture(env: int, name: str = "base_camera", kind: CameraKind = "sensor", **
     return Picture(name, kind, env, np.zeros(7, np.float32), np.full((4, 6, 3), env, np.uint8), **more)
 
 
-def drawn(told: Told, env: int, *cameras: CameraRequest, degree: str = "auto") -> list[DrawPast]:
-    """What is asked for if the page that shows this env wants pictures of the shown moment."""
-    told.session.change(selected_env=env, cameras=cameras, pictures=degree)
-    told.asked(object)
-    draw_past(told.session)
-    return told.asked(DrawPast)
+def drawn(fake: FakeWorkerSession, env: int, *cameras: CameraRequest, degree: str = "auto") -> list[DrawPast]:
+    """The requests when the page shows this env and wants pictures of the shown moment."""
+    fake.session.change(selected_env=env, cameras=cameras, pictures=degree)
+    fake.asked(object)
+    draw_past(fake.session)
+    return fake.asked(DrawPast)
 
 
-def at(told: Told) -> int:
-    """Serial of the moment that is seen."""
-    return told.view.step_serial
+def at(fake: FakeWorkerSession) -> int:
+    """Serial of the shown moment."""
+    return fake.view.step_serial
 
 
-def test_every_env_is_asked_for_its_own_pictures_of_a_past_moment_and_once(played: Told) -> None:
+def test_pictures_of_a_past_moment_are_requested_once_per_env(played: FakeWorkerSession) -> None:
     played.session.happen(MomentShown(2))
     for env in (0, 1, 2, 0):
         (asked,) = drawn(played, env, EYE)
@@ -59,7 +59,9 @@ def test_every_env_is_asked_for_its_own_pictures_of_a_past_moment_and_once(playe
     assert drawn(played, 0, EYE) == []
 
 
-def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures_and_whoever_drags_none(played: Told) -> None:
+def test_a_moment_gets_pictures_when_the_slider_rests_and_none_during_a_drag(
+    played: FakeWorkerSession,
+) -> None:
     played.session.happen(PagesCounted(1))
     played.session.change(cameras=(EYE,))
     played.asked(object)
@@ -75,7 +77,7 @@ def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures_and_whoever_drag
     assert asked.origin == 0
 
 
-def test_only_what_is_lacking_or_no_longer_so_is_asked_for(played: Told) -> None:
+def test_only_missing_or_outdated_pictures_are_requested(played: FakeWorkerSession) -> None:
     played.session.happen(MomentShown(1))
     played.tell(PastPictures(1, (picture(1), picture(0, "hand"))))
     assert drawn(played, 1, EYE) == [] and not played.view.timeline.wants_pictures
@@ -84,7 +86,7 @@ def test_only_what_is_lacking_or_no_longer_so_is_asked_for(played: Told) -> None
     assert [one.cameras for one in drawn(played, 1, EYE, HAND, PEOPLE)] == [(HAND, PEOPLE)]
     deeper = EYE._replace(modalities=("rgb", "depth"))
     assert [one.cameras for one in drawn(played, 1, deeper)] == [(deeper,)]
-    # A camera that moved sees something else now; its namesake does not.
+    # A moved camera's picture is outdated; that of another camera with the same name is not.
     info = replace(camera(played.session, EYE.key).info, kind="human")
     played.tell(Placed(PEOPLE.key, None, info))
     assert drawn(played, 1, EYE) == []
@@ -95,23 +97,23 @@ def test_only_what_is_lacking_or_no_longer_so_is_asked_for(played: Told) -> None
     assert drawn(played, 1, EYE) == [] and not played.view.timeline.wants_pictures
 
 
-def test_a_moment_that_was_drawn_fast_is_drawn_exactly_unless_fast_pictures_are_chosen(played: Told) -> None:
+def test_a_fast_picture_is_redrawn_exactly_unless_fast_pictures_are_chosen(played: FakeWorkerSession) -> None:
     played.tell(Pictures((picture(1, degree="fast"),), 5.0, 1))
     played.session.happen(MomentShown(1))
     assert drawn(played, 1, EYE, degree="fast") == [] and not played.view.timeline.wants_pictures
     assert [one.cameras for one in drawn(played, 1, EYE)] == [(EYE,)] and played.view.timeline.wants_pictures
-    assert list(played.view.pictures) == [EYE.key], "the fast one is seen meanwhile"
+    assert list(played.view.pictures) == [EYE.key], "the fast picture is shown meanwhile"
     played.tell(PastPictures(1, (picture(1, degree="exact"),)))
     assert drawn(played, 1, EYE) == []
 
 
-def test_a_moment_is_pinned_and_left_for_live(played: Told) -> None:
+def test_a_moment_is_pinned_until_the_view_returns_to_live(played: FakeWorkerSession) -> None:
     session = played.session
     assert played.view.timeline.shown is None and at(played) == 3
     seek_by(session, -2)
     played.step()
     view = played.view
-    assert (view.timeline.shown, at(played), view.timeline.last) == (1, 1, 4), "what comes does not move it"
+    assert (view.timeline.shown, at(played), view.timeline.last) == (1, 1, 4), "new steps do not move it"
     assert view.told is view.step.action and view.timeline.can_continue
     assert (view.timeline.tick, view.timeline.steps, view.timeline.steps_ago) == (1, 4, 3)
     seek(session, -5)
@@ -128,54 +130,54 @@ def test_a_moment_is_pinned_and_left_for_live(played: Told) -> None:
     assert played.view.timeline.shown is None, "the newest is live"
 
 
-def test_a_pinned_moment_that_has_to_go_gives_way_to_the_oldest(tmp_path: Path) -> None:
-    with told_session(tmp_path, history_bytes=60_000) as told:
-        told.play(2)
-        told.session.happen(MomentShown(1))
-        told.step(97)
-        timeline = told.view.timeline
-        assert timeline.first > 1 and timeline.shown == timeline.first == at(told)
+def test_when_a_pinned_moment_is_dropped_the_oldest_is_shown(tmp_path: Path) -> None:
+    with fake_worker_session(tmp_path, history_bytes=60_000) as fake:
+        fake.play(2)
+        fake.session.happen(MomentShown(1))
+        fake.step(97)
+        timeline = fake.view.timeline
+        assert timeline.first > 1 and timeline.shown == timeline.first == at(fake)
 
 
-def test_events_steps_and_moments_of_an_env_are_gone_through(told: Told) -> None:
-    session = told.session
-    told.play(1)
-    told.step(success=(1,))
-    told.step()
-    told.reset((1,))  # moment 4
-    told.step()
+def test_keys_move_through_events_steps_and_moments_of_an_env(fake: FakeWorkerSession) -> None:
+    session = fake.session
+    fake.play(1)
+    fake.step(success=(1,))
+    fake.step()
+    fake.reset((1,))  # moment 4
+    fake.step()
     for env, expected in ((1, [4, 2, 0, 0]), (0, [0, 0])):
-        told.session.change(selected_env=env)
+        fake.session.change(selected_env=env)
         seek(session, None)
         seen = []
         for _ in expected:
             session.do(PreviousEvent())
-            seen.append(at(told))
+            seen.append(at(fake))
         assert seen == expected
-    told.session.change(selected_env=1)
+    fake.session.change(selected_env=1)
     session.do(NextEvent())
-    assert at(told) == 2
+    assert at(fake) == 2
     session.do(NextEvent())
     session.do(NextEvent())
-    assert told.view.timeline.shown is None
-    # Of the shown episode, through the resets of others.
+    assert fake.view.timeline.shown is None
+    # Within the shown episode, across resets of other envs.
     session.happen(EpisodeStepShown(1, 0))
-    assert at(told) == 4
+    assert at(fake) == 4
     session.happen(EpisodeStepShown(0, 3))
-    assert at(told) == 3
-    # A step back passes the resets of other envs by.
+    assert at(fake) == 3
+    # A step back skips resets of other envs.
     ways = {}
     for env in (0, 1):
-        told.session.change(selected_env=env)
+        fake.session.change(selected_env=env)
         seek(session, None)
         ways[env] = []
         for _ in range(3):
             seek_by(session, -1)
-            ways[env].append(at(told))
+            ways[env].append(at(fake))
     assert ways == {0: [3, 2, 1], 1: [4, 3, 2]}
 
 
-def test_steps_are_counted_in_one_way_and_a_reset_is_none(played: Told) -> None:
+def test_steps_are_counted_consistently_and_a_reset_is_not_one(played: FakeWorkerSession) -> None:
     session = played.session
     played.reset()
     played.step(2)  # moments 4 to 6
@@ -187,7 +189,7 @@ def test_steps_are_counted_in_one_way_and_a_reset_is_none(played: Told) -> None:
     strip = session.look(lambda run: run.strip(-9, 99))
     assert (strip.low, strip.high) == (0, 5)
     assert np.isnan(strip.reward[0]) and strip.reward[1:].tolist() == [1, 2, 3, 1, 2]
-    # At tick 3 is the last step of the first episode and the reset after it; of the second episode it is the reset.
+    # Tick 3 is the last step of the first episode, and the reset that starts the second.
     session.do(Seek(step=3))
     assert at(played) == 3 and session.look(Run.episode_ticks) == (0, 3)
     seek(session, 6)
@@ -198,7 +200,7 @@ def test_steps_are_counted_in_one_way_and_a_reset_is_none(played: Told) -> None:
     assert [played.view.timeline.steps_ago, played.view.timeline.tick] == [2, 3]
 
 
-def test_in_the_past_the_table_of_envs_is_of_the_past(played: Told) -> None:
+def test_in_the_past_the_table_of_envs_shows_the_past(played: FakeWorkerSession) -> None:
     played.reset((1,))
     played.step()
     assert played.session.env_rows().steps.tolist() == [4, 1, 4]
@@ -208,15 +210,15 @@ def test_in_the_past_the_table_of_envs_is_of_the_past(played: Told) -> None:
     assert [np.isfinite(row).sum() for row in then.rewards] == [2, 2, 2]
 
 
-def test_a_strip_is_of_one_env_between_two_steps(told: Told) -> None:
-    told.play(2)
-    told.step(success=(1,))
-    told.back((1,), (2,), 1)
-    told.step()
-    told.session.change(selected_env=1)
+def test_a_strip_covers_one_env_between_two_steps(fake: FakeWorkerSession) -> None:
+    fake.play(2)
+    fake.step(success=(1,))
+    fake.back((1,), (2,), 1)
+    fake.step()
+    fake.session.change(selected_env=1)
 
     def strip(low: int, high: int) -> Strip:
-        found = told.session.look(lambda run: run.strip(low, high))
+        found = fake.session.look(lambda run: run.strip(low, high))
         assert found is not None
         return found
 
@@ -226,7 +228,7 @@ def test_a_strip_is_of_one_env_between_two_steps(told: Told) -> None:
     part = strip(1, 2)
     assert (part.low, part.high, part.branches) == (1, 2, ()) and part.segments == ((1, 2, False),)
     assert part.reward.tolist() == [1, 2]
-    told.session.change(selected_env=0)
+    fake.session.change(selected_env=0)
     other = strip(0, 5)
     assert other.segments == ((0, 4, False),) and other.branches == () and dict(other.events) == {0: RESET}
 
@@ -238,12 +240,12 @@ def test_a_strip_is_of_one_env_between_two_steps(told: Told) -> None:
     ("scope", "envs", "source"),
     [("this", (2,), (2,)), ("all", (0, 1, 2), (0, 1, 2)), ("into all", (0, 1, 2), (2, 2, 2))],
 )
-def test_who_goes_back_to_whose_moment_and_by_which_steps(
-    played: Told, scope: Any, envs: tuple[int, ...], source: tuple[int, ...]
+def test_which_envs_go_back_to_which_moment_by_which_steps(
+    played: FakeWorkerSession, scope: Any, envs: tuple[int, ...], source: tuple[int, ...]
 ) -> None:
     session = played.session
     played.session.change(selected_env=2)
-    with pytest.raises(Refused):  # there is nothing to go back to while live
+    with pytest.raises(Refused):  # there is no moment to go back to while live
         session.do(ContinueFromHere(scope=scope))
     assert played.asked(Restore) == []
     seek(session, 2)
@@ -260,10 +262,10 @@ def test_who_goes_back_to_whose_moment_and_by_which_steps(
         np.testing.assert_array_equal(asked.ways[env].actions, [action[of] for action in actions])
 
 
-def test_the_way_to_a_moment_begins_at_the_last_exact_point(played: Told) -> None:
-    """Which a moment that was put there is, and one that was lived up to is not."""
+def test_a_replay_to_a_moment_starts_at_the_last_exact_state(played: FakeWorkerSession) -> None:
+    """A restored moment is an exact state; a replayed one is not."""
 
-    def way(env: int, serial: int) -> tuple[int, int, int] | None:
+    def replay(env: int, serial: int) -> tuple[int, int, int] | None:
         played.asked(object)
         played.session.change(selected_env=env)
         played.session.happen(MomentShown(serial))
@@ -273,20 +275,20 @@ def test_the_way_to_a_moment_begins_at_the_last_exact_point(played: Told) -> Non
         return found and (found.start, found.source, len(found.actions))
 
     played.step(3)  # a reset, and steps at moments 1 to 6
-    assert way(0, 5) == (0, 0, 5) and way(0, 0) is None, "the reset itself is put there"
+    assert replay(0, 5) == (0, 0, 5) and replay(0, 0) is None, "the reset itself is restored"
     played.back((0,), (1,), 3)  # 7
     played.step()
     played.step()
-    assert way(0, 8) == (7, 0, 1) and way(1, 8) == (0, 1, 7)
+    assert replay(0, 8) == (7, 0, 1) and replay(1, 8) == (0, 1, 7)
     played.back((0,), (1,), 3, replayed=(0,))  # 10
     played.step(2)
-    assert way(0, 11) == (0, 1, 4)
-    played.reset(snapshot=b"")  # 13: a state that could not be kept
+    assert replay(0, 11) == (0, 1, 4)
+    played.reset(snapshot=b"")  # 13: a state that could not be stored
     played.step(2)
-    assert way(0, 14) is None and way(2, 9) == (0, 2, 8)
+    assert replay(0, 14) is None and replay(2, 9) == (0, 2, 8)
 
 
-def test_a_jump_is_taken_back_in_the_envs_that_it_brought_where_they_are(played: Told) -> None:
+def test_a_jump_is_undone_in_the_envs_that_are_still_in_it(played: FakeWorkerSession) -> None:
     session = played.session
 
     def words() -> list[str | None]:
@@ -305,7 +307,7 @@ def test_a_jump_is_taken_back_in_the_envs_that_it_brought_where_they_are(played:
         assert asked.source == asked.env_idx and played.view.timeline.shown is None
         return asked.env_idx, asked.origin, asked.undoes
 
-    assert words() == [None] * 3, "what was before the oldest moment cannot be returned to"
+    assert words() == [None] * 3, "nothing before the oldest moment can be restored"
     played.reset()  # 4
     played.reset((1,))  # 5
     assert words() == ["reset of 2 envs", "reset of env 1", "reset of 2 envs"]
@@ -313,27 +315,29 @@ def test_a_jump_is_taken_back_in_the_envs_that_it_brought_where_they_are(played:
     played.back((1,), (1,), 4, undoes=5)  # 6
     assert words() == ["reset of all"] * 3 and undone(1) == ((0, 1, 2), 3, 4)
     played.back((0, 1, 2), (0, 1, 2), 3, undoes=4)
-    assert words() == [None] * 3, "what it did in the future that was left is none of what it lives"
+    assert words() == [None] * 3, "jumps in an abandoned future cannot be undone"
     played.step(truncated=(0, 2))
     played.reset((0, 2))
     played.back((1,), (1,), 2)
     assert words() == ["reset at the end", "jump of env 1", "reset at the end"]
 
 
-def test_what_a_going_back_could_not_put_back_is_told_of_its_env_and_episode_alone(played: Told) -> None:
-    def told_of(env: int) -> tuple[tuple[str, ...], str]:
+def test_state_that_a_jump_could_not_restore_is_reported_only_for_its_env_and_episode(
+    played: FakeWorkerSession,
+) -> None:
+    def report_of(env: int) -> tuple[tuple[str, ...], str]:
         played.session.change(selected_env=env)
         view = played.view.timeline
         return view.not_carried, view.arrived
 
     played.back((1,), (1,), 2, not_carried={"actor ball": "the snapshot has none"}, how="put there")
     played.step()
-    lacks = ("actor ball: the snapshot has none",), "put there"
-    assert told_of(1) == lacks and told_of(0) == ((), "")
+    missing = ("actor ball: the snapshot has none",), "put there"
+    assert report_of(1) == missing and report_of(0) == ((), "")
     played.session.happen(MomentShown(1))
-    assert told_of(1) == ((), ""), "before it went back"
+    assert report_of(1) == ((), ""), "before the jump"
     played.session.happen(MomentShown(None))
     played.reset((0,))
-    assert told_of(1) == lacks, "another env was reset"
+    assert report_of(1) == missing, "another env was reset"
     played.reset((1,))
-    assert told_of(1) == ((), "")
+    assert report_of(1) == ((), "")

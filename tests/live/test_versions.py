@@ -1,4 +1,4 @@
-"""What a save, a failure and the end of a worker ask for, along every way down."""
+"""What is loaded after a save, a failure or the end of a worker, along every fallback."""
 
 # The views are of a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false
@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.scenes import description, problem, table_scene
-from tests.drive.session import DEATH, Told, stop_watching, told_session
+from tests.drive.session import DEATH, FakeWorkerSession, fake_worker_session, stop_watching
 from tests.drive.waiting import until
 from workbench.live import load_attempts as recovery
 from workbench.live.commands import PlayRun, RebuildScene, ReloadFile, RestartWorker
@@ -36,24 +36,26 @@ def file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def one(file: Path, tmp_path: Path) -> Iterator[Told]:
-    with told_session(tmp_path / "recordings", str(file)) as told:
-        told.greet()
-        yield told
+def one(file: Path, tmp_path: Path) -> Iterator[FakeWorkerSession]:
+    with fake_worker_session(tmp_path / "recordings", str(file)) as fake:
+        fake.greet()
+        yield fake
 
 
-def runs(one: Told, file: Path, text: str = GOOD, level: str | None = None, *beside: Path) -> None:
-    """The worker says that this text was loaded, and the first moment comes."""
+def runs(
+    one: FakeWorkerSession, file: Path, text: str = GOOD, level: str | None = None, *beside: Path
+) -> None:
+    """The worker reports that this text was loaded, and sends the first moment."""
     if file.read_text() != text:
-        stop_watching(one.session)  # what is on the disk would be taken for a save, some moments later
+        stop_watching(one.session)  # a moment later the watcher would take the file on disk for a save
     files = (str(file), *map(str, beside))
     one.load(level, file=files[0], source_files=files, source={files[0]: text}, source_hash=text)
     one.reset()
     one.asked(object)
 
 
-def next_load(one: Told) -> tuple[str, bool] | None:
-    """The text that a new worker is to load (``disk`` for what is in the file), and whether at a moment."""
+def next_load(one: FakeWorkerSession) -> tuple[str, bool] | None:
+    """The text that a new worker loads (``disk`` for the file's content), and whether at a moment."""
     loads = [request for request in one.greet() if isinstance(request, Load)]
     if not loads:
         return None
@@ -61,14 +63,14 @@ def next_load(one: Told) -> tuple[str, bool] | None:
     return ("disk" if load.source is None else next(iter(load.source.values())), load.snapshot is not None)
 
 
-def saved(one: Told) -> Load:
+def saved(one: FakeWorkerSession) -> Load:
     loads: list[Load] = []
     until(lambda: loads.extend(one.asked(Load)) or loads, "the load of what was saved")
     return loads[-1]
 
 
-def test_a_file_that_never_loaded_is_followed_and_one_beside_it_once_it_was_imported(
-    one: Told, file: Path
+def test_a_file_that_never_loaded_is_followed_and_its_modules_once_imported(
+    one: FakeWorkerSession, file: Path
 ) -> None:
     beside = file.with_name("parts.py")
     beside.write_text(GOOD)
@@ -84,7 +86,7 @@ def test_a_file_that_never_loaded_is_followed_and_one_beside_it_once_it_was_impo
     assert one.view.stale
 
 
-def test_a_module_that_broke_before_the_task_was_whole_is_followed(one: Told, file: Path) -> None:
+def test_a_module_that_failed_during_the_first_import_is_followed(one: FakeWorkerSession, file: Path) -> None:
     beside = file.with_name("parts.py")
     beside.write_text("x =\n")
     one.tell(Loading("", 1), TaskFailed(replace(problem(), file=str(beside)), kept=False))
@@ -93,7 +95,7 @@ def test_a_module_that_broke_before_the_task_was_whole_is_followed(one: Told, fi
     saved(one)
 
 
-def test_each_worker_is_greeted_with_what_the_last_one_knew(one: Told, file: Path) -> None:
+def test_a_new_worker_gets_the_state_of_the_last_one(one: FakeWorkerSession, file: Path) -> None:
     runs(one, file)
     one.session.change(speed=2.0)
     one.session.do(PlayRun())
@@ -108,21 +110,21 @@ def test_each_worker_is_greeted_with_what_the_last_one_knew(one: Told, file: Pat
     assert not any(isinstance(request, Play) for request in one.greet()), "a crash pauses"
 
 
-def test_what_ran_comes_back_at_its_newest_moment_then_at_its_start_and_then_nothing_does(
-    one: Told, file: Path
+def test_the_version_that_ran_is_restored_at_its_newest_moment_then_at_its_start_then_not_at_all(
+    one: FakeWorkerSession, file: Path
 ) -> None:
     runs(one, file)
     one.die()
     assert next_load(one) == (GOOD, True)
     one.die()
-    assert next_load(one) == (GOOD, False), "a moment that kills is not tried twice"
+    assert next_load(one) == (GOOD, False), "a moment that crashes the worker is not tried twice"
     one.die()
     assert next_load(one) is None and one.view.state == "error"
     file.write_text(NEW)
     assert saved(one).source is None
 
 
-def test_a_file_that_kills_before_anything_ran_is_waited_for(one: Told) -> None:
+def test_after_a_first_version_crashes_a_save_is_awaited(one: FakeWorkerSession) -> None:
     one.tell(Loading("", 1))
     one.die()
     assert next_load(one) is None and not one.view.problem_at_run
@@ -132,8 +134,8 @@ def test_a_file_that_kills_before_anything_ran_is_waited_for(one: Told) -> None:
 
 
 @pytest.mark.parametrize("death", [DEATH, HANDED_OVER])
-def test_a_new_version_that_kills_or_is_refused_gives_way_to_the_last_good_one(
-    one: Told, file: Path, death: object
+def test_a_new_version_that_crashes_or_is_refused_is_replaced_by_the_last_good_one(
+    one: FakeWorkerSession, file: Path, death: object
 ) -> None:
     runs(one, file)
     one.session.do(PlayRun())
@@ -148,10 +150,14 @@ def test_a_new_version_that_kills_or_is_refused_gives_way_to_the_last_good_one(
         "it ran" if play else ""
     )
     runs(one, file)
-    assert one.view.stale and one.view.problem is not None, "brought back, and the file holds another"
+    assert one.view.stale and one.view.problem is not None, (
+        "an old version runs, and the file has a newer one"
+    )
 
 
-def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Told, file: Path) -> None:
+def test_a_version_that_fails_in_a_fresh_worker_is_replaced_by_the_one_that_ran(
+    one: FakeWorkerSession, file: Path
+) -> None:
     runs(one, file)
     one.session.do(ReloadFile())
     one.tell(NewProcessNeeded("a class", True))
@@ -164,23 +170,23 @@ def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Tol
     assert load.source == {str(file): GOOD} and load.snapshot is not None and load.because == ""
     runs(one, file)
     one.tell(TaskFailed(problem(), kept=True))
-    assert one.asked(Load) == [], "what ran before still runs"
+    assert one.asked(Load) == [], "the last version still runs"
 
 
-def test_a_save_is_not_lost_with_the_worker_that_dies_before_it_takes_it(one: Told, file: Path) -> None:
+def test_a_save_survives_a_worker_that_dies_before_loading_it(one: FakeWorkerSession, file: Path) -> None:
     runs(one, file)
     one.die()
     assert next_load(one) == (GOOD, True)
     one.session.do(ReloadFile())
     one.die()
-    assert next_load(one) == ("disk", True), "it died at the version that was brought back"
+    assert next_load(one) == ("disk", True), "it died with the restored version"
     runs(one, file)
     one.die()
-    assert next_load(one) == ("disk", True), "it has not begun yet"
+    assert next_load(one) == ("disk", True), "the load has not started yet"
 
 
-def test_a_version_that_crashes_soon_and_again_gives_way_to_the_one_before(
-    one: Told, file: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_version_that_crashes_early_twice_is_replaced_by_the_one_before(
+    one: FakeWorkerSession, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs(one, file)
     one.session.do(ReloadFile())
@@ -188,11 +194,11 @@ def test_a_version_that_crashes_soon_and_again_gives_way_to_the_one_before(
     runs(one, file, NEW, "patched")
     one.die()
     assert next_load(one) == (NEW, True)
-    monkeypatch.setattr(recovery, "_PROVEN_SECONDS", -1.0)  # from now on it had worked for long enough
+    monkeypatch.setattr(recovery, "_PROVEN_SECONDS", -1.0)  # from now on the version counts as proven
     for _ in range(3):
         runs(one, file, NEW)
         one.die()
-        assert next_load(one) == (NEW, True), "what it did before is forgotten"
+        assert next_load(one) == (NEW, True), "earlier crashes are forgotten"
     monkeypatch.undo()
     runs(one, file, NEW)
     one.die()
@@ -203,17 +209,17 @@ def test_a_version_that_crashes_soon_and_again_gives_way_to_the_one_before(
     for _ in range(4):
         runs(one, file)
         one.die(IDLE)
-        assert next_load(one) == (GOOD, True), "there is no other, and it made a step in between"
+        assert next_load(one) == (GOOD, True), "no other version exists, and it made a step in between"
         runs(one, file)
         one.step()
     one.die(IDLE)
     assert next_load(one) == (GOOD, True)
     runs(one, file)
     one.die(IDLE)
-    assert next_load(one) is None, "twice while nothing was asked of it"
+    assert next_load(one) is None, "it died twice without a request"
 
 
-def test_after_too_many_deaths_a_reload_starts_another_worker(one: Told, file: Path) -> None:
+def test_after_too_many_deaths_a_reload_starts_another_worker(one: FakeWorkerSession, file: Path) -> None:
     runs(one, file)
     one.session.do(RebuildScene())
     (load,) = one.asked(Load)
@@ -224,8 +230,8 @@ def test_after_too_many_deaths_a_reload_starts_another_worker(one: Told, file: P
 
 
 @given(st.lists(st.sampled_from(["died", "handed over", "failed", "saved", "began", "loaded"]), max_size=40))
-def test_workers_do_not_die_for_ever(events: list[str]) -> None:
-    """Between two saves only so many processes are started, whatever happens to them."""
+def test_the_number_of_restarts_is_limited(events: list[str]) -> None:
+    """Between two saves only a limited number of processes is started, whatever happens to them."""
     task = description(table_scene(1)[0])
     good, new = ({"push.py": text} for text in (GOOD, NEW))
     newest = lambda: b"newest"  # noqa: E731

@@ -23,7 +23,7 @@ keyrings = st.one_of(st.none(), words.map(lambda word: f"/usr/share/keyrings/{wo
 
 
 @given(uri=uris, suite=words, components=st.lists(words, max_size=3), keyring=keyrings)
-def test_both_formats_of_one_source_parse_to_the_same(
+def test_both_formats_of_a_source_parse_equally(
     uri: str, suite: str, components: list[str], keyring: str | None
 ) -> None:
     options = {} if keyring is None else {"Signed-By": keyring}
@@ -43,7 +43,7 @@ def test_any_text_parses_without_raising(text: str) -> None:
         assert source.uris and source.suites
 
 
-def test_sources_that_are_off_or_hold_no_binaries_are_passed_over() -> None:
+def test_disabled_and_source_only_sources_are_skipped() -> None:
     assert (
         parse_one_line_format("# deb http://m/debian bookworm main\ndeb-src http://m/debian bookworm main")
         == []
@@ -53,7 +53,7 @@ def test_sources_that_are_off_or_hold_no_binaries_are_passed_over() -> None:
     assert parse_deb822_format(f"{off}\n{source_only}") == []
 
 
-def test_backports_comes_from_the_mirror_of_the_release_itself_and_is_trusted_the_same_way() -> None:
+def test_backports_use_the_releases_mirror_and_its_keyring() -> None:
     text = (
         "Types: deb\n# a comment inside\nURIs: http://vendor/apt\nSuites: stable\nComponents: main\n\n"
         "Types: deb deb-src\nURIs: https://mirror.lan/debian\nSuites: bookworm bookworm-updates\n"
@@ -71,7 +71,7 @@ def test_no_backports_source_without_a_mirror_of_the_release() -> None:
     assert backports_source(parse_one_line_format(security), "bookworm") is None
 
 
-def test_the_sources_of_a_machine_are_read_from_all_its_files(tmp_path: Path) -> None:
+def test_sources_are_read_from_all_files(tmp_path: Path) -> None:
     (tmp_path / "sources.list").write_text("deb http://a/debian bookworm main\n")
     (tmp_path / "sources.list.d").mkdir()
     (tmp_path / "sources.list.d" / "b.sources").write_text(

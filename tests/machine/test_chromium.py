@@ -8,7 +8,7 @@ import pytest
 from workbench.machine.doctor import chromium_version, find_chromium, how_to_get_chromium
 
 
-def test_the_chromium_of_this_machine_tells_its_version(chromium_path: str) -> None:
+def test_this_machines_chromium_has_a_version(chromium_path: str) -> None:
     version = chromium_version(chromium_path)
     assert version and any(character.isdigit() for character in version)
 
@@ -21,7 +21,7 @@ def test_the_chromium_of_this_machine_tells_its_version(chromium_path: str) -> N
         "echo 'Chromium 120.0.6099.129'; exit 1",
     ],
 )
-def test_ubuntus_stub_for_the_snap_is_not_taken_for_a_browser(
+def test_ubuntus_snap_stub_is_not_taken_for_a_browser(
     says: str, child_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stub = tmp_path / "chromium-browser"
@@ -32,7 +32,7 @@ def test_ubuntus_stub_for_the_snap_is_not_taken_for_a_browser(
     assert find_chromium() is None
 
 
-def test_a_browser_that_was_named_and_does_not_run_is_not_replaced_by_another(
+def test_a_given_browser_that_does_not_run_is_not_replaced(
     child_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PLAYWRIGHT_CHROMIUM", "/nonexistent/chromium")

@@ -8,7 +8,7 @@ import pytest
 from workbench.machine.folders import CurrentFolder
 
 
-def test_one_comes_back_to_it_also_where_it_was_renamed(
+def test_again_returns_to_the_folder_even_after_a_rename(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "one").mkdir()
@@ -23,7 +23,7 @@ def test_one_comes_back_to_it_also_where_it_was_renamed(
     assert Path.cwd() == tmp_path / "two"
 
 
-def test_a_folder_that_the_block_goes_to_stays_unless_it_fails(
+def test_with_stay_the_blocks_folder_is_kept_unless_it_raises(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "one").mkdir()

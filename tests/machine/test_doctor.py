@@ -1,4 +1,4 @@
-"""`workbench doctor`: what this machine can do, also where a question fails or takes too long."""
+"""`workbench doctor` reports what this machine can do, even if a check fails or times out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def found() -> dict[str, DoctorFinding]:
 
 
 @pytest.mark.slow
-def test_every_topic_is_answered_with_versions_and_this_machine_runs_the_workbench() -> None:
+def test_every_topic_has_a_finding_with_versions_and_this_machine_passes() -> None:
     findings = found()
     assert findings.keys() == TOPICS
     assert exit_code(list(findings.values())) == 0, findings
@@ -35,7 +35,7 @@ def test_every_topic_is_answered_with_versions_and_this_machine_runs_the_workben
     assert maniskill is not None and maniskill[1] in findings["ManiSkill"].what
 
 
-def test_what_fails_or_takes_too_long_is_told_and_the_others_are_answered(
+def test_failed_and_timed_out_checks_are_reported_and_the_others_run(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def fail() -> list[DoctorFinding]:
@@ -48,10 +48,10 @@ def test_what_fails_or_takes_too_long_is_told_and_the_others_are_answered(
     monkeypatch.setattr(
         versions.importlib.metadata, "requires", lambda name: ["viser<1", "no-such-package>=2"]
     )
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        monkeypatch.setattr(doctor, "DEFAULT_PORT", taken.getsockname()[1])
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        monkeypatch.setattr(doctor, "DEFAULT_PORT", listener.getsockname()[1])
         began = time.monotonic()
         findings = found()
     assert time.monotonic() - began < 50 and findings.keys() >= {"CUDA", "ManiSkill"}
@@ -66,7 +66,7 @@ def test_what_fails_or_takes_too_long_is_told_and_the_others_are_answered(
     assert findings["Python"].ok and exit_code(list(findings.values())) == 1
 
 
-def test_a_gpu_that_works_is_not_taken_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_working_gpu_is_used_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     answer = '{"built": "12.8", "cuda": ["A card"], "why_not": null, "library": "/lib/PhysXGpu.so"}'
     monkeypatch.setattr(doctor, "GPU_SCRIPT", f"print('{answer}')")
     monkeypatch.setattr(doctor, "VERSION_SCRIPT", "print('{}')")
@@ -75,9 +75,9 @@ def test_a_gpu_that_works_is_not_taken_unasked(monkeypatch: pytest.MonkeyPatch) 
     assert "--backend gpu" in findings["GPU physics"].what
 
 
-def test_the_report_shows_what_to_do_and_reads_brackets_as_text() -> None:
-    said = io.StringIO()
+def test_the_report_shows_advice_and_prints_brackets_literally() -> None:
+    printed = io.StringIO()
     lack = DoctorFinding("render device", False, "found [none]", "Type: apt install [this]")
-    print_report([DoctorFinding("Python", True, "3.11"), lack], Console(file=said, width=60))
-    assert "found [none]" in said.getvalue() and "Type: apt install [this]" in said.getvalue()
+    print_report([DoctorFinding("Python", True, "3.11"), lack], Console(file=printed, width=60))
+    assert "found [none]" in printed.getvalue() and "Type: apt install [this]" in printed.getvalue()
     assert exit_code([lack]) == 1

@@ -1,4 +1,4 @@
-"""The user's configuration folder: a file is changed whole or not at all, and nothing is left beside it."""
+"""The user's configuration folder: writes are atomic and leave no temporary files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @contextmanager
 def full_disk() -> Iterator[None]:
-    """No file can grow, as far as the kernel is concerned."""
+    """Let the kernel refuse to grow any file."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
     try:
@@ -53,7 +53,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_what_is_written_is_read_by_this_user_alone(folder: Path) -> None:
+def test_files_are_private_to_the_user(folder: Path) -> None:
     assert read_private("a.json") is None
     write_private("a.json", b"one")
     write_private("a.json", b"two")
@@ -67,7 +67,7 @@ def test_what_is_written_is_read_by_this_user_alone(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_write_that_fails_leaves_the_old_content_and_nothing_else(
+def test_a_failed_write_leaves_only_the_old_content(
     folder: Path, call: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_private("a.json", b"one")
@@ -80,9 +80,7 @@ def test_a_write_that_fails_leaves_the_old_content_and_nothing_else(
 
 
 @pytest.mark.parametrize("call", ["fsync", "link"])
-def test_a_new_file_that_cannot_be_made_leaves_nothing(
-    folder: Path, call: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_create_leaves_nothing(folder: Path, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         failing(patch, call)
         with pytest.raises(OSError, match="Input/output"):
@@ -100,7 +98,7 @@ def test_a_full_disk_leaves_nothing(folder: Path, write: Callable[[str, bytes], 
     assert read_private("a.json") == b"one" and names(folder) == ["a.json"]
 
 
-def test_a_lock_lets_one_at_a_time_in(folder: Path) -> None:
+def test_a_lock_admits_one_thread_at_a_time(folder: Path) -> None:
     inside, seen = [0], []
 
     def work() -> None:
@@ -119,13 +117,13 @@ def test_a_lock_lets_one_at_a_time_in(folder: Path) -> None:
         thread.join(60)
     assert set(seen) == {1} and read_private("count") == b"150"
     with locked("other"), locked("a.json"):
-        pass  # of another name, another lock
+        pass  # locks of different names are independent
     assert names(folder) == ["a.json.lock", "count", "other.lock"]
     assert (folder / "a.json.lock").stat().st_mode & 0o777 == 0o600
 
 
 @pytest.mark.parametrize("mode", [0o620, 0o602])
-def test_what_others_may_write_is_not_read(folder: Path, mode: int) -> None:
+def test_files_that_others_can_write_are_not_read(folder: Path, mode: int) -> None:
     write_private("a.json", b"one")
     (folder / "a.json").chmod(mode)
     with pytest.raises(NoUserFolder, match=r"others than this user may write to .*a\.json"):
@@ -145,19 +143,19 @@ def _enter(name: str) -> None:
         pass
 
 
-def test_what_belongs_to_another_user_is_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_of_another_user_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_private("a.json", b"one")
     me = os.geteuid()
-    # Another user cannot be had here; one who is not the owner can.
+    # The test cannot switch users, so it fakes the user id.
     monkeypatch.setattr(module.os, "geteuid", lambda: me + 4711)
     if me == 0:
-        assert read_private("a.json") == b"one"  # root's
+        assert read_private("a.json") == b"one"  # root's files are accepted
         os.chown(folder / "a.json", 4710, -1)
     with pytest.raises(NoUserFolder, match="another user"):
         read_private("a.json")
 
 
-def test_what_is_no_ordinary_file_is_not_read(folder: Path) -> None:
+def test_only_regular_files_are_read(folder: Path) -> None:
     write_private("large", b"")
     os.truncate(folder / "large", MAX_FILE_BYTES + 1)
     os.mkfifo(folder / "pipe", 0o600)

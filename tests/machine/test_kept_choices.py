@@ -1,4 +1,4 @@
-"""What is kept of a person's choices between runs."""
+"""The user's choices that are stored between runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def own_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
 
 
-def test_policies_are_kept_by_folder_the_newest_first() -> None:
+def test_policies_are_stored_by_folder_newest_first() -> None:
     here, there = Path("/home/me/lab"), Path("/home/me/other")
     for reference in ("a.py:act", "b.py:act", "a.py:act"):
         keep_policy(here, reference)
@@ -32,7 +32,7 @@ def test_policies_are_kept_by_folder_the_newest_first() -> None:
     assert used_policies(there) == ("c.py:act",) and used_policies(Path("/")) == ()
 
 
-def test_what_is_kept_is_bounded() -> None:
+def test_stored_choices_are_bounded() -> None:
     for number in range(MAX_FOLDERS + 5):
         keep_policy(Path(f"/{number}"), "a.py:act")
     for number in range(MAX_POLICIES + 5):
@@ -43,7 +43,9 @@ def test_what_is_kept_is_bounded() -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b'{"hints_closed": 3}', b"\xff", b"[" * 100_000])
-def test_a_broken_file_is_no_choice_and_is_told(content: bytes, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_corrupt_file_gives_defaults_and_is_logged(
+    content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
     write_private(FILE, content)
     assert not kept_choices().hints_closed
     assert "Stored choices cannot be read" in caplog.text
@@ -51,7 +53,7 @@ def test_a_broken_file_is_no_choice_and_is_told(content: bytes, caplog: pytest.L
     assert kept_choices().hints_closed
 
 
-def test_where_nothing_can_be_kept_the_page_goes_on(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failed_write_is_logged_and_not_raised(caplog: pytest.LogCaptureFixture) -> None:
     close_hints()
     user_folder().chmod(0o777)
     before = (user_folder() / FILE).read_bytes()

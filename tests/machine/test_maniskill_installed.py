@@ -1,4 +1,4 @@
-"""What is said where ManiSkill is not installed, or both of its distributions are, and which command is named."""
+"""Messages and commands if ManiSkill is not installed, or if both of its distributions are."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def lacking(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def mixed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Two distributions as pip describes them, ahead of the one that is installed here."""
+    """Put metadata of two distributions first on the path, as pip writes it."""
     for name, version in (("mani_skill", "3.0.1"), ("mani_skill_nightly", "2026.8.2.400")):
         folder = tmp_path / f"{name}-{version}.dist-info"
         folder.mkdir()
@@ -37,7 +37,7 @@ def mixed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @pytest.fixture
 def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty folder in the place of this process's environment, with a name that a shell takes apart."""
+    """Replace this process's environment with an empty folder whose name needs shell quoting."""
     folder = tmp_path / "archive-v0" / "an env"
     folder.mkdir(parents=True)
     (folder / "pyvenv.cfg").write_text("home = /usr/bin\nversion = 3.11.2\n")
@@ -50,7 +50,7 @@ def made_by_uv(environment: Path) -> None:
     (environment / "pyvenv.cfg").write_text("home = /usr/bin\nuv = 0.13.9\n")
 
 
-def test_where_one_is_installed_nothing_is_said_and_it_is_not_imported_to_know(child_process: None) -> None:
+def test_with_one_distribution_there_is_no_message_and_no_import(child_process: None) -> None:
     assert not lacks_maniskill() and len(installed_maniskills()) == 1
     code = (
         "import sys; from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed;"
@@ -60,7 +60,7 @@ def test_where_one_is_installed_nothing_is_said_and_it_is_not_imported_to_know(c
     assert done.stdout == "None None []\n", done.stderr
 
 
-def test_a_folder_of_its_assets_is_no_maniskill(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_folder_with_assets_only_is_not_maniskill(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "mani_skill" / "assets").mkdir(parents=True)
     monkeypatch.delitem(sys.modules, "mani_skill", raising=False)
     monkeypatch.setattr(sys, "path", [str(tmp_path)])
@@ -68,7 +68,7 @@ def test_a_folder_of_its_assets_is_no_maniskill(monkeypatch: pytest.MonkeyPatch,
 
 
 @pytest.mark.parametrize("how", ["pip", "uv", "uvx", "uv tool"])
-def test_the_command_is_that_of_what_made_the_environment(
+def test_the_command_is_that_of_the_environments_tool(
     lacking: None, environment: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     python = f"'{environment}/bin/python'"
@@ -89,17 +89,18 @@ def test_the_command_is_that_of_what_made_the_environment(
 
 
 @pytest.mark.parametrize("call", ["open PickCube-v1", "record PickCube-v1", "rescore gone"])
-def test_a_command_that_needs_it_says_so_and_does_nothing(
+def test_a_command_that_needs_maniskill_exits_with_the_install_command(
     call: str, lacking: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
         main.main(call.split())
-    said = capsys.readouterr()
-    assert ended.value.code == 2 and "ManiSkill" in said.err and "install" in said.err and said.out == ""
+    printed = capsys.readouterr()
+    assert ended.value.code == 2 and "ManiSkill" in printed.err and "install" in printed.err
+    assert printed.out == ""
 
 
 @pytest.mark.parametrize("module", ["mani_skill", "sapien"])
-def test_what_users_import_says_it_too_and_another_module_that_is_missing_keeps_its_name(
+def test_an_import_names_the_install_command_only_if_maniskill_is_missing(
     lacking: None, monkeypatch: pytest.MonkeyPatch, module: str
 ) -> None:
     def import_module(name: str) -> object:
@@ -111,18 +112,20 @@ def test_what_users_import_says_it_too_and_another_module_that_is_missing_keeps_
     assert raised.value.name == module and ("install" in str(raised.value)) == (module == "mani_skill")
 
 
-def test_two_that_are_mixed_are_told_with_how_to_keep_one(mixed: None, environment: Path) -> None:
+def test_mixed_distributions_are_reported_with_commands_to_keep_one(mixed: None, environment: Path) -> None:
     for uninstall in (f"'{environment}/bin/python' -m pip uninstall", "uv pip uninstall"):
         lines = lines_if_mixed()
         assert lines is not None
-        said = "\n".join(lines)
-        assert said.count(uninstall) == 2
-        assert "mani_skill==3.0.1" in said and "mani_skill-nightly==2026.8.2.400" in said
+        text = "\n".join(lines)
+        assert text.count(uninstall) == 2
+        assert "mani_skill==3.0.1" in text and "mani_skill-nightly==2026.8.2.400" in text
         made_by_uv(environment)
 
 
-def test_open_warns_of_the_mix_and_goes_on(mixed: None, capsys: pytest.CaptureFixture[str]) -> None:
+def test_open_warns_about_mixed_distributions_and_continues(
+    mixed: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as ended:
         main.main(["open", "gone.py"])
-    said = capsys.readouterr().err
-    assert ended.value.code == 2 and "pip uninstall" in said and "gone.py" in said
+    err = capsys.readouterr().err
+    assert ended.value.code == 2 and "pip uninstall" in err and "gone.py" in err

@@ -1,4 +1,4 @@
-"""Text is parsed in several threads without an error that is none of the text's."""
+"""Parsing in several threads raises only errors of the text itself."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.thorough
 PACKAGE = Path(__file__).parents[2] / "workbench"
 
 
-def test_threads_parse_at_once_while_garbage_is_collected() -> None:
+def test_threads_can_parse_during_garbage_collection() -> None:
     text, failures = (PACKAGE / "envs" / "maniskill_private.py").read_text(), []
 
     def parse(depth: int) -> None:
@@ -29,13 +29,13 @@ def test_threads_parse_at_once_while_garbage_is_collected() -> None:
             except SystemError as error:
                 failures.append(error)
 
-    def go_on(phase: str, info: dict[str, int]) -> None:
-        """As a finalizer may, and what hypothesis does: another thread goes on in the middle of a tree."""
+    def switch_thread(phase: str, info: dict[str, int]) -> None:
+        """Switch threads during a collection, as a finalizer may, while the parser builds a tree."""
         time.sleep(0)
 
     threads = [threading.Thread(target=parse, args=(depth,)) for depth in (0, 30, 60, 90)]
     before = sys.getswitchinterval()
-    gc.callbacks.append(go_on)
+    gc.callbacks.append(switch_thread)
     sys.setswitchinterval(1e-5)
     try:
         for thread in threads:
@@ -44,11 +44,11 @@ def test_threads_parse_at_once_while_garbage_is_collected() -> None:
             thread.join()
     finally:
         sys.setswitchinterval(before)
-        gc.callbacks.remove(go_on)
+        gc.callbacks.remove(switch_thread)
     assert failures == []
 
 
-def test_a_fault_of_the_text_is_told_with_its_line() -> None:
-    with pytest.raises(SyntaxError) as told:
+def test_a_syntax_error_has_its_line_and_file() -> None:
+    with pytest.raises(SyntaxError) as raised:
         parse_python("x = 1\nif\n", "task.py")
-    assert (told.value.lineno, told.value.filename) == (2, "task.py")
+    assert (raised.value.lineno, raised.value.filename) == (2, "task.py")

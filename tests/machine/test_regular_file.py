@@ -30,7 +30,7 @@ def test_one_byte_too_many_is_refused_with_both_sizes(tmp_path: Path) -> None:
         open_regular_file(file, 6)
 
 
-def test_a_file_that_says_no_size_is_read_only_so_far() -> None:
+def test_a_file_without_a_size_is_read_up_to_the_limit() -> None:
     assert os.stat("/proc/self/status").st_size == 0
     with pytest.raises(FileTooLarge, match="has more than the 10 bytes"):
         read_regular_file("/proc/self/status", 10)
@@ -54,7 +54,7 @@ def _socket(path: Path) -> None:
         (lambda path: path.mkdir(), "folder"),
     ],
 )
-def test_what_is_no_file_is_refused_at_once(
+def test_anything_but_a_regular_file_is_refused_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[Path], None], kind: str
 ) -> None:
     monkeypatch.chdir(tmp_path)  # the path of a socket must be short
@@ -66,8 +66,8 @@ def test_what_is_no_file_is_refused_at_once(
         open_regular_file(path)
 
 
-@pytest.mark.timeout(60)  # a read that waits does so for ever
-def test_a_file_that_becomes_a_pipe_meanwhile_is_not_waited_for(tmp_path: Path) -> None:
+@pytest.mark.timeout(60)  # a blocking read would never return
+def test_a_file_replaced_by_a_pipe_does_not_block(tmp_path: Path) -> None:
     path, stop = tmp_path / "task.py", threading.Event()
 
     def exchange() -> None:

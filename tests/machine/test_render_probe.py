@@ -13,7 +13,7 @@ from workbench.machine.software_vulkan import ensure_render_device
 pytestmark = pytest.mark.usefixtures("child_process")
 
 
-def test_this_machine_renders_and_the_driver_is_named() -> None:
+def test_this_machine_renders_and_its_driver_is_named() -> None:
     probe = probe_render_device()
     assert probe.ok, probe.error
     assert probe.name
@@ -21,7 +21,7 @@ def test_this_machine_renders_and_the_driver_is_named() -> None:
     assert probe.driver and any(character.isdigit() for character in probe.driver)
 
 
-def test_a_driver_file_that_leads_nowhere_is_no_render_device(tmp_path: Path) -> None:
+def test_a_driver_file_with_a_missing_library_is_no_render_device(tmp_path: Path) -> None:
     manifest = tmp_path / "broken_icd.json"
     icd = {"library_path": str(tmp_path / "libnothing.so"), "api_version": "1.3.0"}
     manifest.write_text(json.dumps({"file_format_version": "1.0.0", "ICD": icd}))
@@ -30,35 +30,33 @@ def test_a_driver_file_that_leads_nowhere_is_no_render_device(tmp_path: Path) ->
     assert probe.error and str(manifest) in probe.error
 
 
-def test_a_driver_that_kills_the_process_is_an_answer(
+def test_a_driver_that_crashes_the_process_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _let_python_be(tmp_path, monkeypatch, "kill -SEGV $$")
+    _replace_python(tmp_path, monkeypatch, "kill -SEGV $$")
     probe = probe_render_device()
     assert not probe.ok
     assert probe.error == "SAPIEN was killed by SIGSEGV"
 
 
-def test_a_driver_that_hangs_is_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _let_python_be(tmp_path, monkeypatch, "exec sleep 60")
+def test_a_driver_that_hangs_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _replace_python(tmp_path, monkeypatch, "exec sleep 60")
     probe = probe_render_device(timeout_s=0.5)
     assert not probe.ok
     assert probe.error and "no answer" in probe.error
 
 
-def test_a_driver_that_the_person_chose_is_not_replaced(
+def test_a_driver_that_the_user_chose_is_not_replaced(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent.json")
-    monkeypatch.setenv("PATH", str(tmp_path))  # apt-get would not be found, and its absence not forgiven
+    monkeypatch.setenv("PATH", str(tmp_path))  # without apt-get, an attempt to install would fail
     probe = ensure_render_device(install=True)
     assert not probe.ok
     assert probe.error and "unset it" in probe.error
 
 
-def test_where_something_renders_nothing_is_installed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_nothing_is_installed_if_a_device_renders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     called = tmp_path / "called"
     apt = tmp_path / "apt-get"
     apt.write_text(f"#!/bin/sh\ntouch {called}\n")
@@ -68,8 +66,8 @@ def test_where_something_renders_nothing_is_installed(
     assert not called.exists()
 
 
-def _let_python_be(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
-    """Stand in for an interpreter whose native code misbehaves: no driver at hand crashes on demand."""
+def _replace_python(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    """Replace the interpreter by a script, to simulate a driver that crashes or hangs."""
     python = folder / "python"
     python.write_text(f"#!/bin/sh\n{script}\n")
     python.chmod(python.stat().st_mode | stat.S_IXUSR)

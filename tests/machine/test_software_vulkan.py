@@ -30,7 +30,7 @@ UBUNTU_22_04 = "mesa-vulkan-drivers | 23.2.1-1ubuntu3.1~22.04.3 | http://mirror/
         ("N: Unable to locate package mesa-vulkan-drivers\n", None),
     ],
 )
-def test_a_mesa_that_sapien_renders_on_is_chosen(listing: str, wanted: PackageVersion | None) -> None:
+def test_a_mesa_version_that_works_with_sapien_is_chosen(listing: str, wanted: PackageVersion | None) -> None:
     assert first_good_mesa(parse_madison(listing)) == wanted
 
 
@@ -38,25 +38,25 @@ def test_a_mesa_that_sapien_renders_on_is_chosen(listing: str, wanted: PackageVe
     ("version", "wanted"),
     [("1:24.3.0-1", (24, 3)), ("22.3.6-1+deb12u1", (22, 3)), ("25.0.7", (25, 0)), ("git20250101", (0, 0))],
 )
-def test_versions_are_read_as_debian_writes_them(version: str, wanted: tuple[int, int]) -> None:
+def test_debian_versions_are_parsed(version: str, wanted: tuple[int, int]) -> None:
     assert mesa_version(version) == wanted
 
 
 @pytest.mark.usefixtures("child_process")
-def test_a_device_that_was_found_is_not_asked_for_again_until_its_driver_changes(
+def test_a_found_device_is_cached_until_its_driver_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     found = known_render_device(install=False)
     if not found.ok:
         pytest.skip("nothing renders here")
-    (kept,) = (tmp_path / "workbench").glob("render-device-*.json")
-    kept.write_bytes(msgspec.json.encode(RenderProbe(ok=True, name="as it was kept")))
-    assert known_render_device(install=False).name == "as it was kept"
-    kept.write_bytes(b"{")
+    (cached,) = (tmp_path / "workbench").glob("render-device-*.json")
+    cached.write_bytes(msgspec.json.encode(RenderProbe(ok=True, name="from the cache")))
+    assert known_render_device(install=False).name == "from the cache"
+    cached.write_bytes(b"{")
     assert known_render_device(install=False) == found
     broken = tmp_path / "broken.json"
     broken.write_text("{}")
     monkeypatch.setenv("VK_DRIVER_FILES", str(broken))
     assert not known_render_device(install=False).ok
-    assert len([*kept.parent.glob("render-device-*.json")]) == 1, "only what works is kept"
+    assert len([*cached.parent.glob("render-device-*.json")]) == 1, "only working devices are cached"

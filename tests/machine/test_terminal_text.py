@@ -45,7 +45,7 @@ EVIL = st.lists(st.text(st.characters(), max_size=8) | st.sampled_from(PIECES), 
 
 
 def harmful(text: str) -> list[str]:
-    """Characters that do something to a terminal or to how a line reads."""
+    """Return the characters that control a terminal or change a line's reading order."""
     return [
         c
         for c in text
@@ -62,7 +62,7 @@ def test_plain_text_has_no_control_character(text: str) -> None:
 
 
 @given(EVIL)
-def test_beside_colours_nothing_is_left_for_a_terminal(text: str) -> None:
+def test_only_colours_reach_the_terminal(text: str) -> None:
     assert set(harmful(COLOURS.sub("", only_colours(text)))) <= {"\n", "\t"}
     runs, _ = coloured_runs(text)
     assert set(harmful("".join(run.text for run in runs))) <= {"\t"}
@@ -71,12 +71,12 @@ def test_beside_colours_nothing_is_left_for_a_terminal(text: str) -> None:
 
 
 @given(EVIL)
-def test_what_a_reader_sees_is_the_same_with_and_without_colours(text: str) -> None:
+def test_coloured_runs_survive_a_round_trip_through_the_terminal_text(text: str) -> None:
     runs, style = coloured_runs(text)
     printed = for_terminal(tuple(runs))
     again, after = coloured_runs(printed)
     assert [(run.text, run.style) for run in again] == [(run.text, run.style) for run in runs]
-    assert after == PLAIN, "the workbench's own lines are not coloured by what came before"
+    assert after == PLAIN, "a style must not leak into the workbench's next line"
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_what_a_reader_sees_is_the_same_with_and_without_colours(text: str) -> N
         ("\U000e0041", "\\U000e0041"),
     ],
 )
-def test_controls_are_shown_as_python_writes_them(text: str, shown: str) -> None:
+def test_control_characters_are_shown_as_python_escapes(text: str, shown: str) -> None:
     assert plain_text(text) == shown
 
 
@@ -113,12 +113,12 @@ def test_controls_are_shown_as_python_writes_them(text: str, shown: str) -> None
         ("4:3", Style(underline=True)),
     ],
 )
-def test_colours_are_read_as_terminals_do(numbers: str, style: Style) -> None:
+def test_colours_are_parsed_as_terminals_do(numbers: str, style: Style) -> None:
     runs, _ = coloured_runs(f"\x1b[{numbers}mx")
     assert runs == [StyledText("x", style)]
 
 
-def test_a_style_goes_on_over_lines_and_text_that_is_hidden_is_not_hidden() -> None:
+def test_a_style_continues_over_lines_and_hidden_text_is_shown() -> None:
     first, style = coloured_runs("\x1b[31mone")
     second, _ = coloured_runs("two\x1b[0m three", style)
     assert first == [StyledText("one", Style(color="color(1)"))]
@@ -126,7 +126,7 @@ def test_a_style_goes_on_over_lines_and_text_that_is_hidden_is_not_hidden() -> N
     assert only_colours("\x1b[31;8msecret\x1b[0m") == "\\x1b[31;8msecret\x1b[0m"
 
 
-def test_a_logged_traceback_is_some_lines_of_bounded_length(child_process: None) -> None:
+def test_a_logged_traceback_has_bounded_lines_and_length(child_process: None) -> None:
     program = (
         "import logging\nfrom workbench.machine.text import guard_terminal\nguard_terminal()\n"
         "def deeper(n):\n    other(n)\ndef other(n):\n    if not n: raise ValueError('z' * 100_000)\n    deeper(n - 1)\n"

@@ -1,7 +1,7 @@
-"""viser sends no value that is equal to the present one: panels assign freely and rely on it.
+"""viser does not send a value that equals the current one: panels assign freely and rely on it.
 
-A page is drawn many times a second. Equal values would be most of the traffic, and HTML that is sent again is rebuilt in
-the browser, under the pointer of a person about to press it.
+A page is drawn many times a second. Equal values would be most of the traffic, and the browser rebuilds resent HTML
+under the pointer of a user who is about to press it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pytest
 import viser
 import viser.uplot as uplot
 
-from tests.drive.panels import told_so_far
+from tests.drive.panels import messages_sent
 
 Make = Callable[[viser.ViserServer], Any]
 LINES = np.zeros((2, 2, 3), np.float32)
@@ -65,7 +65,7 @@ SKIPPED: tuple[tuple[str, str, object], ...] = (
     ("chart", "visible", False),
     ("chart", "title", "another"),
     ("image", "format", "png"),
-    ("image", "image", np.ones((2, 2, 3), np.uint8)),  # but it is encoded each time
+    ("image", "image", np.ones((2, 2, 3), np.uint8)),  # not sent again, but encoded each time
     ("lines", "points", LINES + 1),
     ("lines", "visible", False),
     ("label", "text", "another"),
@@ -94,13 +94,13 @@ def server() -> Iterator[viser.ViserServer]:
 
 
 def sent_by(server: viser.ViserServer, handle: Any, name: str, value: object) -> int:
-    before = told_so_far(server)
+    before = messages_sent(server)
     setattr(handle, name, value)
-    return told_so_far(server) - before
+    return messages_sent(server) - before
 
 
 @pytest.mark.parametrize(("kind", "name", "value"), SKIPPED)
-def test_what_is_equal_is_not_sent(server: viser.ViserServer, kind: str, name: str, value: object) -> None:
+def test_an_equal_value_is_not_sent(server: viser.ViserServer, kind: str, name: str, value: object) -> None:
     handle = MAKERS[kind](server)
     assert sent_by(server, handle, name, value) >= 1
     again = value.copy() if isinstance(value, np.ndarray) else value
@@ -109,7 +109,7 @@ def test_what_is_equal_is_not_sent(server: viser.ViserServer, kind: str, name: s
 
 
 @pytest.mark.parametrize(("kind", "name", "value"), SENT_AGAIN)
-def test_what_is_sent_again_is_assigned_only_when_it_changes(
+def test_values_that_viser_resends_are_assigned_only_on_change(
     server: viser.ViserServer, kind: str, name: str, value: object
 ) -> None:
     handle = MAKERS[kind](server)

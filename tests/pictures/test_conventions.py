@@ -1,4 +1,4 @@
-"""Poses and lenses said in every way: against ManiSkill's and SAPIEN's own matrices, and there and back."""
+"""Conversions between pose and lens conventions agree with ManiSkill's and SAPIEN's matrices and are invertible."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ DOWN, UP = (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)
 
 def assert_same_pose(a: Any, b: Any, atol: float = 1e-9) -> None:
     assert_allclose(a[:3], b[:3], atol=atol)
-    # q and -q are one rotation, also where the sign hangs on the last digit of a zero.
+    # q and -q are the same rotation, and rounding may decide the sign.
     assert abs(float(np.dot(a[3:], b[3:]))) == pytest.approx(1, abs=atol)
 
 
 class Posed(Bare):
-    """Cameras at four poses, one with an intrinsic matrix of unlike focal lengths off the middle."""
+    """Cameras at four poses, one with unequal focal lengths and an off-centre principal point."""
 
     EYES = ((0.3, 0.0, 0.6), (1.0, -2.0, 0.1), (-0.5, 0.5, 3.0), (0.2, 0.1, 0.05))
     TARGET = (-0.1, 0.0, 0.1)
@@ -55,7 +55,7 @@ class Posed(Bare):
         ]
 
 
-def test_matrices_are_those_of_maniskills_cameras(renderer: None) -> None:
+def test_matrices_equal_those_of_maniskills_cameras(renderer: None) -> None:
     env: Any = batch_of(Posed, 2, obs_mode="rgb", render_backend=RENDER_BACKEND)
     for i, eye in enumerate(Posed.EYES):
         camera = env._sensors[f"c{i}"]
@@ -71,39 +71,39 @@ def test_matrices_are_those_of_maniskills_cameras(renderer: None) -> None:
         if i < 3:
             assert frames.vertical_fov(intrinsic, 48) == pytest.approx(component.fovy, abs=1e-6)
             assert frames.horizontal_fov(intrinsic, 64) == pytest.approx(component.fovx, abs=1e-6)
-        # SAPIEN's own component, whose matrices are computed apart from ManiSkill's.
+        # SAPIEN computes its matrices independently of ManiSkill.
         assert_allclose(frames.opencv_extrinsic(pose), component.get_extrinsic_matrix(), atol=2e-6)
     env.close()
 
 
 @fewer
 @given(positions, positions)
-def test_look_at_is_maniskills_wherever_that_one_is_right(eye: Any, target: Any) -> None:
+def test_look_at_equals_maniskills_where_that_is_correct(eye: Any, target: Any) -> None:
     away = np.subtract(target, eye)
-    # In float32, near the vertical and very near the eye, upstream's has no digits left.
+    # Near the vertical or with a target close to the eye, upstream's float32 result loses all precision.
     assume(np.linalg.norm(away) > 0.1 and math.hypot(*away[:2]) > 0.02 * np.linalg.norm(away))
     theirs = sapien_utils.look_at(eye, target).raw_pose[0].numpy()
     assert_same_pose(frames.pose_from_look_at(LookAt(eye, target)), theirs, atol=2e-4)
 
 
 @pytest.mark.parametrize(("forward", "top"), [(DOWN, (1, 0, 0)), (UP, (-1, 0, 0))])
-def test_straight_down_and_up_are_right_where_upstream_is_not(forward: Any, top: Any) -> None:
+def test_straight_down_and_up_are_correct_where_upstream_is_not(forward: Any, top: Any) -> None:
     eye = (0.2, -0.1, 0.5)
     target = tuple(np.add(eye, forward))
     upstream = sapien_utils.look_at(eye, target).raw_pose[0, 3:].numpy()
-    assert np.linalg.norm(upstream) < 0.9, "upstream mended it: the page need no longer warn"
+    assert np.linalg.norm(upstream) < 0.9, "upstream fixed it, so the page's warning can go"
     pose = frames.pose_from_look_at(LookAt(eye, target))
     assert np.linalg.norm(pose[3:]) == pytest.approx(1)
     ahead, left, up = frames.axes_of(pose[3:])
     assert_allclose([ahead, left, up], [forward, (0, 1, 0), top], atol=1e-12)
-    # It is where an upright camera ends that is tilted: no jump on the way.
+    # The limit of an upright camera as it tilts to vertical, so there is no jump.
     nearly = frames.pose_from_look_at(LookAt(eye, tuple(np.add(target, (0.001, 0, 0)))))
     assert_same_pose(pose, nearly, atol=2e-3)
 
 
 @fewer
 @given(poses, st.floats(0.05, 20))
-def test_look_at_and_back(pose: Any, distance: float) -> None:
+def test_look_at_survives_a_round_trip(pose: Any, distance: float) -> None:
     looking = frames.look_at_of(pose, distance)
     assert np.linalg.norm(np.subtract(looking.target, looking.eye)) == pytest.approx(distance)
     assert_same_pose(frames.pose_from_look_at(looking), pose, atol=1e-8)
@@ -112,13 +112,13 @@ def test_look_at_and_back(pose: Any, distance: float) -> None:
 def test_a_positive_roll_turns_the_camera_clockwise_seen_from_behind() -> None:
     level, rolled = (frames.pose_from_look_at(LookAt((0, 0, 1), (1, 0, 1), roll)) for roll in (0.0, 0.3))
     assert_allclose(frames.axes_of(level[3:])[1], (0, 1, 0), atol=1e-12)
-    assert frames.axes_of(rolled[3:])[1][2] > 0.2, "its left side goes up"
+    assert frames.axes_of(rolled[3:])[1][2] > 0.2, "the camera's left side must rise"
     assert frames.rpy_of(rolled[3:])[0] == pytest.approx(math.degrees(0.3))
 
 
 @fewer
 @given(quaternions)
-def test_quaternion_matrix_axes_and_rpy_are_one_rotation(quaternion: Any) -> None:
+def test_quaternion_matrix_axes_and_rpy_describe_the_same_rotation(quaternion: Any) -> None:
     q = frames.normalised(quaternion)
     r = frames.rotation_matrix(q)
     assert_allclose(r, transforms3d.quaternions.quat2mat(q), atol=1e-9)
@@ -134,14 +134,14 @@ def test_quaternion_matrix_axes_and_rpy_are_one_rotation(quaternion: Any) -> Non
 @pytest.mark.parametrize("pitch", [90.0, -90.0])
 @fewer
 @given(yaw=st.floats(-179, 179))
-def test_of_a_camera_that_looks_straight_down_or_up_all_of_the_turn_is_yaw(pitch: float, yaw: float) -> None:
+def test_straight_down_or_up_the_whole_rotation_is_yaw(pitch: float, yaw: float) -> None:
     q = frames.quaternion_from_rpy(0, pitch, yaw)
     assert_allclose(frames.rpy_of(q), (0, pitch, yaw), atol=1e-3)
 
 
 @fewer
 @given(st.floats(-180, 180), st.floats(-90, 90), st.floats(-180, 180))
-def test_rpy_is_that_of_urdf_and_ros(roll: float, pitch: float, yaw: float) -> None:
+def test_rpy_follows_urdf_and_ros(roll: float, pitch: float, yaw: float) -> None:
     theirs = transforms3d.euler.euler2mat(*np.radians([roll, pitch, yaw]), axes="sxyz")
     assert_allclose(frames.rotation_matrix(frames.quaternion_from_rpy(roll, pitch, yaw)), theirs, atol=1e-9)
 
@@ -151,7 +151,7 @@ def test_rpy_is_that_of_urdf_and_ros(roll: float, pitch: float, yaw: float) -> N
 @given(poses)
 @pytest.mark.parametrize("convention", ["maniskill", "opencv", "opengl"])
 @pytest.mark.parametrize("direction", ["camera_to_world", "world_to_camera"])
-def test_matrices_and_back(convention: Any, direction: Any, pose: Any) -> None:
+def test_matrices_survive_a_round_trip(convention: Any, direction: Any, pose: Any) -> None:
     matrix = frames.matrix_of(pose, convention, direction)
     assert_same_pose(frames.pose_from_matrix(matrix, convention, direction), pose, atol=1e-8)
     assert_same_pose(frames.pose_from_matrix(matrix[:3], convention, direction), pose, atol=1e-8)
@@ -161,7 +161,7 @@ def test_matrices_and_back(convention: Any, direction: Any, pose: Any) -> None:
 
 @fewer
 @given(poses, poses)
-def test_a_mounts_frame_and_back_as_sapien_has_it(mount: Any, local: Any) -> None:
+def test_a_mounts_frame_equals_sapiens_and_survives_a_round_trip(mount: Any, local: Any) -> None:
     world = frames.compose(mount, local)
     theirs = sapien.Pose(mount[:3], mount[3:]) * sapien.Pose(local[:3], local[3:])
     assert_same_pose(world, np.concatenate([theirs.p, theirs.q]), atol=1e-4)
@@ -171,7 +171,7 @@ def test_a_mounts_frame_and_back_as_sapien_has_it(mount: Any, local: Any) -> Non
 
 @fewer
 @given(fovs, sizes, sizes)
-def test_fov_and_intrinsic_are_one_lens(fov: float, width: int, height: int) -> None:
+def test_fov_and_intrinsic_describe_the_same_lens(fov: float, width: int, height: int) -> None:
     k = frames.intrinsic_from_fov(fov, width, height)
     assert frames.vertical_fov(k, height) == pytest.approx(fov)
     larger = frames.scaled_intrinsic(k, (width, height), (2 * width, 3 * height))

@@ -1,4 +1,4 @@
-"""Fast pictures against exact ones of the same state, and what must not change by them."""
+"""Fast pictures differ little from exact pictures of the same state and have no side effects."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ ALL_THREE = ("rgb", "depth", "segmentation")
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[Any]:
-    made = batched("PickCube-v1", obs_mode="rgb+depth+segmentation")
-    made.step(torch.from_numpy(made.action_space.sample()))
-    yield made
-    made.close()
+    env = batched("PickCube-v1", obs_mode="rgb+depth+segmentation")
+    env.step(torch.from_numpy(env.action_space.sample()))
+    yield env
+    env.close()
 
 
 def observed(env: Any) -> dict[str, np.ndarray]:
@@ -46,13 +46,13 @@ def test_a_fast_picture_differs_little_and_an_exact_one_not_at_all(env: Any) -> 
     for name, exact in before.items():
         np.testing.assert_array_equal(after[name], exact)
     off = np.abs(fast["rgb"].astype(int) - before["rgb"])
-    assert off.any(), "it is another picture"
+    assert off.any(), "the fast picture must differ"
     assert off.mean() < 0.6 and (off.max(axis=-1) > 10).mean() < 0.008
     assert (fast["segmentation"] != before["segmentation"]).mean() < 0.01
     assert (np.abs(fast["depth"].astype(int) - before["depth"]) > 20).mean() < 0.01
 
 
-def test_pictures_of_one_camera_are_those_of_the_observation(env: Any) -> None:
+def test_pictures_of_one_camera_equal_the_observation(env: Any) -> None:
     env.scene.pictures = "fast"
     seen = observed(env)
     env.scene.pictures = "exact"
@@ -64,7 +64,7 @@ def test_pictures_of_one_camera_are_those_of_the_observation(env: Any) -> None:
     np.testing.assert_array_equal(exact.rgb, observed(env)["rgb"][0])
 
 
-def test_a_colour_that_is_changed_later_shows_in_both(env: Any) -> None:
+def test_a_later_colour_change_shows_in_fast_and_exact_pictures(env: Any) -> None:
     link = env.agent.robot.links_map["panda_hand"]
     materials = [part.material for shape in link.render_shapes[0] for part in shape.parts]
     was = [list(material.base_color) for material in materials]
@@ -83,7 +83,7 @@ def test_a_colour_that_is_changed_later_shows_in_both(env: Any) -> None:
             material.base_color = color
 
 
-def test_a_body_that_is_hidden_is_hidden_in_both(env: Any) -> None:
+def test_a_hidden_body_is_hidden_in_fast_and_exact_pictures(env: Any) -> None:
     entity = env.agent.robot.links_map["panda_hand"]._objs[0].entity
     body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
     take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
@@ -98,7 +98,7 @@ def test_a_body_that_is_hidden_is_hidden_in_both(env: Any) -> None:
 
 
 @pytest.mark.skipif(RENDER_DEVICE == "cuda", reason="a GPU draws exact pictures")
-def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
+def test_make_with_fast_pictures_warns() -> None:
     with pytest.warns(UserWarning, match="simplified meshes"):
         env: Any = workbench.make("PickCube-v1", 1, obs_mode="rgb", pictures="fast")
     obs, _ = env.reset(seed=0)
@@ -111,13 +111,13 @@ def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
 
 @pytest.fixture(scope="module")
 def wrist() -> Iterator[Any]:
-    made = batched("PickCube-v1", obs_mode="rgb", robot_uids="panda_wristcam")
-    yield made
-    made.close()
+    env = batched("PickCube-v1", obs_mode="rgb", robot_uids="panda_wristcam")
+    yield env
+    env.close()
 
 
 def drawn_by(env: Any, camera: str) -> dict[str, int]:
-    """Triangles that stand for those of each body in fast pictures of env 0, by the body's name; without those that are exact."""
+    """Return the number of simplified triangles drawn for each body in fast pictures of env 0, by body name."""
     count = {}
     for exact, fast in env.scene._fast[0].bodies(("sensor", camera), 0):
         shapes = [] if fast is None else fast.render_shapes
@@ -126,7 +126,7 @@ def drawn_by(env: Any, camera: str) -> dict[str, int]:
 
 
 @pytest.mark.slow
-def test_a_wrist_camera_draws_nothing_of_what_is_beside_and_behind_it(wrist: Any) -> None:
+def test_a_wrist_camera_skips_bodies_outside_its_view(wrist: Any) -> None:
     exact, fast = (
         take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb", "segmentation"])], degree=degree)[0]
         for degree in ("exact", "fast")
@@ -135,7 +135,7 @@ def test_a_wrist_camera_draws_nothing_of_what_is_beside_and_behind_it(wrist: Any
     assert fast.rgb is not None and exact.rgb is not None
     assert np.abs(fast.rgb.astype(int) - exact.rgb).mean() < 1
     drawn = drawn_by(wrist, "hand_camera")
-    # The first is the camera's own body, of 425,000 triangles.
+    # camera_link is the camera's own body, with 425,000 triangles.
     assert drawn["camera_link"] == drawn["panda_link7"] == drawn["panda_link0"] == 0
 
 
@@ -148,9 +148,7 @@ def test_a_wrist_camera_draws_nothing_of_what_is_beside_and_behind_it(wrist: Any
         ((0.1, 0, 0.3), (0.7071068, 0, 0.7071068, 0)),
     ],
 )
-def test_a_camera_that_is_moved_on_its_mount_sees_what_it_is_fixed_to(
-    wrist: Any, at: Any, turned: Any
-) -> None:
+def test_a_camera_moved_on_its_mount_sees_the_mount(wrist: Any, at: Any, turned: Any) -> None:
     component = camera_components(wrist._sensors["hand_camera"])[0]
     take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb"])], degree="fast")
     was = component.local_pose
@@ -177,7 +175,7 @@ def test_a_body_that_comes_into_view_is_drawn(env: Any) -> None:
         component.local_pose = was * sapien.Pose(q=[0, 0, 0, 1])
         (away,) = take_pictures(env, 0, request, degree="fast")
         assert set(drawn_by(env, "base_camera").values()) <= {0, 2}, (
-            "the robot is behind it; the floor is not"
+            "only the floor may be drawn: the robot is behind the camera"
         )
     finally:
         component.local_pose = was

@@ -1,4 +1,4 @@
-"""Objects that a task hides from its sensors: pictures of a batch against those of stock ManiSkill's single CPU env."""
+"""Objects hidden from sensors: pictures of a batch equal those of stock ManiSkill's single CPU env."""
 
 # ManiSkill annotates an env's members as the widest thing they may be, and vectors as tuples.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -29,7 +29,7 @@ KINDS = ("parts", "own", "alone")
 
 
 class Hides(Bare):
-    """Boxes beside each other, each hidden in another way, which move in resets and steps."""
+    """Boxes in a row, each hidden in a different way, that move in resets and steps."""
 
     def _load_scene(self, options: dict) -> None:
         parts = []
@@ -37,7 +37,7 @@ class Hides(Bare):
             part = self._box(f"part_{number}", 0.05 + 0.02 * number, 0.6, [i])
             self._hidden_objects.append(part)
             parts.append(part)
-        # Hidden one by one, and moved and read by the actor that they are merged into.
+        # Hidden one by one, but moved and read through the merged actor.
         self.parts = Actor.merge(parts, "parts")
         self.own = self._box("own", 0.08, 0.2)
         self._hidden_objects.append(self.own)
@@ -87,14 +87,14 @@ def env(renderer: None) -> Iterator[Any]:
 
 
 def ids(env: Any, number: int) -> dict[str, int]:
-    """The segmentation id of each hidden thing that this env has."""
+    """Return the segmentation id of each hidden object that env `number` has."""
     index = scene_index(env)
-    found = {kind: index.entities[number, index.names.index(kind)] for kind in KINDS}
-    return {kind: int(entity.per_scene_id) for kind, entity in found.items() if entity is not None}
+    entities = {kind: index.entities[number, index.names.index(kind)] for kind in KINDS}
+    return {kind: int(entity.per_scene_id) for kind, entity in entities.items() if entity is not None}
 
 
 @pytest.mark.slow
-def test_each_camera_sees_what_that_of_a_stock_env_sees(env: Any) -> None:
+def test_each_camera_sees_what_a_stock_env_sees(env: Any) -> None:
     stocks = [single(Hides, first_env=number, **RENDERED) for number in range(N)]
     ours, _ = env.reset(seed=list(range(N)))
     theirs = [stock.reset(seed=number)[0] for number, stock in enumerate(stocks)]
@@ -109,14 +109,16 @@ def test_each_camera_sees_what_that_of_a_stock_env_sees(env: Any) -> None:
             assert not np.isin(seen["beside/segmentation"][number], [*hidden.values()]).any(), where
             for entry, value in stock.evaluate().items():
                 assert torch.equal(evaluated[entry][number], value[0]), f"{entry} of {where}"
-        # Of one camera, after which stock leaves hidden objects shown, and then of all.
+        # Render one camera at a time: stock leaves hidden objects visible after it.
         for name in ("people", "behind"):
             shown = np.asarray(env.render_rgb_array(name))
             for number, stock in enumerate(stocks):
                 assert np.array_equal(shown[number], stock.render_rgb_array(name)[0]), (
                     f"{name} of env {number}"
                 )
-            assert (shown.astype(int).max(axis=-1) > 150).any(), "else nothing is shown"
+            assert (shown.astype(int).max(axis=-1) > 150).any(), (
+                "hidden objects must be visible to human render cameras"
+            )
         ours = env.step(None)[0]
         theirs = [stock.step(None)[0] for stock in stocks]
     for stock in stocks:
@@ -124,7 +126,7 @@ def test_each_camera_sees_what_that_of_a_stock_env_sees(env: Any) -> None:
 
 
 @pytest.mark.parametrize("before", ["obs", "people", "nothing"])
-def test_the_pages_pictures_are_those_of_the_env_whatever_it_drew_last(env: Any, before: str) -> None:
+def test_the_pages_pictures_equal_the_envs_after_any_earlier_rendering(env: Any, before: str) -> None:
     env.reset(seed=list(range(N)))
     if before == "people":
         env.render_rgb_array("people")
@@ -147,17 +149,17 @@ def test_the_pages_pictures_are_those_of_the_env_whatever_it_drew_last(env: Any,
         assert np.abs(human.rgb.astype(int) - people[number]).mean() < 3
 
 
-def test_a_moment_comes_back_with_what_is_hidden_in_its_place(env: Any) -> None:
+def test_a_restored_snapshot_restores_hidden_objects(env: Any) -> None:
     env.reset(seed=list(range(N)))
     env.step(None)
-    snapshot, then = take_snapshot(env), read_poses(env)
+    snapshot, poses = take_snapshot(env), read_poses(env)
     height, seen = env.evaluate()["height"].clone(), pictures(env.get_obs(env.get_info()))
     people = np.asarray(env.render_rgb_array("people")).copy()
     for _ in range(3):
         env.step(None)
     assert not torch.equal(env.evaluate()["height"], height)
     restore_snapshot(env, snapshot)
-    assert np.array_equal(read_poses(env), then, equal_nan=True)
+    assert np.array_equal(read_poses(env), poses, equal_nan=True)
     assert torch.equal(env.evaluate()["height"], height)
     again = pictures(env.get_obs(env.get_info()))
     assert all(np.array_equal(again[name], picture) for name, picture in seen.items())
@@ -165,7 +167,7 @@ def test_a_moment_comes_back_with_what_is_hidden_in_its_place(env: Any) -> None:
 
 
 class Ghost(Hides):
-    """A part is half transparent where it is shown."""
+    """The box `own` is translucent where it is visible."""
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
@@ -173,7 +175,7 @@ class Ghost(Hides):
             thing.find_component_by_type(sapien.render.RenderBodyComponent).visibility = 0.3
 
 
-def test_a_ghost_stays_one(renderer: None) -> None:
+def test_a_translucent_object_stays_translucent(renderer: None) -> None:
     env = batch_of(Ghost, 1, **RENDERED)
     env.reset(seed=0)
     (never_hidden,) = take_pictures(env, 0, [PEOPLE])

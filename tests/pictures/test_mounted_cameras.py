@@ -1,4 +1,4 @@
-"""Cameras that ride on links and actors, and objects that are hidden from them."""
+"""Cameras mounted on links and actors."""
 
 # ManiSkill annotates an env's members as the widest thing they may be, and vectors as tuples.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -28,7 +28,7 @@ def env(renderer: None) -> Iterator[Any]:
 
 
 @pytest.mark.slow
-def test_pictures_are_those_of_a_stock_env_before_and_after_the_mounts_moved(env: Any) -> None:
+def test_pictures_equal_a_stock_envs_before_and_after_the_mounts_moved(env: Any) -> None:
     obs, _ = env.reset(seed=[0, 1, 2])
     still = pictures(obs)
     for number in range(N):
@@ -47,15 +47,15 @@ def test_pictures_are_those_of_a_stock_env_before_and_after_the_mounts_moved(env
     for name in ("on_link/rgb", "on_link/depth", "on_link/segmentation"):
         for number in range(N):
             assert not np.array_equal(ours[name][number], still[name][number]), (
-                "the link's camera saw no change"
+                "the link's camera did not move"
             )
     assert np.array_equal(ours["beside/depth"], still["beside/depth"])
 
 
-def test_a_camera_on_an_actor_sees_what_is_before_the_actor_of_its_own_env(env: Any) -> None:
+def test_a_camera_on_an_actor_follows_the_actor_of_its_own_env(env: Any) -> None:
     obs, _ = env.reset(seed=[0, 1, 2])
     before = pictures(obs)["on_actor/rgb"]
-    # The envs' riders stand before other walls: each sees mostly its own colour.
+    # Each env's rider stands in front of a different wall and sees mostly its colour.
     middle = before[:, 12, 16].astype(int)
     pose = env.rider.pose.raw_pose.clone()
     pose[1, 1] = 1.2

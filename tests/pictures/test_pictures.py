@@ -1,4 +1,4 @@
-"""Pictures of chosen cameras, against what ManiSkill itself gives for the same state."""
+"""Pictures of chosen cameras equal ManiSkill's own for the same state."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ def act(env: Any) -> None:
 
 
 def assert_same(picture: Picture, obs: dict[str, torch.Tensor], float_shader: bool = False) -> None:
-    """Exactly what ManiSkill observed; depth as its whole millimetres."""
+    """Assert that the picture equals ManiSkill's observation, with depth in whole millimetres."""
     assert picture.rgb is not None and picture.depth is not None and picture.segmentation is not None
     e = picture.env
     np.testing.assert_array_equal(picture.rgb, obs["rgb"][e].cpu().numpy())
     np.testing.assert_array_equal(picture.segmentation, obs["segmentation"][e, ..., 0].cpu().numpy())
     millimetres = obs["depth"][e, ..., 0].cpu().numpy()
     assert picture.depth.dtype == np.float32 and picture.depth.min() >= 0
-    beyond = millimetres == -32768  # what ManiSkill gives for all that is farther than 32.767 m
+    beyond = millimetres == -32768  # ManiSkill's value for everything beyond 32.767 m
     assert (picture.depth[beyond] > 32.7).all()
-    # The minimal shader counts whole millimetres; of a float position ManiSkill cuts the rest off.
+    # The minimal shader rounds to millimetres; ManiSkill truncates float positions.
     whole = np.trunc if float_shader else np.rint
     np.testing.assert_array_equal(whole(picture.depth * np.float32(1000))[~beyond], millimetres[~beyond])
 
 
 @pytest.mark.parametrize(("task", "make"), [("PickCube-v1", stock), ("PegInsertionSide-v1", batched)])
-def test_sensor_pictures_are_maniskills_observation(task: str, make: Any) -> None:
+def test_sensor_pictures_equal_maniskills_observation(task: str, make: Any) -> None:
     env = make(task, obs_mode=OBS_MODE)
     act(env)
     obs = env.get_obs(env.get_info())["sensor_data"]
@@ -56,7 +56,7 @@ def test_sensor_pictures_are_maniskills_observation(task: str, make: Any) -> Non
     env.close()
 
 
-def test_float_shaders_agree_too() -> None:
+def test_pictures_of_float_shaders_equal_maniskills() -> None:
     more = ("position", "normal", "albedo")
     mode = "+".join((OBS_MODE, *more))
     env = batched("PickCube-v1", obs_mode=mode, sensor_configs={"shader_pack": "default"})
@@ -77,14 +77,14 @@ def test_float_shaders_agree_too() -> None:
 
 
 @pytest.mark.parametrize(("make", "obs_first"), [(batched, False), (batched, True), (stock, True)])
-def test_human_pictures_are_maniskills_rendering(make: Any, obs_first: bool) -> None:
+def test_human_pictures_equal_maniskills_rendering(make: Any, obs_first: bool) -> None:
     env = make("PickCube-v1", obs_mode="rgb", render_mode="rgb_array")
     act(env)
     if obs_first:  # leaves the goal hidden
         env.get_obs(env.get_info())
-    taken = [take_pictures(env, e, [("render_camera", "human", ["rgb"])])[0] for e in range(env.num_envs)]
+    ours = [take_pictures(env, e, [("render_camera", "human", ["rgb"])])[0] for e in range(env.num_envs)]
     wanted = env.render_rgb_array().cpu().numpy()
-    for picture in taken:
+    for picture in ours:
         np.testing.assert_array_equal(picture.rgb, wanted[picture.env])
     env.close()
 
@@ -107,7 +107,7 @@ def test_a_picture_leaves_no_trace() -> None:
     env.close()
 
 
-def test_the_goal_is_hidden_from_sensors_and_shown_to_people() -> None:
+def test_the_goal_is_hidden_from_sensors_and_visible_to_human_cameras() -> None:
     env = batched("PickCube-v1", sensor_configs={"width": 512, "height": 512})
     names = segmentation_names(env)
     goal = next(number for number, name in names.items() if name == "goal_site")
@@ -122,7 +122,7 @@ def test_the_goal_is_hidden_from_sensors_and_shown_to_people() -> None:
     env.close()
 
 
-def test_cameras_are_described_and_stand_where_maniskill_says() -> None:
+def test_cameras_are_described_with_maniskills_poses() -> None:
     env = batched("PegInsertionSide-v1")
     act(env)
     info = {c.name: c for c in list_cameras(env)}
@@ -140,13 +140,13 @@ def test_cameras_are_described_and_stand_where_maniskill_says() -> None:
         for e in range(2):
             (picture,) = take_pictures(env, e, [(name, info[name].kind, ["rgb"])])
             np.testing.assert_allclose(picture.pose[:3], wanted[e, :3], atol=1e-5)
-            # q and -q are the same rotation, and the two sides choose differently.
+            # q and -q are the same rotation, and both occur here.
             assert abs(picture.pose[3:] @ wanted[e, 3:]) == pytest.approx(1.0, abs=1e-5)
     env.close()
 
 
 class FarWallEnv(PickCubeEnv):
-    """Walls farther away than an int16 of millimetres can say, and farther than it can wrap to."""
+    """Walls at distances that overflow and that wrap around an int16 of millimetres."""
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -163,7 +163,7 @@ class FarWallEnv(PickCubeEnv):
 
 
 @pytest.mark.parametrize("shader", ["minimal", "default"])
-def test_depth_is_metres_also_where_maniskills_own_ends(shader: str) -> None:
+def test_depth_is_correct_beyond_maniskills_int16_range(shader: str) -> None:
     env: Any = FarWallEnv(
         render_backend=RENDER_BACKEND, reward_mode="none", sensor_configs={"shader_pack": shader}
     )
@@ -180,7 +180,7 @@ def test_depth_is_metres_also_where_maniskills_own_ends(shader: str) -> None:
     env.close()
 
 
-def test_envs_that_are_built_alike_share_their_segmentation() -> None:
+def test_equal_envs_share_their_segmentation_ids() -> None:
     env = batched("PegInsertionSide-v1", num_envs=3)
     names = segmentation_names(env)
     assert set(names.values()) == set(scene_index(env).names)

@@ -1,4 +1,4 @@
-"""A camera placed live, against the same env built with a config that says so: to the last bit."""
+"""A camera placed on a running env equals, to the last bit, the camera of an env built with that config."""
 
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
 
@@ -31,7 +31,7 @@ TURNED = (0.96, 0.0, 0.28, 0.0)
 
 @pytest.fixture(scope="module")
 def envs(renderer: None) -> Iterator[tuple[Any, Any]]:
-    """One whose cameras are placed, and one whose cameras are configured so."""
+    """Yield an env whose cameras are placed, and one whose cameras are configured in ManiSkill."""
     pair = batch_of(Watched, N, **RENDERED), batch_of(Watched, N, **RENDERED)
     yield pair
     for env in pair:
@@ -46,16 +46,16 @@ def env(envs: tuple[Any, Any]) -> Any:
     return env
 
 
-def said(env: Any, key: CameraKey) -> CameraSettings:
+def settings_of_camera(env: Any, key: CameraKey) -> CameraSettings:
     info = next(c for c in list_cameras(env) if (c.kind, c.name) == key)
     assert info.settings is not None
     return info.settings
 
 
 def configured(env: Any, key: CameraKey, settings: CameraSettings) -> Any:
-    """`env` with cameras that ManiSkill made, of a config with these settings."""
+    """Return `env` with cameras that ManiSkill built from a config with these settings."""
     values = dict(vars(settings))
-    del values["distance"]  # is nothing of a config
+    del values["distance"]  # not a field of CameraConfig
     pose = sapien.Pose(values.pop("position"), values.pop("quaternion"))
     intrinsic = values.pop("intrinsic")
     values["intrinsic"] = None if intrinsic is None else np.array(intrinsic)
@@ -96,20 +96,20 @@ INTRINSIC = ((20.0, 0.0, 15.0), (0.0, 22.0, 13.0), (0.0, 0.0, 1.0))
         (PEOPLE, {"position": (-0.4, 0.0, 1.2), "fov": 0.9}),
     ],
 )
-def test_a_placed_camera_sees_what_one_built_so_sees(
+def test_a_placed_camera_equals_one_built_from_config(
     env: Any, envs: tuple[Any, Any], key: CameraKey, change: dict[str, Any]
 ) -> None:
-    settings = replace(said(env, key), **change)
+    settings = replace(settings_of_camera(env, key), **change)
     reshaped = PlacedCameras().place(env, key, settings)
     assert reshaped == bool(change.keys() & {"width", "height", "shader_pack"})
-    # A camera that is drawn before and after an exchange: the group of the old one must not be asked.
+    # The camera is rendered before and after its exchange; the old camera group must not be used.
     assert_sees_alike(env, configured(envs[1], key, settings), key)
     assert segmentation_names(env) == segmentation_names(envs[1])
 
 
-def test_a_placement_goes_over_another_and_back(env: Any, envs: tuple[Any, Any]) -> None:
+def test_placements_replace_each_other_and_can_be_undone(env: Any, envs: tuple[Any, Any]) -> None:
     before = pictures(env.get_obs(env.get_info()))
-    placed, file = PlacedCameras(), said(env, BESIDE)
+    placed, file = PlacedCameras(), settings_of_camera(env, BESIDE)
     for change in (
         {"fov": None, "intrinsic": INTRINSIC},
         {"position": (1.0, 0.0, 1.0)},
@@ -119,15 +119,15 @@ def test_a_placement_goes_over_another_and_back(env: Any, envs: tuple[Any, Any])
         placed.place(env, BESIDE, replace(file, **change))  # pyright: ignore[reportArgumentType]
         assert_sees_alike(env, configured(envs[1], BESIDE, replace(file, **change)), BESIDE)  # pyright: ignore[reportArgumentType]
     placed.place(env, BESIDE, None)
-    assert said(env, BESIDE) == file
+    assert settings_of_camera(env, BESIDE) == file
     after = pictures(env.get_obs(env.get_info()))
     assert all(np.array_equal(after[name], picture) for name, picture in before.items())
 
 
-def test_resets_and_snapshots_leave_a_placed_camera_where_it_is(env: Any) -> None:
+def test_resets_and_snapshots_keep_a_placed_camera(env: Any) -> None:
     placed = PlacedCameras()
     kept = take_snapshot(env)
-    settings = replace(said(env, BESIDE), position=(0.5, 0.0, 1.3), width=30)
+    settings = replace(settings_of_camera(env, BESIDE), position=(0.5, 0.0, 1.3), width=30)
     placed.place(env, BESIDE, settings)
     for do in (
         lambda: env.reset(seed=SEEDS),
@@ -142,7 +142,7 @@ def test_resets_and_snapshots_leave_a_placed_camera_where_it_is(env: Any) -> Non
 
 
 class Wandering(Watched):
-    """Each time that its scene is built a camera stands elsewhere, and looks another way."""
+    """The human render camera has a different pose in each rebuilt scene."""
 
     builds = 0
 
@@ -155,18 +155,18 @@ class Wandering(Watched):
         self.builds += 1
 
 
-def test_a_camera_goes_back_to_where_the_scene_that_is_there_has_it(renderer: None) -> None:
+def test_a_camera_is_restored_to_its_pose_in_the_rebuilt_scene(renderer: None) -> None:
     env = batch_of(Wandering, 2, **RENDERED)
     env.reset(seed=SEEDS)
-    placed, first = PlacedCameras(), said(env, PEOPLE)
+    placed, first = PlacedCameras(), settings_of_camera(env, PEOPLE)
     placed.place(env, PEOPLE, replace(first, position=(-1.0, 0.5, 0.2)))
     env.reset(seed=SEEDS, options={"reconfigure": True})
-    second = said(env, PEOPLE)
+    second = settings_of_camera(env, PEOPLE)
     assert second.position != first.position
     placed.put_back(env)
-    assert np.allclose(said(env, PEOPLE).position, (-1.0, 0.5, 0.2))
+    assert np.allclose(settings_of_camera(env, PEOPLE).position, (-1.0, 0.5, 0.2))
     placed.place(env, PEOPLE, None)
-    assert said(env, PEOPLE) == second
+    assert settings_of_camera(env, PEOPLE) == second
     (picture,) = take_pictures(env, 1, [("people", "human", ("rgb",))])
     assert np.allclose(picture.pose, [*second.position, *second.quaternion])
     env.close()
@@ -185,22 +185,22 @@ def test_a_camera_goes_back_to_where_the_scene_that_is_there_has_it(renderer: No
         ({"shader_pack": "nonsense"}, "there is no shader pack"),
     ],
 )
-def test_what_is_no_camera_is_refused_and_changes_nothing(env: Any, change: dict, says: str) -> None:
-    before = said(env, BESIDE)
+def test_invalid_settings_are_refused_and_change_nothing(env: Any, change: dict, says: str) -> None:
+    before = settings_of_camera(env, BESIDE)
     with pytest.raises(ValueError, match=says):
         PlacedCameras().place(env, BESIDE, replace(before, **change))
     with pytest.raises(ValueError, match="there is no human camera"):
         PlacedCameras().place(env, ("human", "beside"), before)
-    assert said(env, BESIDE) == before
+    assert settings_of_camera(env, BESIDE) == before
 
 
-def test_a_pose_that_differs_between_envs_is_said_and_comes_back(env: Any) -> None:
+def test_a_pose_that_differs_between_envs_is_flagged_and_restored(env: Any) -> None:
     for i, component in enumerate(env._sensors["beside"].camera._render_cameras):
         component.local_pose = sapien.Pose([0.1 * i, 0, 1])
     info = next(c for c in list_cameras(env) if c.name == "beside")
     assert info.varies and not next(c for c in list_cameras(env) if c.name == "people").varies
     placed = PlacedCameras()
-    placed.place(env, BESIDE, replace(said(env, BESIDE), position=(0.5, 0.5, 0.5)))
+    placed.place(env, BESIDE, replace(settings_of_camera(env, BESIDE), position=(0.5, 0.5, 0.5)))
     placed.place(env, BESIDE, None)
     (picture,) = take_pictures(env, 1, [("beside", "sensor", ("rgb",))])
     assert np.allclose(picture.pose[:3], [0.1, 0, 1])

@@ -1,4 +1,4 @@
-"""Ray traced cameras: as stock draws them where the driver can, with another shader and a warning where it cannot."""
+"""Ray traced cameras equal stock's where the driver can trace rays, and fall back to another shader with a warning elsewhere."""
 
 # ManiSkill annotates poses as what they become.
 # pyright: reportArgumentType=false
@@ -42,14 +42,14 @@ def registered() -> Any:
     del REGISTERED_ENVS[ID], gym.registry[ID]
 
 
-def test_without_ray_tracing_its_pictures_are_those_of_the_default_shader() -> None:
+def test_without_ray_tracing_the_default_shader_is_used_with_a_warning() -> None:
     if why_no_ray_tracing() is None:
         pytest.skip("this machine traces rays")
-    with pytest.warns(Warning, match="render_camera") as told:
+    with pytest.warns(Warning, match="render_camera") as warned:
         traced = workbench.make(ID, num_envs=2, render_mode="rgb_array")
     lines, first = inspect.getsourcelines(RayTraced)
     line = first + next(n for n, text in enumerate(lines) if "rt-fast" in text)
-    assert (__file__, line) in [(each.filename, each.lineno) for each in told]
+    assert (__file__, line) in [(each.filename, each.lineno) for each in warned]
     human = {"human_render_camera_configs": {"shader_pack": "default"}}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -63,8 +63,8 @@ def test_without_ray_tracing_its_pictures_are_those_of_the_default_shader() -> N
         env.close()
 
 
-@pytest.mark.slow  # a software driver compiles for some twenty seconds
-def test_with_ray_tracing_its_pictures_are_stocks(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow  # a software driver compiles shaders for about 20 s
+def test_with_ray_tracing_pictures_equal_stocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_shader, "why_no_ray_tracing", lambda: None)
     ours = workbench.make(ID, num_envs=2, render_mode="rgb_array")
     stock = gym.make(ID, render_mode="rgb_array")

@@ -1,4 +1,4 @@
-"""What is made of measured pixels and depths, by numbers that can be checked by hand; `test_visibility` measures real ones."""
+"""Reports computed from hand-checkable pixel counts and depths; `test_visibility` measures real ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NAN = float("nan")
 
 
 def thing(name: str = "cube", **given: Any) -> ObjectSeen:
-    """In one env, whole and in the open, of a hundred pixels; or as many envs as numbers are given."""
+    """Return an object that is fully visible with 100 pixels in one env; `given` overrides, with one number per env."""
     values: dict[str, Any] = {"pixels": 100, "unhindered": None, "alone": None, "cut": False, "margin": 0.25}
     values |= {"present": True, "never_drawn": False, "scenery": False, **given}
     for less, more in (("pixels", "unhindered"), ("unhindered", "alone")):
@@ -41,7 +41,7 @@ def report(*objects: ObjectSeen, envs: tuple[int, ...] = (0,), **given: Any) -> 
     return replace(plain, **given)
 
 
-def test_a_summary_is_of_the_envs_that_have_it() -> None:
+def test_a_summary_covers_the_envs_that_have_the_object() -> None:
     seen = thing(
         pixels=[25, 0, 0, 70, 999],
         unhindered=[50, 0, 40, 70, 999],
@@ -54,18 +54,18 @@ def test_a_summary_is_of_the_envs_that_have_it() -> None:
         "seen": 0.5,
         "median_pixels": 12.5,
         "cut": 0.25,
-        "hidden": 0.5,  # a half, and a whole, and nothing: of the three that are in sight without the robot
+        "hidden": 0.5,  # mean of 0.5, 1 and 0, over the three envs in whose view it is without the robot
         "wholly_hidden": 0.25,
         "covered": 0.375,
     }
-    gone = thing(present=False).summary()
-    assert gone.present == 0
-    assert_array_equal([value for name, value in gone.__dict__.items() if name != "present"], [NAN] * 6)
+    absent = thing(present=False).summary()
+    assert absent.present == 0
+    assert_array_equal([value for name, value in absent.__dict__.items() if name != "present"], [NAN] * 6)
     away = thing(pixels=0).summary()
     assert (away.seen, away.wholly_hidden) == (0, 0) and np.isnan([away.hidden, away.covered]).all()
 
 
-def test_the_mark_of_an_env_is_that_of_its_worst_object_that_is_to_be_seen() -> None:
+def test_an_envs_mark_is_that_of_its_worst_wanted_object() -> None:
     envs = (4, 0, 2, 1)
     cube = thing("cube", pixels=[100, 25, 100, 0], present=[True, True, False, True])
     ball = thing("ball", pixels=[25, 100, 100, 100], present=[True, True, False, True])
@@ -91,7 +91,9 @@ def test_the_mark_of_an_env_is_that_of_its_worst_object_that_is_to_be_seen() -> 
     ("nearest", "near"),
     [([0.5, 0.9], 0.25), ([0.129, NAN], 0.064), ([3.99], 1.9), ([0.2], 0.1), ([NAN], None), ([np.inf], None)],
 )
-def test_the_near_plane_keeps_half_way_to_the_nearest(nearest: list[float], near: float | None) -> None:
+def test_the_suggested_near_plane_is_at_half_the_nearest_depth(
+    nearest: list[float], near: float | None
+) -> None:
     assert depth(nearest).suggested_near == near
 
 
@@ -99,11 +101,13 @@ def test_the_near_plane_keeps_half_way_to_the_nearest(nearest: list[float], near
     ("farthest", "far"),
     [([1.0, 2.0], 3.0), ([0.67, NAN], 1.1), ([67.0], 110.0), ([2.01], 3.1), ([NAN], None)],
 )
-def test_the_far_plane_leaves_half_as_much_again(farthest: list[float], far: float | None) -> None:
+def test_the_suggested_far_plane_is_at_1_5_times_the_farthest_object(
+    farthest: list[float], far: float | None
+) -> None:
     assert depth([1.0], farthest).suggested_far == far
 
 
-def test_joined_reports_are_end_to_end() -> None:
+def test_joined_reports_are_concatenated() -> None:
     one = report(thing(pixels=[1, 2]), envs=(0, 3), depth=depth([1.0, 2.0], [3.0, 4.0]))
     other = report(thing(pixels=[5], cut=True), envs=(0,), depth=depth([7.0], [8.0]), pictures=4)
     both = join_reports([one, other])
@@ -127,7 +131,7 @@ def test_joined_reports_are_end_to_end() -> None:
         ({"objects": (thing("ball"),)}, "different scenes"),
     ],
 )
-def test_what_is_not_of_one_camera_and_one_scene_is_not_joined(changes: Any, says: str) -> None:
+def test_reports_of_different_cameras_or_scenes_are_not_joined(changes: Any, says: str) -> None:
     first = report(thing())
     with pytest.raises(ValueError, match=says):
         join_reports([first, first, replace(first, **changes)])

@@ -1,4 +1,4 @@
-"""Placements that are suggested see what was asked for, wherever it was in the envs, and the same ones every time."""
+"""Suggested placements see the wanted objects in all envs and are reproducible."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ LOW, HIGH = (-0.8, -0.8, 0.1), (0.8, 0.8, 1.0)
 
 @pytest.fixture(scope="module")
 def env(renderer: None) -> Iterator[Any]:
-    made = batched("PushCube-v1", N, render=True)
-    made.reset(seed=3)
-    yield made
-    made.close()
+    env = batched("PushCube-v1", N, render=True)
+    env.reset(seed=3)
+    yield env
+    env.close()
 
 
 def measured(env: Any, placement: Placement, size: tuple[int, int]) -> CameraReport:
@@ -38,9 +38,9 @@ def measured(env: Any, placement: Placement, size: tuple[int, int]) -> CameraRep
 @pytest.mark.slow
 def test_suggestions_see_the_objects_and_stand_apart(env: Any) -> None:
     space = SearchSpace(("cube", "goal_region"), LOW, HIGH, LENS, candidates=12, best=2, apart=0.2)
-    told: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     before = [(s.physx_system.pack(), s.pack_poses()) for s in env.scene.sub_scenes]
-    found = suggest_cameras(env, space, range(N), progress=lambda done, total: told.append((done, total)))
+    found = suggest_cameras(env, space, range(N), progress=lambda done, total: progress.append((done, total)))
     assert [(s.physx_system.pack(), s.pack_poses()) for s in env.scene.sub_scenes] == before
     assert 1 <= len(found) <= 2 and [s.score for s in found] == sorted((s.score for s in found), reverse=True)
     for suggestion in found:
@@ -50,7 +50,7 @@ def test_suggestions_see_the_objects_and_stand_apart(env: Any) -> None:
         np.testing.assert_allclose(
             axes_of(suggestion.settings.quaternion)[0], away / np.linalg.norm(away), atol=1e-9
         )
-        # Judged again from nothing but its settings, it is as good as was said.
+        # Measured again from its settings alone, the placement gets the same score.
         again = measured(env, Placement(suggestion.settings), suggestion.report.measured_size)
         assert score_of(again, space.objects) == pytest.approx(suggestion.score, abs=1e-6)
         assert all(thing.summary().seen == 1 for thing in again.wanted_objects(space.objects))
@@ -58,11 +58,11 @@ def test_suggestions_see_the_objects_and_stand_apart(env: Any) -> None:
     assert found[0].score > 0.6
     eyes = np.array([s.settings.position for s in found])
     assert all(np.linalg.norm(a - b) >= 0.2 for i, a in enumerate(eyes) for b in eyes[:i])
-    done = [looks for looks, _ in told]
-    assert done == sorted(done) and done[-1] == told[-1][1]
+    done = [looks for looks, _ in progress]
+    assert done == sorted(done) and done[-1] == progress[-1][1]
 
 
-def test_a_search_that_is_cancelled_ends_at_once_with_what_it_has(env: Any) -> None:
+def test_a_cancelled_search_ends_at_once_with_its_results(env: Any) -> None:
     looks: list[int] = []
     space = SearchSpace(("cube",), LOW, HIGH, LENS, candidates=1000)
     assert (
@@ -71,19 +71,19 @@ def test_a_search_that_is_cancelled_ends_at_once_with_what_it_has(env: Any) -> N
         )
         == ()
     )
-    assert len(looks) == 6, "five looks, and the last word"
+    assert len(looks) == 6, "five candidates, and the final progress call"
 
 
-def test_a_placement_that_sees_nothing_is_not_offered(env: Any) -> None:
+def test_a_placement_that_sees_nothing_is_not_suggested(env: Any) -> None:
     under_the_table = SearchSpace(("cube",), (0, 0, -0.5), (0, 0, -0.5), LENS, candidates=4)
     assert suggest_cameras(env, under_the_table, [0]) == ()
 
 
-def test_a_camera_on_a_link_is_suggested_places_in_that_links_frame_that_keep_its_picture_upright(
+def test_suggestions_for_a_mounted_camera_are_upright_and_in_the_links_frame(
     env: Any,
 ) -> None:
     mount, low, high = "panda/panda_hand", (-0.12, -0.12, -0.05), (0.12, 0.12, 0.1)
-    # Its picture's top is towards the hand's x.
+    # The top of its picture points along the hand's x.
     lens = replace(LENS, quaternion=(math.sqrt(0.5), 0, -math.sqrt(0.5), 0), fov=1.4)
     assert np.allclose(axes_of(lens.quaternion)[0], [0, 0, 1])
     space = SearchSpace(("cube",), low, high, lens, candidates=12, best=1, mount=mount)
@@ -101,10 +101,10 @@ def test_a_camera_on_a_link_is_suggested_places_in_that_links_frame_that_keep_it
 
 
 @pytest.mark.slow
-def test_the_robots_hand_can_be_what_must_be_seen_and_the_rest_of_the_robot_hides_it(env: Any) -> None:
+def test_the_robots_hand_can_be_a_wanted_object_that_the_arm_hides(env: Any) -> None:
     (robot,) = (thing for thing in objects_to_see(env) if thing.robot)
     assert set(robot.links[:3]) == {"panda/panda_leftfinger", "panda/panda_rightfinger", "panda/panda_hand"}
-    assert "panda/panda_hand_tcp" not in robot.links, "it has nothing to be seen"
+    assert "panda/panda_hand_tcp" not in robot.links, "a link without visual shapes"
     hand = "panda/panda_hand"
     space = SearchSpace((hand, "cube"), LOW, HIGH, LENS, candidates=16, best=1)
     (found,) = suggest_cameras(env, space, range(N))
@@ -112,9 +112,9 @@ def test_the_robots_hand_can_be_what_must_be_seen_and_the_rest_of_the_robot_hide
     assert set(seen) == {hand, "cube"} and found.picture.segmentation is not None
     number = next(n for n, name in segmentation_names(env).items() if name == hand)
     e = found.report.envs.index(found.picture.env)
-    # Counted in a smaller picture, of which each pixel stands for some of the camera's own.
+    # Counted in a smaller picture, whose pixels each stand for several of the camera's own.
     assert (found.picture.segmentation == number).sum() == pytest.approx(seen[hand].pixels[e], rel=0.4)
-    # From behind the arm's base less of the hand is left to see than if the arm were not there.
+    # From behind the arm's base, the arm hides part of the hand.
     behind = SearchSpace((hand,), (-1.2, 0.0, 0.2), (-1.2, 0.0, 0.2), LENS, candidates=1, best=1)
     for thing in suggest_cameras(env, behind, range(N))[0].report.wanted_objects((hand,)):
         assert (thing.pixels < thing.alone).all() and (thing.hidden_share > 0).all()

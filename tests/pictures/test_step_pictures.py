@@ -1,4 +1,4 @@
-"""Pictures out of the observation are those that would be drawn."""
+"""Pictures taken from the observation equal those that would be rendered."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ALL = ("rgb", "depth", "segmentation")
 
 
 @pytest.mark.slow
-def test_what_was_observed_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_observed_pictures_are_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
     task = TaskEnv(batched("PickCube-v1", obs_mode="rgb+depth+segmentation", robot_uids="panda_wristcam"))
     task.reset(seed=1)
     drawn: list[str] = []

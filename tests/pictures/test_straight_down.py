@@ -1,4 +1,4 @@
-"""ManiSkill's ``look_at`` straight down gives a quaternion of length 0.707; every picture of ours is what stock draws with it."""
+"""ManiSkill's ``look_at`` straight down returns a quaternion of length 0.707; our pictures equal stock's with it, too."""
 
 # ManiSkill annotates poses as what they become.
 # pyright: reportArgumentType=false
@@ -29,7 +29,7 @@ class SeenFromAbove(PushCubeEnv):
 
 
 @pytest.mark.slow
-def test_pictures_and_parameters_are_those_of_stock(renderer: None) -> None:
+def test_pictures_and_parameters_equal_stocks(renderer: None) -> None:
     register_env(ID, max_episode_steps=50, override=True)(SeenFromAbove)
     try:
         ours = workbench.make(ID, obs_mode="rgb+depth+segmentation")
@@ -42,11 +42,11 @@ def test_pictures_and_parameters_are_those_of_stock(renderer: None) -> None:
     for name, matrix in theirs["sensor_param"]["above"].items():
         torch.testing.assert_close(seen["sensor_param"]["above"][name], matrix, atol=1e-6, rtol=0)
     env, rgb = ours.unwrapped, theirs["sensor_data"]["above"]["rgb"][0].numpy()
-    request, then = ("above", "sensor", ("rgb",)), read_poses(env)[0]
+    request, poses = ("above", "sensor", ("rgb",)), read_poses(env)[0]
     shown = {
         "exact": take_pictures(env, 0, [request]),
         "fast": take_pictures(env, 0, [request], degree="fast"),
-        "past": take_pictures(env, 0, [request], then),
+        "past": take_pictures(env, 0, [request], poses),
         "studio": [picture_of(env, 0, placement_of(env, ("sensor", "above"), 0))],
     }
     for how, (picture,) in shown.items():

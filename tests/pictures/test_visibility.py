@@ -1,4 +1,4 @@
-"""What a camera sees of the task's objects: against ManiSkill's own segmentation, and without a trace."""
+"""A camera's visibility report agrees with ManiSkill's own segmentation, and measuring leaves no trace."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def built(task: str, **kwargs: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[Any]:
-    """The cube to push; sensors with a shader other than the one of reports."""
+    """Yield PushCube with a sensor shader that differs from the one that reports use."""
     made = built("PushCube-v1", sensor_configs={"shader_pack": "default"})
     yield made
     made.close()
@@ -73,7 +73,7 @@ def seen(report: CameraReport, name: str) -> ObjectSeen:
     return next(thing for thing in report.objects if thing.name == name)
 
 
-def test_pixels_are_those_of_maniskills_segmentation(env: Any) -> None:
+def test_pixels_equal_maniskills_segmentation(env: Any) -> None:
     report = join_reports([measure_camera(env, SENSOR, e) for e in range(N)])
     images = env.get_obs(env.get_info())["sensor_data"]["base_camera"]
     cube = segmentation_names(env)
@@ -91,7 +91,7 @@ def test_pixels_are_those_of_maniskills_segmentation(env: Any) -> None:
     assert report.size == report.measured_size == (128, 128) and report.envs == (0, 1, 2)
 
 
-def test_judging_leaves_no_trace(env: Any) -> None:
+def test_measuring_leaves_no_trace(env: Any) -> None:
     def state() -> list[Any]:
         scenes = env.scene.sub_scenes
         bodies = [b for s in scenes for b in s.render_system.render_bodies]
@@ -123,8 +123,8 @@ def test_judging_leaves_no_trace(env: Any) -> None:
     assert state() == before
 
 
-def test_what_the_robot_stands_before_is_said(env: Any) -> None:
-    # From behind the robot's base, at the height of the cube: the base is in the way.
+def test_objects_hidden_by_the_robot_are_reported(env: Any) -> None:
+    # From behind the robot's base at the cube's height, the base hides the cube.
     x, y, z = cube_at(env, 0)
     behind = looking(LookAt((-1.2, 0.0, z + 0.05), (x, y, z)), fov=0.6)
     above = looking(LookAt((x, y, 0.5), (x, y, 0.0)), fov=0.6)
@@ -138,11 +138,11 @@ def test_what_the_robot_stands_before_is_said(env: Any) -> None:
     assert free.env_marks(["cube"])[0] > 0.7 and 0.3 < cube.margin[0] < 0.5
 
 
-def test_an_object_that_reaches_any_of_the_four_borders_is_cut_and_one_that_stops_short_of_it_is_not(
+def test_an_object_is_cut_exactly_when_it_reaches_a_border(
     env: Any,
 ) -> None:
     x, y, _ = cube_at(env, 1)
-    # Straight down from 0.4 m a pixel is 5 mm wide, and the picture is not square.
+    # From 0.4 m above, a pixel is 5 mm wide; the picture is not square.
     down = looking(LookAt((x, y, 0.4), (x, y, 0.0)), width=48, height=40, fov=0.5)
 
     def from_there(axis: int, by: float) -> ObjectSeen:
@@ -159,13 +159,13 @@ def test_an_object_that_reaches_any_of_the_four_borders_is_cut_and_one_that_stop
                 middle = (whole + cut) / 2
                 thing = from_there(axis, side * middle)
                 whole, cut = (whole, middle) if thing.cut[0] or thing.alone[0] == 0 else (middle, cut)
-            # Just before it is cut there is one row of pixels between it and the border.
+            # Just before the object is cut, one row of pixels separates it from the border.
             near, over = from_there(axis, side * whole), from_there(axis, side * cut)
             assert near.margin[0] == pytest.approx(1 / 40) and over.margin[0] == 0, (axis, side)
             assert over.alone[0] > 0.5 * near.alone[0] > 10
 
 
-def test_a_smaller_picture_has_the_same_view_and_counts_the_cameras_own_pixels(env: Any) -> None:
+def test_a_smaller_picture_has_the_same_view_and_scales_its_counts(env: Any) -> None:
     x, y, _ = cube_at(env, 0)
     settings = looking(LookAt((x - 0.3, y, 0.5), (x, y, 0)), width=320, height=200, fov=0.8)
     whole = measure_placement(env, 0, Placement(settings))
@@ -177,7 +177,7 @@ def test_a_smaller_picture_has_the_same_view_and_counts_the_cameras_own_pixels(e
     assert small_size(320, 200) == (102, 64) and small_size(20, 40) == (20, 40)
 
 
-def test_depth_says_background_far_floor_and_where_the_planes_may_stand(env: Any) -> None:
+def test_depth_reports_background_far_floor_and_suggested_planes(env: Any) -> None:
     report = in_all_envs(env, Placement(looking(FAR_FLOOR)))
     depth = report.depth
     assert (depth.background > 0.2).all() and (depth.beyond > 0.05).all()
@@ -190,7 +190,7 @@ def test_depth_says_background_far_floor_and_where_the_planes_may_stand(env: Any
     assert (tighter.depth.background > depth.background).all()
 
 
-def test_a_mounted_placement_rides_along_in_every_env(env: Any) -> None:
+def test_a_mounted_placement_follows_its_mount_in_every_env(env: Any) -> None:
     hand = scene_index(env).names.index("panda/panda_hand")
     poses = read_poses(env)
     x, y, _ = cube_at(env, 0)
@@ -199,11 +199,11 @@ def test_a_mounted_placement_rides_along_in_every_env(env: Any) -> None:
     mounted = Placement(with_pose(looking(FAR_FLOOR), local), mount="panda/panda_hand")
     for e in range(N):
         there = Placement(with_pose(looking(FAR_FLOOR), compose(poses[e, hand], local)))
-        ridden, still = measure_placement(env, e, mounted), measure_placement(env, e, there)
-        assert_array_equal(seen(ridden, "cube").pixels, seen(still, "cube").pixels)
+        from_mount, from_world = measure_placement(env, e, mounted), measure_placement(env, e, there)
+        assert_array_equal(seen(from_mount, "cube").pixels, seen(from_world, "cube").pixels)
 
 
-def test_a_goal_that_is_hidden_from_the_policy_is_not_seen_by_its_cameras() -> None:
+def test_a_goal_hidden_from_sensors_is_reported_as_never_drawn() -> None:
     env = built("PickCube-v1")
     sensor, people = measure_camera(env, SENSOR, 0), measure_camera(env, PEOPLE, 0, size=(128, 128))
     assert seen(sensor, "goal_site").never_drawn and seen(sensor, "goal_site").pixels[0] == 0

@@ -1,4 +1,4 @@
-"""`workbench.Planner`: the same plans always, from nothing but the state; and the env that is planned for is only read."""
+"""`workbench.Planner`: plans depend only on the state and the seed, and planning does not change the env."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from workbench.envs.snapshots.cpu_state import CpuState
 from workbench.planning.rollouts import NotAlike
 
 TASKS = Path(__file__).parents[2] / "tasks"
-REACHES = '''
-"""The hand is to rise, the author's way: NaN, an early end and a draw of random numbers where a test asks for them."""
+TASK_SOURCE = '''
+"""Rewards a rising hand; `trouble` adds NaN rewards, an early failure or random rewards."""
 import torch
 from mani_skill.envs.tasks import PushCubeEnv
 from mani_skill.utils.registration import register_env
@@ -57,7 +57,7 @@ pytestmark = pytest.mark.usefixtures("child_process")
 @pytest.fixture(scope="module")
 def task(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("planned") / "planned.py"
-    file.write_text(REACHES)
+    file.write_text(TASK_SOURCE)
     return file
 
 
@@ -70,7 +70,7 @@ def push() -> Iterator[tuple[Any, workbench.Planner]]:
     env.close()
 
 
-def test_the_same_state_and_seed_give_the_same_plan_whatever_was_planned_before(
+def test_plans_do_not_depend_on_earlier_plans(
     push: tuple[Any, workbench.Planner],
 ) -> None:
     env, planner = push
@@ -81,7 +81,7 @@ def test_the_same_state_and_seed_give_the_same_plan_whatever_was_planned_before(
     assert not np.array_equal(first[:, 0], first[:, 1])
 
 
-def test_an_env_gets_the_plan_that_it_gets_alone(push: tuple[Any, workbench.Planner]) -> None:
+def test_an_envs_plan_does_not_depend_on_the_batch(push: tuple[Any, workbench.Planner]) -> None:
     env, planner = push
     together = walk(env, planner, None)
     alone = workbench.make("PushCube-v1", 1, **MADE)
@@ -109,7 +109,7 @@ def test_another_process_gives_the_same_plan(push: tuple[Any, workbench.Planner]
     assert there.stdout.split()[-1] == here.tobytes().hex()
 
 
-def test_a_plan_changes_neither_the_env_nor_the_random_numbers_of_the_process(
+def test_planning_changes_neither_the_env_nor_the_processs_generators(
     push: tuple[Any, workbench.Planner],
 ) -> None:
     env, planner = push
@@ -126,7 +126,7 @@ def test_a_plan_changes_neither_the_env_nor_the_random_numbers_of_the_process(
         assert buffer.is_as(before.memory.task.buffers[name]), name
 
 
-def test_envs_that_are_not_planned_for_hold_still(push: tuple[Any, workbench.Planner]) -> None:
+def test_envs_without_a_plan_hold_still(push: tuple[Any, workbench.Planner]) -> None:
     env, planner = push
     taken = walk(env, planner, [2])
     assert not taken[:, [0, 1, 3], :6].any()
@@ -144,7 +144,7 @@ def test_actions_stay_within_the_space_and_the_gripper_is_open_or_closed(
     assert plan.actions.shape == (4, 7) and plan.rewards.shape == (8, 4)
 
 
-def test_every_says_how_many_actions_of_a_plan_are_taken(task: Path) -> None:
+def test_every_sets_how_many_actions_of_a_plan_are_taken(task: Path) -> None:
     env = workbench.make(task, 1, **MADE)
     planner = workbench.Planner(env, every=3, **SMALL)
     env.reset(seed=0)
@@ -160,7 +160,7 @@ def test_every_says_how_many_actions_of_a_plan_are_taken(task: Path) -> None:
 
 
 @pytest.mark.parametrize("trouble", [pytest.param("nan", marks=pytest.mark.slow), "fail"])
-def test_a_rollout_earns_nothing_after_a_fail_and_counts_as_worst_with_nan(task: Path, trouble: str) -> None:
+def test_a_rollout_earns_nothing_after_a_fail_and_ranks_worst_with_nan(task: Path, trouble: str) -> None:
     env = workbench.make(task, 1, trouble=trouble, **MADE)
     planner = workbench.Planner(env, rollouts=32, horizon=0.5)
     env.reset(seed=0)
@@ -183,7 +183,7 @@ def test_a_rollout_earns_nothing_after_a_fail_and_counts_as_worst_with_nan(task:
     env.close()
 
 
-def test_what_a_task_draws_in_a_step_is_drawn_in_the_same_way_again(task: Path) -> None:
+def test_random_draws_of_a_tasks_step_are_repeatable(task: Path) -> None:
     env = workbench.make(task, 1, trouble="noise", **MADE)
     planner = planner_of(env)
     first = walk(env, planner, None, steps=2)
@@ -193,7 +193,7 @@ def test_what_a_task_draws_in_a_step_is_drawn_in_the_same_way_again(task: Path) 
     env.close()
 
 
-def test_an_env_that_observes_pictures_has_rollouts_that_draw_nothing() -> None:
+def test_rollouts_of_an_env_with_picture_observations_render_nothing() -> None:
     env = workbench.make("PushCube-v1", 1, backend="cpu", obs_mode="rgb")
     planner = planner_of(env)
     rolled = planner._rollouts.env
@@ -204,7 +204,7 @@ def test_an_env_that_observes_pictures_has_rollouts_that_draw_nothing() -> None:
     env.close()
 
 
-def test_a_task_with_other_bodies_in_each_env_is_refused_by_their_name() -> None:
+def test_a_task_whose_bodies_differ_by_env_is_refused_with_their_name() -> None:
     env = workbench.make(TASKS / "different_objects.py", 4, backend="cpu", render_backend="none")
     planner = planner_of(env)
     env.reset(seed=0)

@@ -1,4 +1,4 @@
-"""Candidates around a plan: within bounds, smooth where they may be, and each method moves the plan to what earned more."""
+"""Sampling of candidate plans: bounds, interpolation, and improvement of the plan by each method."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from workbench.planning.options import Method, PlanOptions
 from workbench.planning.sampling import Sampler
 
 METHODS: tuple[Method, ...] = ("mppi", "predictive", "cem")
-USUAL = PlanOptions()
+DEFAULTS = PlanOptions()
 GRIPPER = torch.tensor([False, False, True])
 
 
-def sampler_of(options: PlanOptions = USUAL, steps: int = 10, seed: int = 0) -> Sampler:
+def sampler_of(options: PlanOptions = DEFAULTS, steps: int = 10, seed: int = 0) -> Sampler:
     return Sampler(options, steps, GRIPPER, torch.ones(3), seed)
 
 
 def improved(sampler: Sampler, rounds: int, target: torch.Tensor) -> torch.Tensor:
-    """The knots of the plan after rounds in which a candidate earns more the nearer it is to a target (A,)."""
+    """Return the plan's knots after `rounds` in which candidates closer to `target`, (A,), earn more."""
     for _ in range(rounds):
         knots = sampler.candidates(torch.zeros(3))
         sampler.improve(knots, -(sampler.sequences(knots) - target).square().sum((1, 2)))
@@ -34,7 +34,7 @@ def improved(sampler: Sampler, rounds: int, target: torch.Tensor) -> torch.Tenso
     noise=st.floats(0.01, 10.0),
     method=st.sampled_from(METHODS),
 )
-def test_candidates_stay_within_their_bounds_at_any_time_of_an_episode(
+def test_candidates_stay_within_bounds_during_an_episode(
     knots: int, steps: int, shift: int, noise: float, method: Method
 ) -> None:
     sampler = sampler_of(PlanOptions(method, rollouts=8, knots=knots, noise=noise), steps)
@@ -48,26 +48,26 @@ def test_candidates_stay_within_their_bounds_at_any_time_of_an_episode(
 
 
 @given(knots=st.integers(2, 9), steps=st.integers(2, 40), value=st.floats(-1, 1), shift=st.integers(0, 50))
-def test_knots_of_one_value_are_a_plan_of_that_value_before_and_after_a_shift(
+def test_constant_knots_give_a_constant_plan_before_and_after_a_shift(
     knots: int, steps: int, value: float, shift: int
 ) -> None:
-    """The weights of the interpolation add up to 1."""
+    """The interpolation's weights must add up to 1."""
     sampler = sampler_of(PlanOptions(rollouts=4, knots=knots), steps)
     sampler.candidates(torch.full((3,), value))
     sampler.shift(shift)
     torch.testing.assert_close(sampler.sequences(sampler.plan[None]), torch.full((1, steps, 3), value))
 
 
-def test_a_shift_brings_forward_what_was_planned_for_later() -> None:
+def test_a_shift_moves_the_plan_forward() -> None:
     sampler = sampler_of(PlanOptions(rollouts=8, knots=4), steps=10)
     improved(sampler, 2, torch.tensor([0.3, -0.8, 1.0]))
     before = sampler.sequences(sampler.plan[None])[0]
-    sampler.shift(3)  # the distance of two knots
+    sampler.shift(3)  # the distance between two knots
     after = sampler.sequences(sampler.plan[None])[0]
     torch.testing.assert_close(after[:7, :2], before[3:, :2])
 
 
-def test_candidates_spread_again_as_at_first_once_the_plan_has_moved_on() -> None:
+def test_a_shift_restores_the_initial_spread_of_candidates() -> None:
     sampler = sampler_of(PlanOptions("cem", rollouts=300, knots=4), steps=10)
 
     def width() -> torch.Tensor:
@@ -80,7 +80,7 @@ def test_candidates_spread_again_as_at_first_once_the_plan_has_moved_on() -> Non
     assert narrow < 0.6 * first and width() > 0.9 * first
 
 
-def test_a_gripper_switches_where_an_arm_goes_along_a_line() -> None:
+def test_a_gripper_switches_while_an_arm_interpolates() -> None:
     sampler = sampler_of(PlanOptions(rollouts=4, knots=2), steps=5)
     line = torch.tensor([[[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]])
     sampler.candidates(torch.zeros(3))
@@ -92,7 +92,7 @@ def test_a_gripper_switches_where_an_arm_goes_along_a_line() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_each_method_moves_the_plan_to_what_earns_more(method: Method) -> None:
+def test_each_method_improves_the_plan(method: Method) -> None:
     target = torch.tensor([0.6, -0.4, 1.0])
     sampler = sampler_of(PlanOptions(method, rollouts=64))
     plan = improved(sampler, 30, target)
@@ -101,7 +101,7 @@ def test_each_method_moves_the_plan_to_what_earns_more(method: Method) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_return_that_is_nan_or_infinite_is_the_worst(method: Method) -> None:
+def test_a_nan_or_infinite_return_ranks_worst(method: Method) -> None:
     sampler = sampler_of(PlanOptions(method, rollouts=8))
     knots = sampler.candidates(torch.zeros(3))
     returns = torch.tensor(
@@ -123,16 +123,16 @@ def test_the_plan_and_holding_still_are_always_among_the_candidates() -> None:
     assert torch.equal(knots[1], hold.expand(4, 3))
 
 
-def test_holding_still_holds_what_the_gripper_has() -> None:
+def test_holding_still_keeps_the_gripper_closed() -> None:
     sampler = sampler_of()
     improved(sampler, 20, torch.tensor([0.3, -0.8, -1.0]))
     assert sampler.plan[0, 2] == -1
     sampler.shift(1)
-    # An env says where its gripper is: at the width of what it holds, which no force holds then.
+    # The env's hold action keeps the gripper at the object's width, which would exert no force.
     assert sampler.candidates(torch.tensor([0.0, 0.0, 0.2]))[1].tolist() == [[0.0, 0.0, -1.0]] * 4
 
 
-def test_what_earns_nothing_is_hardly_moved() -> None:
+def test_dimensions_that_earn_nothing_hardly_move() -> None:
     plans = []
     for seed in range(8):
         sampler = sampler_of(seed=seed)
@@ -155,7 +155,7 @@ def test_a_gripper_of_the_plan_is_open_or_closed(method: Method) -> None:
             assert set(sampler.plan[:, 2].tolist()) <= {-1.0, 1.0}
 
 
-def test_the_seed_alone_decides_what_is_drawn() -> None:
+def test_draws_depend_only_on_the_seed() -> None:
     one, same, other = sampler_of(seed=3), sampler_of(seed=3), sampler_of(seed=4)
     torch.manual_seed(0)
     drawn = one.candidates(torch.zeros(3))
@@ -177,6 +177,6 @@ def test_the_seed_alone_decides_what_is_drawn() -> None:
         ({"every": 0}, "every must be at least 1"),
     ],
 )
-def test_options_out_of_range_are_refused_by_name(wrong: dict, says: str) -> None:
+def test_options_out_of_range_are_refused_with_their_name(wrong: dict, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         PlanOptions(**wrong)

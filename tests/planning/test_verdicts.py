@@ -1,4 +1,4 @@
-"""Verdicts on a reward, each on arrays of episodes that show it and of ones that do not."""
+"""Verdicts on a reward: each with episodes that show it and episodes that do not."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def row(values: Sequence[float] | float, dtype: type = np.float32) -> Any:
 
 
 def rises(seed: int = 0, solved_at: int = 15) -> PlannedEpisode:
-    """A good episode: the reward rises to success, and rollouts differ until then."""
+    """Return a good episode: the reward rises until success, and rollouts differ until then."""
     reward = np.minimum(np.arange(1, STEPS + 1) / solved_at, 1.0).astype(np.float32)
     success = np.arange(1, STEPS + 1) >= solved_at
     best, one = row((HORIZON * reward + 1).tolist()), np.float32(1)
@@ -50,31 +50,31 @@ def rules(*episodes: PlannedEpisode) -> list[str]:
     return [verdict.rule for verdict in of_episodes(episodes)]
 
 
-def test_good_episodes_show_nothing() -> None:
+def test_good_episodes_have_no_verdict() -> None:
     assert rules(rises(0), rises(1), rises(2, solved_at=9)) == []
     assert rules() == []
     assert in_the_way(rises(), [rises()]) == ""
 
 
-def test_an_unsolved_episode_that_simply_ran_out_of_time_shows_nothing() -> None:
+def test_an_unsolved_episode_that_ran_out_of_time_has_no_verdict() -> None:
     slow = unsolved(np.linspace(0, 0.7, STEPS).tolist())
     assert rules(rises(), slow) == []
     assert in_the_way(slow, [rises(), slow]) == "not solved within the step limit"
 
 
-def test_more_pay_without_success_than_with_it_is_an_exploit() -> None:
+def test_a_higher_reward_without_success_is_an_exploit() -> None:
     held = replace(unsolved(1.0, seed=7), evaluate={"success": 0.0, "height": 0.2})
     (verdict,) = of_episodes([rises(0), held])
     assert (verdict.rule, verdict.seeds) == ("reward-exploited", (7,))
     assert "earned 1.000 a step at their end without success" in verdict.message
     assert "evaluate at the end of seed 7: success 0, height 0.2" in verdict.message
     assert rules(rises(0), unsolved(0.99)) == []
-    # What success pays is known from successes only.
+    # Without a success, its reward is unknown.
     assert rules(held) == []
     assert in_the_way(held, [rises(), held]) == "earned 1.000 a step without success"
 
 
-def test_where_all_rollouts_earn_the_same_nothing_leads_on() -> None:
+def test_rollouts_that_all_earn_the_same_are_flat() -> None:
     plateau = unsolved(0.4, seed=3, gain=0.0, spread=0.0)
     plateau.best[:6] += 3
     plateau = replace(plateau, terms={"reach": row(0.0), "place": row(2.0)})
@@ -84,7 +84,7 @@ def test_where_all_rollouts_earn_the_same_nothing_leads_on() -> None:
     assert in_the_way(plateau, [rises(), plateau]) == "all rollouts earned the same from step 7 on"
 
 
-def test_a_sparse_reward_is_told_as_what_planning_cannot_find() -> None:
+def test_a_sparse_reward_is_named_in_the_flat_verdict() -> None:
     (verdict,) = of_episodes([unsolved(0.0, seed, gain=0.0, spread=0.0) for seed in (1, 2)])
     assert (verdict.rule, verdict.seeds) == ("reward-flat", (1, 2))
     assert "sparse" in verdict.message
@@ -93,16 +93,16 @@ def test_a_sparse_reward_is_told_as_what_planning_cannot_find() -> None:
     assert "sparse" in of_episodes([lucky, unsolved(0.0, gain=0.0, spread=0.0)])[0].message
 
 
-def test_where_nothing_earns_more_than_holding_still_it_is_stuck() -> None:
+def test_a_reward_is_stuck_if_nothing_beats_holding_still() -> None:
     still = unsolved(0.6, seed=4, gain=0.0)
     (verdict,) = of_episodes([rises(0), still])
     assert (verdict.rule, verdict.seeds) == ("reward-stuck", (4,))
     assert "--horizon" in verdict.message
-    # Where there is no success, what earns most stays there.
+    # In a task without success, staying at the highest reward is fine.
     assert rules(replace(still, evaluate={"speed": 1.0})) == []
 
 
-def test_it_is_stuck_where_holding_still_lets_fall_what_is_held() -> None:
+def test_a_reward_is_stuck_even_if_holding_still_drops_the_object() -> None:
     slips = unsolved(0.6, seed=4, gain=0.0)
     slips = replace(slips, hold=slips.hold - 3, worst=slips.worst - 3)
     assert rules(rises(0), slips) == ["reward-stuck"]
@@ -114,17 +114,17 @@ def test_it_is_stuck_where_holding_still_lets_fall_what_is_held() -> None:
     assert rules(rises(0), replace(going_on, hold=going_on.hold - 3)) == []
 
 
-def test_a_reward_that_falls_on_the_way_to_success_is_against() -> None:
+def test_a_reward_that_falls_before_success_is_against_it() -> None:
     dip = rises(5)
     dip.reward[6:11] = [0.4, 0.2, 0.0, 0.1, 0.5]
     (verdict,) = of_episodes([dip, dip, rises(0)])
     assert (verdict.rule, verdict.seeds) == ("reward-against", (5, 5))
-    assert rules(dip, dip) == [], "most of two says nothing"
+    assert rules(dip, dip) == [], "two episodes are too few for a verdict"
     assert (
         "from 0.400 at step 6 to 0.000 at step 9, success at step 15" in verdict.message
         or "step 7" in verdict.message
     )
-    # After success it may fall.
+    # The reward may fall after success.
     after = rises(5)
     after.reward[16:] = 0.0
     assert rules(after) == []
@@ -140,7 +140,7 @@ def test_success_that_does_not_stay_is_lost() -> None:
     assert rules(blinking, rises(0)) == []
 
 
-def test_an_early_fail_where_every_step_costs_pays() -> None:
+def test_failing_early_pays_if_every_step_costs() -> None:
     ended = unsolved(-0.5, seed=8)
     ended.fail[-1] = True
     (verdict,) = of_episodes([ended, ended, unsolved(-0.5)])
@@ -150,7 +150,7 @@ def test_an_early_fail_where_every_step_costs_pays() -> None:
     assert rules(paid, paid, paid) == []
 
 
-def test_an_episode_that_was_cut_off_by_the_clock_breaks_no_rule() -> None:
+def test_an_episode_that_timed_out_breaks_no_rule() -> None:
     for one in (unsolved(1.0), unsolved(0.4, gain=0.0, spread=0.0), unsolved(0.6, gain=0.0)):
         assert rules(rises(0), one) != []
         cut = replace(one, cut_off=True)
@@ -161,7 +161,7 @@ def test_an_episode_that_was_cut_off_by_the_clock_breaks_no_rule() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_rewards_that_are_no_numbers_do_not_end_it(value: float) -> None:
+def test_nan_and_infinite_rewards_raise_nothing(value: float) -> None:
     broken = unsolved(0.4)
     for each in (broken.reward, broken.best, broken.hold, broken.worst):
         each[:] = value

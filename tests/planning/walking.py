@@ -1,4 +1,4 @@
-"""Steps that are planned and taken: in a test, and in a process beside it."""
+"""Plan and take steps, in a test or in a child process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MADE: dict[str, Any] = {"control_mode": "pd_ee_delta_pose", "render_backend": "n
 
 
 def walk(env: Any, planner: workbench.Planner, env_idx: list[int] | None, steps: int = 3) -> np.ndarray:
-    """(T, N, A) the actions that are planned and taken from a reset on."""
+    """Reset, then plan and take `steps`; return the actions, (T, N, A)."""
     env.reset(seed=[5, 6, 7, 8][: open_env(env).num_envs])
     planner.reset()
     taken = []

@@ -1,4 +1,4 @@
-"""Recording, saving and rescoring as values: any sequence of events and commands, and the order of what has to be done."""
+"""Recording, saving and rescoring as state machines: any sequence of events and commands, and the order of effects."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ NOW = Now(5.0, 1e9)
 
 
 def loaded(level: Any = None, hash: str = "a", envs: int = ENVS) -> VersionLoaded:
-    """The worker has loaded a version; without a level the first."""
+    """An event: the worker has loaded a version, the first one if `level` is None."""
     geometry, poses = table_scene(envs)
     first = step_of(poses, success=np.zeros(envs, bool))
     task = replace(description(geometry, (camera(),)), source_hash=hash)
@@ -129,43 +129,43 @@ def first() -> State:
     return State(run, LiveRecording("recordings"), first_studio(None))
 
 
-Passed = tuple[State, SessionEvent, State, list[Effect]]
-"""The state before, the event, the state after it, and what has to be done."""
+AppliedEvent = tuple[State, SessionEvent, State, list[Effect]]
+"""The state before, the event, the state after it, and the effects."""
 
 
-def apply_of_these(state: State, event: SessionEvent) -> tuple[State, list[Effect]]:
-    """The state after an event, and what these features and the run have to do."""
+def apply_filtered(state: State, event: SessionEvent) -> tuple[State, list[Effect]]:
+    """Return the state after an event, and the effects for these features and the run."""
     state, effects = apply(state, event, NOW)
     return state, [
         effect for effect in effects if isinstance(effect, RecordEffect | RescoreEffect | RunEffect)
     ]
 
 
-def passed(happened: list[SessionEvent]) -> list[Passed]:
-    """What each event came to; one that is refused changes nothing."""
-    state, came = first(), []
+def apply_all(happened: list[SessionEvent]) -> list[AppliedEvent]:
+    """Apply the events in order; a refused event changes nothing."""
+    state, steps = first(), []
     for event in happened:
         before = state
         effects: list[Effect] = []
         try:
-            state, effects = apply_of_these(state, event)
+            state, effects = apply_filtered(state, event)
         except Refused as reason:
             assert str(reason)
-        came.append((before, event, state, effects))
-    return came
+        steps.append((before, event, state, effects))
+    return steps
 
 
 def after(*happened: SessionEvent) -> tuple[State, list[Effect]]:
-    """The state at the end, and what has to be done then."""
-    return passed(list(happened))[-1][2:]
+    """Return the state after the last event, and the effects of that event."""
+    return apply_all(list(happened))[-1][2:]
 
 
 @given(st.lists(EVENTS, max_size=25))
-def test_any_sequence_gives_the_same_values_and_records_nothing_that_was_not_asked_for(
+def test_any_sequence_is_deterministic_and_records_only_what_was_requested(
     happened: list[SessionEvent],
 ) -> None:
-    came, again = passed(happened), passed(happened)
-    for (before, event, state, effects), (_, _, other, _) in zip(came, again, strict=True):
+    steps, again = apply_all(happened), apply_all(happened)
+    for (before, event, state, effects), (_, _, other, _) in zip(steps, again, strict=True):
         assert (state.recording, state.rescoring) == (other.recording, other.rescoring)
         recording, status = state.recording, state.recording.status(state.run)
         assert status.active == bool(recording.env_idx) and status.saving.failed in (False, True)
@@ -185,14 +185,14 @@ def test_any_sequence_gives_the_same_values_and_records_nothing_that_was_not_ask
             assert EndEpisodes() in effects
 
 
-def test_an_episode_that_a_load_ends_is_followed_by_the_next_one_of_each_env() -> None:
+def test_an_episode_ended_by_a_load_is_followed_by_the_next_of_each_env() -> None:
     begun = loaded(), RESET, Asked(ToggleRecording()), RESET, STEP
     state, effects = after(*begun, loaded("patched", "b"))
     assert EndEpisodes() in effects and not state.recording.env_idx
     again, effects = after(*begun, loaded("patched", "b"), LoadDone())
     begin, capture = effects
     assert isinstance(begin, BeginEpisodes) and begin.task.source_hash == "b"
-    assert capture == Send(SetCapture((0,), from_reset=True)), "no reset, which would lose the moment"
+    assert capture == Send(SetCapture((0,), from_reset=True)), "a reset would lose the current moment"
     assert again.recording.since == NOW.wall and again.recording.env_idx == (0,)
     state, effects = after(*begun, loaded("rebuilt", "b"), LoadDone())
     assert effects[1:] == [Send(SetCapture((0,), from_reset=True)), Then(EnvsReset((0,)))]
@@ -200,7 +200,7 @@ def test_an_episode_that_a_load_ends_is_followed_by_the_next_one_of_each_env() -
     assert state.recording.env_idx == (0,) and effects == []
 
 
-def test_envs_that_a_smaller_version_lacks_are_recorded_no_more() -> None:
+def test_envs_that_a_smaller_version_lacks_are_no_longer_recorded() -> None:
     all_envs = Asked(ChooseRecordedEnvs(envs="all")), Asked(ToggleRecording())
     state, effects = after(loaded(), *all_envs, RESET, loaded("rebuilt", "b", envs=2), LoadDone())
     assert state.recording.env_idx == (0, 1) and Then(EnvsReset((0, 1))) in effects
@@ -209,17 +209,17 @@ def test_envs_that_a_smaller_version_lacks_are_recorded_no_more() -> None:
     assert not state.recording.env_idx and effects == []
 
 
-def test_what_dies_is_not_recorded_again_and_what_is_handed_over_is() -> None:
+def test_only_a_worker_that_was_handed_over_is_recorded_again() -> None:
     for end in End:
         died = WorkerDied(replace(DEATH, end=end), "")
         state, _ = after(loaded(), RESET, Asked(ToggleRecording()), died, loaded(), LoadDone())
         assert bool(state.recording.env_idx) == (end is End.HANDED_OVER)
 
 
-def test_envs_are_reset_after_their_capture_was_asked_for() -> None:
+def test_envs_are_reset_after_their_capture_was_requested() -> None:
     state, effects = after(loaded(), Asked(ChooseRecordedEnvs(envs="all")), Asked(ToggleRecording()))
     assert effects[1:] == [Send(SetCapture((0, 1, 2), from_reset=True)), Then(EnvsReset())]
-    _, effects = apply_of_these(state, EnvsReset())
+    _, effects = apply_filtered(state, EnvsReset())
     assert effects == [Send(Reset(None, state.run.seed))]
 
 
@@ -233,32 +233,32 @@ def test_steps_that_wait_for_the_disk_are_bounded(monkeypatch: pytest.MonkeyPatc
     )
 
 
-def test_what_an_older_recording_or_job_says_changes_nothing_but_the_bytes_that_wait() -> None:
+def test_late_events_of_an_older_recording_or_job_change_only_the_waiting_bytes() -> None:
     state, _ = after(loaded(), RESET, STEP, Asked(ToggleRecording()), Asked(RecordNextEpisode()))
     assert state.recording.number == 2
-    said, effects = apply_of_these(state, StepRecorded(1, 10, (), RunningEpisodes(1, 1, 1), "it failed"))
-    assert effects == [] and said.recording == replace(state.recording, waiting_bytes=-10)
+    changed, effects = apply_filtered(state, StepRecorded(1, 10, (), RunningEpisodes(1, 1, 1), "it failed"))
+    assert effects == [] and changed.recording == replace(state.recording, waiting_bytes=-10)
     state, effects = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveWanted((1,)))
     assert [type(effect) for effect in effects] == [BeginSaving]
-    said = RescoringTold(1, RescoreView("done"))
-    for event in (EpisodesSaved(1, "saved"), SaveFailed(1, "it failed"), said):
-        assert apply_of_these(state, event) == (state, [])
-    state, _ = apply_of_these(state, EpisodesSaved(2, "saved"))
+    late = RescoringTold(1, RescoreView("done"))
+    for event in (EpisodesSaved(1, "saved"), SaveFailed(1, "it failed"), late):
+        assert apply_filtered(state, event) == (state, [])
+    state, _ = apply_filtered(state, EpisodesSaved(2, "saved"))
     assert state.recording.status(state.run).saving.message == "saved"
 
 
 def test_episodes_are_saved_once_they_are_solved_and_one_job_at_a_time() -> None:
     state, _ = after(loaded(), RESET, STEP)
     with pytest.raises(Refused):
-        apply_of_these(state, Asked(SaveSolved()))
+        apply_filtered(state, Asked(SaveSolved()))
     solved = Solving(episodes={env: RunningEpisode(solved_at=1) for env in (0, 2)})
-    state, (begin,) = apply_of_these(replace(state, solving=solved), Asked(SaveSolved()))
+    state, (begin,) = apply_filtered(replace(state, solving=solved), Asked(SaveSolved()))
     assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [0, 2]
     with pytest.raises(Refused):
-        apply_of_these(state, Asked(SaveSolved()))
+        apply_filtered(state, Asked(SaveSolved()))
 
 
-def test_a_rescoring_that_a_save_stopped_begins_again_if_the_version_stays_the_same() -> None:
+def test_a_rescoring_stopped_by_a_save_restarts_if_the_version_stays_the_same() -> None:
     begun = loaded(), RESET, STEP, loaded("patched", "b")
     state, effects = after(*begun)
     assert any(isinstance(effect, BeginRescoring) for effect in effects)
@@ -272,14 +272,14 @@ def test_a_rescoring_that_a_save_stopped_begins_again_if_the_version_stays_the_s
     state, _ = after(*begun, Asked(StopRescoring()))
     assert state.rescoring.view.stopped_by is StoppedBy.HAND
     with pytest.raises(Refused):
-        apply_of_these(state, Asked(StopRescoring()))
+        apply_filtered(state, Asked(StopRescoring()))
 
 
-def test_an_episode_that_was_saved_of_the_past_is_none_of_the_recording() -> None:
+def test_an_episode_saved_from_the_past_does_not_count_as_recorded() -> None:
     state, _ = after(loaded(), Asked(ToggleRecording()), EpisodeEnded(live=True), EpisodeEnded(live=False))
     assert (state.recording.episodes, state.recording.being_written) == (1, 2)
 
 
-def test_every_command_of_these_features_is_taken() -> None:
+def test_every_command_of_these_features_is_handled() -> None:
     taken = of_recording.DOES | of_rescoring.DOES
     assert {type(command) for command in COMMANDS} == taken

@@ -1,4 +1,4 @@
-"""The files of episodes are made one after the other, at the end on two threads, and each says for itself what came of it."""
+"""The files of episodes are written one by one, at the end on two threads, and each reports its own result."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from workbench.episodes.writing.episode_writer import EpisodeFiles
 from workbench.record.gather import EpisodeFinisher, GatheredEpisode
 
 
-def test_why_one_could_not_be_written_is_not_lost_to_the_next(tmp_path: Path) -> None:
+def test_the_error_of_one_episode_is_not_lost_when_the_next_is_written(tmp_path: Path) -> None:
     folders = (tmp_path / "gone", tmp_path / "there")
     episodes = [
         GatheredEpisode(appended(folder, made(3), pictures=False), env=env, seed=0)
@@ -26,10 +26,10 @@ def test_why_one_could_not_be_written_is_not_lost_to_the_next(tmp_path: Path) ->
 
 
 class Panic(BaseException):
-    """As rerun's Rust code raises: no `Exception`."""
+    """Like a panic in rerun's Rust code: not an `Exception`."""
 
 
-def test_a_panic_is_one_episode_that_could_not_be_written_and_is_waited_for_no_more(tmp_path: Path) -> None:
+def test_a_panic_fails_one_episode_and_is_no_longer_waited_for(tmp_path: Path) -> None:
     panics = [Panic("in Rust")]
 
     def then(files: EpisodeFiles) -> None:

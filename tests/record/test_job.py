@@ -1,4 +1,4 @@
-"""``workbench record``: the same episodes on any number of envs and processes, from any source of actions."""
+"""``workbench record``: equal episodes with any number of envs and processes, from any source of actions."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def read_all(recorded: Recorded) -> list[Episode]:
 
 
 def assert_same(one: Episode, other: Episode) -> None:
-    """To the last bit."""
+    """Assert that two episodes are equal, bit for bit."""
     assert one.info.seed == other.info.seed
     np.testing.assert_array_equal(one.action, other.action)
     np.testing.assert_array_equal(one.reward, other.reward)
@@ -74,7 +74,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     return done
 
 
-def test_every_episode_is_three_files_that_stand_alone(recorded: Recorded) -> None:
+def test_every_episode_is_three_self_contained_files(recorded: Recorded) -> None:
     for episode in recorded.written:
         assert verify_rrd(episode.path) is None
         files = sorted(episode.path.parent.glob(f"{episode.path.stem}.*"))
@@ -90,16 +90,18 @@ def test_every_episode_is_three_files_that_stand_alone(recorded: Recorded) -> No
     }
 
 
-def test_a_recording_says_which_pictures_it_holds(recorded: Recorded, renderer: None, tmp_path: Path) -> None:
+def test_a_recording_names_the_kind_of_its_pictures(
+    recorded: Recorded, renderer: None, tmp_path: Path
+) -> None:
     assert {episode.info.pictures for episode in read_all(recorded)} == {"exact"}
     options = TaskOptions(num_envs=1)
     fast = record(RecordOptions("PushCube-v1", tmp_path, 1, fast_pictures=True, max_steps=1, options=options))
     (episode,) = read_all(fast)
     assert episode.info.pictures == "fast"
-    assert options_of(episode.info, 1).pictures == "fast", "and is scored with the same"
+    assert options_of(episode.info, 1).pictures == "fast", "it must be rescored with the same kind"
 
 
-def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(recorded: Recorded) -> None:
+def test_an_episode_starts_like_the_stock_env_with_its_seed(recorded: Recorded) -> None:
     stock: Any = gym.make("PushCube-v1", num_envs=1, obs_mode="state", render_backend="none").unwrapped
     for seed, episode in zip((10, 11, 12), read_all(recorded), strict=True):
         assert episode.info.seed == seed
@@ -134,7 +136,7 @@ def test_the_episodes_are_the_same_on_any_number_of_envs_and_processes(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [2, 4])
-def test_processes_that_are_killed_cost_no_episode_and_double_none(workers: int, tmp_path: Path) -> None:
+def test_killed_processes_lose_and_duplicate_no_episode(workers: int, tmp_path: Path) -> None:
     policy = tmp_path / "act.py"
     policy.write_text(
         "import torch\n\ntorch.manual_seed(0)\nlayer = torch.nn.Linear(35, 8)\n\n\n"
@@ -153,7 +155,7 @@ def test_processes_that_are_killed_cost_no_episode_and_double_none(workers: int,
 
     def kill(progress: RecordProgress) -> None:
         for child in psutil.Process().children(recursive=True) if len(killed) < 2 else ():
-            with suppress(psutil.Error):  # it has ended meanwhile
+            with suppress(psutil.Error):  # the process may have ended meanwhile
                 words = child.cmdline()
                 if progress.over and "workbench.jobs.local_processes" in words and child.children() == []:
                     child.kill()
@@ -168,7 +170,7 @@ def test_processes_that_are_killed_cost_no_episode_and_double_none(workers: int,
 
 
 def test_an_episode_does_not_depend_on_those_before_it_in_its_process(tmp_path: Path) -> None:
-    """Of a task in which bodies touch: what PhysX keeps of contacts would differ by its last bits."""
+    """Bodies touch in this task: contacts cached by PhysX would change the last bits."""
     task = str(Path(__file__).parents[2] / "tasks" / "broken" / "reach_ball.py")
     kwargs = {**PLAIN, "control_mode": "pd_ee_delta_pose"}
     found = {}
@@ -182,8 +184,8 @@ def test_an_episode_does_not_depend_on_those_before_it_in_its_process(tmp_path: 
     assert_same(found[1], found[2])
 
 
-class InAnyOrder:
-    """Episodes that end in the order that the data draws, with files that are empty."""
+class RandomOrderExecutor:
+    """An executor whose episodes end in a drawn order, with empty files."""
 
     def __init__(self, good: list[bool], slots: int, data: st.DataObject) -> None:
         self.good, self.slots, self.data = good, slots, data
@@ -215,14 +217,14 @@ class InAnyOrder:
     slots=st.integers(1, 8),
     data=st.data(),
 )
-def test_the_kept_successes_are_those_with_the_lowest_numbers(
+def test_successes_with_the_lowest_numbers_are_kept(
     wanted: int, tries: int, good: list[bool], slots: int, data: st.DataObject
 ) -> None:
     first = [index for index in range(tries) if good[index]][:wanted]
     seen: list[RecordProgress] = []
     with tempfile.TemporaryDirectory() as folder:
         what = RecordOptions("PushCube-v1", Path(folder), successes=wanted, tries=tries)
-        done = record(what, on_progress=seen.append, executor=InAnyOrder(good, slots, data))
+        done = record(what, on_progress=seen.append, executor=RandomOrderExecutor(good, slots, data))
         left = sorted(path.name for path in Path(folder).iterdir())
     assert [episode.index for episode in done.written] == first
     assert left == sorted(f"v1.{number}{suffix}" for number in first for suffix in (".rrd", ".h5", ".json"))
@@ -230,7 +232,7 @@ def test_the_kept_successes_are_those_with_the_lowest_numbers(
     assert max(progress.kept for progress in seen) <= wanted
 
 
-def test_successes_are_kept_and_nothing_else(tmp_path: Path) -> None:
+def test_only_successes_are_kept(tmp_path: Path) -> None:
     lazy = tmp_path / "lazy.py"
     lazy.write_text(
         f"{PUSHER.read_text()}\n\ndef lazy(obs):\n    move = act(obs)\n    move[3] = 0.0\n    return move\n"
@@ -252,7 +254,7 @@ def test_successes_are_kept_and_nothing_else(tmp_path: Path) -> None:
     assert len(list((tmp_path / "out").iterdir())) == 12
 
 
-def test_actions_come_from_a_file_and_are_done_to_its_end(recorded: Recorded, tmp_path: Path) -> None:
+def test_actions_from_a_file_are_played_to_its_end(recorded: Recorded, tmp_path: Path) -> None:
     actions = [episode.action for episode in read_all(recorded)]
     np.savez(tmp_path / "actions.npz", *actions)
     what = RecordOptions(
@@ -315,8 +317,8 @@ def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def tires(tmp_path: Path) -> RecordOptions:
-    """Two episodes of three steps; the policy raises in the second one."""
+def failing_policy(tmp_path: Path) -> RecordOptions:
+    """Options for two episodes of three steps; the policy raises in the second one."""
     (tmp_path / "tires.py").write_text(
         "asked = 0\n\n\ndef act(obs):\n    global asked\n    asked += 1\n"
         "    if asked > 4:\n        raise RuntimeError('tired')\n    return obs.new_zeros(len(obs), 8)\n"
@@ -328,22 +330,24 @@ def tires(tmp_path: Path) -> RecordOptions:
     )
 
 
-def test_an_episode_that_failed_is_no_longer_under_way(tires: RecordOptions) -> None:
+def test_a_failed_episode_is_no_longer_in_progress(failing_policy: RecordOptions) -> None:
     progress: list[RecordProgress] = []
-    record(tires, on_progress=progress.append)
+    record(failing_policy, on_progress=progress.append)
     assert any(1 in now.running for now in progress)
     last = progress[-1]
     assert [list(failure.numbers) for failure in last.failures] == [[1]]
     assert last.running == {} and last.done == last.kept == 1
 
 
-def test_what_was_kept_before_a_failure_is_said(tires: RecordOptions, capsys: pytest.CaptureFixture) -> None:
-    assert record_in_terminal(tires) == 1
-    said = capsys.readouterr()
-    assert "policy failed" in said.err and "tired" in said.err
-    assert "without a result, 1 in all: episode 1" in said.err
-    assert "1 episode recorded, 1 without a result" in said.err
-    assert "Look at them with: workbench review" in said.out
+def test_episodes_kept_before_a_failure_are_reported(
+    failing_policy: RecordOptions, capsys: pytest.CaptureFixture
+) -> None:
+    assert record_in_terminal(failing_policy) == 1
+    printed = capsys.readouterr()
+    assert "policy failed" in printed.err and "tired" in printed.err
+    assert "without a result, 1 in all: episode 1" in printed.err
+    assert "1 episode recorded, 1 without a result" in printed.err
+    assert "Look at them with: workbench review" in printed.out
 
 
 DRAWS = """
@@ -359,12 +363,10 @@ class Draws(PushCubeEnv):
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_rule_that_the_task_breaks_is_told_once_by_however_many_processes(
-    workers: int, tmp_path: Path
-) -> None:
+def test_a_broken_rule_is_reported_once_with_any_number_of_processes(workers: int, tmp_path: Path) -> None:
     file, found = tmp_path / "draws.py", []
     file.write_text(DRAWS)
-    # A partial reset in each process takes two envs.
+    # A process needs two envs for a partial reset.
     options = TaskOptions(num_envs=2 * workers, env_kwargs=PLAIN)
     what = RecordOptions(
         str(file), tmp_path / "out", 4, pictures=False, max_steps=2, workers=workers, options=options
@@ -375,7 +377,7 @@ def test_a_rule_that_the_task_breaks_is_told_once_by_however_many_processes(
     assert len(record(off, on_finding=found.append).written) == 4 and len(found) == 1
 
 
-def test_a_file_with_the_name_of_a_library_is_told_once_in_the_terminal(
+def test_a_file_with_the_name_of_a_library_is_reported_once_in_the_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = Path(shutil.copy(TASKS / "minimal.py", tmp_path))
@@ -412,7 +414,7 @@ def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
     )
     until(lambda: (tmp_path / "hung").exists() or process.poll() is not None, "the loop")
     for _ in range(2):
-        time.sleep(0.5)  # the first must have been heard, or both are one
+        time.sleep(0.5)  # the first signal must be handled, or both merge into one
         os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 130 and "interrupted" in errors
@@ -421,7 +423,7 @@ def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
+def test_ctrl_c_keeps_finished_episodes(workers: str, tmp_path: Path) -> None:
     command = [
         *(sys.executable, "-m", "workbench.cli.main", "record", "PushCube-v1", "--no-pictures"),
         *("--env", "render_backend=none"),
@@ -432,15 +434,17 @@ def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     until(lambda: list(tmp_path.glob("*.json")) or process.poll() is not None, "the first episode")
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does it
-    said, errors = process.communicate(timeout=60)
+    os.killpg(process.pid, signal.SIGINT)  # a terminal signals the process group too
+    stdout, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and "interrupted" in errors
     assert "Traceback" not in errors
     written = sorted(tmp_path.glob("*.json"))
-    assert len(said.splitlines()) == len(written) + 1
-    told = re.findall(
+    assert len(stdout.splitlines()) == len(written) + 1
+    counted = re.findall(
         r"^episode (\d+): 3 steps, return -?[\d.]+, no success, (\d+) of 100000 kept$", errors, re.M
     )
-    assert [int(kept) for _, kept in told] == list(range(1, len(written) + 1)), "a line for each, in a pipe"
+    assert [int(kept) for _, kept in counted] == list(range(1, len(written) + 1)), (
+        "in a pipe, each episode prints a line"
+    )
     assert not (tmp_path / ".writing").exists()
     assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])

@@ -1,4 +1,4 @@
-"""Recording while the page runs, from the next reset, and after the fact: the same files."""
+"""Recording live, from the next reset, and afterwards from the history gives the same files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ EYE = "eye=[0.45, 0, 0.6]"
 @pytest.fixture(scope="module")
 def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     folder = tmp_path_factory.mktemp("task")
-    # Small pictures: drawn in software, those of 512 by 512 take most of the time.
+    # Small pictures: software rendering of 512 x 512 would take most of the time.
     (folder / "push_cube.py").write_text((TASKS / "push_cube.py").read_text().replace("512", "64"))
     with live_session(folder / "push_cube.py", folder / "recordings", seed=5, draw=True) as session:
         yield session
@@ -48,7 +48,7 @@ def elapsed(view: SessionView) -> int:
 
 
 def written(session: Session, count: int) -> list[Episode]:
-    """The episodes that there are, oldest first, once there are so many."""
+    """Wait for this many episodes and return them, oldest first."""
     view = wait_until(session, lambda view: view.of(RecordingStatus).episodes_written >= count, "the files")
     paths = sorted(
         Path(view.of(RecordingStatus).folder).glob("*.json"), key=lambda path: path.stat().st_mtime_ns
@@ -58,7 +58,7 @@ def written(session: Session, count: int) -> list[Episode]:
 
 
 def assert_same(one: Episode, other: Episode) -> None:
-    """All of it, to the last bit, but for who and when."""
+    """Assert that two episodes hold the same data, bit for bit; ids and dates may differ."""
     assert (one.info.seed, one.info.env_index) == (other.info.seed, other.info.env_index)
     assert one.info.acted_by == other.info.acted_by
     assert one.poses is not None and other.poses is not None
@@ -80,7 +80,7 @@ def assert_same(one: Episode, other: Episode) -> None:
 
 
 @pytest.mark.slow
-def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session) -> None:
+def test_an_episode_saved_afterwards_equals_one_recorded_live(session: Session) -> None:
     session.happen(RecordingWanted())
     wait_until(
         session,
@@ -94,8 +94,8 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
     live = written(session, 2)
     session.happen(SaveWanted())
     wait_until(session, lambda view: bool(view.of(RecordingStatus).saving.message), "the keeping")
-    said = f"saved 2 episodes, {2 * STEPS} steps; none of them had ended"
-    assert session.view().of(RecordingStatus).saving.message == said
+    expected = f"saved 2 episodes, {2 * STEPS} steps; none of them had ended"
+    assert session.view().of(RecordingStatus).saving.message == expected
     every = written(session, 4)
     kept = {episode.info.env_index: episode for episode in every[2:]}
     assert kept.keys() == {0, 1}
@@ -104,7 +104,7 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
     for episode in live:
         stock.reset(seed=episode.info.seed)
         start = stock.unwrapped.get_state_dict()["actors"]["cube"][0].numpy()
-        # The seed that a person reads of it starts it again, though the page reset both envs.
+        # The seed shown to the user reproduces the episode, though the page reset both envs.
         np.testing.assert_allclose(episode.env_states["actors/cube"][0], start, rtol=0, atol=1e-6)
     stock.close()
     for episode in live:
@@ -114,7 +114,7 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
 
 
 @pytest.mark.slow
-def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> None:
+def test_the_previous_episode_can_be_saved(session: Session) -> None:
     count = session.view().of(RecordingStatus).episodes_written
     for steps in (3, 1):
         session.happen(EnvsReset())
@@ -125,24 +125,26 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
     session.happen(SaveWanted((0,), before=True))
     kept = written(session, count + 1)[-1]
     assert kept.length == 3 and kept.info.env_index == 0
-    # Nobody recorded, so both envs were reset at once: the first of them as alone, and the other otherwise.
-    said = session.view().of(RecordingStatus).saving.message
-    assert kept.info.seed == 5 and "seed" not in said
+    # Without a recording both envs were reset together: env 0 starts as it would alone, env 1 does not.
+    message = session.view().of(RecordingStatus).saving.message
+    assert kept.info.seed == 5 and "seed" not in message
     session.happen(SaveWanted((1,), before=True))
     kept = written(session, count + 2)[-1]
     assert kept.info.env_index == 1 and kept.info.seed == -1
-    said = (
-        wait_until(session, lambda view: bool(view.of(RecordingStatus).saving.message), "what came of it")
+    message = (
+        wait_until(
+            session, lambda view: bool(view.of(RecordingStatus).saving.message), "the result of saving"
+        )
         .of(RecordingStatus)
         .saving.message
     )
-    assert "without a seed" in said
+    assert "without a seed" in message
     assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
     session.change(action_source="random")
 
 
 @pytest.mark.slow
-def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it(session: Session) -> None:
+def test_an_episode_of_an_earlier_version_is_saved_with_its_own_source(session: Session) -> None:
     count = session.view().of(RecordingStatus).episodes_written
     session.happen(EnvsReset())
     wait_until(session, lambda view: elapsed(view) == 0, "a reset")
@@ -152,8 +154,8 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
     assert version is not None and version.file is not None and played.step is not None
     file = Path(version.file)
     text = file.read_text()
-    said = camera(session, BASE).now
-    assert said is not None and text.count(EYE) == 1
+    shown = camera(session, BASE).now
+    assert shown is not None and text.count(EYE) == 1
     file.write_text(text.replace("= 3\n", "= 4\n").replace(EYE, "eye=[0.4, 0, 0.6]"))
     wait_until(
         session, lambda view: view.task is not None and view.task.source_hash != version.source_hash, "it"
@@ -164,11 +166,11 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
     assert list(kept.info.source.values()) == list(version.source.values())
     np.testing.assert_array_equal(kept.reward[-1], played.step.reward[0])
     assert "an earlier version" in session.view().of(RecordingStatus).saving.message
-    # What its source does not say of the pictures.
+    # The camera placement of the pictures, which the episode's source does not hold.
     now = session.view().task
     assert now is not None and kept.info.observed_by == now.source_hash
     ((moved, used, in_file),) = [(m.name, m.used, m.in_file) for m in kept.info.moved_cameras]
-    assert (moved, in_file) == ("base_camera", said) and used.position == pytest.approx((0.4, 0, 0.6))
+    assert (moved, in_file) == ("base_camera", shown) and used.position == pytest.approx((0.4, 0, 0.6))
     file.write_text(text)
     wait_until(
         session, lambda view: view.task is not None and view.task.source_hash == version.source_hash, "it"
@@ -176,7 +178,7 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
 
 
 @pytest.mark.slow
-def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_a_reset(
+def test_a_rebuild_while_recording_keeps_every_env_in_place_and_waits_for_a_reset(
     session: Session,
 ) -> None:
     session.happen(RecordingWanted((0,)))
@@ -204,7 +206,7 @@ def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_
 
 
 @pytest.mark.slow
-def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:
+def test_recording_the_next_episode_waits_for_a_reset_and_ends_with_the_next(session: Session) -> None:
     before = session.view().of(RecordingStatus).episodes_written
     session.happen(RecordingWanted((1,), next_episode=True))
     step(session, 1)
@@ -224,12 +226,10 @@ def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session)
 
 
 @pytest.mark.slow
-def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
-    session: Session, tmp_path: Path
-) -> None:
+def test_an_unwritable_folder_is_reported_and_the_session_continues(session: Session, tmp_path: Path) -> None:
     view = session.view()
     folder = Path(view.of(RecordingStatus).folder)
-    folder.mkdir(exist_ok=True)  # nothing may have been recorded yet
+    folder.mkdir(exist_ok=True)  # it may not exist yet
     aside = folder.rename(folder.with_name("aside"))
     folder.write_text("in the way")
     session.happen(RecordingWanted((0,)))
@@ -250,10 +250,10 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
 
 
 @pytest.mark.slow
-def test_what_is_recorded_says_where_a_moved_camera_was_and_where_the_file_has_it(
+def test_a_recording_holds_both_the_moved_and_the_files_camera_placement(
     session: Session, tmp_path: Path
 ) -> None:
-    """Live, and of the past; as data in the .json, as facts in exports."""
+    """This holds live and for saved past episodes, in the .json and in exports."""
     in_file = camera(session, BASE).now
     assert in_file is not None
     there = replace(in_file, position=(0.31, 0.02, 0.55))
@@ -281,7 +281,7 @@ def test_what_is_recorded_says_where_a_moved_camera_was_and_where_the_file_has_i
         (3, "base_camera", in_file, in_file),
     ]
     assert past.info.moved_cameras == live.info.moved_cameras[:1]
-    # As the pictures say, which have a pose each.
+    # Each picture has its own pose.
     track = next(track for track in live.cameras if track.info.key == BASE)
     stood = np.array([(0.31, 0.02, 0.55)] * 3 + [(0.45, 0, 0.6)] * 2)
     np.testing.assert_allclose(track.pose[:, :3], stood, atol=1e-6)

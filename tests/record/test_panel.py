@@ -1,4 +1,4 @@
-"""The Episodes tab: what can be recorded or saved, and what a press asks for."""
+"""The Episodes tab: what can be recorded or saved, and the commands of its buttons."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from workbench.record.state import RecordingStatus
 PAST = TimelineView(0, 40, None, 0, 40, 40, moments=41)
 
 
-def test_what_can_be_done_is_offered_and_asked_for_of_the_chosen_envs(live_page: Live) -> None:
+def test_possible_commands_are_offered_and_sent_for_the_chosen_envs(live_page: Live) -> None:
     def show(recording: RecordingStatus | None = None, past: TimelineView = PAST, **changes: Any) -> None:
         live_page.show(
             running(3, selected_env=1, recording=recording or RecordingStatus(), timeline=past, **changes)
@@ -47,7 +47,7 @@ def test_what_can_be_done_is_offered_and_asked_for_of_the_chosen_envs(live_page:
     ]
     live_page.asked.clear()
     show(past=replace(PAST, first_tick=33, first=33))
-    assert not tab.shows(SAVE_BEFORE), "seven steps are this episode's own"
+    assert not tab.shows(SAVE_BEFORE), "all seven steps belong to this episode"
     show(RecordingStatus(True, (1,), 1e9, waiting=1))
     tab.press(STOP_WAITING)
     show(RecordingStatus(True, (1,), 1e9))

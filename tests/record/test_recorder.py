@@ -1,4 +1,4 @@
-"""`workbench.Recorder` around what `workbench.make` gives: partial resets, auto-resets, and files that fail."""
+"""`workbench.Recorder` around an env of `workbench.make`: partial resets, auto-resets, and failing files."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_auto_resets_end_an_episode_and_begin_the_next(tmp_path: Path) -> None:
     assert read[0].info.max_episode_steps == 3 and bool(read[0].truncated[-1])
 
 
-def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_path: Path) -> None:
-    """The same run through both, RecordEpisode around ours: states, actions, rewards and flags are equal."""
+def test_it_records_the_same_data_as_maniskills_own_recorder(child_process: None, tmp_path: Path) -> None:
+    """One run through both, RecordEpisode wrapped around ours, gives equal states, actions, rewards and flags."""
     env = workbench.make(str(TASKS / "push_cube.py"), 2, **CPU)
     ours = workbench.Recorder(env, tmp_path / "ours")
     theirs_in = str(tmp_path / "theirs")
@@ -67,7 +67,7 @@ def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_pa
     assert sorted(e.length for e in read) == sorted(e.length for e in theirs) == [2, 3, 5]
     for one in read:
         (other,) = [e for e in theirs if e.length == one.length]
-        # The partial reset had no seed; RecordEpisode goes on saying the one of the previous episode.
+        # The partial reset had no seed; RecordEpisode repeats the seed of the previous episode.
         assert one.info.seed == (NO_SEED if one.length == 2 else other.info.seed)
         for name in ("action", "reward", "terminated", "truncated"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
@@ -79,10 +79,10 @@ def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_pa
 
 
 @pytest.mark.parametrize(("envs", "cores", "begun"), [(4, 2, 1), (4, 1, 0), (3, 2, 0)])
-def test_where_it_pays_a_process_makes_the_files(
+def test_a_subprocess_writes_the_files_where_it_is_worthwhile(
     child_process: None, tmp_path: Path, envs: int, cores: int, begun: int
 ) -> None:
-    """Not of a few envs, and not where there is no core for it."""
+    """It does not with few envs or without a spare core."""
     all_cores = os.sched_getaffinity(0)
     if len(all_cores) < cores:
         pytest.skip("this machine has one core")
@@ -110,7 +110,7 @@ def test_where_it_pays_a_process_makes_the_files(
         pytest.param(False, marks=pytest.mark.slow),
     ],
 )
-def test_the_pictures_that_were_asked_for_are_there_and_are_those_of_the_env(
+def test_the_requested_pictures_are_recorded_and_match_the_env(
     renderer: None, tmp_path: Path, asked: bool | tuple[str, ...]
 ) -> None:
     with pytest.warns(UserWarning, match="renders simplified meshes"):
@@ -128,7 +128,7 @@ def test_the_pictures_that_were_asked_for_are_there_and_are_those_of_the_env(
             assert track.frame.tolist() == [0, 1, 2]
         if asked is True:
             kept = np.array([tracks["base_camera"].pictures["rgb"][step] for step in range(3)], np.int16)
-            # With the loss of a JPEG; each is nearest to the one of its env and step.
+            # JPEG is lossy, so each picture only has to be nearest to that of its own env and step.
             off = np.abs(kept[:, None, None] - seen).mean(axis=(-3, -2, -1))
             assert off.reshape(3, -1).argmin(axis=1).tolist() == [2 * step + number for step in range(3)]
             assert off.min(axis=(1, 2)).max() < 6
@@ -145,7 +145,7 @@ def test_a_full_disk_warns_once_and_the_run_goes_on(tmp_path: Path) -> None:
     env.close()
 
 
-def test_what_came_before_an_unseen_reset_is_kept(tmp_path: Path) -> None:
+def test_steps_before_an_unseen_reset_are_kept(tmp_path: Path) -> None:
     env = workbench.Recorder(workbench.make("PushCube-v1", 2, **CPU), tmp_path)
     env.reset(seed=0)
     for _ in range(3):
@@ -174,7 +174,7 @@ for step in range(1, 10**6):
 
 @pytest.mark.slow
 def test_a_killed_program_loses_a_second(child_process: None, tmp_path: Path) -> None:
-    """A second is for all that waits anywhere."""
+    """Everything that waits is written within a second."""
     child = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert child.stdout is not None and child.stdout.readline() == "begun\n"
     lines, begun = [child.stdout.readline()], time.time()

@@ -1,4 +1,4 @@
-"""Recording with a worker that is the test: what is recovered, refused, and what a failure ends."""
+"""Recording with a scripted worker: recovered episodes, refusals, and the effects of failures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.drive.episodes import begin, made
-from tests.drive.session import Told, moment, moment_at, told_session
+from tests.drive.session import FakeWorkerSession, fake_worker_session, moment, moment_at
 from tests.drive.waiting import until
 from workbench.episodes.reader.read_episode import read_episode
 from workbench.live.messages import Reset, SetCapture
@@ -24,38 +24,36 @@ from workbench.record.saving_state import SaveWanted
 from workbench.record.state import RecordingStatus, RecordingWanted
 
 
-def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
+def test_a_recovered_episode_is_named_on_the_page_and_in_the_terminal(
     child_process: None, tmp_path: Path
 ) -> None:
     begin(tmp_path, made(5, seed=8))
-    said: list[str] = []
-    with told_session(tmp_path, on_notice=said.append) as told:
-        until(lambda: said, "a word of it")
+    notices: list[str] = []
+    with fake_worker_session(tmp_path, on_notice=notices.append) as fake:
+        until(lambda: notices, "the notice")
         (rrd,) = tmp_path.glob("*.rrd")
-        assert len(said) == 1 and str(rrd) in said[0]
-        assert told.view.of(RecordingStatus).recovered == (str(rrd),)
+        assert len(notices) == 1 and str(rrd) in notices[0]
+        assert fake.view.of(RecordingStatus).recovered == (str(rrd),)
 
 
-def test_what_is_stopped_or_dies_in_the_middle_of_an_episode_is_written(
-    child_process: None, tmp_path: Path
-) -> None:
-    with told_session(tmp_path) as told:
+def test_an_episode_cut_off_by_a_stop_or_a_death_is_written(child_process: None, tmp_path: Path) -> None:
+    with fake_worker_session(tmp_path) as fake:
         with pytest.raises(Refused):
-            told.session.happen(RecordingWanted())
-        assert told.asked(SetCapture) == [], "before there is a task"
-        told.play(0)
+            fake.session.happen(RecordingWanted())
+        assert fake.asked(SetCapture) == [], "no task is loaded yet"
+        fake.play(0)
         with pytest.raises(Refused):
-            told.session.do(StopRecording())
-        for count, end in enumerate((lambda: told.session.do(StopRecording()), told.die), 1):
-            told.asked(object)
-            told.session.happen(RecordingWanted((0, 2)))
-            assert [type(one) for one in told.asked((SetCapture, Reset))] == [SetCapture, Reset]  # type: ignore[arg-type]
-            told.reset((2,))
-            told.step()
+            fake.session.do(StopRecording())
+        for count, end in enumerate((lambda: fake.session.do(StopRecording()), fake.die), 1):
+            fake.asked(object)
+            fake.session.happen(RecordingWanted((0, 2)))
+            assert [type(one) for one in fake.asked((SetCapture, Reset))] == [SetCapture, Reset]  # type: ignore[arg-type]
+            fake.reset((2,))
+            fake.step()
             end()
             status = until(
                 lambda count=count: (
-                    s if (s := told.view.of(RecordingStatus)).episodes_written == count else None
+                    s if (s := fake.view.of(RecordingStatus)).episodes_written == count else None
                 ),
                 "the file",
             )
@@ -64,99 +62,103 @@ def test_what_is_stopped_or_dies_in_the_middle_of_an_episode_is_written(
         assert len(list(tmp_path.glob("*.rrd"))) == 2
 
 
-def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_not_the_thread(
-    played: Told,
+def test_an_invalid_step_ends_the_recording_with_a_message_and_keeps_the_thread(
+    played: FakeWorkerSession,
 ) -> None:
-    said: list[str] = []
-    listen(said.append)
+    notices: list[str] = []
+    listen(notices.append)
     try:
         for _ in range(2):
             played.session.happen(RecordingWanted((0,)))
-            assert played.view.of(RecordingStatus).problem is None, "that of the one before is forgotten"
+            assert played.view.of(RecordingStatus).problem is None, (
+                "the problem of the previous recording is cleared"
+            )
             played.reset((0,))
             now: Any = played.view.step
-            bad: Any = {"state": SimpleNamespace(nbytes=0)}  # what is no array
+            bad: Any = {"state": SimpleNamespace(nbytes=0)}  # not an array
             played.tell(replace(moment(now.elapsed_steps + 1), columns=bad))
             until(lambda: played.view.of(RecordingStatus).problem is not None, "the problem")
             assert not played.view.of(RecordingStatus).active
-        assert said
+        assert notices
     finally:
-        stop_listening(said.append)
+        stop_listening(notices.append)
 
 
-def test_what_cannot_be_saved_of_the_past_is_refused_for_what_is_shown_alone(tmp_path: Path) -> None:
-    with told_session(tmp_path, history_bytes=20_000) as told:
-        told.session.happen(SaveWanted((0,)))
-        assert told.view.of(RecordingStatus).saving.failed, "no task"
-        told.play(0)
-        told.session.happen(SaveWanted((0,)))
-        assert told.view.of(RecordingStatus).saving.failed, "no step"
-        told.step(100)
-        assert told.view.timeline.first > 0 and not told.view.of(RecordingStatus).saving.message
-        told.session.happen(SaveWanted((0,)))
-        refused = told.view.of(RecordingStatus).saving
+def test_a_refusal_to_save_the_past_is_shown_only_where_it_applies(tmp_path: Path) -> None:
+    with fake_worker_session(tmp_path, history_bytes=20_000) as fake:
+        fake.session.happen(SaveWanted((0,)))
+        assert fake.view.of(RecordingStatus).saving.failed, "no task"
+        fake.play(0)
+        fake.session.happen(SaveWanted((0,)))
+        assert fake.view.of(RecordingStatus).saving.failed, "no step"
+        fake.step(100)
+        assert fake.view.timeline.first > 0 and not fake.view.of(RecordingStatus).saving.message
+        fake.session.happen(SaveWanted((0,)))
+        refused = fake.view.of(RecordingStatus).saving
         assert refused.failed and "no longer in memory" in refused.message and refused.progress is None
-        told.session.change(selected_env=1)
-        assert not told.view.of(RecordingStatus).saving.message, "it is of env 0"
-        told.session.change(selected_env=0)
-        assert told.view.of(RecordingStatus).saving.failed
-        told.step()
-        assert not told.view.of(RecordingStatus).saving.message, "it is of the moment before"
-        told.reset()
-        told.step(2)
-        told.reset()
-        told.session.happen(SaveWanted((0,), before=True))
-        assert told.view.of(RecordingStatus).saving.failed, "the one before began earlier than what is kept"
-        told.session.happen(RecordingWanted())
-        assert not told.view.of(RecordingStatus).saving.message, "something else is recorded"
-        assert moment_at(told.session, 0) is None
+        fake.session.change(selected_env=1)
+        assert not fake.view.of(RecordingStatus).saving.message, "the message is about env 0"
+        fake.session.change(selected_env=0)
+        assert fake.view.of(RecordingStatus).saving.failed
+        fake.step()
+        assert not fake.view.of(RecordingStatus).saving.message, "the message is about the previous moment"
+        fake.reset()
+        fake.step(2)
+        fake.reset()
+        fake.session.happen(SaveWanted((0,), before=True))
+        assert fake.view.of(RecordingStatus).saving.failed, (
+            "the previous episode began before the kept history"
+        )
+        fake.session.happen(RecordingWanted())
+        assert not fake.view.of(RecordingStatus).saving.message, "a new recording replaces the message"
+        assert moment_at(fake.session, 0) is None
 
 
-def test_what_the_disk_has_taken_does_not_wait_any_more(
+def test_bytes_on_the_disk_no_longer_count_as_waiting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However much a recording holds in all: it ends only where too much waits at once, and the next begins anew."""
+    """A recording ends only if too much waits at once, whatever its total size; the next one starts from zero."""
     monkeypatch.setattr(recording, "MAX_PENDING_BYTES", 10_500)
-    taker = Taker()
+    taker = BlockingRecorder()
     monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: taker)
-    with told_session(tmp_path) as told:
-        told.play(0)
+    with fake_worker_session(tmp_path) as fake:
+        fake.play(0)
         given = 0
         try:
             for _ in range(2):
                 taker.disk.set()
-                told.session.happen(RecordingWanted((0,)))
-                told.step(snapshot=b"")
+                fake.session.happen(RecordingWanted((0,)))
+                fake.step(snapshot=b"")
                 given += 1
-                size = told.view.step.nbytes  # pyright: ignore[reportOptionalMemberAccess]
+                size = fake.view.step.nbytes  # pyright: ignore[reportOptionalMemberAccess]
                 at_once = 10_500 // size
                 assert at_once > 2
                 for _ in range(3):
-                    told.step(at_once - 1, snapshot=b"")
+                    fake.step(at_once - 1, snapshot=b"")
                     given += at_once - 1
                     until(
-                        lambda given=given: told.view.of(RecordingStatus).steps == given,
+                        lambda given=given: fake.view.of(RecordingStatus).steps == given,
                         "the steps to be taken",
                     )
                     assert (
-                        told.view.of(RecordingStatus).problem is None and told.view.of(RecordingStatus).active
+                        fake.view.of(RecordingStatus).problem is None and fake.view.of(RecordingStatus).active
                     )
                 taker.disk.clear()
-                told.step(at_once, snapshot=b"")
+                fake.step(at_once, snapshot=b"")
                 given += at_once
-                assert told.view.of(RecordingStatus).active
-                told.step(snapshot=b"")
+                assert fake.view.of(RecordingStatus).active
+                fake.step(snapshot=b"")
                 assert (
-                    not told.view.of(RecordingStatus).active
-                    and told.view.of(RecordingStatus).problem is not None
+                    not fake.view.of(RecordingStatus).active
+                    and fake.view.of(RecordingStatus).problem is not None
                 )
                 taker.disk.set()
         finally:
             taker.disk.set()
 
 
-class Taker:
-    """Takes every step, if the disk does."""
+class BlockingRecorder:
+    """Stands in for a recorder; takes a step once the `disk` event is set."""
 
     env_idx = (0,)
 
@@ -173,4 +175,4 @@ class Taker:
         self.taken += 1
 
     def finish(self) -> None:
-        """Nothing is left of it."""
+        """Do nothing; there are no files."""

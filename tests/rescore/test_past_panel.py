@@ -1,4 +1,4 @@
-"""The past judged with the new code, on the Reward tab."""
+"""Rescoring of the past with the new code, on the Reward tab."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STOP = "Stop rescoring"
 
 
 def episode(env: int = 0, **changes: Any) -> Verdict[PastRun]:
-    """An episode of fifty moments that differs at its fifth step."""
+    """The verdict on an episode of fifty moments that differs at its fifth step."""
     run = PastRun(env, 0, 10 * env + np.arange(50))
     reward = {"first_difference": 5, "look_at": 5, "differing": ("reward",), "largest": 0.25}
     return replace(
@@ -50,8 +50,8 @@ def same(env: int = 0, **changes: Any) -> Verdict[PastRun]:
 
 def done(*verdicts: Verdict[PastRun], **changes: Any) -> RescoreView:
     differing = frozenset(name for verdict in verdicts for name in verdict.differing)
-    told = {"names": ("reward", "success"), "differing_names": differing, "task": "the new code", **changes}
-    return replace(RescoreView("done", 1, verdicts, 50, 50), **told)
+    fields = {"names": ("reward", "success"), "differing_names": differing, "task": "the new code", **changes}
+    return replace(RescoreView("done", 1, verdicts, 50, 50), **fields)
 
 
 class Rescored:
@@ -74,7 +74,7 @@ def rescored(live_page: Live) -> Rescored:
     return Rescored(live_page)
 
 
-def test_the_stand_is_said_above_and_below_and_only_what_runs_can_be_stopped(rescored: Rescored) -> None:
+def test_the_state_is_shown_above_and_below_and_only_a_running_job_can_be_stopped(rescored: Rescored) -> None:
     assert not rescored.draw(RescoreView()).shows(STOP) and "wb-again" not in rescored.panels.html()
     for state, says in (
         ("loading", "loading the new code"),
@@ -90,7 +90,7 @@ def test_the_stand_is_said_above_and_below_and_only_what_runs_can_be_stopped(res
     assert "the file was saved again" in rescored.panels.html()
 
 
-def test_a_problem_is_told_with_file_and_line_as_text(rescored: Rescored) -> None:
+def test_a_problem_is_shown_as_text_with_file_and_line(rescored: Rescored) -> None:
     problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
     html = rescored.draw(done(state="failed", why="the new code raised", problem=problem, done=20)).html(
         "wb-again"
@@ -98,7 +98,7 @@ def test_a_problem_is_told_with_file_and_line_as_text(rescored: Rescored) -> Non
     assert "push.py:88" in html and "20 of 50" in html and "KeyError: &#39;&lt;b&gt;" in html
 
 
-def test_the_new_line_lies_over_the_recorded_one(rescored: Rescored) -> None:
+def test_the_new_curve_is_drawn_over_the_recorded_one(rescored: Rescored) -> None:
     (chart,) = rescored.draw(done(episode(3)), env=3).charts()
     _, old, new = chart.data
     assert (old == 3).all() and (new == 6).all()
@@ -107,20 +107,20 @@ def test_the_new_line_lies_over_the_recorded_one(rescored: Rescored) -> None:
     rescored.panels.do(ChooseRescoredCurve(curve="../../etc"))
     assert rescored.panels.client.notices and rescored.panels.field("Curve").value == "success"
     rescored.draw(done(episode(3), names=("reward",)))
-    assert rescored.panels.field("Curve").value == "reward", "there is no such curve any more"
+    assert rescored.panels.field("Curve").value == "reward", "the chosen curve no longer exists"
     rescored.draw(done(same(3), serial=2), env=3)
     assert rescored.panels.charts() == [] and not rescored.panels.shows("Curve")
 
 
-def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescored: Rescored) -> None:
+def test_rows_open_their_moment_and_forgotten_moments_only_their_env(rescored: Rescored) -> None:
     many = done(same(30), *(episode(env) for env in range(MAX_ROWS + 3)))
     assert f"1 to {MAX_ROWS} of {MAX_ROWS + 3}" in rescored.draw(many).html()
     rescored.panels.ask(ShowRescored(run="2 25"))
     rescored.panels.ask(TurnRescored(by=1))
-    assert f"{MAX_ROWS + 1} to {MAX_ROWS + 3} of" in rescored.draw(many).html(), "the page is turned"
+    assert f"{MAX_ROWS + 1} to {MAX_ROWS + 3} of" in rescored.draw(many).html(), "the next page is shown"
     last = MAX_ROWS + 2
     rescored.panels.ask(ShowRescored(run=f"{last} {10 * last + 5}"))
-    rescored.panels.do(ShowRescored(run="99 1"))  # there is no such run
+    rescored.panels.do(ShowRescored(run="99 1"))  # no run has this id
     asked = rescored.live.asked
     assert asked == [MomentShown(25, 2), MomentShown(10 * last + 5, last)]
     rescored.panels.ask(TurnRescored(by=-1))
@@ -131,11 +131,11 @@ def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescore
     rescored.panels.ask(TurnRescored(by=1))
     rescored.draw(RescoreView())
     assert f"1 to {MAX_ROWS} of" in rescored.draw(replace(many, serial=5)).html(), (
-        "a new past begins with its first page"
+        "a new result begins at its first page"
     )
 
 
-def test_the_key_goes_round(rescored: Rescored) -> None:
+def test_the_key_cycles_through_the_differences(rescored: Rescored) -> None:
     rescored.live.do(NextDifference())
     assert rescored.live.asked == []
     rescored.draw(done(episode(0), episode(1)))
@@ -147,7 +147,7 @@ def test_the_key_goes_round(rescored: Rescored) -> None:
     assert rescored.live.asked[-1] == MomentShown(15, 1)
 
 
-def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
+def test_only_the_part_of_a_long_record_around_the_shown_moment_is_drawn() -> None:
     count = 3 * MAX_POINTS
     tick = np.arange(count)
     curve = RescoredCurve(tick, tick + 7, np.zeros(count, np.float32), np.ones(count, np.float32))
@@ -157,7 +157,7 @@ def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
     assert len(chart_data(curve, 10**6)) == 3
 
 
-# --- the words of a verdict, which `workbench rescore` says too ------------------------------------
+# --- the texts of a verdict, which `workbench rescore` prints too ----------------------------------
 
 
 @pytest.mark.parametrize(
@@ -165,26 +165,26 @@ def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
     [(0.0, 0.0, "to the last bit", False), (4e-4, 1e-4, "0.4 mm", False), (0.032, 0.0, "3.2 cm", True)]
     + [(0.0, 0.2, "11°", True), (float("inf"), 0.0, "infinite", True)],
 )  # fmt: skip
-def test_drift_is_told_and_doubted_where_it_is_large(
+def test_drift_is_reported_and_large_drift_raises_doubt(
     metres: float, radians: float, says: str, far: bool
 ) -> None:
     found = [same(1), same(7, metres=metres, radians=radians)]
-    told = verdict_text.drift_summary(found)
-    assert says in told and verdict_text.count_drifted(found) == far
-    assert metres == 0 or ("env 7" in told) == far
+    summary = verdict_text.drift_summary(found)
+    assert says in summary and verdict_text.count_drifted(found) == far
+    assert metres == 0 or ("env 7" in summary) == far
 
 
 def test_outcomes_come_before_rewards_and_nan_is_counted() -> None:
     moved = verdict_text.change_text(episode(success=(None, 41), fail=(7, None)))
     assert moved.index("success") < moved.index("41") < moved.index("fail") < moved.index("7")
     lost, nan = float("inf"), float("nan")
-    said = {
+    texts = {
         verdict_text.change_text(episode(largest=lost, returns=two))
         for two in ((1.0, nan), (nan, 1.0), (nan, nan))
     }
-    assert len(said) == 3 and all("NaN" in one for one in said)
-    told = [episode(returns=(1.0, 2.0)), episode(1, returns=(1.0, nan))]
-    assert verdict_text.totals(told) == ["mean return: 1 → 2, NaN in 1 of 2"]
+    assert len(texts) == 3 and all("NaN" in one for one in texts)
+    verdicts = [episode(returns=(1.0, 2.0)), episode(1, returns=(1.0, nan))]
+    assert verdict_text.totals(verdicts) == ["mean return: 1 → 2, NaN in 1 of 2"]
     none, flags = same(0, has=()), same(0, has=("success", "fail"))
     assert verdict_text.totals([none]) == [] and "return" not in "".join(verdict_text.totals([flags]))
     assert verdict_text.returns_text(none) == "" and "2 of 2" in verdict_text.headline(

@@ -1,4 +1,4 @@
-"""The past judged again, with real processes on the example task: one that plays and one that judges."""
+"""Rescoring the past with real processes on the example task: one plays and one rescores."""
 
 # pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalOperand=false
 
@@ -35,8 +35,8 @@ ORIGINAL = (
 )
 REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
-IN_THE_JUDGE = "os.getpriority(os.PRIO_PROCESS, 0) == 10"
-"""True in the process that judges: it has a lower priority."""
+IN_RESCORER = "os.getpriority(os.PRIO_PROCESS, 0) == 10"
+"""An expression that is true in the rescoring process, which has a lower priority."""
 
 
 @dataclass
@@ -45,12 +45,12 @@ class Desk:
     file: Path
 
     def edit(self, old: str, new: str) -> None:
-        """The file as it was first, but for this."""
+        """Write the original file with this replacement."""
         assert old in ORIGINAL
         self.file.write_text(ORIGINAL.replace(old, new))
 
     def record(self, steps: int) -> list[Moment]:
-        """Start anew with the original, play, and stop at the first moment of new episodes; the whole record."""
+        """Restart with the original, play, and pause at the first moment of new episodes; returns the whole record."""
         session = self.session
         session.do(PauseRun())
         self.file.write_text(ORIGINAL)
@@ -58,7 +58,7 @@ class Desk:
         session.do(RebuildScene())
         first = session.view().timeline.last
         wait_until(session, lambda v: v.timeline.first > first and v.timeline.moments == 1, "a new history")
-        with suppress(Refused):  # nothing may be rescored
+        with suppress(Refused):  # no rescoring may be running
             session.do(StopRescoring())
         session.change(speed=math.inf)
         session.do(PlayRun())
@@ -78,12 +78,12 @@ class Desk:
                 states or ("done",)
             )
 
-        return wait_until(self.session, reached, f"a judgement that is {states or 'done'}").of(RescoreView)
+        return wait_until(self.session, reached, f"a rescoring in state {states or 'done'}").of(RescoreView)
 
     serial = 0
 
     def note(self) -> None:
-        """From here on `rescored` waits for something new."""
+        """Make `rescored` wait for a result newer than now."""
         self.serial = self.session.view().of(RescoreView).serial
 
 
@@ -106,12 +106,12 @@ def steps_of(record: list[Moment]) -> list[Moment]:
 
 
 def episodes_of(record: list[Moment]) -> int:
-    """Those of all envs that have a step: how many a fast machine plays before it is paused is not known."""
+    """Count the episodes of all envs with at least one step; a fast machine plays more of them before the pause."""
     begins = np.array([moment.jumped for moment in record])
     return int((begins[:-1] & ~begins[1:]).sum())
 
 
-def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: Desk, record) -> None:
+def test_a_doubled_reward_is_rescored_as_double_bit_for_bit(desk: Desk, record) -> None:
     desk.edit(REWARD, f"{REWARD} * 2")
     view = desk.rescored()
     rewards = np.array([moment.step.reward for moment in steps_of(record)])
@@ -130,8 +130,8 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
 
 
 @pytest.mark.slow
-def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk, record) -> None:
-    """Success becomes "the gripper is above a height", which the recorded poses tell by themselves."""
+def test_episodes_with_a_changed_success_are_listed_with_their_steps(desk: Desk, record) -> None:
+    """The new success is "the gripper is above a height", which can be computed from the recorded poses."""
     hand = desk.session.view().task.geometry.body_names.index("panda/panda_hand_tcp")
     heights = np.array([moment.step.poses[:, hand, 2] for moment in record])
     limit = float(np.float32(np.quantile(heights, 0.8)))
@@ -156,9 +156,9 @@ def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk,
 
 
 @pytest.mark.slow
-def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk, record) -> None:
+def test_code_that_raises_is_reported_with_its_line_and_the_record_stays(desk: Desk, record) -> None:
     late = "if bool((self.elapsed_steps > 20).any()): raise KeyError('late')"
-    # The process that judges now stands at the end of an episode, where the new code raises at once.
+    # The rescoring process is now at the end of an episode, where the new code raises at once.
     desk.edit(REWARD, f"{REWARD} * 2")
     desk.rescored()
     desk.note()
@@ -175,9 +175,9 @@ def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk,
 
 
 @pytest.mark.slow
-def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(desk: Desk, record) -> None:
+def test_the_next_save_replaces_a_running_rescoring_while_the_worker_plays(desk: Desk, record) -> None:
     calls = desk.file.with_name("calls")
-    slow = f"if {IN_THE_JUDGE}: time.sleep(0.1) or open({str(calls)!r}, 'a').write('.')"
+    slow = f"if {IN_RESCORER}: time.sleep(0.1) or open({str(calls)!r}, 'a').write('.')"
     desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
     desk.rescored("rescoring")
     session = desk.session
@@ -189,20 +189,20 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
     session.do(PauseRun())
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 4")
-    # That the first is told as stopped is seen for as long as the process takes to come back, which may be no time.
+    # The state "stopped" of the first rescoring lasts only until the process is free, which may be too short to see.
     view = desk.rescored("done")
     assert len(calls.read_text()) < view.done
     for env in range(N):
         curve = session.rescored_curve("reward", env)
-        # What was played since the first of the two saves was rewarded twofold when it was recorded.
+        # Steps played after the first of the two saves were recorded with the doubled reward.
         factor = np.where(curve.serial <= record[-1].serial, 4, 2)
         np.testing.assert_array_equal(curve.new, factor * curve.old)
 
 
 @pytest.mark.slow
-def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(desk: Desk, record) -> None:
+def test_a_rescoring_in_an_endless_loop_can_be_stopped_and_the_next_one_runs(desk: Desk, record) -> None:
     loops = desk.file.with_name("loops")
-    loop = f"while {IN_THE_JUDGE} and int(self.elapsed_steps.max()) > 20: open({str(loops)!r}, 'w').close()"
+    loop = f"while {IN_RESCORER} and int(self.elapsed_steps.max()) > 20: open({str(loops)!r}, 'w').close()"
     desk.edit(REWARD, f"{loop}\n        {REWARD}")
     desk.rescored("rescoring")
     until(loops.exists, "the loop")
@@ -221,8 +221,8 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
 
 
 @pytest.mark.slow
-def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk, record) -> None:
-    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
+def test_a_dead_rescoring_process_is_reported_and_replaced_for_the_next_rescoring(desk: Desk, record) -> None:
+    slow = f"time.sleep(0.1 if {IN_RESCORER} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD}")
     desk.rescored("rescoring")
     first = background_pid(desk.session)
@@ -235,7 +235,7 @@ def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk
     desk.rescored("done")
     second = background_pid(desk.session)
     assert second not in (None, first)
-    # The process is kept for the next time.
+    # The process is kept for the next rescoring.
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 3")
     desk.rescored("stopped", "done")

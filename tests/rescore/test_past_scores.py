@@ -1,4 +1,4 @@
-"""The comparison of record and judgement, against one that is worked out plainly, env by env and step by step."""
+"""The comparison of recorded and new scores, checked against plain loops over envs and steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.drive.session import Told, history_of, told_session
+from tests.drive.session import FakeWorkerSession, fake_worker_session, history_of
 from workbench.envs.step_result import StepResult
 from workbench.live.history.moments import History
 from workbench.live.messages import Load
@@ -43,26 +43,26 @@ def a_step(reward: np.ndarray, success: np.ndarray, elapsed: np.ndarray) -> Step
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Told]:
-    with told_session(tmp_path_factory.mktemp("recordings")) as told:
-        yield told
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeWorkerSession]:
+    with fake_worker_session(tmp_path_factory.mktemp("recordings")) as fake:
+        yield fake
 
 
 def recorded(
-    told: Told, steps: list[StepResult], jumped: np.ndarray, snapshots: list[bytes] | None = None
+    fake: FakeWorkerSession, steps: list[StepResult], jumped: np.ndarray, snapshots: list[bytes] | None = None
 ) -> History:
-    """What a session keeps of these, whose last worker has told of nothing else."""
-    told.load("rebuilt", num_envs=len(steps[0].reward))
+    """The history of a session whose worker has sent these steps."""
+    fake.load("rebuilt", num_envs=len(steps[0].reward))
     for row, step in enumerate(steps):
         body = b"body" if snapshots is None else snapshots[row]
         keys, parts = ((1,), {1: b"part"}) if row == 0 else (None, {})
         action = None if jumped[row].any() else np.zeros((len(step.reward), 2), np.float32)
-        told.tell(Stepped(replace(step, action=action), jumped[row], (), None, body, keys, parts, row))
-    return history_of(told.session)
+        fake.tell(Stepped(replace(step, action=action), jumped[row], (), None, body, keys, parts, row))
+    return history_of(fake.session)
 
 
-def drawn(seed: int, rows: int, envs: int) -> tuple[list[StepResult], list[StepResult], np.ndarray]:
-    """A record, what is said of it now, and its jumps."""
+def random_record(seed: int, rows: int, envs: int) -> tuple[list[StepResult], list[StepResult], np.ndarray]:
+    """Random recorded steps, rescored steps, and jumps (rows, envs)."""
     rng = np.random.default_rng(seed)
     jumped = np.zeros((rows, envs), bool)
     jumped[0] = True
@@ -83,10 +83,10 @@ def drawn(seed: int, rows: int, envs: int) -> tuple[list[StepResult], list[StepR
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), rows=st.integers(2, 30), envs=st.integers(1, 4), part=st.floats(0, 1))
-def test_differences_are_those_that_plain_loops_find(
-    shared: Told, seed: int, rows: int, envs: int, part: float
+def test_differences_equal_those_found_by_plain_loops(
+    shared: FakeWorkerSession, seed: int, rows: int, envs: int, part: float
 ) -> None:
-    old, new, jumped = drawn(seed, rows, envs)
+    old, new, jumped = random_record(seed, rows, envs)
     history = recorded(shared, old, jumped)
     rescored = RescoredPast(history)
     chosen = [row for run in rescored.runs() for row in run][: max(1, int(part * rows))]
@@ -116,7 +116,7 @@ def test_differences_are_those_that_plain_loops_find(
                 tuple(float(sum(side[r].reward[env] for r in steps)) for side in (old, new)),
                 len(steps),
                 int(old[min(parted)].elapsed_steps[env]) if parted else None,
-                looked_at(old, new, inside, others, env, parted),
+                expected_moment(old, new, inside, others, env, parted),
             )
     found = {
         (v.of.env, int(v.of.serials[0]) - history.first): (
@@ -136,7 +136,7 @@ def test_differences_are_those_that_plain_loops_find(
     assert rescored.names()[1] == names
 
 
-def looked_at(
+def expected_moment(
     old: list[StepResult],
     new: list[StepResult],
     inside: list[int],
@@ -144,7 +144,7 @@ def looked_at(
     env: int,
     parted: list[int],
 ) -> int | None:
-    """The moment that shows most: success, else the largest change of the reward, else the first difference."""
+    """The most telling moment: a changed success, else the largest change of the reward, else the first difference."""
     then, now = (next((r for r in inside if side[r].evaluate["success"][env]), None) for side in (old, new))
     if then != now:
         return then if now is None else now
@@ -153,16 +153,16 @@ def looked_at(
     return min(parted, default=None)
 
 
-def test_the_record_ends_at_a_jump_that_cannot_be_put_back(shared: Told) -> None:
-    old, _, _ = drawn(2, 6, 2)
+def test_the_record_ends_at_a_jump_that_cannot_be_restored(shared: FakeWorkerSession) -> None:
+    old, _, _ = random_record(2, 6, 2)
     jumped = np.zeros((6, 2), bool)
     jumped[[0, 4]] = True
     assert RescoredPast(recorded(shared, old, jumped, [b"b"] * 4 + [b""] * 2)).runs() == [range(4)]
     assert RescoredPast(recorded(shared, old, jumped, [b""] * 6)).steps == 0
 
 
-def test_a_moment_that_is_judged_anew_is_compared_anew_and_not_a_number_is_a_difference(shared: Told) -> None:
-    old, _, _ = drawn(3, 5, 2)
+def test_a_moment_scored_again_is_compared_again_and_nan_is_a_difference(shared: FakeWorkerSession) -> None:
+    old, _, _ = random_record(3, 5, 2)
     jumped = np.zeros((5, 2), bool)
     jumped[0] = True
     history = recorded(shared, old, jumped)
@@ -173,17 +173,19 @@ def test_a_moment_that_is_judged_anew_is_compared_anew_and_not_a_number_is_a_dif
     assert rescored.names() == (("reward", "success", "height"), frozenset())
     rescored.add(3, replace(old[3], reward=np.array([np.nan, old[3].reward[1]], np.float32)))
     first, second = rescored.verdicts()
-    assert rescored.verdicts()[0] is first, "what nothing was added to is not compared again"
+    assert rescored.verdicts()[0] is first, "a run without new moments is not compared again"
     assert first.of.env == 0 and first.differing == ("reward",) and np.isinf(first.largest)
     assert first.look_at is not None and first.of.at(first.look_at) - history.first == 3
     assert second.of.name == "env 1" and not second.differs
     assert rescored.names() == (("reward", "success", "height"), frozenset({"reward"}))
 
 
-def test_a_judgement_that_is_stopped_before_its_turn_keeps_nothing_of_the_past(shared: Told) -> None:
+def test_a_rescoring_stopped_before_it_starts_keeps_no_reference_to_the_past(
+    shared: FakeWorkerSession,
+) -> None:
     process = Background()
     rescorer = PastRescorer(process, lambda event: None)
-    old, _, jumped = drawn(1, 6, 2)
+    old, _, jumped = random_record(1, 6, 2)
     goes_on = loop.do(asyncio.Event)
 
     async def other_job() -> None:
@@ -197,7 +199,7 @@ def test_a_judgement_that_is_stopped_before_its_turn_keeps_nothing_of_the_past(s
         begin = BeginRescoring(1, RescoreView(), Load("Nothing-v1", TaskOptions()), rescored)
         loop.do(lambda: rescorer.perform(begin))
         del history
-        shared.load("rebuilt")  # the session keeps it no longer
+        shared.load("rebuilt")  # the session drops the old history
         gc.collect()
         assert moment() is not None
         loop.do(lambda: rescorer.perform(EndRescoring()))
@@ -209,8 +211,8 @@ def test_a_judgement_that_is_stopped_before_its_turn_keeps_nothing_of_the_past(s
         process.close()
 
 
-def test_an_entry_that_only_one_version_has_differs_and_comes_first(shared: Told) -> None:
-    old, _, jumped = drawn(3, 5, 2)
+def test_an_entry_that_only_one_version_has_differs_and_comes_first(shared: FakeWorkerSession) -> None:
+    old, _, jumped = random_record(3, 5, 2)
     rescored = RescoredPast(recorded(shared, old, jumped))
     assert rescored.names() == (("reward", "success", "height"), frozenset())
     for row in rescored.runs()[0]:
@@ -221,8 +223,8 @@ def test_an_entry_that_only_one_version_has_differs_and_comes_first(shared: Told
     assert curve is not None and np.isnan(curve.old).all() and np.isfinite(curve.new).all()
 
 
-def test_drift_is_that_of_each_env_in_its_own_run(shared: Told) -> None:
-    old, _, _ = drawn(1, 6, 2)
+def test_drift_is_measured_per_env_and_run(shared: FakeWorkerSession) -> None:
+    old, _, _ = random_record(1, 6, 2)
     jumped = np.zeros((6, 2), bool)
     jumped[0] = True
     rescored = RescoredPast(recorded(shared, old, jumped))

@@ -1,4 +1,4 @@
-"""Recorded episodes judged by today's code, against what a direct computation gives."""
+"""Recorded episodes rescored with today's code, compared with a direct computation."""
 
 # pyright: reportOptionalSubscript=false, reportArgumentType=false
 
@@ -30,8 +30,8 @@ TCP: list[int] = []
 
 
 @dataclass(frozen=True)
-class Held:
-    """An episode that is in memory, where a file is asked for."""
+class InMemorySource:
+    """An in-memory episode in place of a file."""
 
     run: RecordedRun
     name: str = "held"
@@ -56,15 +56,15 @@ def recorded() -> Recorded:
     return recorded
 
 
-def verdicts_of(task: OpenedTask, files: list[Held], use_env_states: bool) -> list[Verdict]:
-    parts = rescore(task, files, use_env_states=use_env_states, read=Held.read)
+def verdicts_of(task: OpenedTask, files: list[InMemorySource], use_env_states: bool) -> list[Verdict]:
+    parts = rescore(task, files, use_env_states=use_env_states, read=InMemorySource.read)
     return [verdict for part in parts for verdict in part.verdicts]
 
 
 def rescored(
     tmp_path: Path, recorded: Recorded, edits: dict[str, str], num_envs: int = 2, use_env_states: bool = False
 ) -> list[Verdict]:
-    """Verdicts of the five episodes, of five lengths, in their order."""
+    """Verdicts on the five episodes of different lengths, in their order."""
     text = TEXT
     for old, new in edits.items():
         assert old in text
@@ -72,14 +72,14 @@ def rescored(
     file = tmp_path / "push_cube.py"
     file.write_text(text)
     task = opened(str(file), num_envs)
-    files = [Held(recorded.run(k).until(STEPS - 3 * k), name=str(k), id=str(k)) for k in range(5)]
+    files = [InMemorySource(recorded.run(k).until(STEPS - 3 * k), name=str(k), id=str(k)) for k in range(5)]
     verdicts = verdicts_of(task, files, use_env_states)
     task.env.close()
     return sorted(verdicts, key=lambda verdict: verdict.of.name)
 
 
 @pytest.mark.parametrize("use_env_states", [False, True], ids=["actions", "states"])
-def test_unchanged_code_says_what_was_recorded_to_the_last_bit(
+def test_unchanged_code_gives_the_recorded_values_bit_for_bit(
     tmp_path: Path, recorded: Recorded, use_env_states: bool
 ) -> None:
     for k, verdict in enumerate(rescored(tmp_path, recorded, {}, use_env_states=use_env_states)):
@@ -89,7 +89,7 @@ def test_unchanged_code_says_what_was_recorded_to_the_last_bit(
         np.testing.assert_array_equal(verdict.new_reward, verdict.old_reward)
 
 
-def test_another_success_is_found_at_the_state_at_which_a_direct_look_finds_it(
+def test_a_changed_success_is_found_at_the_same_state_as_by_direct_computation(
     tmp_path: Path, recorded: Recorded
 ) -> None:
     heights = [np.array([step.poses[k, TCP[0], 2] for step in recorded.steps]) for k in range(5)]
@@ -104,20 +104,22 @@ def test_another_success_is_found_at_the_state_at_which_a_direct_look_finds_it(
     assert firsts[0] is not None and firsts[0] > 1
 
 
-def test_what_cannot_be_judged_says_why_and_the_rest_is(tmp_path: Path, recorded: Recorded) -> None:
+def test_unusable_recordings_are_reported_with_a_reason_and_the_others_are_rescored(
+    tmp_path: Path, recorded: Recorded
+) -> None:
     task = opened(str(TASKS / "push_cube.py"), 2)
     run = recorded.run(0)
     files = [
-        Held(replace(run, action=run.action[:, :3]), name="narrow"),
-        Held(run.until(0), name="empty"),
-        Held(run.until(4), name="fine"),
-        Held(replace(run, env_states={}), name="no states"),
+        InMemorySource(replace(run, action=run.action[:, :3]), name="narrow"),
+        InMemorySource(run.until(0), name="empty"),
+        InMemorySource(run.until(4), name="fine"),
+        InMemorySource(replace(run, env_states={}), name="no states"),
     ]
-    told = {verdict.of.name: verdict for verdict in verdicts_of(task, files, True)}
+    by_name = {verdict.of.name: verdict for verdict in verdicts_of(task, files, True)}
     task.env.close()
-    assert "3 dimensions" in told["narrow"].why_not and told["empty"].why_not == "it has no step"
-    assert told["no states"].why_not == "it holds no env states"
-    assert told["fine"].why_not == "" and not told["fine"].differs
+    assert "3 dimensions" in by_name["narrow"].why_not and by_name["empty"].why_not == "it has no step"
+    assert by_name["no states"].why_not == "it holds no env states"
+    assert by_name["fine"].why_not == "" and not by_name["fine"].differs
 
 
 BALL = """
@@ -144,7 +146,7 @@ class FallingBallEnv(BaseEnv):
         return {}
 
     def get_state_dict(self):
-        return self.scene.get_sim_state()  # BaseEnv's asks the robot
+        return self.scene.get_sim_state()  # BaseEnv's version needs a robot
 
     def _get_obs_extra(self, info):
         return {"ball": self.ball.pose.p}
@@ -158,19 +160,19 @@ class FallingBallEnv(BaseEnv):
 
 
 @pytest.mark.parametrize("use_env_states", [False, True], ids=["actions", "states"])
-def test_a_task_without_a_robot_is_given_its_rewards(tmp_path: Path, use_env_states: bool) -> None:
+def test_a_task_without_a_robot_is_rescored(tmp_path: Path, use_env_states: bool) -> None:
     (tmp_path / "ball.py").write_text(BALL)
     task = opened(str(tmp_path / "ball.py"), 2)
-    said = [task.env.reset(0)]
+    steps = [task.env.reset(0)]
     states = [read_states(task.env.env)]
     for _ in range(10):
-        said.append(task.env.step(None))
+        steps.append(task.env.step(None))
         states.append(read_states(task.env.env))
-    reward = np.array([step.reward[0] for step in said[1:]], np.float32)
-    low = np.array([step.evaluate["low"][0] for step in said])
+    reward = np.array([step.reward[0] for step in steps[1:]], np.float32)
+    low = np.array([step.evaluate["low"][0] for step in steps])
     rows = {name: np.stack([state[name][0] for state in states]) for name in states[0]}
     run = RecordedRun("fallen", 0, {}, np.zeros((10, 0), np.float32), rows, {"low": low}, reward)
-    (verdict,) = verdicts_of(task, [Held(run)], use_env_states)
+    (verdict,) = verdicts_of(task, [InMemorySource(run)], use_env_states)
     task.env.close()
     assert verdict.why_not == "" and reward[0] > reward[-1] and low[-1]
     np.testing.assert_array_equal(verdict.new_reward, reward)

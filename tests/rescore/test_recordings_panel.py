@@ -1,4 +1,4 @@
-"""What the Rescore tab says of verdicts, and where a press on one goes."""
+"""The verdicts on the Rescore tab, and what a press on one opens."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def verdict(id: str = "a", **changes: Any) -> Verdict:
     )
 
 
-def test_all_of_them_are_one_sentence() -> None:
+def test_all_verdicts_are_summarised_in_one_sentence() -> None:
     many = [
         verdict("a"),
         verdict("b", success=(None, 3), has=("reward", "success"), first_difference=3, returns=(1.0, 5.0)),
@@ -57,11 +57,11 @@ def test_all_of_them_are_one_sentence() -> None:
     assert verdict_text.summary(many[2:]) == "No episode could be rescored."
     assert "to the last bit" in verdict_text.drift_summary(many) and not verdict_text.count_drifted(many)
     assert verdict_text.drift_summary([verdict(metres=None)]) == ""
-    told = verdict_text.drift_summary([verdict(metres=0.032)], verdict_text.PUT_IN)
-    assert "3.2 cm" in told and "furthest in push_a" in told and told.endswith(verdict_text.PUT_IN)
+    summary = verdict_text.drift_summary([verdict(metres=0.032)], verdict_text.PUT_IN)
+    assert "3.2 cm" in summary and "furthest in push_a" in summary and summary.endswith(verdict_text.PUT_IN)
 
 
-def test_numbers_that_are_none_are_null_in_json() -> None:
+def test_nan_is_null_in_json() -> None:
     assert '"return_now": null' in verdict_text.as_json([verdict(returns=(1.0, float("nan")))])
     assert verdict_text.as_csv([]) == "\n"
 
@@ -88,14 +88,14 @@ def review(library: Library) -> Iterator[Review]:
     review.close()
 
 
-class Told:
-    """Stands where what judges again stands for the panel: what it has told last."""
+class FakeJob:
+    """Stands in for the rescoring job of the panel; holds its last view."""
 
     def __init__(self) -> None:
         self.view = RescoreView()
 
     def start(self, *args: object, **named: object) -> None:
-        """Nothing is judged here."""
+        """Do nothing; no job runs here."""
 
     def do(self, command: StopRescoring) -> None:
         self.view = replace(self.view, state="stopped")
@@ -103,27 +103,27 @@ class Told:
 
 @dataclass
 class Rescoring:
-    """The panel on a page, with what it is told."""
+    """The panel on a page, with its inputs."""
 
     panel: RescorePanel
     panels: Panels
     clock: Clock
     review: Review
     choices: RescoreChoices
-    told: Told
+    job: FakeJob
 
-    def draw(self, told: RescoreView) -> None:
-        self.told.view = told
+    def draw(self, view: RescoreView) -> None:
+        self.job.view = view
         self.clock.passes()
         self.panel.draw(self.review.view())
 
 
 @pytest.fixture
 def rescoring(panels: Panels, library: Library, review: Review, clock: Clock) -> Rescoring:
-    told, choices = Told(), RescoreChoices(AS_RECORDED)
-    panel = RescorePanel(panels.server, cast(Any, told), review, library, choices)
+    job, choices = FakeJob(), RescoreChoices(AS_RECORDED)
+    panel = RescorePanel(panels.server, cast(Any, job), review, library, choices)
     panels.visitors.do = panel.do
-    return Rescoring(panel, panels, clock, review, choices, told)
+    return Rescoring(panel, panels, clock, review, choices, job)
 
 
 def test_a_row_opens_its_episode_at_the_first_difference(
@@ -141,12 +141,12 @@ def test_a_row_opens_its_episode_at_the_first_difference(
     until(lambda: review.view().opened, "the recording", seen=lambda: review.view().problems)
     view = review.view()
     assert view.opened[0].id == rows[2].id and view.states == (3,)
-    rescoring.draw(replace(rescoring.told.view, serial=2))
+    rescoring.draw(replace(rescoring.job.view, serial=2))
     assert len(rescoring.panels.charts()) == 1 and rescoring.panels.shows("Rescore the open recordings")
     assert "wb-selected" in rescoring.panels.html()
 
 
-def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescoring: Rescoring) -> None:
+def test_a_row_names_the_changes_and_an_unchanged_row_is_paler(rescoring: Rescoring) -> None:
     moved = {"first_difference": 4, "largest": 0.25, "differing": ("reward",), "returns": (1.0, 2.5)}
     given = (
         verdict("same", seed=5),
@@ -156,16 +156,16 @@ def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescori
     rescoring.draw(RescoreView("done", 1, given, 3, 3))
     html = rescoring.panels.html("wb-again-table")
     rows = re.findall(r'<tr [^>]*class="([^"]*)" title="[^"]*">(.*?)</tr>', html)
-    said = [(style.split(), re.sub(r"<[^>]*>", "|", cells)) for style, cells in rows]
-    assert said == [
+    shown = [(style.split(), re.sub(r"<[^>]*>", "|", cells)) for style, cells in rows]
+    assert shown == [
         ([], "|seed 7||reward by up to 0.25, from step 4|drifted 3.2 cm|||1 → 2.5|"),
         (["wb-same"], "|seed 5||unchanged||10|"),
         (["wb-same"], "|seed 6||not rescored: it has no step|||"),
     ]
-    assert verdict_text.PUT_IN in rescoring.panels.html("wb-again"), "of what drifted"
+    assert verdict_text.PUT_IN in rescoring.panels.html("wb-again"), "the text about drifted states"
 
 
-def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
+def test_a_long_list_is_shown_in_pages(rescoring: Rescoring) -> None:
     many = tuple(verdict(str(k), first_difference=1, returns=(0.0, 99.0 - k), seed=k) for k in range(23))
     rescoring.draw(RescoreView("done", 1, many, 23, 23))
     assert (
@@ -178,10 +178,10 @@ def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     assert "21 to 23 of 23" in rescoring.panels.html()
     rescoring.panel.rescore(["no such"])
     rescoring.draw(RescoreView("done", 3, many, 23, 23))
-    assert "1 to 10 of 23" in rescoring.panels.html(), "what is judged anew begins with its first page"
+    assert "1 to 10 of 23" in rescoring.panels.html(), "a new result begins at its first page"
 
 
-def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -> None:
+def test_an_invalid_choice_sent_by_a_page_is_harmless(rescoring: Rescoring) -> None:
     rescoring.draw(RescoreView())
     assert rescoring.panels.field("Code").value == "as recorded"
     rescoring.panels.set("Recorded states", True)
@@ -193,15 +193,15 @@ def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -
     assert rescoring.choices == RescoreChoices(TODAYS_CODE, True)
 
 
-def test_it_can_be_stopped_while_it_runs(rescoring: Rescoring) -> None:
+def test_a_rescoring_can_be_stopped_while_it_runs(rescoring: Rescoring) -> None:
     rescoring.draw(RescoreView("rescoring", 1, total=3))
     rescoring.panels.press("Stop")
-    assert rescoring.told.view.state == "stopped"
-    rescoring.draw(replace(rescoring.told.view, serial=2))
+    assert rescoring.job.view.state == "stopped"
+    rescoring.draw(replace(rescoring.job.view, serial=2))
     assert not rescoring.panels.shows("Stop")
 
 
-def test_recordings_that_are_gone_are_not_judged(library: Library) -> None:
+def test_deleted_recordings_are_not_rescored(library: Library) -> None:
     rows = library.view().rows
     found = episode_files(library, ["no such", rows[0].id, rows[0].id])
     assert [(file.id, file.path) for file in found] == [(rows[0].id, rows[0].paths[0])]

@@ -1,4 +1,4 @@
-"""Moments of the past lived through again by the code that a worker has, to the last bit."""
+"""Replay of past moments with a worker's current code, bit for bit."""
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
@@ -22,7 +22,7 @@ from workbench.task.open import OpenedTask, Opening, build_task
 N = 3
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
 DRAWS = f'{SUCCESS} "noise": torch.rand(self.num_envs) + torch.randn(()),'
-"""By torch's own generator, which no env has to itself."""
+"""Draws from torch's global generator, which all envs share."""
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def draws(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OpenedTask]:
 
 
 class Record:
-    """A session's record: a reset of all, steps, and resets of some of them in between."""
+    """A session's record: a reset of all envs, then steps, with partial resets in between."""
 
     def __init__(self, opened: OpenedTask) -> None:
         task, rng = opened.env, np.random.default_rng(0)
@@ -60,15 +60,15 @@ class Record:
                 jump(task.reset([90 + i for i in envs], envs), envs)
 
 
-def test_a_task_that_draws_from_torchs_own_generator_in_its_steps_is_judged_to_the_last_bit(
+def test_a_task_that_draws_from_torchs_global_generator_is_replayed_bit_for_bit(
     draws: OpenedTask,
 ) -> None:
-    """Also behind a reset of some envs, at which nobody's generator is put back but those envs' own."""
+    """This holds too after a partial reset, which restores only the generators of its own envs."""
     record = Record(draws)
     made = [step for moment, step in zip(record.moments, record.steps, strict=True) if not moment.snapshot]
     assert len({step.evaluate["noise"].tobytes() for step in made}) == len(made) == 16
     for _ in range(2):
-        draws.env.step(np.zeros((N, 8), np.float32))  # it draws on meanwhile
+        draws.env.step(np.zeros((N, 8), np.float32))  # the generator advances meanwhile
         rescored = rescore_moments(draws, RescoreMoments(tuple(record.moments)))
         assert rescored.problem is None and rescored.not_carried == {}
         for moment, was, now in zip(record.moments, record.steps, rescored.steps, strict=True):
@@ -78,7 +78,7 @@ def test_a_task_that_draws_from_torchs_own_generator_in_its_steps_is_judged_to_t
                 np.testing.assert_array_equal(now.reward, was.reward)
 
 
-def test_in_pieces_it_comes_to_what_it_comes_to_at_once(draws: OpenedTask) -> None:
+def test_a_replay_in_pieces_equals_one_at_once(draws: OpenedTask) -> None:
     record = Record(draws)
     whole = rescore_moments(draws, RescoreMoments(tuple(record.moments)))
     pieces: list[RescoredMoments] = [

@@ -1,4 +1,4 @@
-"""Recordings in files judged again: ours, and those of ManiSkill's RecordEpisode; from code, terminal and page."""
+"""Rescoring of recorded files, ours and those of ManiSkill's RecordEpisode, from code, terminal and page."""
 
 # pyright: reportOptionalMemberAccess=false
 
@@ -53,7 +53,7 @@ STEPS, EPISODES = 12, 3
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The author's file, and a folder of recordings beside it."""
+    """A folder with the author's file and a folder of recordings."""
     folder = tmp_path_factory.mktemp("author")
     (folder / "push_cube.py").write_text(TEXT)
     options = TaskOptions(2, "cpu", 20, {"render_backend": "none"})
@@ -73,14 +73,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def author(folder: Path) -> Path:
-    """The same, with the file as it was recorded."""
+    """The same folder, with the file restored as recorded."""
     (folder / "push_cube.py").write_text(TEXT)
     return folder
 
 
 @pytest.fixture(scope="module")
 def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What ManiSkill's own wrapper writes of two episodes of a stock env."""
+    """Two episodes of a stock env, written by ManiSkill's own wrapper."""
     folder = tmp_path_factory.mktemp("foreign")
     env: Any = gym.make("PickCube-v1", obs_mode="state", reward_mode="dense", render_backend="none")
     env = RecordEpisode(env, str(folder), save_video=False, trajectory_name="demos", source_type="test")
@@ -111,7 +111,7 @@ def test_no_recording_is_opened_in_this_process(
     assert [run.length for run in read_actions(foreign)[0]] == [STEPS, STEPS]
 
 
-def test_todays_file_is_found_and_says_what_was_recorded(author: Path) -> None:
+def test_todays_file_is_found_and_gives_the_recorded_values(author: Path) -> None:
     verdicts, notes = rescore_all(RescoreOptions((author / "recordings",)))
     assert [verdict.seed for verdict in verdicts] == [20, 21, 22] and notes == ()
     for verdict in verdicts:
@@ -119,7 +119,7 @@ def test_todays_file_is_found_and_says_what_was_recorded(author: Path) -> None:
         assert verdict.missed == {} and not verdict.start_differs and verdict.length == STEPS
 
 
-def test_an_edited_reward_differs_by_what_was_edited_and_the_recorded_text_does_not(author: Path) -> None:
+def test_an_edited_reward_differs_by_the_edit_and_the_recorded_text_does_not(author: Path) -> None:
     edit(author, REWARD, f"{REWARD} + 0.25")
     files = tuple(sorted((author / "recordings").glob("*.rrd"))[:2])
     verdicts, _ = rescore_all(RescoreOptions(files))
@@ -134,7 +134,7 @@ def test_an_edited_reward_differs_by_what_was_edited_and_the_recorded_text_does_
     assert set(Path("/tmp").glob("workbench-recorded-*")) <= before
 
 
-def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: Path) -> None:
+def test_a_file_of_record_episode_is_rescored_with_the_env_that_it_names(foreign: Path) -> None:
     found = find_all_sources((foreign,))
     assert [source.part for source in found] == ["traj_0", "traj_1"]
     for use_env_states in (False, True):
@@ -148,7 +148,7 @@ def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: P
 
 
 @pytest.mark.slow
-def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, tmp_path: Path) -> None:
+def test_a_lerobot_dataset_is_skipped_and_refused_if_alone(author: Path, tmp_path: Path) -> None:
     write(tmp_path / "made", made(6, seed=1), pictures=False)
     dataset = tmp_path / "set"
     assert export_in_terminal([tmp_path / "made"], dataset, ExportOptions()) == 0
@@ -159,14 +159,14 @@ def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, 
     assert len(verdicts) == EPISODES and not any(verdict.why_not for verdict in verdicts)
 
 
-def test_a_broken_recording_is_a_row_and_the_others_are_judged(author: Path, tmp_path: Path) -> None:
+def test_a_broken_recording_is_a_row_and_the_others_are_rescored(author: Path, tmp_path: Path) -> None:
     for file in (author / "recordings").iterdir():
         shutil.copy(file, tmp_path)
     broken, cut, _ = sorted(tmp_path.glob("*.rrd"))
     for file in (broken, broken.with_suffix(".h5"), cut):
         file.write_bytes(file.read_bytes()[:1000])
     verdicts, _ = rescore_all(RescoreOptions((tmp_path,), task=str(author / "push_cube.py")))
-    # Of the second what there is to judge by is whole.
+    # The parts of the second recording that rescoring needs are intact.
     assert [bool(verdict.why_not) for verdict in verdicts] == [True, False, False]
     assert broken.stem in verdicts[0].why_not
 
@@ -187,7 +187,7 @@ DIES_ONCE = (
 )
 
 
-def told(verdicts: list[Any]) -> list[Any]:
+def comparable(verdicts: list[Any]) -> list[Any]:
     return [
         (row, verdict.new_reward.tolist(), verdict.old_reward.tolist())
         for row, verdict in zip(verdict_text.as_rows(verdicts), verdicts, strict=True)
@@ -195,10 +195,10 @@ def told(verdicts: list[Any]) -> list[Any]:
 
 
 @pytest.mark.slow
-def test_any_number_of_workers_gives_the_same_also_if_one_is_killed(
+def test_any_number_of_workers_gives_equal_verdicts_even_if_one_is_killed(
     author: Path, foreign: Path, tmp_path: Path
 ) -> None:
-    """One recording a chunk; those of two tasks, and one that cannot be read."""
+    """One recording per chunk: recordings of two tasks, and one that cannot be read."""
     for file in author.glob("recordings/*seed0021*"):
         (tmp_path / file.name).write_bytes(file.read_bytes()[:100])
     text = TEXT
@@ -218,17 +218,17 @@ def test_any_number_of_workers_gives_the_same_also_if_one_is_killed(
         verdicts, _ = rescore_all(
             what, clearances=trusted, run=JobArguments(workers=workers, job=tmp_path / f"{workers}.job")
         )
-        assert told(verdicts) == told(alone)
-    assert mark.exists(), "one was killed"
+        assert comparable(verdicts) == comparable(alone)
+    assert mark.exists(), "one worker must have died"
     mark.unlink()
     activities: list[str] = []
     again = JobArguments(job=tmp_path / "2.job")
     verdicts, _ = rescore_all(what, activities.append, clearances=trusted, run=again)
-    assert told(verdicts) == told(alone) and activities == [], "all were done"
+    assert comparable(verdicts) == comparable(alone) and activities == [], "all chunks were already done"
 
 
-def test_an_episode_in_which_the_code_raises_is_a_row_and_the_others_are_judged(author: Path) -> None:
-    """A job goes on: the chunk after it begins with envs of its own."""
+def test_an_episode_in_which_the_code_raises_is_a_row_and_the_others_are_rescored(author: Path) -> None:
+    """The job continues: the next chunk gets new envs."""
     raises = "assert 21 not in self._episode_seed.tolist(), 'not this one'\n        "
     edit(author, REWARD, raises + REWARD)
     verdicts, _ = rescore_all(RescoreOptions((author / "recordings",), num_envs=1))
@@ -236,23 +236,23 @@ def test_an_episode_in_which_the_code_raises_is_a_row_and_the_others_are_judged(
     assert not any(verdict.differs for verdict in verdicts)
 
 
-def test_each_verdict_is_told_once_however_often_progress_is(
+def test_each_verdict_is_sent_once_however_often_progress_is_reported(
     author: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = itertools.count()
     monkeypatch.setattr(
         "workbench.rescore.replay_recordings.time", SimpleNamespace(monotonic=lambda: next(clock))
     )
-    files, said = find_all_sources((author / "recordings",)), []
+    files, parts = find_all_sources((author / "recordings",)), []
     options = TaskOptions(1, env_kwargs={"render_backend": "none"})
     question = Rescore(str(author / "push_cube.py"), options, options, tuple(files), False)
-    said.append(answer(question, lambda done, total, part: said.append(part)))
-    names = [verdict.of.name for now in said for verdict in now.verdicts]
-    assert sorted(names) == sorted(file.name for file in files) and len(said) > EPISODES
+    parts.append(answer(question, lambda done, total, part: parts.append(part)))
+    names = [verdict.of.name for part in parts for verdict in part.verdicts]
+    assert sorted(names) == sorted(file.name for file in files) and len(parts) > EPISODES
 
 
-class Elsewhere:
-    """Notes the work, and does it here."""
+class StoringExecutor:
+    """An executor that stores its work and does it in this process."""
 
     elsewhere = True
     work: Work[Any, Any, Any]
@@ -265,7 +265,7 @@ class Elsewhere:
 def test_recordings_travel_to_other_machines_unless_they_are_large(
     author: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the folder of the task. What does not travel is looked for where it is."""
+    """They are copied with the folder of the task. Large recordings are read from their own path."""
     shutil.copytree(author, tmp_path / "author")
     task = str(tmp_path / "author" / "push_cube.py")
     paths = sorted((tmp_path / "author" / "recordings").glob("*.rrd"))[:1]
@@ -275,13 +275,13 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
     recording = Recording(0, bytes(source.path), None, source.part, source.id, source.name)
     setup = setup_of([(code, [recording])], 1, use_env_states=False)
 
-    executor = Elsewhere()
+    executor = StoringExecutor()
     (result,) = rescore_recordings(setup, executor)
     assert not result.verdict.why_not and result.verdict.of == source
     assert {file.suffix for file in executor.work.files} == {".rrd", ".h5", ".json"}
     assert list(executor.work.folders) == [tmp_path / "author"]
     assert executor.work.setup.items[0].travels == source.path
-    # Recordings beside the task do not travel with it, but on their own.
+    # Recordings beside the task are not part of its folder's copy; they are copied separately.
     worker_files = pack_worker_files(executor.work.folders, executor.work.files)
     (tmp_path / "there").mkdir()
     here = Path.cwd()
@@ -304,8 +304,8 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
 def run(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
     with pytest.raises(SystemExit) as ended:
         main(["rescore", *arguments])
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out, told.err
+    printed = capsys.readouterr()
+    return int(ended.value.code or 0), printed.out, printed.err
 
 
 def test_the_command_prints_a_table_and_writes_it(
@@ -318,14 +318,12 @@ def test_the_command_prints_a_table_and_writes_it(
     assert code == 0 and f"{EPISODES} of {EPISODES} episodes differ" in out
     rows = list(csv.DictReader(tables[0].open()))
     assert [row["seed"] for row in rows] == ["20", "21", "22"]
-    said = json.loads(tables[1].read_text())
-    assert all(row["return_now"] == pytest.approx(2 * row["return_before"], rel=1e-5) for row in said)
-    assert all(row["first_difference"] == 1 and row["drift_metres"] == 0 for row in said)
+    from_json = json.loads(tables[1].read_text())
+    assert all(row["return_now"] == pytest.approx(2 * row["return_before"], rel=1e-5) for row in from_json)
+    assert all(row["first_difference"] == 1 and row["drift_metres"] == 0 for row in from_json)
 
 
-def test_what_is_printed_for_programs_has_nothing_else_in_it(
-    author: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_output_for_programs_contains_nothing_else(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit(author, REWARD, f"print('printed by the task')\n        {REWARD}")
     code, out, err = run([str(author / "recordings"), "--json"], capsys)
     assert code == 0 and [row["seed"] for row in json.loads(out)] == [20, 21, 22]
@@ -334,7 +332,7 @@ def test_what_is_printed_for_programs_has_nothing_else_in_it(
     assert code == 0 and [row["seed"] for row in csv.DictReader(out.splitlines())] == ["20", "21", "22"]
 
 
-def test_a_broken_task_is_told_with_its_line(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_broken_task_is_reported_with_its_line(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit(author, REWARD, "return self.nonsense(obs)")
     code, _, err = run([str(author / "recordings")], capsys)
     line = TEXT[: TEXT.index(REWARD)].count("\n") + 1
@@ -344,7 +342,7 @@ def test_a_broken_task_is_told_with_its_line(author: Path, capsys: pytest.Captur
 
 
 @pytest.mark.slow
-def test_parts_that_are_merged_print_what_the_whole_would(
+def test_merged_parts_print_the_same_as_the_whole(
     author: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -372,7 +370,7 @@ def test_parts_that_are_merged_print_what_the_whole_would(
 
 
 @pytest.mark.slow
-def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreign: Path) -> None:
+def test_a_page_rescores_in_a_subprocess_and_stops_it(author: Path, foreign: Path) -> None:
     rescorer = Rescorer()
     try:
         edit(author, REWARD, f"{REWARD} * 2")

@@ -1,4 +1,4 @@
-"""Which code recordings can be judged with, by what the server knows."""
+"""The choices of code for rescoring recordings."""
 
 from __future__ import annotations
 
@@ -39,11 +39,13 @@ def test_the_file_that_a_recording_names_is_named(file: Path) -> None:
     assert (todays.label, text.label) == (TODAYS, RECORDED)
     assert f"{file}" in todays.told and todays.file is None and text.recorded
     held = source_hash({file.name: file.read_text()}, Path())
-    assert f"(version {held})" in text.told, "of the text that it holds, whatever it says of it"
+    assert f"(version {held})" in text.told, (
+        "the version is that of the held text, whatever the recording claims"
+    )
     assert "Push-v1 as a package registers it" in codes_for([recorded(None)], [])[0].told
 
 
-def test_a_copy_with_that_task_is_a_choice_and_other_files_are_none(file: Path, tmp_path: Path) -> None:
+def test_a_copy_with_that_task_is_a_choice_and_other_files_are_not(file: Path, tmp_path: Path) -> None:
     copy, other = tmp_path / "mine" / "push.py", tmp_path / "other.py"
     copy.parent.mkdir()
     copy.write_text(TASK)
@@ -53,5 +55,5 @@ def test_a_copy_with_that_task_is_a_choice_and_other_files_are_none(file: Path, 
     assert str(copy) in found[2].told
 
 
-def test_of_recordings_that_are_not_open_any_known_file_may_have_the_task(file: Path) -> None:
+def test_for_unopened_recordings_every_known_file_is_a_choice(file: Path) -> None:
     assert [code.file for code in codes_for([], [file])[2:]] == [file]

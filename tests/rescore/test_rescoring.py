@@ -1,4 +1,4 @@
-"""Rescoring recordings as a value: what a page asks for, and what a job tells."""
+"""Rescoring of recordings as a state machine: commands of a page, and reports of a job."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BEGUN = Rescoring().begun(RescoreView("loading", total=2, unit="episodes"))
 HALF = RescoringTold(BEGUN.job, replace(BEGUN.view, state="rescoring", done=1))
 
 
-def test_results_so_far_stay_when_it_is_stopped_and_the_job_changes_nothing_any_more() -> None:
+def test_a_stopped_rescoring_keeps_its_results_and_ignores_late_reports() -> None:
     half, effects = apply_to_job(BEGUN, HALF)
     assert effects == [] and (half.view.state, half.view.done, half.view.total) == ("rescoring", 1, 2)
     stopped, effects = apply_to_job(half, Asked(StopRescoring()))
@@ -28,7 +28,7 @@ def test_results_so_far_stay_when_it_is_stopped_and_the_job_changes_nothing_any_
         apply_to_job(stopped, Asked(StopRescoring()))
 
 
-def test_the_next_job_begins_with_nothing_of_the_one_before() -> None:
+def test_the_next_job_begins_without_results() -> None:
     half, _ = apply_to_job(BEGUN, HALF)
     again = half.begun(BEGUN.view)
     assert again.view.done == 0 and again.view.serial > half.view.serial

@@ -1,4 +1,4 @@
-"""What is otherwise in a run, by the numbers that a task says of it."""
+"""Verdicts: differences between the recorded and the new scores of a run."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from workbench.rescore.verdict import (
 REWARD = [0.0, 1.0, 2.0, 3.0]
 
 
-def said(reward: Any = REWARD, **evaluate: Any) -> Scores:
+def scores(reward: Any = REWARD, **evaluate: Any) -> Scores:
     return Scores(np.array(reward, float), {name: np.array(rows) for name, rows in evaluate.items()})
 
 
-def test_what_is_the_same_differs_nowhere() -> None:
+def test_equal_scores_have_no_difference() -> None:
     found = compare(
-        "it", said(success=[False] * 5, height=[0.1] * 5), said(success=[0.0] * 5, height=[0.1] * 5)
+        "it", scores(success=[False] * 5, height=[0.1] * 5), scores(success=[0.0] * 5, height=[0.1] * 5)
     )
     assert found.of == "it" and found.length == 4 and not found.differs and found.differing == ()
     assert found.returns == (6, 6) and found.largest == 0 and found.has_success
@@ -40,71 +40,75 @@ def test_what_is_the_same_differs_nowhere() -> None:
 
 
 @pytest.mark.parametrize(("share", "differs"), [(0.9e-5, False), (1.1e-5, True)])
-def test_a_reward_is_another_from_a_share_of_the_largest_on(share: float, differs: bool) -> None:
+def test_a_reward_differs_from_a_fraction_of_the_largest_reward_on(share: float, differs: bool) -> None:
     now = [0.0, 1.0, 2.0 + 3.0 * share, 3.0]
-    found = compare(0, said(), said(now))
+    found = compare(0, scores(), scores(now))
     assert found.differs == differs and found.largest == pytest.approx(3 * share)
     assert found.first_difference == (3 if differs else None) and found.differing == ("reward",) * differs
 
 
-def test_the_reward_differs_first_and_most_at_steps_of_the_episode() -> None:
-    found = compare(0, said(), said([0.0, 1.5, 4.0, 3.5]), begin=10)
+def test_the_first_and_largest_reward_difference_are_steps_of_the_episode() -> None:
+    found = compare(0, scores(), scores([0.0, 1.5, 4.0, 3.5]), begin=10)
     assert (found.first_difference, found.look_at, found.largest) == (12, 13, 2)
     assert verdict_text.change_text(found) == "reward by up to 2, from step 12"
 
 
-def test_success_and_fail_are_named_by_the_step_after_which_they_are_first_true() -> None:
-    old = said(success=[0, 0, 1, 1, 0], fail=[0] * 5)
-    found = compare(0, old, said(success=[0, 0, 0, 1, 0], fail=[0, 1, 0, 0, 0]), begin=5)
+def test_success_and_fail_are_located_by_their_first_true_step() -> None:
+    old = scores(success=[0, 0, 1, 1, 0], fail=[0] * 5)
+    found = compare(0, old, scores(success=[0, 0, 0, 1, 0], fail=[0, 1, 0, 0, 0]), begin=5)
     assert found.success == (7, 8) and found.fail == (None, 6)
     assert (found.first_difference, found.look_at) == (6, 8) and found.differing == ("success", "fail")
     assert (
         verdict_text.change_text(found)
         == "success now at step 8, was at step 7, fail now at step 6, was never"
     )
-    gone = compare(0, said([1, 1, 1, 1], fail=[0, 0, 1, 1, 1]), said([1, 1, 1, 9]))
-    assert gone.fail == (2, None) and gone.look_at == 2 and gone.first_difference == 2
-    assert not gone.has_success
+    missing = compare(0, scores([1, 1, 1, 1], fail=[0, 0, 1, 1, 1]), scores([1, 1, 1, 9]))
+    assert missing.fail == (2, None) and missing.look_at == 2 and missing.first_difference == 2
+    assert not missing.has_success
 
 
-def test_a_flag_that_is_first_true_as_before_and_then_otherwise_is_said() -> None:
-    found = compare(0, said(success=[0, 1, 1, 1, 1]), said(success=[0, 1, 1, 0, 1]))
+def test_a_flag_that_changes_after_its_first_true_step_is_reported() -> None:
+    found = compare(0, scores(success=[0, 1, 1, 1, 1]), scores(success=[0, 1, 1, 0, 1]))
     assert found.success == (1, 1) and found.differing == ("success",)
     assert (found.first_difference, found.look_at) == (3, 3)
     assert verdict_text.change_text(found) == "success at other steps, from step 3"
-    assert not compare(0, said(success=[0.5] * 5), said(success=[0.0] * 5)).differs, "half a truth is none"
-    both = compare(0, said(success=[1, 1, 1, 1, 1]), said([9, 1, 2, 3], success=[1, 0, 1, 1, 1]))
+    assert not compare(0, scores(success=[0.5] * 5), scores(success=[0.0] * 5)).differs, (
+        "0.5 does not count as true"
+    )
+    both = compare(0, scores(success=[1, 1, 1, 1, 1]), scores([9, 1, 2, 3], success=[1, 0, 1, 1, 1]))
     assert verdict_text.change_text(both) == "reward by up to 9, from step 1" and both.look_at == 1
 
 
-def test_other_entries_that_both_have_are_named_and_are_no_difference() -> None:
-    old = said(height=[0.1] * 5, speed=[1.0] * 5, gone=[1] * 5)
-    found = compare(0, old, said(height=[0.1, 0.1, 0.2, 0.1, 0.1], speed=[1.0] * 5, new=[2] * 5))
+def test_other_shared_entries_are_named_but_count_as_no_difference() -> None:
+    old = scores(height=[0.1] * 5, speed=[1.0] * 5, gone=[1] * 5)
+    found = compare(0, old, scores(height=[0.1, 0.1, 0.2, 0.1, 0.1], speed=[1.0] * 5, new=[2] * 5))
     assert not found.differs and found.differing == found.others == ("height",)
     assert verdict_text.change_text(found) == "unchanged, except height"
 
 
-def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_file_says_nothing_of() -> None:
+def test_nan_against_a_number_is_a_difference_except_where_a_file_has_no_value() -> None:
     nan = np.nan
-    old = said(a=[nan, 1, 1, 1, 1], b=[1, 1, 1, nan, 1], c=[1, 1, 1, 1, 1], success=[nan, 0, 0, 0, 0])
-    found = compare(0, old, said(a=[5, 1, 1, 1, 1], b=[1, 1, 1, 1, 1], c=[nan, 1, 1, 1, 1], success=[0] * 5))
+    old = scores(a=[nan, 1, 1, 1, 1], b=[1, 1, 1, nan, 1], c=[1, 1, 1, 1, 1], success=[nan, 0, 0, 0, 0])
+    found = compare(
+        0, old, scores(a=[5, 1, 1, 1, 1], b=[1, 1, 1, 1, 1], c=[nan, 1, 1, 1, 1], success=[0] * 5)
+    )
     assert found.differing == ("b", "c")
-    assert compare(0, old, said(a=[5, 2, 1, 1, 1])).differing == ("a",)
-    inf = compare(0, said([np.inf, 1, 1, 1]), said([np.inf, 1, 1, 1]))
+    assert compare(0, old, scores(a=[5, 2, 1, 1, 1])).differing == ("a",)
+    inf = compare(0, scores([np.inf, 1, 1, 1]), scores([np.inf, 1, 1, 1]))
     assert not inf.differs and inf.largest == 0
     assert gap(np.array([nan, np.inf, 1, 1]), np.array([nan, np.inf, 1, nan])).tolist() == [0, 0, 0, np.inf]
-    lost = compare(0, said(), said([0.0, nan, 2.0, 3.0]))
+    lost = compare(0, scores(), scores([0.0, nan, 2.0, 3.0]))
     assert (
         lost.look_at == lost.first_difference == 2
         and verdict_text.change_text(lost) == "reward NaN now, from step 2"
     )
 
 
-def test_drift_is_that_of_the_state_that_is_furthest() -> None:
+def test_drift_is_that_of_the_furthest_state() -> None:
     drift = np.array([[0, 0], [2e-3, 1e-4], [1e-3, 0.02], [0, 0], [0, 0]])
-    found = compare(0, said(), said(), drift, begin=7)
+    found = compare(0, scores(), scores(), drift, begin=7)
     assert (found.metres, found.radians, found.drift_at) == (2e-3, 0.02, 8) and found.drifted
-    still = compare(0, said(), said(), np.zeros((5, 2)))
+    still = compare(0, scores(), scores(), np.zeros((5, 2)))
     assert (still.metres, still.drift_at) == (0, None) and not still.drifted
     for metres, radians, drifted in (
         (DOUBTFUL_METRES, DOUBTFUL_RADIANS, False),
@@ -118,7 +122,7 @@ def test_drift_is_that_of_the_state_that_is_furthest() -> None:
         assert Verdict(0, metres=metres, radians=radians).drifted == drifted
 
 
-def test_what_changed_most_comes_first_and_what_was_not_judged_last() -> None:
+def test_the_largest_changes_come_first_and_unjudged_runs_last() -> None:
     moved = {"first_difference": 1, "returns": (1.0, 1.0)}
     given = [
         Verdict("same"),
@@ -136,7 +140,7 @@ def test_what_changed_most_comes_first_and_what_was_not_judged_last() -> None:
     assert [verdict.of for verdict in by_change([never, given[2]])] == ["less", "lost"]
 
 
-def test_entries_of_one_number_an_env_are_compared_and_no_others() -> None:
+def test_only_entries_with_one_number_per_env_are_compared() -> None:
     evaluate: dict[str, Any] = {
         "flag": np.array([True, False]),
         "column": np.array([[1], [2]]),

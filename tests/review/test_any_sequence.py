@@ -1,4 +1,4 @@
-"""Whatever is asked of a review and whatever its reading comes to, in any order: each state draws, and is the same again."""
+"""Any sequence of commands and reading events gives states of a review that can be drawn and are reproducible."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ ROWS = {
     for number, id in enumerate(EPISODES)
 }
 Happens = Callable[[ReviewState], ReviewEvent]
-"""An event as it can come in a state."""
+"""Makes an event for a given state."""
 
 
 def read(id: str, late: int, scene: bool) -> Happens:
@@ -98,7 +98,7 @@ def scene(id: str, late: int, there: bool) -> Happens:
 
 
 def read_next(late: int, scene: bool) -> Happens:
-    """The row of an opening that comes next is read."""
+    """The event that the next row of an opening was read."""
 
     def event(state: ReviewState) -> ReviewEvent:
         rows = state.opening.rows[state.opening.done :]
@@ -168,7 +168,7 @@ def states_after(happened: list[tuple[Happens, float]]) -> list[ReviewState]:
 
 
 def plain(state: ReviewState) -> object:
-    """What can be compared: two `Opened` never are equal."""
+    """A comparable form of a state: two `Opened` are never equal."""
     opened = [(one.id, id(one.episode), one.scene, one.making) for one in state.view.opened]
     read = [one.id for one in state.opening.read]
     without = replace(state, view=replace(state.view, opened=()), opening=replace(state.opening, read=()))
@@ -198,7 +198,7 @@ def draw() -> Iterator[Callable[[ReviewView], None]]:
 
 
 @given(sequences)
-def test_any_sequence_gives_states_that_draw_and_the_same_ones_again(
+def test_any_sequence_gives_drawable_and_reproducible_states(
     draw: Callable[[ReviewView], None], happened: list[tuple[Happens, float]]
 ) -> None:
     states = states_after(happened)

@@ -1,4 +1,4 @@
-"""Where two recordings part."""
+"""Differences between two recordings."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def test_the_first_body_that_moves_elsewhere_and_when() -> None:
     assert parts_at(difference(a, b, (0, 0), tolerance=0.1)) == 8
 
 
-def test_is_compared_as_they_are_aligned() -> None:
-    """The same motion, begun three states later: equal once the two are aligned at it."""
+def test_recordings_are_compared_as_aligned() -> None:
+    """The same motion, starting three states later, is equal once both are aligned at it."""
     a, b = made(10), made(13)
     poses_of(b)[:, BODY["cube"], 0] = np.maximum(np.arange(14) - 3, 0) * 0.01
     assert parts_at(difference(a, b, (0, 0))) == 1
@@ -41,15 +41,15 @@ def test_is_compared_as_they_are_aligned() -> None:
     assert parts_at(found) is None and (found.begin, found.compared) == (0, 11)
 
 
-def test_other_bodies_lengths_and_entries_are_said() -> None:
+def test_different_bodies_lengths_and_entries_are_reported() -> None:
     a, b = made(10), made(4)
     b.geometry = replace(geometry_of(b), body_names=("ground", "table", "arm/hand", "box"), visuals=())
     del b.evaluate["distance"]
     b.action = np.zeros((4, 3), np.float32)
     found = difference(a, b, (0, 0))
     assert found.not_in_both == ("cube (only in A)", "box (only in B)") and found.compared == 5
-    said = {p.name: p.values for p in found.numbers}
-    assert said["distance"] == "only in A" and said["action"] == "shape (2,) → (3,)"
+    values = {p.name: p.values for p in found.numbers}
+    assert values["distance"] == "only in A" and values["action"] == "shape (2,) → (3,)"
     b.geometry = None
     assert difference(a, b, (0, 0)).bodies is None
 
@@ -62,7 +62,7 @@ def test_turning_counts_and_either_sign_of_a_quaternion_is_the_same() -> None:
     assert distances(still, lacking) == np.inf and distances(lacking, lacking) == 0
 
 
-def test_the_lines_that_changed() -> None:
+def test_changed_source_lines_are_listed() -> None:
     ((name, lines),) = source_changes(
         {"a/task_v1.py": "a\nb\n", "a/m.py": "x"}, {"b/task_v2.py": "a\nc\n", "b/m.py": "x"}
     )

@@ -1,4 +1,4 @@
-"""The numbers beside the curves of a recording."""
+"""The curves of recordings, and the numbers beside them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workbench.review.curves_panel import ReviewCurves, compared
 from workbench.review.view import Opened, ReviewView, find_events
 
 
-def test_what_only_another_recording_has_is_in_the_table() -> None:
+def test_values_that_only_another_recording_has_are_in_the_table() -> None:
     old = [NumberRow("reward", "0.50", ""), NumberRow("success", "true", "", "good")]
     new = [*old[:1], NumberRow("slope", "0.10", ""), NumberRow("success", "false", "")]
     assert compared(old, [(old, 3), (new, 3)]) == [
@@ -26,7 +26,7 @@ def test_what_only_another_recording_has_is_in_the_table() -> None:
 
 
 def aligned(*recordings: tuple[int, int], selected: int = 0, position: int = 0) -> ReviewView:
-    """A view of recordings of so many steps, whose state of that number is at position 0."""
+    """A view of recordings, each (number of steps, state at position 0)."""
     episodes = [made(steps) for steps, _ in recordings]
     anchors = tuple(anchor for _, anchor in recordings)
     return ReviewView(
@@ -41,7 +41,7 @@ def aligned(*recordings: tuple[int, int], selected: int = 0, position: int = 0) 
 
 
 def drawn(server: viser.ViserServer, view: ReviewView, chart: str = "reward") -> list[list[Any]]:
-    """What is sent to a chart: the positions, a line for each recording, and the dot; None where there is a gap."""
+    """Data sent to a chart: the positions, a line per recording, and the dot; None marks gaps."""
     curves = ReviewCurves(server)
     curves.draw(view)
     handle = curves._charts[chart].handle
@@ -57,14 +57,14 @@ def test_the_dot_lies_on_the_selected_line_at_the_position(
     view = aligned((10, 5), (6, 2), selected=selected, position=position)
     positions, *lines, dot = drawn(server, view)
     assert positions == list(range(-5, 6))
-    # A reward is the number of its step; the first state has none.
+    # The reward equals the number of its step; the first state has none.
     assert lines[0] == [None, *range(1, 11)]
     assert lines[1] == [None] * 4 + [1, 2, 3, 4, 5, 6] + [None]
     at = positions.index(position)
     assert dot == [lines[selected][at] if i == at else None for i in range(11)]
 
 
-def test_of_a_long_recording_the_dot_is_on_the_point_nearest_to_the_position(
+def test_in_a_long_recording_the_dot_is_on_the_point_nearest_to_the_position(
     server: viser.ViserServer,
 ) -> None:
     steps, anchor = 1000, 400
@@ -73,7 +73,7 @@ def test_of_a_long_recording_the_dot_is_on_the_point_nearest_to_the_position(
         assert (positions[0], positions[-1]) == (-400 + 1, 600) and 400 < len(positions) <= 600
         (at,) = [i for i, value in enumerate(dot) if value is not None] or [0]
         assert abs(positions[at] - position) <= 3
-        value = position + anchor  # its own, and not that of the point
+        value = position + anchor  # the value at the position, not at the point
         assert dot[at] == (None if value == 0 else value)
         assert line[at] in (None, positions[at] + anchor)
 

@@ -1,4 +1,4 @@
-"""Scenes of ManiSkill's own recordings, made again by a process of their own: against the env that was recorded."""
+"""Scenes of ManiSkill's own recordings, rebuilt in a subprocess and compared with the recorded env."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ STEPS = 6
 
 
 class GivenUp(Exception):
-    """Nobody waits for the scenes any more."""
+    """The scenes are no longer needed."""
 
 
 @pytest.fixture(scope="module")
 def recorded(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Path, list[NDArray[np.float32]], tuple[str, ...]]:
-    """The .h5 of two episodes, the poses of all bodies in each, and the names of the bodies."""
+    """The .h5 of two episodes, the poses of all bodies in each, and the bodies' names."""
     folder = tmp_path_factory.mktemp("theirs")
     env: Any = gym.make("PushCube-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
     env = RecordEpisode(env, str(folder), save_video=False, record_env_state=True)
@@ -51,22 +51,22 @@ def recorded(
 
 
 def make(episodes: dict[int, Episode], files: tuple[Path, ...] = (), stop: bool = False) -> dict[int, Any]:
-    said: list[str] = []
+    messages: list[str] = []
 
     def check() -> None:
         if stop:
             raise GivenUp
 
-    made = SceneProcess(files)([*episodes.values()], check, lambda _, words: said.append(words))
+    made = SceneProcess(files)([*episodes.values()], check, lambda _, words: messages.append(words))
     ended: dict[int, Any] = {}
     with suppress(GivenUp):
         for key, scene in zip(episodes, made, strict=True):
             ended[key] = scene if isinstance(scene, SceneError) else scene[0]
-    assert said
+    assert messages
     return ended
 
 
-def test_has_every_body_where_it_was(recorded: Any) -> None:
+def test_a_rebuilt_scene_has_every_body_at_its_pose(recorded: Any) -> None:
     file, poses, names = recorded
     episodes = {k: read_maniskill(file, f"traj_{k}") for k in (0, 1)}
     assert episodes[0].geometry is None
@@ -83,12 +83,12 @@ def test_has_every_body_where_it_was(recorded: Any) -> None:
     assert "no env NobodyHasThis-v1" in str(ended[2]) and "--task FILE" in str(ended[2])
 
 
-def test_stops_when_it_is_told(recorded: Any) -> None:
+def test_rebuilding_stops_on_request(recorded: Any) -> None:
     assert make({0: read_maniskill(recorded[0], "traj_0")}, stop=True) == {}
 
 
 @pytest.mark.slow
-def test_what_the_process_sends_and_cannot_be_read_is_told(recorded: Any, tmp_path: Path) -> None:
+def test_an_unreadable_message_of_the_process_is_reported(recorded: Any, tmp_path: Path) -> None:
     file = tmp_path / "sends.py"
     file.write_text(
         "import os, time\n"

@@ -1,4 +1,4 @@
-"""Opened recordings and the one position that they share: opening, playing, aligning, files that change."""
+"""Opened recordings and their shared position: opening, playing, aligning, and changing files."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class Row:
 
 
 @dataclass
-class Shelf:
-    """Recordings in memory, by id; what is an exception is raised when it is read."""
+class FakeLibrary:
+    """In-memory recordings by id; an exception is raised when it is read."""
 
     episodes: dict[str, Episode | Exception]
     now: float = 0.0
@@ -77,9 +77,9 @@ def _date(episode: Episode | Exception) -> datetime | None:
     return datetime.fromisoformat(written) if written else None
 
 
-def review_of(**episodes: Episode | Exception) -> tuple[Review, Shelf]:
-    shelf = Shelf(episodes)
-    return Review(shelf, shelf.read, clock=shelf.clock), shelf  # type: ignore[arg-type]
+def review_of(**episodes: Episode | Exception) -> tuple[Review, FakeLibrary]:
+    library = FakeLibrary(episodes)
+    return Review(library, library.read, clock=library.clock), library  # type: ignore[arg-type]
 
 
 def reach(review: Review, reached: Callable[[ReviewView], bool], what: str) -> ReviewView:
@@ -102,26 +102,26 @@ def close_one(review: Review, index: int) -> None:
     review.do(CloseRecording(id=review.view().opened[index].id))
 
 
-def test_plays_at_the_control_rate_and_stops_at_the_end() -> None:
-    review, shelf = review_of(a=made(10))
+def test_playback_runs_at_the_control_rate_and_stops_at_the_end() -> None:
+    review, library = review_of(a=made(10))
     assert opened(review, "a").last == 10
     review.do(TogglePlay())
-    shelf.now += 0.26
+    library.now += 0.26
     assert review.view().position == 5 and review.view().playing
     review.do(ChoosePlaybackSpeed(speed=2.0))
-    shelf.now += 0.11
+    library.now += 0.11
     assert review.view().position == 9
-    shelf.now += 10
+    library.now += 10
     view = review.view()
     assert view.position == 10 and not view.playing
     review.do(TogglePlay())
-    assert review.view().position == 0, "from the end it begins anew"
+    assert review.view().position == 0, "playing from the end restarts"
     review.do(LoopPlayback(on=True))
-    shelf.now += 0.05 * 11 / 2 + 1e-3
+    library.now += 0.05 * 11 / 2 + 1e-3
     assert review.view().position == 0 and review.view().playing
 
 
-def test_goes_frame_by_frame_and_from_event_to_event() -> None:
+def test_stepping_goes_frame_by_frame_and_from_event_to_event() -> None:
     review, _ = review_of(a=made(10, success_from=7))
     opened(review, "a")
     review.do(StepForward())
@@ -129,7 +129,7 @@ def test_goes_frame_by_frame_and_from_event_to_event() -> None:
     review.do(NextEvent())
     assert review.view().position == 7
     review.do(NextEvent())
-    assert review.view().position == 10, "the end is where the last jump leads"
+    assert review.view().position == 10, "the last jump goes to the end"
     review.do(PreviousEvent())
     review.do(PreviousEvent())
     assert review.view().position == 0
@@ -137,14 +137,14 @@ def test_goes_frame_by_frame_and_from_event_to_event() -> None:
     assert review.view().position == 10
 
 
-def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
+def test_when_aligned_each_recording_shows_its_own_state_of_the_event() -> None:
     review, _ = review_of(a=made(10, success_from=7), b=made(6, success_from=2), c=made(4))
     view = opened(review, "a", "b", "c")
     assert view.states == (0, 0, 0)
     review.do(Seek(step=5))
     review.do(AlignRecordings(at="first success"))
     view = review.view()
-    assert view.states == (5, 0, 0), "what is shown of the selected one stays"
+    assert view.states == (5, 0, 0), "the selected recording keeps its state"
     assert (view.first, view.last) == (-7, 4)
     review.do(Seek(step=0))
     assert review.view().states == (7, 2, 0)
@@ -163,10 +163,10 @@ def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
     review.do(NextEvent())
 
 
-def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_older_recording_comes_first_and_two_can_be_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "workbench.review.state.FIRST_SHOWN_SECONDS", 0.0
-    )  # it is seen before the other is read
+    )  # the first is shown before the other is read
     review, _ = review_of(
         new=made(4, written_at="2026-11-22T10:00:00+00:00"),
         old=made(6, written_at="2026-11-21T10:00:00+00:00"),
@@ -185,8 +185,8 @@ def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytes
     assert [one.id for one in review.view().opened] == ["new", "old"]
 
 
-def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
-    shelf = Shelf(
+def test_unreadable_recordings_are_reported_and_the_others_open() -> None:
+    library = FakeLibrary(
         {
             "a": made(3),
             "b": UnreadableRecording("it is a picture of a cat"),
@@ -199,19 +199,19 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
 
     def read(row: Row, *_: object) -> Episode:
         assert readable.wait(60)
-        return shelf.read(row)
+        return library.read(row)
 
-    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
+    review = Review(library, read, clock=library.clock)  # type: ignore[arg-type]
     review.open(["a", "b", "c", "d", "e"])
     view = reach(review, lambda view: bool(view.opened) and not view.loading, "the one that can be read")
     assert [o.id for o in view.opened] == ["a"]
-    said = " ".join(view.problems)
+    problems = " ".join(view.problems)
     assert (
-        "file b was not opened. it is a picture of a cat" in said
-        and "ZeroDivisionError: oh" in said
-        and "file d was not opened. gone" in said
+        "file b was not opened. it is a picture of a cat" in problems
+        and "ZeroDivisionError: oh" in problems
+        and "file d was not opened. gone" in problems
     )
-    assert "no longer in the folder" in said and view.not_opened == ("b", "c", "d")
+    assert "no longer in the folder" in problems and view.not_opened == ("b", "c", "d")
     readable.clear()
     review.do(OpenAgain())
     assert review.view().not_opened == () and review.view().loading
@@ -220,22 +220,22 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
     assert [o.id for o in view.opened] == ["a"]
     review.open(["b"])
     view = reach(review, lambda view: not view.loading and len(view.problems) == 1, "its problem")
-    assert [o.id for o in view.opened] == ["a"], "what was open stays"
+    assert [o.id for o in view.opened] == ["a"], "the open recording stays"
 
 
-def test_what_is_open_at_once_may_take_so_much_memory_and_no_more() -> None:
-    shelf, held = Shelf({f"e{i}": made(2) for i in range(6)}), []
+def test_the_memory_of_open_recordings_is_limited() -> None:
+    library, held = FakeLibrary({f"e{i}": made(2) for i in range(6)}), []
 
     def read(row: Row, *_: object) -> Episode:
         held.append(64 * 2**20)
-        return shelf.read(row)
+        return library.read(row)
 
     review = Review(
-        shelf,  # type: ignore[arg-type]
+        library,  # type: ignore[arg-type]
         read,  # type: ignore[arg-type]
-        clock=shelf.clock,
+        clock=library.clock,
         most_bytes=100 * 2**20,
-        memory=lambda: 2**30 + sum(held),  # that of this process is of all tests before, and may fall
+        memory=lambda: 2**30 + sum(held),  # the process's own memory includes earlier tests, and may fall
     )
     review.open([f"e{i}" for i in range(6)])
     view = reach(review, lambda v: bool(v.problems) and not v.loading, "the word for it")
@@ -244,28 +244,28 @@ def test_what_is_open_at_once_may_take_so_much_memory_and_no_more() -> None:
     review.close()
 
 
-def test_files_that_change_or_go_are_said_and_stay_open(
+def test_changed_and_deleted_files_are_reported_and_stay_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workbench.review.playback.CHECK_SECONDS", 0.01)
     changed, gone = tmp_path / "a.rrd", tmp_path / "a.h5"
     changed.write_text("1")
     gone.write_text("1")
-    review, shelf = review_of(a=made(3))
-    shelf.extra["a"] = (changed, gone)
+    review, library = review_of(a=made(3))
+    library.extra["a"] = (changed, gone)
     opened(review, "a")
-    time.sleep(0.1)  # some checks
+    time.sleep(0.1)  # let some checks pass
     assert review.view().problems == ()
     changed.write_text("another")
     gone.unlink()
     reach(review, lambda view: len(view.problems) == 2, "the word for both")
-    said = " ".join(review.view().problems)
-    assert "a.rrd has changed" in said and "a.h5 was deleted" in said
+    problems = " ".join(review.view().problems)
+    assert "a.rrd has changed" in problems and "a.h5 was deleted" in problems
     review.close()
     assert len(review.view().opened) == 1
 
 
-def test_what_changed_of_the_selected_recordings_task_is_told_at_once_and_again_after_a_save(
+def test_changes_of_the_selected_recordings_task_are_reported_at_once_and_after_a_save(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workbench.review.playback.CHECK_SECONDS", 0.01)
@@ -299,7 +299,7 @@ def filled(child_process: None, tmp_path: Path) -> Iterator[Library]:
     library.close()
 
 
-def test_the_newest_is_opened_library_stays_once_it_is_listed_and_only_once(filled: Library) -> None:
+def test_the_newest_recording_is_opened_beside_the_library_once_listed_and_only_once(filled: Library) -> None:
     review = Review(filled)
     filled.on_change.add(review.library_changed)
     review.open_first("newest")
@@ -308,7 +308,9 @@ def test_the_newest_is_opened_library_stays_once_it_is_listed_and_only_once(fill
     filled.refresh()
     view = reach(review, lambda view: bool(view.opened) and not view.loading, "the newest")
     assert [one.episode.info.seed for one in view.opened] == [2] and view.library_stays
-    assert view.problems == ("A killed program left half an episode.",), "nobody could have read it"
+    assert view.problems == ("A killed program left half an episode.",), (
+        "a person had no chance to read it yet"
+    )
     close_one(review, 0)
     write(filled.folder, made(3, seed=4), pictures=False)
     filled.refresh()
@@ -316,21 +318,21 @@ def test_the_newest_is_opened_library_stays_once_it_is_listed_and_only_once(fill
     review.close()
 
 
-def test_a_file_is_opened_library_stays_once_it_is_listed(filled: Library) -> None:
+def test_a_file_is_opened_beside_the_library_once_listed(filled: Library) -> None:
     filled.refresh()
     review = Review(filled)
     filled.on_change.add(review.library_changed)
     review.open_first("newest")
     later = write(filled.folder, made(3, seed=4, written_at="2026-11-22T10:00:00+00:00"), pictures=False)
     review.open_first(later.with_suffix(".rrd"))
-    reach(review, lambda view: not view.loading, "what the second wish came for")
+    reach(review, lambda view: not view.loading, "the second request")
     filled.refresh()
     view = reach(review, lambda v: [o.episode.info.seed for o in v.opened] == [4], "the file")
     assert view.library_stays
     review.close()
 
 
-def test_nothing_is_opened_library_stays_after_a_person_has_opened_a_recording(
+def test_nothing_is_opened_automatically_after_a_person_has_opened_a_recording(
     filled: Library, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     elsewhere = write(tmp_path_factory.mktemp("other"), made(3, seed=4), pictures=False)
@@ -349,18 +351,18 @@ def test_nothing_is_opened_library_stays_after_a_person_has_opened_a_recording(
     review.close()
 
 
-def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_recordings_are_shown_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workbench.review.state.FIRST_SHOWN_SECONDS", 0.0)
-    review, shelf = review_of(a=made(10), b=made(20), c=made(10), d=made(30, success_from=9), e=made(10))
+    review, library = review_of(a=made(10), b=made(20), c=made(10), d=made(30, success_from=9), e=made(10))
     reached, go_on = threading.Event(), threading.Event()
 
     def read(row: Row, *_: object) -> Episode:
         if row.id == "d":
             reached.set()
             assert go_on.wait(60)
-        return shelf.read(row)
+        return library.read(row)
 
-    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
+    review = Review(library, read, clock=library.clock)  # type: ignore[arg-type]
     review.open("abcde", state=4)
     assert reached.wait(60)
     view = reach(review, lambda view: len(view.opened) == 3, "the first three")
@@ -375,17 +377,17 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
     review.do(TogglePlay())
     go_on.set()
     view = reach(review, lambda view: not view.loading, "the others")
-    assert [o.id for o in view.opened] == ["b", "c", "d", "e"], "what was closed does not come back"
+    assert [o.id for o in view.opened] == ["b", "c", "d", "e"], "a closed recording does not come back"
     assert (view.selected, view.position, view.playing, view.last) == (0, 15, True, 30)
     assert "first success" in view.alignments
     review.open("ab")
     view = reach(review, lambda view: not view.loading, "both")
-    assert [o.id for o in view.opened] == ["a", "b"], "who opens it again sees it again"
+    assert [o.id for o in view.opened] == ["a", "b"], "a closed recording can be opened again"
 
 
-def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_opening_ends_one_that_has_already_shown_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workbench.review.state.FIRST_SHOWN_SECONDS", 0.0)
-    shelf = Shelf({"a": made(10), "b": made(20), "c": made(30)})
+    library = FakeLibrary({"a": made(10), "b": made(20), "c": made(30)})
     reached, go_on = threading.Event(), threading.Event()
     readers: list[threading.Thread] = []
 
@@ -394,9 +396,9 @@ def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.M
         if row.id == "b":
             reached.set()
             assert go_on.wait(60)
-        return shelf.read(row)
+        return library.read(row)
 
-    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
+    review = Review(library, read, clock=library.clock)  # type: ignore[arg-type]
     review.open("ab")
     assert reached.wait(60)
     opened(review, "c")
@@ -405,7 +407,7 @@ def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.M
     assert [o.id for o in review.view().opened] == ["c"] and not review.view().loading
 
 
-def test_real_files_come_back_with_scene_pictures_and_numbers(child_process: None, tmp_path: Path) -> None:
+def test_real_files_are_read_with_scene_pictures_and_numbers(child_process: None, tmp_path: Path) -> None:
     write(tmp_path, made(4, success_from=3))
     library = Library(tmp_path)
     library.refresh()
@@ -422,14 +424,14 @@ def test_real_files_come_back_with_scene_pictures_and_numbers(child_process: Non
     assert abs(int(seen.rgb.mean()) - 40) <= 2 and np.allclose(seen.depth, 0.2) and seen.segmentation is None
     again = reader.pictures(one.episode, 2, wanted, env=0)["sensor", "base_camera"]
     assert again is seen, "the same state is not decoded again"
-    assert seen.degree is None, "of any recording that does not say that they are fast"
+    assert seen.degree is None, "only recordings that name fast pictures have a degree"
     of_fast = replace(one.episode, info=replace(one.episode.info, pictures="fast"))
     assert reader.pictures(of_fast, 2, wanted, env=0)["sensor", "base_camera"].degree == "fast"
     library.close()
 
 
-def test_half_a_recording_and_a_broken_one(child_process: None, tmp_path: Path) -> None:
-    """Without its .rrd there is neither scene nor picture; with half of one a sentence."""
+def test_an_incomplete_and_a_broken_recording(child_process: None, tmp_path: Path) -> None:
+    """Without its .rrd a recording has no scene or pictures; with half of one there is a message."""
     half = write(tmp_path, made(4, seed=1))
     half.with_suffix(".rrd").unlink()
     broken = write(tmp_path, made(4, seed=2))
@@ -456,7 +458,7 @@ def test_events_of_an_episode_are_where_an_entry_becomes_true() -> None:
     episode.reward[8] = np.nan
     found = [(h.state, h.name) for h in find_events(episode)]
     assert found[:4] == [(0, "reset"), (2, "grasped"), (4, "success"), (6, "grasped")]
-    assert [state for state, _ in found[4:]] == [9], "the reward that is no number"
+    assert [state for state, _ in found[4:]] == [9], "the NaN reward"
     states, values = curves(episode)["reward"]["reward"]
     assert (states[0], values[0]) == (1, 1)
 
@@ -464,9 +466,7 @@ def test_events_of_an_episode_are_where_an_entry_becomes_true() -> None:
 @given(
     length=st.integers(0, 30), anchor=st.integers(0, 30), first=st.integers(-40, 0), last=st.integers(0, 40)
 )
-def test_a_line_over_positions_has_each_number_at_its_place(
-    length: int, anchor: int, first: int, last: int
-) -> None:
+def test_a_line_has_each_number_at_its_position(length: int, anchor: int, first: int, last: int) -> None:
     states = np.arange(length + 1)
     axis = np.arange(first, last + 1)
     line = column_at(states, states.astype(np.float64) * 1.5, anchor, axis)

@@ -1,4 +1,4 @@
-"""Recordings as one scene: ghosts and side by side."""
+"""Several recordings in one scene: as ghosts and side by side."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ def opened(*episodes: Episode) -> tuple[Opened, ...]:
     return tuple(Opened(str(i), str(i), e, find_events(e)) for i, e in enumerate(episodes))
 
 
-def test_side_by_side_shares_shapes_and_has_places() -> None:
+def test_side_by_side_recordings_share_shapes_and_are_placed_apart() -> None:
     scene = review_scene(opened(made(10), made(4, speed=0.02)), ghosts=False)
     assert scene is not None
-    assert len(group_visuals(scene.geometry)) == 4, "what looks the same is one node"
+    assert len(group_visuals(scene.geometry)) == 4, "visuals with equal shapes share one node"
     assert all(len(visual.envs) == 2 for visual in scene.geometry.visuals)
     assert not np.allclose(scene.layout.offsets[0], scene.layout.offsets[1])
     poses = scene.poses((7, 3))
     assert np.allclose(poses[:, BODY["cube"], 0], (0.07, 0.06))
 
 
-def test_a_ghost_is_tinted_and_drawn_only_where_it_parts() -> None:
+def test_a_ghost_is_tinted_and_drawn_only_where_it_differs() -> None:
     a, b = made(10), made(10)
     poses_of(b)[5:, BODY["cube"], 1] += 0.1
     scene = review_scene(opened(a, b), ghosts=True)
     assert scene is not None and not scene.layout.offsets.any()
     ghosts = {int(v.bodies[0]): v.material for v in scene.geometry.visuals if 1 in v.envs}
-    assert set(ghosts) == {BODY["cube"]}, "what rests at one place in both is drawn once"
+    assert set(ghosts) == {BODY["cube"]}, "bodies at rest at the same pose are drawn once"
     assert ghosts[BODY["cube"]].base_color[3] == GHOST_ALPHA
-    assert np.isnan(scene.poses((4, 4))[1]).all(), "as long as they are together there is no ghost"
+    assert np.isnan(scene.poses((4, 4))[1]).all(), "no ghost is drawn while the poses are equal"
     apart = scene.poses((6, 6))[1]
     assert np.isfinite(apart[BODY["cube"]]).all() and np.isnan(apart[BODY["arm/hand"]]).all()
 
 
-def test_recordings_with_other_bodies_and_without_a_scene() -> None:
+def test_recordings_with_different_bodies_or_without_a_scene() -> None:
     a, b, c = made(3), made(3), made(3)
     b.geometry = replace(geometry_of(b), body_names=("ground", "table", "arm/hand", "box"))
     c.geometry = c.poses = None

@@ -1,4 +1,4 @@
-"""Things are made from recordings in a process of its own: the page hears of it, stops it, and keeps nothing half-made."""
+"""Films and archives are made from recordings in a subprocess: it reports progress, can be stopped, and leaves no partial file."""
 
 from __future__ import annotations
 
@@ -61,30 +61,30 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Told:
-    """A `Making`, and a way to wait for what it tells."""
+class MakingProbe:
+    """A `Making`, with a way to wait for its view."""
 
     def __init__(self) -> None:
         self.making = Making()
 
     def wait(self, reached: Callable[[MakingView], bool]) -> MakingView:
-        until(lambda: reached(self.making.view()), "what is waited for", seen=self.making.view)
+        until(lambda: reached(self.making.view()), "the expected view", seen=self.making.view)
         return self.making.view()
 
 
 @pytest.mark.slow
-def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
-    told = Told()
-    told.making.start(MakeRequest("film", find_all_sources([recordings]) * 20, tmp_path / "films", "eye"))
-    told.wait(lambda view: view.done > 0.01 and "eye" in view.doing)
-    told.making.stop()
-    view = told.wait(lambda view: not view.running)
+def test_stopping_leaves_no_partial_file(recordings: Path, tmp_path: Path) -> None:
+    probe = MakingProbe()
+    probe.making.start(MakeRequest("film", find_all_sources([recordings]) * 20, tmp_path / "films", "eye"))
+    probe.wait(lambda view: view.done > 0.01 and "eye" in view.doing)
+    probe.making.stop()
+    view = probe.wait(lambda view: not view.running)
     assert (view.problem, view.made) == ("", ())
     assert not [path for path in (tmp_path / "films").iterdir() if path.suffix != ".mp4"]
 
 
 @pytest.mark.slow
-def test_an_archive_unpacked_is_the_recording_again(recordings: Path, tmp_path: Path) -> None:
+def test_an_unpacked_archive_equals_the_recording(recordings: Path, tmp_path: Path) -> None:
     (source,) = find_all_sources([recordings])
     made = make(MakeRequest("zip", (source,), tmp_path))
     assert made.words == "3 files of 1 recording" and made.paths == (tmp_path / f"{source.stem}.zip",)
@@ -97,38 +97,36 @@ def test_an_archive_unpacked_is_the_recording_again(recordings: Path, tmp_path: 
 
 @pytest.mark.slow
 def test_downloads_of_one_name_are_kept_apart_until_the_end(recordings: Path, tmp_path: Path) -> None:
-    told = Told()
+    probe = MakingProbe()
     wanted = MakeRequest("zip", find_all_sources([recordings]), tmp_path)
-    assert told.making.start(wanted, download=True) and not told.making.start(wanted), "one at a time"
-    told.wait(lambda view: not view.running)
-    told.making.start(wanted, download=True)
-    view = told.wait(lambda view: len(view.made) == 2)
+    assert probe.making.start(wanted, download=True) and not probe.making.start(wanted), "one at a time"
+    probe.wait(lambda view: not view.running)
+    probe.making.start(wanted, download=True)
+    view = probe.wait(lambda view: len(view.made) == 2)
     (second,), (first,) = (made.paths for made in view.made)
     assert first.name == second.name and first != second and not list(tmp_path.iterdir())
     assert view.made[0].sizes == (second.stat().st_size,) and first.exists()
-    told.making.close()
+    probe.making.close()
     assert not first.exists() and not second.exists()
 
 
-def test_the_end_waits_for_work_that_was_begun_and_does_not_wait_for_ever(
+def test_closing_waits_for_work_in_progress_but_not_forever(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workbench.share.make.END_SECONDS", 0.1)
-    told, go_on = Told(), threading.Event()
+    probe, go_on = MakingProbe(), threading.Event()
     monkeypatch.setattr(
         "workbench.share.make.Processes", lambda count: SimpleNamespace(run=lambda *work: go_on.wait(60))
     )
-    told.making.start(MakeRequest("zip", find_all_sources([recordings]), tmp_path))
-    told.making.close()
-    assert told.making.view().running, "it hangs"
+    probe.making.start(MakeRequest("zip", find_all_sources([recordings]), tmp_path))
+    probe.making.close()
+    assert probe.making.view().running, "the hanging work still runs"
     go_on.set()
-    view = told.wait(lambda view: not view.running)
+    view = probe.wait(lambda view: not view.running)
     assert (view.problem, view.made) == ("", ())
 
 
-def test_an_archive_of_several_has_each_file_once_and_nothing_that_a_link_names(
-    recordings: Path, tmp_path: Path
-) -> None:
+def test_an_archive_has_each_file_once_and_no_target_of_a_link(recordings: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(recordings, tmp_path / "copy"))
     (tmp_path / "secret.h5").write_text("of somebody")
     for name in ("other.json", "other.rrd"):

@@ -1,4 +1,4 @@
-"""The Share tab without a browser: what it is about, and what a press makes."""
+"""The Share tab without a browser: what it offers, and what its buttons make."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from workbench.share.make import EVERY_CAMERA, Made, MakeRequest, Making, Making
 from workbench.share.panel import ALL_CAMERAS, MAX_NAMED, Chosen, SharePanel, will_make
 
 
-class Noted(Making):
-    """Notes what is wanted instead of starting a process for it."""
+class RecordingMaking(Making):
+    """Records requests instead of starting a process for them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -35,8 +35,8 @@ class Noted(Making):
 
 
 @pytest.fixture
-def making() -> Iterator[Noted]:
-    making = Noted()
+def making() -> Iterator[RecordingMaking]:
+    making = RecordingMaking()
     yield making
     making.close()
 
@@ -47,7 +47,7 @@ def panels(gated_server: GatedServer) -> Panels:
 
 
 @pytest.fixture
-def panel(panels: Panels, gated_server: GatedServer, making: Noted, tmp_path: Path) -> SharePanel:
+def panel(panels: Panels, gated_server: GatedServer, making: RecordingMaking, tmp_path: Path) -> SharePanel:
     panel = SharePanel(gated_server.server, Downloads(gated_server.add_route), making, tmp_path)
     panels.visitors.do = panel.do
     return panel
@@ -56,8 +56,8 @@ def panel(panels: Panels, gated_server: GatedServer, making: Noted, tmp_path: Pa
 RECORDING = Source(Path("/recordings/Push_seed1.json"))
 
 
-def test_without_a_recording_there_is_nothing_to_make(
-    panel: SharePanel, panels: Panels, making: Noted
+def test_without_a_recording_nothing_can_be_made(
+    panel: SharePanel, panels: Panels, making: RecordingMaking
 ) -> None:
     panel.draw(Chosen())
     assert panels.button("Make").command is None and "Select recordings" in panels.html()
@@ -66,12 +66,12 @@ def test_without_a_recording_there_is_nothing_to_make(
 
 
 def test_recordings_and_files_are_named_before_they_are_made(
-    panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
+    panel: SharePanel, panels: Panels, making: RecordingMaking, tmp_path: Path
 ) -> None:
     panel.draw(Chosen((RECORDING,), ("base_camera", "hand/camera"), selected=True))
     assert "Selected in the library" in panels.html() and "Push_seed1" in panels.html()
-    said = panels.html()
-    assert "2 files" in said and "Push_seed1.base_camera.mp4" in said and "Push_seed1.hand_camera.mp4" in said
+    html = panels.html()
+    assert "2 files" in html and "Push_seed1.base_camera.mp4" in html and "Push_seed1.hand_camera.mp4" in html
     many = tuple(Source(Path(f"/recordings/r{k}.json")) for k in range(MAX_NAMED + 2))
     will = will_make("sheet", Chosen(many), ALL_CAMERAS, tmp_path)
     assert (will["what"], will["files"][0]) == (f"{MAX_NAMED + 2} files", ("r0.sheet.png",) * 2)
@@ -84,8 +84,8 @@ def test_recordings_and_files_are_named_before_they_are_made(
     assert panels.html().count("and 2 more") == 2 and panels.html().count(".sheet.png<") == MAX_NAMED
 
 
-def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(
-    panel: SharePanel, panels: Panels, making: Noted
+def test_a_film_shows_the_chosen_camera_or_every_camera(
+    panel: SharePanel, panels: Panels, making: RecordingMaking
 ) -> None:
     panel.draw(Chosen((RECORDING,), ("base_camera", "hand_camera")))
     assert list(panels.field("Camera").options) == [ALL_CAMERAS, "base_camera", "hand_camera"]
@@ -98,8 +98,8 @@ def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(
     assert not panels.shows("Camera"), "there is no choice"
 
 
-def test_demonstrations_go_there_too_and_are_not_offered_to_be_saved_without_their_json(
-    panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
+def test_demonstrations_are_saved_with_the_datasets_and_not_offered_as_a_download(
+    panel: SharePanel, panels: Panels, making: RecordingMaking, tmp_path: Path
 ) -> None:
     panels.set("Make", "ManiSkill demonstrations (h5)")
     panel.draw(Chosen((RECORDING,)))
@@ -116,8 +116,8 @@ def test_demonstrations_go_there_too_and_are_not_offered_to_be_saved_without_the
     assert "download" not in panels.html()
 
 
-def test_only_successes_cannot_be_ticked_where_none_reaches_success(
-    panel: SharePanel, panels: Panels, making: Noted
+def test_only_successes_cannot_be_ticked_without_a_success(
+    panel: SharePanel, panels: Panels, making: RecordingMaking
 ) -> None:
     several = tuple(Source(Path(f"/recordings/r{k}.json")) for k in range(3))
     panels.set("Make", "LeRobot dataset")
@@ -138,8 +138,8 @@ def test_only_successes_cannot_be_ticked_where_none_reaches_success(
     assert not ticked.off and not ticked.value
 
 
-def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(
-    panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
+def test_made_files_can_be_saved_and_errors_are_shown(
+    panel: SharePanel, panels: Panels, making: RecordingMaking, tmp_path: Path
 ) -> None:
     film = tmp_path / "a<b>.mp4"
     making.shown = MakingView(running=True, done=0.4, doing="a: the 3D view")
@@ -149,5 +149,5 @@ def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(
         made=(Made((film,), "1 file", sizes=(2_500_000,)),), problem="There is no <room>."
     )
     panel.draw(Chosen((RECORDING,)))
-    said = panels.html()
-    assert "a&lt;b&gt;.mp4" in said and "2.5 MB" in said and "/offered/" in said and "<room>" not in said
+    html = panels.html()
+    assert "a&lt;b&gt;.mp4" in html and "2.5 MB" in html and "/offered/" in html and "<room>" not in html

@@ -1,4 +1,4 @@
-"""rerun's viewer through the page's door: what is served, to whom, and that nobody else is asked."""
+"""Rerun's viewer on the page's server: what is served, to whom, and that no other server is asked."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def get(gated_server: GatedServer, path: str, **headers: str) -> tuple[int, http
         connection.close()
 
 
-def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(
+def test_a_file_is_sent_completely_and_only_under_its_generated_address(
     gated_server: GatedServer, tmp_path: Path
 ) -> None:
     offers = Downloads(gated_server.add_route)
@@ -72,7 +72,7 @@ def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(
     assert get(gated_server, address)[0] == 404
 
 
-def test_the_viewer_is_sent_packed_to_those_who_take_it(
+def test_the_viewer_is_sent_compressed_to_clients_that_accept_it(
     gated_server: GatedServer, pages: RerunPages, recording: Path
 ) -> None:
     viewer = get(gated_server, pages.address([recording]))[2].decode().partition('location.replace("')[2]
@@ -92,7 +92,7 @@ def test_the_viewer_is_sent_packed_to_those_who_take_it(
 
 
 @pytest.mark.slow
-def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
+def test_the_page_opens_the_recording_beside_the_scene_and_asks_no_other_server(
     gated_server: GatedServer, pages: RerunPages, recording: Path, browser: Browser
 ) -> None:
     library = gated_server.server.gui.add_panel()
@@ -122,7 +122,7 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         assert answer.value.status == 200
         frame = tab.frame_locator("iframe.wb-rerun")
         frame.locator("canvas.visible").wait_for(timeout=90_000)
-        # The state of the viewer as it tells it: the cursor of the timeline "step" is at 12.
+        # The viewer's own state: the cursor of the timeline "step" is at 12.
         inside = next(frame for frame in tab.frames if "/rerun/viewer-" in frame.url)
         state = "() => new TextDecoder().decode(window._handle.viewer_state())"
         until(
@@ -131,7 +131,9 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         tab.get_by_text("from step 12").wait_for()
         width = "document.querySelector('iframe.wb-rerun').clientWidth"
         until(lambda: tab.evaluate(width) > 450, "half of the page")
-        assert tab.evaluate("document.activeElement.tagName") != "IFRAME", "the keys are the page's"
+        assert tab.evaluate("document.activeElement.tagName") != "IFRAME", (
+            "the page must keep the keyboard focus"
+        )
         tab.get_by_role("button", name="Close rerun").click()
         tab.locator("iframe.wb-rerun").wait_for(state="detached")
     stopping.set()
@@ -142,4 +144,4 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         if not r.url.startswith((ours, f"ws://127.0.0.1:{gated_server.port}", "data:", "blob:"))
     }
     assert {url: failed.get(url) for url in foreign} == dict.fromkeys(foreign, "csp")
-    assert foreign, "rerun's page has stopped asking others; the policy can be simpler"
+    assert foreign, "rerun's page no longer asks other servers; the policy can be simpler"

@@ -1,4 +1,4 @@
-"""The moving page of a scene plays from the disk, and asks nobody for anything."""
+"""The animated HTML page of a scene plays from the disk without any network request."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DRAWN = """before => {
         return Math.abs(x - (-0.3 + 0.03 * step)) < 1e-4;
     });
 }"""
-"""Whether another step is told than before, and the cube is drawn where it was at that step."""
+"""Whether the caption shows another step than before, and the cube is drawn at its pose of that step."""
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def episode() -> Episode:
 
 
 @pytest.mark.slow
-def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, browser: Browser) -> None:
+def test_a_scene_page_plays_without_a_server(episode: Episode, tmp_path: Path, browser: Browser) -> None:
     path, done = tmp_path / "a.html", []
     write_scene_html(path, episode, on_progress=done.append)
     assert done == sorted(done) and done[-1] == 1.0
@@ -64,7 +64,7 @@ def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, browser: Br
             "() => document.querySelector('input') && parseFloat(document.querySelector('input').value) > 0.3"
         )
         assert float(time_shown.input_value()) <= 3.2
-        # What is said is the episode's own time, to its end and no further while the last state is held.
+        # The caption shows the episode's own time, and stops at its end while the last state is held.
         tab.wait_for_function(
             "() => document.querySelector('#wb-time').textContent === 'step 20 of 20, 2.00 of 2.00 s'"
         )
@@ -80,7 +80,7 @@ def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, browser: Br
     assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
 
 
-def test_it_takes_the_place_of_nothing(episode: Episode, tmp_path: Path) -> None:
+def test_a_scene_page_overwrites_no_file(episode: Episode, tmp_path: Path) -> None:
     (tmp_path / "a.html").write_text("mine")
     with pytest.raises(FileExistsError):
         write_scene_html(tmp_path / "a.html", episode)

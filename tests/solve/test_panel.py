@@ -1,4 +1,4 @@
-"""The folder *Solve*: what it says of a plan, and what it asks the session for."""
+"""The folder *Solve*: its texts about a plan, and its requests to the session."""
 
 from __future__ import annotations
 
@@ -60,20 +60,20 @@ def solve(live_page: Live) -> Solve:
     return Solve(live_page)
 
 
-def test_it_tells_what_the_rollouts_earned_and_what_came_of_it(solve: Solve) -> None:
+def test_the_folder_shows_the_rollouts_returns_and_the_result(solve: Solve) -> None:
     solve.draw(source="random")
     assert not solve.live.part("Solve").seen
     solve.draw()
     part = solve.live.part("Solve")
     assert part.seen and part.field("Rollouts").value == 32 and part.field("Horizon").value == 0.5
-    for told in (
+    for words in (
         "Env 0 is solved at step 3",
         "3.5",
         "<b>1</b> in 3 steps",
         "5 rollouts in 0.25 s",
         "5 125 env-steps/s",
     ):
-        assert told in part.html()
+        assert words in part.html()
     (chart,) = part.charts()
     assert [list(line) for line in chart.data[1:]] == [
         pytest.approx([0.5, 0.6, 0.9]),
@@ -83,23 +83,23 @@ def test_it_tells_what_the_rollouts_earned_and_what_came_of_it(solve: Solve) -> 
     assert part.charts() == []
 
 
-def test_what_the_episode_earned_is_what_the_table_of_envs_says() -> None:
+def test_the_episodes_return_equals_the_env_tables() -> None:
     later = replace(SOLVED, begins=6)
     assert "<b>3</b> in 30 steps" in solve_html(later, rows_of(), 5)
-    assert "<b>20</b> in 33 steps" in solve_html(later, rows_of(), 1), "until the end"
-    assert "has earned" not in solve_html(later, rows_of(), 3), "it was not followed from its start"
+    assert "<b>20</b> in 33 steps" in solve_html(later, rows_of(), 1), "the return covers the whole episode"
+    assert "has earned" not in solve_html(later, rows_of(), 3), "the episode was not followed from its start"
 
 
-def test_without_a_plan_it_says_why_there_is_none() -> None:
+def test_without_a_plan_the_reason_is_shown() -> None:
     assert "building envs" in solve_html(SolveView("starting", activity="building envs"), None, 0)
     failed = solve_html(SolveView("failed", why="it is <b>random", problem=problem()), None, 0)
     assert "it is &lt;b&gt;random: KeyError" in failed and "push.py:88" in failed
     flat = replace(PLAN, returns=np.ones(5, np.float32), success_at=np.zeros(5, np.int32))
-    assert "nothing leads on" in solve_html(replace(SOLVED, plan=flat), None, 0)
-    assert "nothing leads on" not in solve_html(SOLVED, None, 0)
+    assert "show no direction" in solve_html(replace(SOLVED, plan=flat), None, 0)
+    assert "show no direction" not in solve_html(SOLVED, None, 0)
 
 
-def test_controls_ask_for_other_plans(solve: Solve) -> None:
+def test_controls_change_the_plan_options(solve: Solve) -> None:
     solve.draw()
     solve.live.set("Method", "CEM")
     solve.live.set("Plan for", ALL_ENVS)
@@ -114,10 +114,10 @@ def test_controls_ask_for_other_plans(solve: Solve) -> None:
         SetRollouts(rollouts=64),
         SetPlanEvery(every=2),
     ]
-    assert len(solve.live.client.notices) == 1, "too far"
+    assert len(solve.live.client.notices) == 1, "the horizon is out of range"
 
 
-def test_a_solved_episode_is_saved_and_a_playing_one_is_not_offered(solve: Solve) -> None:
+def test_a_solved_episode_can_be_saved_but_not_while_playing(solve: Solve) -> None:
     solve.draw(playing=True)
     assert not solve.live.shows(SAVE_SOLVED)
     solve.draw()
@@ -132,17 +132,17 @@ def test_a_solved_episode_is_saved_and_a_playing_one_is_not_offered(solve: Solve
     assert not solve.live.shows(SAVE_SOLVED)
 
 
-def test_a_success_is_told_once_for_each_episode(solve: Solve, monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[str] = []
+def test_a_success_is_announced_once_per_episode(solve: Solve, monkeypatch: pytest.MonkeyPatch) -> None:
+    announced: list[str] = []
     monkeypatch.setattr(
-        "workbench.solve.panel.tell_all", lambda server, title, text, **more: told.append(text)
+        "workbench.solve.panel.tell_all", lambda server, title, text, **more: announced.append(text)
     )
     for view in (SolveView(), SOLVED, SOLVED, SolveView(), SOLVED):
         solve.draw(view)
-    assert told == ["Env 0 is solved at step 3."] * 2
+    assert announced == ["Env 0 is solved at step 3."] * 2
 
 
-def test_a_rollout_of_the_last_plan_can_be_looked_at_while_it_is_paused(solve: Solve) -> None:
+def test_a_rollout_of_the_last_plan_can_be_viewed_while_paused(solve: Solve) -> None:
     solve.draw(playing=True)
     assert not solve.live.shows("Look at")
     solve.draw()
@@ -159,22 +159,22 @@ def test_a_rollout_of_the_last_plan_can_be_looked_at_while_it_is_paused(solve: S
     assert in_words(replace(PLAN, drawn=(0, 1, 3)), 2).startswith("Rollout 4 of 5: return 1")
 
 
-def test_the_ways_are_in_the_view_unless_the_past_is_shown_or_a_person_hides_them(solve: Solve) -> None:
-    def ways() -> int:
+def test_rollout_paths_are_drawn_unless_the_past_is_shown_or_they_are_hidden(solve: Solve) -> None:
+    def path_nodes() -> int:
         return len(solve.live.nodes("/rollouts"))
 
     solve.draw()
-    assert ways() == 1
+    assert path_nodes() == 1
     solve.draw(timeline=replace(running(2).timeline, shown=0))
-    assert ways() == 0
+    assert path_nodes() == 0
     solve.draw()
-    assert ways() == 1
+    assert path_nodes() == 1
     solve.live.set("Show rollouts", False)
     solve.draw()
-    assert ways() == 0
+    assert path_nodes() == 0
 
 
-def test_the_control_mode_in_which_plans_are_found_is_offered_where_the_robot_has_it(solve: Solve) -> None:
+def test_the_control_mode_that_suits_planning_is_offered_if_the_robot_has_it(solve: Solve) -> None:
     solve.draw()
     assert not solve.live.shows(USE_MODE)
     choices = ('"pd_ee_delta_pose"', '"pd_joint_delta_pos"')
@@ -189,6 +189,6 @@ def test_the_control_mode_in_which_plans_are_found_is_offered_where_the_robot_ha
     assert not solve.live.shows(USE_MODE)
 
 
-def test_the_usual_horizon_is_shown_in_seconds() -> None:
+def test_the_default_horizon_is_converted_to_seconds() -> None:
     assert horizon_seconds(PlanOptions(), 0.05) == pytest.approx(0.5)
     assert horizon_seconds(PlanOptions(horizon=1.0), 0.05) == pytest.approx(1.0)

@@ -36,7 +36,7 @@ def planned(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     return record(replace(PLANNED, out=tmp_path_factory.mktemp("planned")))
 
 
-def test_an_episode_says_how_it_was_planned_and_what_its_rollouts_earned(planned: Recorded) -> None:
+def test_an_episode_records_its_planner_and_its_rollouts_returns(planned: Recorded) -> None:
     for written in planned.written:
         episode, of_plans = read_episode(written.path), written.planned
         assert episode.info.acted_by == ((0, "solve (mppi, 8 rollouts of 4 steps)"),)
@@ -66,7 +66,7 @@ def test_planned_episodes_are_the_same_on_any_number_of_envs_and_processes(
 
 
 @pytest.mark.slow
-def test_an_episode_goes_on_after_its_success_where_that_is_asked_for(tmp_path: Path) -> None:
+def test_after_success_sets_how_long_an_episode_continues(tmp_path: Path) -> None:
     easy = tmp_path / "easy.py"
     easy.write_text(
         "from mani_skill.envs.tasks import PushCubeEnv\n"
@@ -81,7 +81,7 @@ def test_an_episode_goes_on_after_its_success_where_that_is_asked_for(tmp_path: 
     assert steps == [2, 5, 9]
 
 
-def test_a_mistake_in_a_rollout_is_told_at_its_line(tmp_path: Path) -> None:
+def test_an_error_in_a_rollout_is_reported_at_its_line(tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.py"
     wrong.write_text(
         "from mani_skill.envs.tasks import PushCubeEnv\n"

@@ -1,4 +1,4 @@
-"""The open task solved from many seeds in processes beside."""
+"""Solving the open task from many seeds in other processes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.session import TASKS, Told, told_session
+from tests.drive.session import TASKS, FakeWorkerSession, fake_worker_session
 from tests.drive.waiting import until
 from workbench.checks.commands import ChooseSeeds, SolveSeeds, StopSolving
 from workbench.page.command import Refused
@@ -24,21 +24,21 @@ MADE = TaskOptions(
 
 
 @contextmanager
-def solving(task: object, recordings: Path) -> Iterator[Told]:
-    with told_session(recordings, task) as told:
-        told.session.change(plan=FEW)
-        told.load(options=MADE)
-        yield told
+def solving(task: object, recordings: Path) -> Iterator[FakeWorkerSession]:
+    with fake_worker_session(recordings, task) as fake:
+        fake.session.change(plan=FEW)
+        fake.load(options=MADE)
+        yield fake
 
 
-def solve(told: Told, seeds: int) -> SeedsView:
-    told.session.do(ChooseSeeds(seeds=seeds))
-    told.session.do(SolveSeeds())
-    return told.view.of(SeedsView)
+def solve(fake: FakeWorkerSession, seeds: int) -> SeedsView:
+    fake.session.do(ChooseSeeds(seeds=seeds))
+    fake.session.do(SolveSeeds())
+    return fake.view.of(SeedsView)
 
 
 @pytest.mark.slow
-def test_each_seed_is_solved_recorded_and_told_and_what_is_done_stays_when_it_is_stopped(
+def test_each_seed_is_solved_recorded_and_reported_and_results_stay_after_a_stop(
     child_process: None, tmp_path: Path
 ) -> None:
     with solving(str(TASKS / "push_cube.py"), tmp_path / "recordings") as told:
@@ -61,7 +61,7 @@ def test_each_seed_is_solved_recorded_and_told_and_what_is_done_stays_when_it_is
 
 
 @pytest.mark.slow
-def test_a_task_that_fails_says_where(child_process: None, tmp_path: Path) -> None:
+def test_a_task_that_fails_is_reported_with_its_line(child_process: None, tmp_path: Path) -> None:
     file = tmp_path / "broken.py"
     file.write_text("raise KeyError('goal')\n")
     with solving(str(file), tmp_path / "recordings") as told:
@@ -77,13 +77,13 @@ def test_a_task_that_fails_says_where(child_process: None, tmp_path: Path) -> No
     assert "KeyError" in view.problem.message and view.report is None
 
 
-def test_a_task_that_a_recording_names_is_not_run_from_the_disk(tmp_path: Path) -> None:
+def test_a_task_named_by_a_recording_is_not_run_from_disk(tmp_path: Path) -> None:
     with solving(RecordedTask("PushCube-v1"), tmp_path / "recordings") as told:
         view = solve(told, 2)
     assert view.state == "failed" and "open its file" in view.why
 
 
-def test_without_a_task_there_is_nothing_to_solve(told: Told) -> None:
+def test_solving_seeds_is_refused_without_a_task(fake: FakeWorkerSession) -> None:
     with pytest.raises(Refused):
-        solve(told, 2)
-    assert (told.view.of(SeedsView).state, told.view.of(SeedsView).chosen) == ("none", 2)
+        solve(fake, 2)
+    assert (fake.view.of(SeedsView).state, fake.view.of(SeedsView).chosen) == ("none", 2)

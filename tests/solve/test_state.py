@@ -1,4 +1,4 @@
-"""The source of actions *solve* in a real session: plans of a process beside are followed until the task is solved."""
+"""The action source *solve* in a real session: plans of another process are followed until the task is solved."""
 
 from __future__ import annotations
 
@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, Told, heard, live_session, start_over, step, wait_until
+from tests.drive.session import (
+    TASKS,
+    FakeWorkerSession,
+    after_worker_reply,
+    live_session,
+    start_over,
+    step,
+    wait_until,
+)
 from workbench.app.session import Session
 from workbench.live.commands import Interrupt, PauseRun, PlayRun, Step
 from workbench.live.messages import PlanDropped, PlanWanted, Play
@@ -20,7 +28,7 @@ from workbench.record.state import RecordingStatus
 from workbench.solve.state import SolveView
 
 FEW = PlanOptions(rollouts=16, horizon=0.3, noise=0.8)
-"""Enough for a cube that is pushed."""
+"""Enough to push a cube."""
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +46,7 @@ def session(child_process: None, file: Path, tmp_path_factory: pytest.TempPathFa
         yield session
 
 
-def test_what_an_episode_came_to_is_kept_until_it_is_over(played: Told) -> None:
+def test_an_episodes_result_is_kept_until_the_next_episode(played: FakeWorkerSession) -> None:
     change = played.session.change
     change(action_source="solve")
     played.reset()
@@ -52,7 +60,7 @@ def test_what_an_episode_came_to_is_kept_until_it_is_over(played: Told) -> None:
     played.reset((0,))
     assert played.view.of(SolveView).solved == () and len(played.view.of(SolveView).achieved) == 0
     played.step(success=(0,))
-    assert played.view.of(SolveView).solved == ((0, 1),), "and of the next episode the same"
+    assert played.view.of(SolveView).solved == ((0, 1),), "the next episode's success is shown, too"
     played.session.do(PlayRun())
     played.asked(object)
     played.tell(PlanWanted(5, (0,), why_not="it cannot be copied"))
@@ -60,14 +68,14 @@ def test_what_an_episode_came_to_is_kept_until_it_is_over(played: Told) -> None:
     assert solve.state == "failed" and "cannot be copied" in solve.why
     assert [play.playing for play in played.asked(Play)] == [False] and not played.view.playing
     played.tell(PlanDropped())
-    assert played.view.of(SolveView).state == "failed", "it is said until something is planned"
+    assert played.view.of(SolveView).state == "failed", "the failure is shown until something is planned"
     change(action_source="random")
     played.step()
     assert played.view.of(SolveView).solved == () and len(played.view.of(SolveView).achieved) == 0
 
 
 @pytest.mark.slow
-def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(session: Session) -> None:
+def test_playing_stops_when_the_selected_env_is_solved_and_other_envs_hold_still(session: Session) -> None:
     start_over(session, 3)
     before = session.view().step
     session.do(PlayRun())
@@ -79,7 +87,7 @@ def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(ses
     assert view.of(SolveView).solved == ((0, view.of(SolveView).solved_at),)
     assert step.evaluate["success"].tolist() == [True, False]
     assert step.elapsed_steps[0] == view.of(SolveView).solved_at == len(view.of(SolveView).achieved)
-    # The cube of the other env lies where it lay.
+    # The other env's cube has not moved.
     assert view.task is not None
     cube = view.task.geometry.body_names.index("cube")
     assert np.abs(step.poses[1, cube] - before.poses[1, cube]).max() < 1e-3
@@ -87,14 +95,14 @@ def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(ses
     assert plan is not None and plan.horizon == 6 and plan.actions.shape == (1, 7)
     assert len(plan.returns) == 16 and (np.diff(plan.returns) <= 0).all()
     assert plan.paths.shape == (16, 7, 3) and plan.traced == "panda/panda_hand_tcp"
-    # What is predicted and what comes is of one size: the best of the last plan is a success.
+    # Predicted and achieved rewards have the same scale: the best rollout of the last plan succeeds.
     assert np.isfinite(view.of(SolveView).predicted).all() and view.of(SolveView).predicted[
         -1
     ] == pytest.approx(1, abs=0.6)
     session.happen(SaveWanted((0,)))
     view = wait_until(session, lambda view: bool(view.of(RecordingStatus).saving.message), "the recording")
     assert view.of(RecordingStatus).episodes_written == 1 and not view.of(RecordingStatus).saving.failed, (
-        "it is kept like any other"
+        "the recording must be stored like any other"
     )
 
 
@@ -109,13 +117,13 @@ def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(ses
         session, lambda view: not view.playing and view.of(SolveView).state == "none", "the pause"
     )
     serial = session.view().step_serial
-    view = heard(session)
+    view = after_worker_reply(session)
     assert view.step_serial - serial <= 1 and view.of(SolveView).state == "none"
 
 
-def test_a_wish_that_comes_after_the_pause_was_sent_is_not_planned_for(session: Session) -> None:
+def test_a_plan_request_that_arrives_after_a_pause_is_dropped(session: Session) -> None:
     start_over(session, 4)
-    # Some of these pauses meet the worker's wish on its way.
+    # Some of these pauses cross the worker's plan request.
     for after in np.linspace(0, 0.03, 7):
         session.do(PlayRun())
         time.sleep(after)
@@ -124,7 +132,7 @@ def test_a_wish_that_comes_after_the_pause_was_sent_is_not_planned_for(session: 
         wait_until(session, lambda view: not view.playing and view.of(SolveView).state == "none", "the end")
 
 
-def test_a_pressed_step_is_made_also_if_another_env_is_selected_while_it_is_planned(session: Session) -> None:
+def test_a_pressed_step_is_taken_even_if_another_env_is_selected_meanwhile(session: Session) -> None:
     start_over(session, 4)
     last = session.view().timeline.last
     session.do(Step())
@@ -135,12 +143,12 @@ def test_a_pressed_step_is_made_also_if_another_env_is_selected_while_it_is_plan
 
 
 @pytest.mark.slow
-def test_a_pressed_step_that_waited_for_its_plan_is_found_hanging_and_can_be_interrupted(
+def test_a_planned_step_that_hangs_is_detected_and_can_be_interrupted(
     session: Session, file: Path, tmp_path: Path
 ) -> None:
     text = file.read_text()
     hangs = tmp_path / "hangs"
-    # Rollouts are more than two.
+    # Only the task hangs: rollouts have more than two envs.
     loop = f"        while self.num_envs == 2 and __import__('os').path.exists({str(hangs)!r}):\n            pass\n"
     serial = session.view().task_serial
     file.write_text(text.replace("        return reward\n", f"{loop}        return reward\n"))
@@ -148,7 +156,7 @@ def test_a_pressed_step_that_waited_for_its_plan_is_found_hanging_and_can_be_int
     start_over(session, 4)
     hangs.touch()
     session.do(Step())
-    view = wait_until(session, lambda view: view.busy is not None, "that it hangs")
+    view = wait_until(session, lambda view: view.busy is not None, "the hang to be detected")
     assert view.busy is not None and view.busy.file == str(file)
     session.do(Interrupt())
     view = wait_until(session, lambda view: view.problem is not None and view.busy is None, "the interrupt")
@@ -156,10 +164,10 @@ def test_a_pressed_step_that_waited_for_its_plan_is_found_hanging_and_can_be_int
     hangs.unlink()
     step(session)
     file.write_text(text)
-    wait_until(session, lambda view: view.task_serial > serial + 1, "the version before")
+    wait_until(session, lambda view: view.task_serial > serial + 1, "the original version")
 
 
-def test_another_body_is_traced_and_all_envs_are_planned_for_in_turn(session: Session) -> None:
+def test_another_body_can_be_traced_and_all_envs_planned_in_turn(session: Session) -> None:
     start_over(session, 5)
     session.change(solve_all=True, traced="cube", plan=replace(FEW, every=2))
     session.do(PlayRun())
@@ -171,12 +179,12 @@ def test_another_body_is_traced_and_all_envs_are_planned_for_in_turn(session: Se
     session.change(solve_all=False, traced="", plan=FEW, selected_env=0)
 
 
-def test_a_save_is_planned_with_and_one_that_fails_in_a_rollout_says_where(
+def test_a_saved_version_is_used_for_planning_and_its_errors_are_reported_at_their_line(
     session: Session, file: Path
 ) -> None:
     text = file.read_text()
     start_over(session, 6)
-    # It fails later than a load tries it.
+    # It fails later than a load's trial steps.
     broken = "        if (self.elapsed_steps > 4).any():\n            raise ValueError('too far')\n        return reward\n"
     assert text.count("        return reward\n") == 1
     serial = session.view().task_serial
@@ -188,6 +196,6 @@ def test_a_save_is_planned_with_and_one_that_fails_in_a_rollout_says_where(
     problem = view.of(SolveView).problem
     assert problem is not None and problem.message == "ValueError: too far" and problem.file == str(file)
     file.write_text(text)
-    wait_until(session, lambda view: view.task_serial > serial + 1, "the mended version")
+    wait_until(session, lambda view: view.task_serial > serial + 1, "the fixed version")
     step(session)
     assert session.view().of(SolveView).state == "planning"

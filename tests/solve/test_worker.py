@@ -1,4 +1,4 @@
-"""Plans in the worker: asked for once a moment, followed while nothing else moves the envs, and made by rollouts."""
+"""Plans in the worker: requested once per state, followed until something else moves the envs, and made by rollouts."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def plan(push: OpenedTask) -> Iterator[Callable[..., tuple[PlannedEnv, ...]]]:
     plans.close()
 
 
-def test_each_env_gets_a_plan_of_its_own_and_what_its_rollouts_earned(
+def test_each_env_gets_its_own_plan_with_its_rollouts_returns(
     push: OpenedTask, plan: Callable[..., tuple[PlannedEnv, ...]]
 ) -> None:
     poses = push.env.reset(3).poses
@@ -62,45 +62,45 @@ def test_each_env_gets_a_plan_of_its_own_and_what_its_rollouts_earned(
     assert one.actions.shape == (1, 7) and not np.array_equal(one.returns, other.returns)
     assert (np.diff(one.returns) <= 0).all() and {one.plan, one.hold} <= set(range(6))
     assert one.paths.shape == (6, 5, 3) and one.drawn == tuple(range(6)) and len(one.drawn) <= MAX_PATHS
-    # They begin where the hand is.
+    # Paths start at the hand.
     hand = push.description.geometry.body_names.index("panda/panda_hand_tcp")
     assert np.abs(one.paths[:, 0] - poses[0, hand, :3]).max() < 1e-5
 
 
-def test_a_plan_is_asked_for_once_and_dropped_if_anything_else_moved_the_envs(push: OpenedTask) -> None:
-    asked: list[PlanWanted] = []
+def test_a_plan_is_requested_once_and_dropped_if_something_else_moved_the_envs(push: OpenedTask) -> None:
+    requested: list[PlanWanted] = []
     dropped: list[PlanDropped] = []
 
     def send(event: PlanWanted | PlanDropped) -> None:
         if isinstance(event, PlanWanted):
-            asked.append(event)
+            requested.append(event)
         else:
             dropped.append(event)
 
     followed = FollowedPlan(send)
     assert not followed.ready(push, 5, [1]) and not followed.ready(push, 5, [1])
-    assert [(one.number, one.env_idx) for one in asked] == [(5, (1,))] and followed.awaited
-    assert pickle.loads(asked[0].snapshot).env_idx == (1,)
-    assert asked[0].bodies == bodies_in(push, [1]) and "cube" in asked[0].bodies[0]
+    assert [(one.number, one.env_idx) for one in requested] == [(5, (1,))] and followed.awaited
+    assert pickle.loads(requested[0].snapshot).env_idx == (1,)
+    assert requested[0].bodies == bodies_in(push, [1]) and "cube" in requested[0].bodies[0]
     actions = np.full((2, 1, 7), 0.25, np.float32)
     followed.take(FollowPlan(4, (1,), actions))
-    assert followed.awaited, "a plan of another moment"
+    assert followed.awaited, "a plan for another state must be ignored"
     followed.take(FollowPlan(5, (1,), actions))
     assert followed.ready(push, 5, [1]) and not followed.awaited
     action = followed.next_action(push.env, 5)
     assert (action[1] == 0.25).all() and not (action[0] == 0.25).any()
-    assert followed.ready(push, 6, [1]) and len(asked) == 1
-    # A reset came between.
-    assert not followed.ready(push, 7, [1]) and len(asked) == 2 and not dropped
+    assert followed.ready(push, 6, [1]) and len(requested) == 1
+    # A reset in between invalidates the plan.
+    assert not followed.ready(push, 7, [1]) and len(requested) == 2 and not dropped
     followed.forget()
     assert len(dropped) == 1
     followed.forget()
-    assert len(dropped) == 1, "nothing was wanted since"
+    assert len(dropped) == 1, "nothing was requested since"
     followed.take(FollowPlan(7, (1,), actions))
     assert not followed.ready(push, 7, [1])
 
 
-def test_what_is_solved_is_not_planned_for_until_all_is(push: OpenedTask) -> None:
+def test_solved_envs_get_no_plan_until_all_are_solved(push: OpenedTask) -> None:
     last = push.env.reset(3)
     assert envs_to_plan(Settings(selected_env=1), push.env, last) == [1]
     every = Settings(solve_all=True)

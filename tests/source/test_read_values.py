@@ -1,4 +1,4 @@
-"""Where the values of a running call stand: each call is made by a text that really runs."""
+"""Finds where the values of a running call are written; each call is made by source text that really runs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PLACES = "/author/places.py"
 
 
 def traced(text: str, others: Mapping[str, str] | None = None, **instead: Any) -> tuple[Project, Trace]:
-    """Of the last call of ``note(a, b)`` that the text makes; `instead` is what it came to have in place of that."""
+    """Trace the last call of ``note(a, b)`` in the text. `instead` replaces the values of its arguments."""
     sources = {FILE: HEAD + text, **(others or {})}
     project = Project(sources)
     found: list[Trace | None] = []
@@ -43,23 +43,25 @@ def traced(text: str, others: Mapping[str, str] | None = None, **instead: Any) -
     return project, found[-1]
 
 
-def told(text: str, others: Mapping[str, str] | None = None, **instead: Any) -> str:
-    """What is said of the first argument: its text with what is changed in it, and the names that led there."""
+def described(text: str, others: Mapping[str, str] | None = None, **instead: Any) -> str:
+    """Describe the trace of the first argument: its text, the values changed in it, and the names that led there."""
     project, trace = traced(text, others, **instead)
     if "a" in trace.unknown:
         assert "a" not in trace.parts
         return trace.unknown["a"]
-    return said(project, trace.parts["a"])
+    return description_of(project, trace.parts["a"])
 
 
-def said(project: Project, part: TracedValue) -> str:
+def description_of(project: Project, part: TracedValue) -> str:
     text = project.texts[part.at.file][part.at.start : part.at.end]
     inside = ""
     if "of" in part.parts:
         per = "degrees" if part.slope == DEGREE else f"{part.slope:g}"
-        inside = f" {{{said(project, part.parts['of'])} times {per} plus {round(part.offset, 5) + 0:g}}}"
+        inside = (
+            f" {{{description_of(project, part.parts['of'])} times {per} plus {round(part.offset, 5) + 0:g}}}"
+        )
     elif part.parts:
-        inside = f" {{{', '.join(said(project, item) for item in part.parts.values())}}}"
+        inside = f" {{{', '.join(description_of(project, item) for item in part.parts.values())}}}"
     reads = [
         project.texts[read.at.file][read.at.start : read.at.end]
         + (f" ({read.others})" if read.others else "")
@@ -87,7 +89,7 @@ def said(project: Project, part: TracedValue) -> str:
         ("H = 0.2\nnote(H - 0.5 + 0.25)", "H - 0.5 + 0.25 {0.25 times 1 plus -0.3}"),
         ("H = 0.2\nnote(2 * H)", "2 * H"),
         ("V = np.array([1, 2])\nnote(V + [0, 1])", "V + [0, 1]"),
-        # Functions that only hold what they are given.
+        # Functions that only store their arguments.
         ("note(float(2))", "2"),
         ("note(np.array([1, 2]))", "[1, 2] {1, 2}"),
         ("V = [1, 2]\nnote(torch.tensor(V))", "torch.tensor(V) {1 < V, 2 < V}"),
@@ -109,8 +111,8 @@ def said(project: Project, part: TracedValue) -> str:
         ("L, I = (1, 2), 1\nnote(L[I])", "2 < L[I]"),
     ],
 )
-def test_a_value_is_followed_to_where_it_is_written(text: str, what: str) -> None:
-    assert told(text) == what
+def test_a_value_is_traced_to_where_it_is_written(text: str, what: str) -> None:
+    assert described(text) == what
 
 
 @pytest.mark.parametrize(
@@ -127,7 +129,7 @@ def test_a_value_is_followed_to_where_it_is_written(text: str, what: str) -> Non
         ("X = 1\nX += 1\nnote(X)", "`X` cannot be read in the file: it is computed"),
         ("L = [1, 2]\nL[0] = 3\nnote(L)", "`L` cannot be read in the file: a part of it is set"),
         ("for x in (1,):\n    note(x)", "`x` cannot be read in the file: it changes in a loop"),
-        ("L = [1, 2]\nnote(L[int(0)])", "`L[int(0)]` depends on what only the running task knows"),
+        ("L = [1, 2]\nnote(L[int(0)])", "`L[int(0)]` depends on a value that only the running task has"),
         ('D = {**{"x": 1}, "y": 2}\nnote(D["y"])', '`D["y"]` is computed when the task runs'),
         (
             "class A(list):\n    def __eq__(self, other):\n        return self.pop() == other\n"
@@ -140,17 +142,17 @@ def test_a_value_is_followed_to_where_it_is_written(text: str, what: str) -> Non
         ),
     ],
 )
-def test_what_cannot_be_followed_is_unknown_with_the_reason(text: str, why: str) -> None:
-    assert told(text, {PLACES: ""}) == why
+def test_an_untraceable_value_is_unknown_with_the_reason(text: str, why: str) -> None:
+    assert described(text, {PLACES: ""}) == why
 
 
-def test_a_call_that_came_to_have_another_value_is_computed() -> None:
-    assert told("X = 1.5\nnote(X)", a=1.5000001) == "1.5 < X"
-    assert told("X = 1.5\nnote(X)", a=1.6) == "`X` is computed when the task runs"
-    assert told("X = [1, 2]\nnote(X)", a=[1, 2, 3]) == "`X` is computed when the task runs"
-    assert told("note('x')", a="y") == "`'x'` is computed when the task runs"
-    assert told("note(None)", a=0.0) == "`None` is computed when the task runs"
-    assert told("note(None)", a=np.zeros(1)) == "`None` is computed when the task runs"
+def test_a_value_that_differs_from_the_text_is_computed() -> None:
+    assert described("X = 1.5\nnote(X)", a=1.5000001) == "1.5 < X"
+    assert described("X = 1.5\nnote(X)", a=1.6) == "`X` is computed when the task runs"
+    assert described("X = [1, 2]\nnote(X)", a=[1, 2, 3]) == "`X` is computed when the task runs"
+    assert described("note('x')", a="y") == "`'x'` is computed when the task runs"
+    assert described("note(None)", a=0.0) == "`None` is computed when the task runs"
+    assert described("note(None)", a=np.zeros(1)) == "`None` is computed when the task runs"
 
 
 TASK = """\
@@ -192,7 +194,7 @@ task.hook()
     ],
 )
 def test_attributes_are_those_of_the_running_object(call: str, what: str) -> None:
-    assert told(TASK.format(call)) == what
+    assert described(TASK.format(call)) == what
 
 
 OTHER = """
@@ -207,23 +209,25 @@ class Other:
 """
 
 
-def test_an_attribute_of_a_class_that_the_object_is_none_of_is_another() -> None:
+def test_an_attribute_of_an_unrelated_class_is_not_followed() -> None:
     note = TASK.format("note(self.own)")
-    assert told(OTHER.format("pass") + note) == "3.5 < self.own"
-    assert told(f"import places\n{note}", {PLACES: OTHER.format("pass")}) == "3.5 < self.own"
-    # A parameter may be any object, and a class that inherits both has the attribute from either.
-    assert "places.py:9 in Other.move" in told(
+    assert described(OTHER.format("pass") + note) == "3.5 < self.own"
+    assert described(f"import places\n{note}", {PLACES: OTHER.format("pass")}) == "3.5 < self.own"
+    # A parameter may be any object, and a class that inherits from both gets the attribute from either.
+    assert "places.py:9 in Other.move" in described(
         f"import places\n{note}", {PLACES: OTHER.format("task.own = 1.0")}
     )
     both = OTHER.format("pass") + note.replace("class Task(Parent)", "class Task(Parent, Other)")
-    assert "in Other.__init__" in told(both) and "in Task.__init__" in told(both)
+    assert "in Other.__init__" in described(both) and "in Task.__init__" in described(both)
     child = note.replace(
         "task = Task()", "class Child(Task):\n    def look(self): return self.own\n\ntask = Task()"
     )
-    assert told(child).startswith("3.5 < self.own (line "), "editing the line would change the child's too"
+    assert described(child).startswith("3.5 < self.own (line "), (
+        "editing the line would change the child's too"
+    )
 
 
-def test_a_call_whose_owner_is_made_anew_is_not_made_again() -> None:
+def test_a_call_on_a_newly_created_owner_is_not_repeated() -> None:
     text = """\
 made = []
 class Eye:
@@ -234,7 +238,7 @@ def eye():
 note(eye().x)
 assert len(made) == 1
 """
-    assert told(text) == "`eye().x` is computed when the task runs"
+    assert described(text) == "`eye().x` is computed when the task runs"
 
 
 @pytest.mark.parametrize(
@@ -263,19 +267,19 @@ assert len(made) == 1
         ),
     ],
 )
-def test_constants_of_files_beside_it_are_followed_there(text: str, others: str, what: str) -> None:
+def test_constants_are_traced_into_neighbour_files(text: str, others: str, what: str) -> None:
     more = {"/author/more.py": "X = 1.5"} if "more" in others else {}
-    assert told(text, {**more, PLACES: others}) == what
+    assert described(text, {**more, PLACES: others}) == what
 
 
-def test_of_several_lines_the_one_with_the_running_value_is_meant() -> None:
+def test_of_several_assignments_the_one_with_the_running_value_is_chosen() -> None:
     text = "X = 1.5\ndef f():\n    note(X)\nif len('ab') > 1:\n    X = 2.5\nelse:\n    X = max(3, 4)\nf()"
-    assert told(text) == "2.5 < X"
+    assert described(text) == "2.5 < X"
     text = text.removesuffix("f()") + "vars()['X'] = 7.5\nf()"
-    assert told(text) == "`X` gets other values than its current one in lines 9 and 13 and 15"
+    assert described(text) == "`X` gets other values than its current one in lines 9 and 13 and 15"
 
 
-def test_values_within_a_function_are_those_of_its_frame() -> None:
+def test_values_in_a_function_are_read_from_its_frame() -> None:
     text = """\
 X = 1.5
 def f(flag):
@@ -289,4 +293,4 @@ def f(flag):
     g()
 f(False)
 """
-    assert told(text) == "[X, Y] {3.5 < X, 4.5 < Y}"
+    assert described(text) == "[X, Y] {3.5 < X, 4.5 < Y}"

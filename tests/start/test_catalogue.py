@@ -1,4 +1,4 @@
-"""The list of tasks: what is in it, what is refused, and what comes of ManiSkill's cached pictures."""
+"""The list of tasks: its entries, what it refuses, and ManiSkill's cached thumbnails."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from workbench.machine.loop import do, result_of
 from workbench.start import catalogue as catalogue_module
 from workbench.start import registered as registered_module
@@ -30,7 +30,7 @@ TASK = "class Task(BaseEnv): pass\n"
 
 
 def cached(folder: Path, ids: list[str], **more: object) -> Path:
-    """A cache in which nothing is left to draw."""
+    """Write a complete thumbnail cache."""
     folder.mkdir(parents=True, exist_ok=True)
     gone = {
         one: {"text": "needs ycb", "needs_download": True, "tries": 9, "last": time.time()} for one in ids
@@ -73,9 +73,7 @@ def listed(catalogue: Catalogue, *in_folder: str) -> dict[Section, list[Entry]]:
     return rows_of(catalogue)
 
 
-def test_all_sections_are_there_and_say_what_is_opened(
-    made: Callable[..., Catalogue], tmp_path: Path
-) -> None:
+def test_all_sections_are_listed_with_what_they_open(made: Callable[..., Catalogue], tmp_path: Path) -> None:
     catalogue = made()
     (tmp_path / "work/sub").mkdir()
     (tmp_path / "work/sub/push.py").write_text(f"@register_env('Push-v1')\n{TASK}")
@@ -94,7 +92,7 @@ def test_all_sections_are_there_and_say_what_is_opened(
     assert (pick.reference, pick.file, pick.blank) == ("PickCube-v1", None, "needs a download")
 
 
-def test_only_a_listed_number_is_an_entry_and_it_is_never_anothers(
+def test_only_a_listed_number_is_an_entry_and_numbers_are_not_reused(
     made: Callable[..., Catalogue], tmp_path: Path
 ) -> None:
     catalogue = made()
@@ -113,7 +111,7 @@ def test_only_a_listed_number_is_an_entry_and_it_is_never_anothers(
     assert again == {"push.py": entry.number, "other.py": other.number}
 
 
-def test_the_list_follows_its_folder_and_stays_the_same_while_nothing_changes(
+def test_the_list_follows_its_folder_and_is_unchanged_without_changes(
     made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(catalogue_module, "SEARCH_SECONDS", 0.02)
@@ -149,7 +147,7 @@ def test_the_list_follows_its_folder_and_stays_the_same_while_nothing_changes(
     assert catalogue.view() is view
 
 
-def test_a_list_that_nobody_looks_at_does_not_follow_its_folder(
+def test_a_list_that_is_not_shown_does_not_follow_its_folder(
     made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(catalogue_module, "SEARCH_SECONDS", 0.01)
@@ -160,7 +158,7 @@ def test_a_list_that_nobody_looks_at_does_not_follow_its_folder(
         catalogue_module, "find_task_files", lambda *given: (searches.append(1), find(*given))[1]
     )
     catalogue = made()
-    assert not catalogue.view().entries, "nothing is looked for before somebody asks"
+    assert not catalogue.view().entries, "there is no search before a request"
     catalogue.refresh()
 
     def rests() -> bool:
@@ -169,10 +167,10 @@ def test_a_list_that_nobody_looks_at_does_not_follow_its_folder(
 
     until(rests, "an end of the searches")
     before = len(searches)
-    until(lambda: catalogue.view() and len(searches) > before, "another search, once somebody looks")
+    until(lambda: catalogue.view() and len(searches) > before, "another search, once the list is shown")
 
 
-def test_what_changes_behind_a_search_that_is_under_way_is_found_by_the_next(
+def test_a_change_during_a_search_is_found_by_the_next_search(
     made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     passed_by, go_on, search = threading.Event(), threading.Event(), catalogue_module.find_task_files
@@ -180,14 +178,14 @@ def test_what_changes_behind_a_search_that_is_under_way_is_found_by_the_next(
     def slow(*asked: Any) -> Any:
         found = search(*asked)
         passed_by.set()
-        go_on.wait(PATIENCE)
+        go_on.wait(TIMEOUT_SECONDS)
         return found
 
     catalogue, file = made(), tmp_path / "work" / "push.py"
     file.write_text(TASK)
     monkeypatch.setattr(catalogue_module, "find_task_files", slow)
     catalogue.refresh()
-    assert passed_by.wait(PATIENCE)
+    assert passed_by.wait(TIMEOUT_SECONDS)
     file.unlink()
     catalogue.refresh()
     go_on.set()
@@ -235,7 +233,7 @@ def test_a_typed_path_is_a_row(
         ("/\ud800.py", "surrogates"),
     ],
 )
-def test_what_is_wrong_with_a_typed_path_is_told(
+def test_an_invalid_typed_path_is_explained(
     made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, said: str
 ) -> None:
     catalogue, work = made(), tmp_path / "work"
@@ -258,7 +256,7 @@ def jpeg() -> bytes:
     return written.getvalue()
 
 
-def test_a_cached_picture_is_shown_and_what_is_none_is_not(
+def test_a_cached_thumbnail_is_shown_and_an_invalid_one_is_not(
     made: Callable[..., Catalogue], tmp_path: Path
 ) -> None:
     catalogue = made(["Good-v1", "Bad-v1", "Large-v1"])
@@ -278,7 +276,7 @@ def test_maniskills_tasks_are_listed_and_drawn_once(child_process: None, tmp_pat
     first = RegisteredTasks(folder=tmp_path)
     first.start()
     first.start()
-    # Those that come first lack a download on most machines; they are told apart from what is broken.
+    # The first tasks lack a download on most machines; this is not shown as broken.
     until(lambda: first.view.pictures or first.view.problem, "a picture", 280, lambda: first.view)
     view = first.view
     first.close()
@@ -286,7 +284,7 @@ def test_maniskills_tasks_are_listed_and_drawn_once(child_process: None, tmp_pat
     drawn = next(iter(view.pictures))
     picture = Image.open(io.BytesIO(first.picture(drawn) or b""))
     assert picture.size == (registered_module.WIDTH_PIXELS, registered_module.HEIGHT_PIXELS)
-    assert np.asarray(picture).std() > 5, "something is to be seen on it"
+    assert np.asarray(picture).std() > 5, "the picture is not empty"
     again = RegisteredTasks(lambda: False, folder=tmp_path)
     again.start()
     until(lambda: again.view.pictures, "the cached one")
@@ -295,7 +293,7 @@ def test_maniskills_tasks_are_listed_and_drawn_once(child_process: None, tmp_pat
 
 
 class Process:
-    """Takes the place of the process of the pictures."""
+    """Replaces the process that draws the thumbnails."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(registered_module, "Background", self.made)
@@ -325,7 +323,7 @@ class Hanging(Process):
         await asyncio.Event().wait()
 
 
-def test_a_task_that_cannot_be_drawn_is_not_tried_for_ever(
+def test_a_task_that_cannot_be_drawn_is_not_retried_forever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     process = Process(monkeypatch)
@@ -339,7 +337,7 @@ def test_a_task_that_cannot_be_drawn_is_not_tried_for_ever(
     assert process.asked == ["A-v1"] * registered_module.MAX_TRIES
 
 
-def test_a_picture_that_takes_too_long_is_left_out_and_its_process_ends(
+def test_a_thumbnail_that_times_out_is_omitted_and_its_process_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     process = Hanging(monkeypatch)
@@ -351,7 +349,7 @@ def test_a_picture_that_takes_too_long_is_left_out_and_its_process_ends(
     tasks.close()
 
 
-def test_it_ends_in_the_middle_of_a_picture_and_begins_nothing_after_its_end(
+def test_close_stops_a_running_thumbnail_and_starts_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     process = Hanging(monkeypatch)

@@ -1,4 +1,4 @@
-"""The list of tasks on a page: search, sections, what is said where nothing is, and what is refused."""
+"""The list of tasks on a page: search, sections, texts of empty lists, and refusals."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ EVIL = Entry(3, Section.RECENT, "<b>x.py", "a & b", '/w/"><script>.py', Path("/w
 
 
 class Chosen:
-    """Keeps what was chosen."""
+    """Records the chosen entries."""
 
     def __init__(self, catalogue: Catalogue) -> None:
         self.catalogue, self.numbers = catalogue, list[int]()
@@ -78,7 +78,7 @@ def number_of(chosen: Chosen, name: str) -> int:
     return next(one.number for one in chosen.catalogue.view().entries if one.name == name)
 
 
-def test_a_press_on_a_row_chooses_it_and_what_is_not_listed_chooses_nothing(
+def test_a_press_on_a_row_chooses_it_and_an_unlisted_number_chooses_nothing(
     panels: Panels, chosen: Chosen
 ) -> None:
     done: list[bool] = []
@@ -94,7 +94,7 @@ def test_a_press_on_a_row_chooses_it_and_what_is_not_listed_chooses_nothing(
     assert chosen.numbers == [push] and done == [True]
 
 
-def test_the_search_leaves_what_has_all_words_and_can_be_cleared(panels: Panels, chosen: Chosen) -> None:
+def test_the_search_keeps_entries_with_all_words_and_can_be_cleared(panels: Panels, chosen: Chosen) -> None:
     listed = TaskList(panels.server, chosen)
     panels.visitors.do = listed.do
     panels.type("Search", "PUSH .py")
@@ -110,7 +110,7 @@ def test_the_search_leaves_what_has_all_words_and_can_be_cleared(panels: Panels,
     assert "pull.py" in panels.html("wb-tasks") and panels.typed("Search") == ""
 
 
-def test_enter_opens_the_first_that_is_not_open_or_says_that_there_is_none(
+def test_enter_opens_the_first_unopened_match_or_reports_that_there_is_none(
     panels: Panels, chosen: Chosen
 ) -> None:
     panels.visitors.do = TaskList(panels.server, chosen).do
@@ -125,7 +125,7 @@ def test_enter_opens_the_first_that_is_not_open_or_says_that_there_is_none(
     assert len(chosen.numbers) == 2 and len(panels.client.notices) == 1
 
 
-def test_a_path_is_looked_for_and_enter_opens_what_it_means_then(
+def test_a_path_is_searched_and_enter_opens_the_current_match(
     panels: Panels, chosen: Chosen, tmp_path: Path
 ) -> None:
     listed = TaskList(panels.server, chosen)
@@ -145,7 +145,7 @@ def test_a_path_is_looked_for_and_enter_opens_what_it_means_then(
     assert entry is not None and entry.file == file
     panels.type("Search", f"{file}:Other")
     until(lambda: f"{file}:Other</b>" in html(), "the row of the path", seen=html)
-    # What a quick hand types next counts, not what was looked for before.
+    # The newest typed text counts, not the finished search.
     for words in (f"{file}", "push.py"):
         panels.type("Search", words)
     panels.do(OpenFoundTask())
@@ -154,7 +154,9 @@ def test_a_path_is_looked_for_and_enter_opens_what_it_means_then(
 
 
 @pytest.mark.parametrize("words", ["a/\0.py", "/\x1b[31m\0", "file://[/x.py"])
-def test_words_that_no_path_can_have_leave_the_list_alive(panels: Panels, chosen: Chosen, words: str) -> None:
+def test_words_that_are_no_valid_path_do_not_break_the_list(
+    panels: Panels, chosen: Chosen, words: str
+) -> None:
     listed = TaskList(panels.server, chosen)
     panels.visitors.do = listed.do
     panels.type("Search", words)
@@ -163,7 +165,7 @@ def test_words_that_no_path_can_have_leave_the_list_alive(panels: Panels, chosen
     assert chosen.numbers == [] and len(panels.client.notices) == 1
 
 
-def test_the_best_match_is_a_file_that_is_there() -> None:
+def test_the_best_match_is_an_existing_file() -> None:
     gone, there, other = replace(PUSH, gone=True), PUSH, PICK
     assert best_row([gone, there, other], lambda row: False) == there
     assert best_row([gone, there, other], lambda row: row is there) == other
@@ -171,7 +173,7 @@ def test_the_best_match_is_a_file_that_is_there() -> None:
     assert best_row([gone], lambda row: False) == gone and best_row([], lambda row: False) is None
 
 
-def test_a_new_task_is_asked_for_by_its_name_and_its_template(panels: Panels, chosen: Chosen) -> None:
+def test_a_new_task_is_requested_with_name_and_template(panels: Panels, chosen: Chosen) -> None:
     done: list[bool] = []
     listed = TaskList(panels.server, chosen, lambda: done.append(True))
     panels.visitors.do = listed.do
@@ -189,7 +191,7 @@ def test_a_new_task_is_asked_for_by_its_name_and_its_template(panels: Panels, ch
 
 
 @pytest.mark.parametrize("name", ["x" * 201, "a\nb", "a\0b", "\u202eyp.kcats"])
-def test_a_name_that_no_file_can_have_is_refused(panels: Panels, chosen: Chosen, name: str) -> None:
+def test_an_invalid_file_name_is_refused(panels: Panels, chosen: Chosen, name: str) -> None:
     listed = TaskList(panels.server, chosen)
     panels.visitors.do = listed.do
     panels.set("Name", name)
@@ -201,12 +203,12 @@ def html(view: CatalogueView) -> str:
     return tasks_html(view, Search(), "")
 
 
-def test_names_are_escaped_and_what_is_gone_says_so() -> None:
+def test_names_are_escaped_and_missing_files_are_marked() -> None:
     text = html(CatalogueView((EVIL,)))
     assert "&lt;b&gt;x.py" in text and "<script>" not in text and "gone · a &amp; b" in text
 
 
-def test_a_picture_or_the_reason_why_there_is_none_is_on_each_card() -> None:
+def test_each_card_has_a_thumbnail_or_the_reason_for_none() -> None:
     known = RegisteredView(("PickCube-v1", "Ycb-v1"), frozenset({"PickCube-v1"}), {"Ycb-v1": NotDrawn("x")})
     ycb = Entry(
         4, Section.REGISTERED, "Ycb-v1", "needs ycb", "Ycb-v1", env_id="Ycb-v1", blank="needs a download"
@@ -216,7 +218,7 @@ def test_a_picture_or_the_reason_why_there_is_none_is_on_each_card() -> None:
     assert 'src="/task_pictures/Ycb-v1.jpg"' not in text
 
 
-def test_the_dialog_opens_once_chooses_and_goes(panels: Panels, chosen: Chosen) -> None:
+def test_the_dialog_opens_once_and_closes_on_a_choice(panels: Panels, chosen: Chosen) -> None:
     dialog = OpenDialog(panels.server, chosen)
     panels.visitors.do = dialog.do
     dialog.add_button()
@@ -229,16 +231,16 @@ def test_the_dialog_opens_once_chooses_and_goes(panels: Panels, chosen: Chosen) 
     dialog.draw(None)
     assert chosen.numbers == [push] and panels.html("wb-tasks") == ""
     panels.do(OpenListedTask(number=push))
-    assert chosen.numbers == [push], "it is closed"
+    assert chosen.numbers == [push], "the dialog is closed"
     panels.do(OpenTaskList())
     dialog.draw(None)
     assert "push.py" in panels.html("wb-tasks")
     panels.do(OpenTaskList())
     dialog.draw(None)
-    assert panels.html("wb-tasks") == "", "the key that opened it closes it"
+    assert panels.html("wb-tasks") == "", "the key that opened the dialog closes it"
 
 
-def test_a_picture_is_given_by_the_name_of_a_listed_task_alone(
+def test_a_thumbnail_is_served_only_for_the_id_of_a_listed_task(
     chosen: Chosen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: Callable[[str], bytes | None] = {"PickCube-v1": b"\xff\xd8\xff"}.get

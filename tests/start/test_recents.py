@@ -1,4 +1,4 @@
-"""Recent tasks are kept for the next run, and whatever their file holds they never break the page."""
+"""Recent tasks are kept for the next run, and no content of their file breaks the page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def recents(folder: Path) -> RecentTasks:
     return RecentTasks(lambda: folder)
 
 
-def test_the_last_one_comes_first_with_its_options_also_in_another_run(folder: Path, tmp_path: Path) -> None:
+def test_the_last_task_comes_first_with_its_options_also_in_another_run(folder: Path, tmp_path: Path) -> None:
     here = recents(folder)
     here.add(f"{tmp_path}/push.py:Push", TaskOptions(4, env_kwargs={"robot_uids": "fetch", "size": 0.5}))
     here.add("PickCube-v1", TaskOptions(2))
@@ -33,10 +33,10 @@ def test_the_last_one_comes_first_with_its_options_also_in_another_run(folder: P
             ("PickCube-v1", 2),
         ]
     assert recents(folder).list()[1].file is None
-    assert os.stat(folder / RECENT_FILE).st_mode & 0o077 == 0, "nobody else reads what one works on"
+    assert os.stat(folder / RECENT_FILE).st_mode & 0o077 == 0, "no other user can read the recent tasks"
 
 
-def test_two_runs_do_not_take_each_others_and_only_the_newest_are_kept(folder: Path) -> None:
+def test_two_runs_keep_each_others_tasks_and_only_the_newest_are_kept(folder: Path) -> None:
     first, second = recents(folder), recents(folder)
     for number in range(MAX_TASKS):
         (first, second)[number % 2].add(f"Task{number}-v1", TaskOptions())
@@ -46,7 +46,7 @@ def test_two_runs_do_not_take_each_others_and_only_the_newest_are_kept(folder: P
     assert kept[0] == "Last-v1" and len(kept) == MAX_TASKS and "Task0-v1" not in kept
 
 
-def test_a_name_lasts_in_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_is_valid_in_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab/envs.py").touch()
@@ -72,7 +72,7 @@ HOSTILE = [
 ]
 
 
-def test_an_entry_that_cannot_be_one_is_dropped_and_the_others_stay(folder: Path) -> None:
+def test_an_invalid_entry_is_dropped_and_the_others_stay(folder: Path) -> None:
     recents(folder).add("PickCube-v1", TaskOptions())
     rows = json.loads((folder / RECENT_FILE).read_text())["tasks"]
     (folder / RECENT_FILE).write_text(json.dumps({"tasks": [*HOSTILE, *rows]}))
@@ -80,7 +80,7 @@ def test_an_entry_that_cannot_be_one_is_dropped_and_the_others_stay(folder: Path
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"tasks": 3}', '{"tasks": [' * 5000, "\x00", "\ud800"])
-def test_a_broken_file_is_survived_and_written_anew(folder: Path, text: str) -> None:
+def test_a_broken_file_is_ignored_and_rewritten(folder: Path, text: str) -> None:
     folder.mkdir(mode=0o700)
     (folder / RECENT_FILE).write_bytes(text.encode("utf-8", "surrogatepass"))
     one = recents(folder)
@@ -89,13 +89,13 @@ def test_a_broken_file_is_survived_and_written_anew(folder: Path, text: str) -> 
     assert [task.reference for task in recents(folder).list()] == ["PickCube-v1"]
 
 
-def test_a_file_that_others_may_write_is_not_believed(folder: Path) -> None:
+def test_a_file_writable_by_others_is_not_trusted(folder: Path) -> None:
     recents(folder).add("PickCube-v1", TaskOptions())
     (folder / RECENT_FILE).chmod(0o666)
     assert recents(folder).list() == []
 
 
-def test_where_nothing_can_be_written_they_last_for_this_run(tmp_path: Path) -> None:
+def test_in_a_read_only_folder_recents_last_for_this_run(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     one = RecentTasks(lambda: tmp_path / "file" / "state")
     one.add("PickCube-v1", TaskOptions())

@@ -1,4 +1,4 @@
-"""``workbench sweep``: each seed once for each point, the changed text in its recordings, the same on any number of workers."""
+"""``workbench sweep`` runs each seed once per point, records the changed source, and does not depend on the number of workers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def options(
 
 
 def numbers(report: SweepReport) -> list[object]:
-    """All that does not say when it was made."""
+    """Return the results without the recordings' names, which differ by run."""
     return [replace(row, recording="") for row in report.results.episodes]
 
 
@@ -43,11 +43,11 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def swept(out: Path) -> SweepReport:
-    seen: list[RecordProgress] = []
-    report = sweep(options(out, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix"), on_progress=seen.append)
-    over = [progress.over for progress in seen if progress.over is not None]
+    reports: list[RecordProgress] = []
+    report = sweep(options(out, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix"), on_progress=reports.append)
+    over = [progress.over for progress in reports if progress.over is not None]
     assert sorted(written.seed for _, written in over if written is not None) == [5, 5, 6, 6, 7, 7], (
-        "told as they come"
+        "every episode must be reported"
     )
     return report
 
@@ -64,20 +64,22 @@ def test_each_seed_is_recorded_once_for_each_point(swept: SweepReport, out: Path
         assert episode.means == row.means and "reward_terms/reach" in row.means
 
 
-def test_a_recording_holds_the_text_that_ran_and_the_file_stays(swept: SweepReport, out: Path) -> None:
+def test_a_recording_holds_the_source_that_ran_and_the_file_is_unchanged(
+    swept: SweepReport, out: Path
+) -> None:
     before = REWARD_TERMS.read_text()
     texts = {}
     for row in swept.results.episodes:
         if row.recording:
             (texts[row.point],) = read_episode(out / row.recording).info.source.values()
     assert texts == {0: before, 2: before.replace("MOST = 5.0", "MOST = 1.0")}
-    # And it is what ran: normalized by another most.
+    # The changed source ran: MOST normalizes the reward.
     first, other = swept.results.episodes[0], swept.results.episodes[6]
     assert first.total_reward is not None and other.total_reward is not None
     assert other.total_reward == pytest.approx(5 * first.total_reward, rel=1e-5)
 
 
-def test_a_point_that_cannot_be_built_is_told_in_its_rows_and_the_others_go_on(swept: SweepReport) -> None:
+def test_a_point_that_cannot_be_built_fails_in_its_rows_and_the_others_run(swept: SweepReport) -> None:
     failed = [row for row in swept.results.episodes if row.failure]
     assert [row.point for row in failed] == [1, 1, 1, 3, 3, 3]
     assert all("nix" in row.failure and row.success is None for row in failed)
@@ -96,7 +98,7 @@ def test_the_numbers_are_the_same_on_any_number_of_workers(
 
 
 class KillOnce:
-    """Kills a worker, with SIGKILL, when the first episode is over."""
+    """Progress callback that sends SIGKILL to a worker after the first episode."""
 
     def __init__(self) -> None:
         self.done = False
@@ -118,11 +120,11 @@ def test_a_killed_worker_changes_no_number(swept: SweepReport, tmp_path: Path) -
     what = options(tmp_path, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix")
     again = sweep(what, on_progress=killer, executor=Processes(2))
     assert killer.done and numbers(again) == numbers(swept)
-    kept = [row.recording for row in again.results.episodes if row.recording]
-    assert sorted(kept) == sorted(str(file.relative_to(tmp_path)) for file in tmp_path.glob("*/*.rrd"))
+    recordings = [row.recording for row in again.results.episodes if row.recording]
+    assert sorted(recordings) == sorted(str(file.relative_to(tmp_path)) for file in tmp_path.glob("*/*.rrd"))
 
 
-# --- what varies ---------------------------------------------------------------------------------------
+# --- settings ---------------------------------------------------------------------------------------
 
 SEVERAL = """
 import math
@@ -170,7 +172,7 @@ def several(tmp_path: Path) -> Path:
 
 
 def changed(file: Path, given: str, task: str = "") -> tuple[dict[str, object], str, str]:
-    """Arguments, and the changed line as it was and is, of the only point. The file is never run: it cannot be."""
+    """Return the only point's env arguments and its changed line, old and new. The file is never run."""
     (recording,) = recordings_of(replace(options(file.parent, given), task=task or str(file)))
     (text,) = recording.source.values()
     pairs = zip(SEVERAL.splitlines(), text.splitlines(), strict=True)
@@ -179,7 +181,7 @@ def changed(file: Path, given: str, task: str = "") -> tuple[dict[str, object], 
     return given_kwargs, old, new
 
 
-def test_the_smallest_edit_is_made_of_a_constant(several: Path) -> None:
+def test_a_constant_is_changed_with_the_smallest_edit(several: Path) -> None:
     assert changed(several, "LIMITS=[1, 0.5]") == ({}, "LIMITS = (0.1, 0.2)", "LIMITS = (1.0, 0.5)")
     assert changed(several, "NAME=ball") == ({}, 'NAME = "cube"', "NAME = 'ball'")
     assert changed(several, "several.SCALE=4") == ({}, "SCALE = 2", "SCALE = 4")
@@ -189,7 +191,7 @@ def test_the_smallest_edit_is_made_of_a_constant(several: Path) -> None:
     assert changed(several, "GAIN=2", f"{several}:Swept") == ({}, *gain)
 
 
-def test_an_argument_of_the_constructor_is_given_to_it(several: Path) -> None:
+def test_a_constructor_argument_is_passed_to_the_env(several: Path) -> None:
     assert changed(several, "tall=true") == ({"tall": True}, "", "")
     assert changed(several, "control_mode=pd_joint_pos") == ({"control_mode": "pd_joint_pos"}, "", "")
     assert changed(several, "Swept.__init__.weight=2") == ({"weight": 2}, "", "")
@@ -209,7 +211,7 @@ def test_an_argument_of_the_constructor_is_given_to_it(several: Path) -> None:
         ("several.SCALE=true", "several.SCALE is a number (line 7); got True"),
     ],
 )
-def test_a_name_that_cannot_be_set_is_refused_with_what_to_do(several: Path, given: str, why: str) -> None:
+def test_a_name_that_cannot_be_set_is_refused_with_a_reason(several: Path, given: str, why: str) -> None:
     with pytest.raises(ValueError, match=".") as refused:
         changed(several, given)
     assert why in str(refused.value)
@@ -232,9 +234,9 @@ def test_values_are_json_or_text(text: str, values: tuple[object, ...]) -> None:
     assert setting.values == values
 
 
-def test_how_the_episodes_are_cut_does_not_hang_on_the_workers(tmp_path: Path) -> None:
+def test_chunks_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     what = options(tmp_path, "MOST=1,2,3", seeds=100, num_envs=4)
     assert replace(what, workers=7).chunk == what.chunk == 8
     assert what.stride == 104 and len(what.items) == 300 and what.items[100] == 104
     many = replace(what, settings=(Setting("MOST", tuple(range(200))),))
-    assert many.chunk == 100, "then a point is opened once"
+    assert many.chunk == 100, "with many points, a chunk is a whole point"

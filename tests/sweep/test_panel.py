@@ -1,4 +1,4 @@
-"""The Sweep tab's HTML and what its rows and lines do, on real files without a browser."""
+"""The Sweep tab's HTML and commands, on real files without a browser."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from workbench.sweep.panel import SweepPanel, best_first
 
 
 class Tab:
-    """The tab on a page, with a hand on it."""
+    """The Sweep tab on a page, with helpers to send commands."""
 
     def __init__(self, server: viser.ViserServer, folder: Path) -> None:
         self.library = Library(folder)
@@ -55,7 +55,7 @@ class Tab:
         self.draw()
 
     def points(self) -> list[str]:
-        """Of the table, the first two cells of each row."""
+        """Return the first two cells of each row of the table."""
         rows = re.findall(r"<tr data-do.*?</tr>", self.panels.html("wb-sweep-scroll"), re.DOTALL)
         return [" ".join(re.findall(r"<td[^>]*>(.*?)</td>", row)[:2]) for row in rows]
 
@@ -80,7 +80,7 @@ def tab(child_process: None, server: viser.ViserServer, folder: Path) -> Iterato
     tab.library.close()
 
 
-def test_points_are_listed_the_best_first_and_sorted_by_any_column(tab: Tab) -> None:
+def test_points_are_listed_best_first_and_can_be_sorted_by_any_column(tab: Tab) -> None:
     best = ["2 panda", "2 fetch", "1 panda", "1 fetch", "0.5 panda", "0.5 fetch"]
     assert tab.points()[:6] == best and len(tab.points()) == 9
     assert "36 seeds failed" in tab.panels.html("wb-note")
@@ -92,7 +92,7 @@ def test_points_are_listed_the_best_first_and_sorted_by_any_column(tab: Tab) -> 
     assert tab.points()[0] == "0.5 panda"
 
 
-def test_the_best_and_the_worst_episodes_of_a_point_open_with_a_press(tab: Tab) -> None:
+def test_a_points_best_and_worst_episodes_can_be_opened(tab: Tab) -> None:
     assert tab.seeds() == ["0", "1", "2", "3", "4", "11", "10", "9", "8", "7"]
     tab.ask(OpenSweepEpisode(id="p6s11"))
     assert tab.opened == [("p6s11",)]
@@ -102,21 +102,21 @@ def test_the_best_and_the_worst_episodes_of_a_point_open_with_a_press(tab: Tab) 
     )
 
 
-def test_a_value_of_an_axis_leaves_the_other_points_out(tab: Tab) -> None:
+def test_a_value_of_an_axis_filters_the_points(tab: Tab) -> None:
     tab.ask(FilterSweep(name="robot_uids", value='"fetch"'))
     assert tab.points() == ["2 fetch", "1 fetch", "0.5 fetch"]
     assert tab.panels.html("wb-parallel").count("wb-left-out") == 6
     assert "robot_uids = fetch" in tab.panels.html("wb-sweep-point"), (
-        "what is chosen is among those that are shown"
+        "the chosen point must be one of the listed ones"
     )
     tab.ask(FilterSweep(name="robot_uids", value='"panda"'))
     assert len(tab.points()) == 6
     tab.ask(ClearSweepFilter())
     assert len(tab.points()) == 9
-    assert "robot_uids = panda" in tab.panels.html("wb-sweep-point"), "what was shown before"
+    assert "robot_uids = panda" in tab.panels.html("wb-sweep-point"), "the earlier point is shown again"
 
 
-def test_another_order_and_other_values_begin_on_the_first_page(
+def test_sorting_and_filtering_return_to_the_first_page(
     child_process: None,
     server: viser.ViserServer,
     folder: Path,
@@ -136,7 +136,7 @@ def test_another_order_and_other_values_begin_on_the_first_page(
     tab.library.close()
 
 
-def test_the_point_of_the_open_episode_is_shown_until_another_one_is_chosen(tab: Tab) -> None:
+def test_the_open_episodes_point_is_shown_until_another_is_chosen(tab: Tab) -> None:
     place = "wb-sweep-point"
     assert "reach_weight = 2, robot_uids = panda" in tab.panels.html(place)
     tab.view = ReviewView(opened=(opened("p0s03"),))
@@ -149,7 +149,7 @@ def test_the_point_of_the_open_episode_is_shown_until_another_one_is_chosen(tab:
     assert "reach_weight = 0.5, robot_uids = fetch" in tab.panels.html(place)
 
 
-def test_new_results_are_shown_by_themselves(tab: Tab, folder: Path) -> None:
+def test_new_results_are_shown_automatically(tab: Tab, folder: Path) -> None:
     results = sweep_folder(folder)
     write_results(folder / RESULTS, replace(results, actions="zero"))
     tab.library.refresh()
@@ -171,7 +171,7 @@ HOSTILE = SweepResults(
 )
 
 
-def test_hostile_results_are_shown_as_text_and_open_nothing(
+def test_hostile_results_are_escaped_and_open_nothing(
     child_process: None, server: viser.ViserServer, folder: Path
 ) -> None:
     write_results(folder / RESULTS, HOSTILE)
@@ -190,7 +190,7 @@ def test_hostile_results_are_shown_as_text_and_open_nothing(
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1 nonsense PAR1"])
-def test_a_file_that_is_no_sweep_says_so(
+def test_an_unreadable_results_file_is_reported(
     child_process: None, server: viser.ViserServer, folder: Path, content: bytes
 ) -> None:
     (folder / RESULTS).write_bytes(content)
@@ -216,7 +216,7 @@ def test_a_link_to_results_elsewhere_is_not_followed(
     tab.library.close()
 
 
-def test_the_earlier_success_is_better_then_the_higher_return() -> None:
+def test_earlier_success_ranks_first_then_higher_return() -> None:
     rows = [
         SweepEpisode(0, 0, False, False, None, 9, 5.0),
         SweepEpisode(0, 1, True, False, 7, 9, 1.0),

@@ -2,11 +2,11 @@
 
     python -m tests.sweeps.check_tasks                  all ids, into check_tasks.json
     python -m tests.sweeps.check_tasks PickCube-v1 ...  some ids
-    python -m tests.sweeps.check_tasks --select RULE    one rule, as after a change of it
+    python -m tests.sweeps.check_tasks --select RULE    one rule, e.g. after it changed
 
-Each id gets a process of its own: a task that ends the process or never returns is one row. Nothing can be asked
-there and nothing fetched, and ManiSkill's folder for downloads is an empty one. What is found is read by a person and
-told in web_assets/docs/reference/checked_tasks.md.
+Each id runs in its own process, so a crash or a hang is one row. The process has no standard input and no network, and
+its ManiSkill download folder is empty. A person reads the findings and reports them in
+web_assets/docs/reference/checked_tasks.md.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from tests.sweeps.task_ids import refuse_the_network, registered_ids
 FILE = Path("check_tasks.json")
 NUM_ENVS = 4
 SEEDS = 8
-LIMIT = 900.0
-"""Seconds for one id: the slowest needs 60 alone on a core, and a tenth of a core on a busy machine."""
+LIMIT_SECONDS = 900.0
+"""Timeout for one id: the slowest needs 60 s on an idle core, and a busy machine gives it a tenth of a core."""
 CRASHES = ("crashed", "hung")
 
 
 def sweep(
-    ids: Sequence[str], workers: int, limit: float = LIMIT, select: tuple[str, ...] = ()
+    ids: Sequence[str], workers: int, limit: float = LIMIT_SECONDS, select: tuple[str, ...] = ()
 ) -> Iterator[dict[str, Any]]:
-    """A row for each id, as they are done.
+    """Yield a row for each id as it finishes.
 
     Args:
         select: only these rules; empty for all.
     """
     with tempfile.TemporaryDirectory() as nothing_downloaded, ThreadPoolExecutor(workers) as pool:
         os.environ["MS_ASSET_DIR"] = nothing_downloaded
-        # Forked from a process that has imported all, which takes ten seconds, and has used nothing.
+        # Fork from a server that has imported everything (10 s) and holds no other state.
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(["mani_skill.envs", "workbench.checks.job"])
         for done in as_completed([pool.submit(_row, context, env_id, limit, select) for env_id in ids]):
@@ -78,8 +78,8 @@ def _row(context: Any, env_id: str, limit: float, select: tuple[str, ...]) -> di
 
 
 def check_here(env_id: str, select: tuple[str, ...], sender: Any) -> None:
-    """Send the row of one id."""
-    # What the task prints is not wanted, and it can ask nothing.
+    """Check one id and send its row."""
+    # Discard the task's output and give it no standard input.
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):
         os.dup2(nothing, stream)
@@ -92,7 +92,7 @@ def check_here(env_id: str, select: tuple[str, ...], sender: Any) -> None:
 
 
 def _needs(env_id: str) -> dict[str, Any] | None:
-    """The row of an id that cannot be built without a download or a further package."""
+    """Return a row if the id needs a download or another package, else None."""
     import mani_skill.envs  # noqa: F401  registers the ids
     from mani_skill.utils.registration import REGISTERED_ENVS
 
@@ -101,7 +101,7 @@ def _needs(env_id: str) -> dict[str, Any] | None:
 
     spec = REGISTERED_ENVS[env_id]
     options = EnvOptions(1, "cpu", render=False, rules="off")
-    with suppress(Exception):  # the checks say it
+    with suppress(Exception):  # other errors are left to the checks
         try:
             make_env(
                 spec.cls, options, asset_ids=spec.asset_download_ids or (), default_kwargs=spec.default_kwargs
@@ -140,7 +140,7 @@ def _checked(env_id: str, select: tuple[str, ...]) -> dict[str, Any]:
 
 
 def line_of(row: dict[str, Any]) -> str:
-    """What came of one id, for the terminal."""
+    """Return one id's result as a line for the terminal."""
     if row["outcome"] != "checked":
         return f"{row['env_id']}: {row['outcome']}: {row['why']}"
     rules = Counter(finding["rule"] for finding in row["findings"])
@@ -158,7 +158,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--json", type=Path, default=FILE)
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--select", action="append", default=[], help="only this rule; repeatable")
-    parser.add_argument("--limit", type=float, default=LIMIT, help="seconds for one id")
+    parser.add_argument("--limit", type=float, default=LIMIT_SECONDS, help="timeout for one id in seconds")
     given = parser.parse_args(arguments)
     rows: list[dict[str, Any]] = []
     for row in sweep(given.ids or registered_ids(), given.workers, given.limit, tuple(given.select)):

@@ -1,11 +1,11 @@
-"""One task through everything that a user does with it, with default options: open, check, record, rescore, export, solve.
+"""Run every command on a task with default options: open, check, record, rescore, export, solve.
 
-    python -m tests.sweeps.every_command                     all examples, templates and built-in tasks, a line each
+    python -m tests.sweeps.every_command                     all examples, templates and built-in tasks, one line each
     python -m tests.sweeps.every_command swing_up PickCube-v1
-    python -m tests.sweeps.every_command --quick     with few envs, seeds and rollouts, in one process: a twentieth of the time
+    python -m tests.sweeps.every_command --quick     few envs, seeds and rollouts in one process: 20 times faster
 
-The commands are those of a terminal, in processes of their own but for ``new`` and ``export``. Only the length of episodes
-and the candidates of ``solve`` are bounded.
+Commands run in their own processes, as from a terminal, except ``new`` and ``export``. Only the length of episodes and the
+candidates of ``solve`` are limited.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from workbench.task.open import open_task
 ROOT = Path(__file__).parents[2]
 EXAMPLES = tuple(sorted(file.stem for file in (ROOT / "tasks").glob("*.py")))
 FROM_TEMPLATES = tuple(f"template {template.name}" for template in TEMPLATES)
-SECONDS = 1800.0
-"""For one command, on a busy machine."""
+COMMAND_TIMEOUT_SECONDS = 1800.0
+"""Timeout of one command; generous for a busy machine."""
 ALONE = ("--workers", "1", "--num-envs", "2")
 FEW_CANDIDATES = "--rollouts", "4", "--knots", "2"
 FEW: Mapping[str, Sequence[str]] = {
@@ -50,11 +50,11 @@ FEW: Mapping[str, Sequence[str]] = {
     "rescore": ALONE,
     "solve": ("--workers", "1"),
 }
-"""Options of a quick walk."""
+"""Options of each command in a quick walk."""
 
 
 def built_in() -> tuple[str, ...]:
-    """The ids of ManiSkill that need no download, as the page of all ids lists them."""
+    """Return ManiSkill's ids that need no download, as listed on the docs page of all ids."""
     page = (ROOT / "web_assets" / "docs" / "reference" / "task_ids.md").read_text()
     rows = re.findall(r"^\| (\S+-v\d+) \| [^|]* \| ([^|]+) \|", page, re.M)
     return tuple(env_id for env_id, outcome in rows if outcome != "download")
@@ -66,35 +66,35 @@ def fails_in_partial_resets(task: str) -> bool:
 
 @dataclass(frozen=True)
 class Ran:
-    """What came of one command."""
+    """Result of one command."""
 
     task: str
     command: str
     code: int
     seconds: float
-    told: Any
-    """The JSON that it printed, if that was asked for; of ``open``, states of rules and findings."""
+    output: Any
+    """The printed JSON with ``--json``, else None; for ``open``, the states of rules and the findings."""
     err: str = ""
 
     def rules(self, state: str) -> dict[str, str]:
-        """Of ``check`` and ``open``, why the rules of this state have it."""
-        return {one["rule"]: one["why"] for one in self.told["rules"] if one["state"] == state}
+        """Return the reasons of all rules in this state, for ``check`` and ``open``."""
+        return {one["rule"]: one["why"] for one in self.output["rules"] if one["state"] == state}
 
     @property
     def broken(self) -> list[str]:
-        return [one["rule"] for one in self.told["rules"] if one["state"] == "broken"]
+        return [one["rule"] for one in self.output["rules"] if one["state"] == "broken"]
 
 
 def walk(task: str, folder: Path, quick: bool = False, checks: bool = True) -> Iterator[Ran]:
-    """Each command on a task, as it is done.
+    """Run each command on a task and yield its result.
 
     Args:
-        task: the name of an example, ``template`` and the name of one, or an id.
-        folder: empty; everything is written there.
-        quick: in this process, with `FEW` of all; ``open`` without a session.
-        checks: whether the session looks at all rules, as its Checks tab does; else only the command does.
+        task: the name of an example, ``template NAME``, or an env id.
+        folder: an empty folder for all output.
+        quick: run in this process with the options of `FEW`; ``open`` without a session.
+        checks: also run all rules in the session, as its Checks tab does.
 
-    A task of ManiSkill's that fails in a partial reset has one env where the batch is refused, as the message says.
+    ManiSkill's tasks that fail in a partial reset run with one env where a batch is refused.
     """
     alone = ("--num-envs", "1") if fails_in_partial_resets(task) else ()
     num_envs = 1 if alone else 16
@@ -106,14 +106,16 @@ def walk(task: str, folder: Path, quick: bool = False, checks: bool = True) -> I
             shutil.copy(file, folder)
     elif task in FROM_TEMPLATES:
         reference = "from_template.py"
-        made = in_this_process(task, "new", folder, "from_template", "--from", task.removeprefix("template "))
-        assert made.code == 0, made.err
+        created = in_this_process(
+            task, "new", folder, "from_template", "--from", task.removeprefix("template ")
+        )
+        assert created.code == 0, created.err
     at = folder / reference if reference.endswith(".py") else reference
     yield opened_here(task, at, num_envs) if quick else opened(task, at, folder, num_envs, checks)
     yield command(task, "check", folder, reference, "--json")
     yield command(task, "record", folder, reference, *steps, *alone)
     yield command(task, "rescore", folder, "recordings", "--json", *alone)
-    # Here, which saves two starts of Python: what a process would change is nothing to it.
+    # In this process, which saves two starts of Python; export does not depend on its process.
     yield in_this_process(task, "export", folder, "recordings", "--lerobot", "lerobot")
     yield in_this_process(task, "export", folder, "recordings", "--maniskill", "demos.h5")
     yield command(
@@ -122,7 +124,7 @@ def walk(task: str, folder: Path, quick: bool = False, checks: bool = True) -> I
 
 
 def in_this_process(task: str, name: str, folder: Path, *words: str) -> Ran:
-    """Run ``workbench`` in this folder, with `FEW` of all."""
+    """Run ``workbench`` in this process in `folder`, with the options of `FEW`."""
     began, code = time.monotonic(), 0
     out, err = io.StringIO(), io.StringIO()
     with chdir(folder), redirect_stdout(out), redirect_stderr(err):
@@ -134,7 +136,7 @@ def in_this_process(task: str, name: str, folder: Path, *words: str) -> Ran:
 
 
 def in_a_process(task: str, name: str, folder: Path, *words: str) -> Ran:
-    """Run ``workbench`` in this folder."""
+    """Run ``workbench`` in a new process in `folder`."""
     began = time.monotonic()
     ended = subprocess.run(
         [sys.executable, "-m", "workbench.cli.main", name, *words],
@@ -143,19 +145,19 @@ def in_a_process(task: str, name: str, folder: Path, *words: str) -> Ran:
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=SECONDS,
+        timeout=COMMAND_TIMEOUT_SECONDS,
     )
     return _ran(task, name, words, ended.returncode, began, ended.stdout, ended.stderr)
 
 
 def _ran(task: str, name: str, words: Sequence[str], code: int, began: float, out: str, err: str) -> Ran:
-    told = json.loads(out) if "--json" in words and out.startswith(("{", "[")) else None
+    output = json.loads(out) if "--json" in words and out.startswith(("{", "[")) else None
     words = (name, *(word for word in words if word in ("--lerobot", "--maniskill")))
-    return Ran(task, " ".join(words), code, round(time.monotonic() - began, 1), told, err[-6000:])
+    return Ran(task, " ".join(words), code, round(time.monotonic() - began, 1), output, err[-6000:])
 
 
 def opened_here(task: str, reference: Path | str, num_envs: int) -> Ran:
-    """Opened as a session does, and stepped."""
+    """Open the task as a session does, and step it."""
     began = time.monotonic()
     done = open_task(str(reference), TaskOptions(num_envs=num_envs))
     try:
@@ -168,7 +170,7 @@ def opened_here(task: str, reference: Path | str, num_envs: int) -> Ran:
 
 
 def opened(task: str, reference: Path | str, folder: Path, num_envs: int, checks: bool) -> Ran:
-    """A session of it, as a page has one: opened, stepped, and perhaps all rules of the Checks tab looked at."""
+    """Open the task in a session as a page does, step it, and run all rules if `checks`."""
     began = time.monotonic()
     with live_session(reference, folder / "live", num_envs=num_envs, draw=True) as session:
         step(session, 3)
@@ -178,13 +180,13 @@ def opened(task: str, reference: Path | str, folder: Path, num_envs: int, checks
         until(
             lambda: session.view().of(ChecksView).state not in RUNNING,
             "the end of the checks",
-            SECONDS,
+            COMMAND_TIMEOUT_SECONDS,
             seen=lambda: session.view().of(ChecksView),
         )
-        looked = session.view().of(ChecksView)
-    rules = [{"rule": one.rule, "state": one.state, "why": one.why} for one in looked.results]
-    told = {"state": looked.state, "why": looked.why, "total": looked.total, "rules": rules}
-    return Ran(task, "open", 0 if looked.state == "done" else 2, round(time.monotonic() - began, 1), told)
+        view = session.view().of(ChecksView)
+    rules = [{"rule": one.rule, "state": one.state, "why": one.why} for one in view.results]
+    output = {"state": view.state, "why": view.why, "total": view.total, "rules": rules}
+    return Ran(task, "open", 0 if view.state == "done" else 2, round(time.monotonic() - began, 1), output)
 
 
 def main(words: Sequence[str]) -> None:

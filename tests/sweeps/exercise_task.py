@@ -1,8 +1,8 @@
-"""One built-in task through everything that the core promises of every task, with cameras on.
+"""Check on one built-in task what the core guarantees for every task, with cameras on.
 
-Made with four envs, reset with seeds, some random actions, a partial reset of two envs that may not change a bit of
-the other two, a snapshot that gives the same bits when it is restored, and pictures that show something. What the
-task itself does wrong (`upstream_faults`) is recorded, and the rest is still done.
+With four envs: seeded resets, random actions, a partial reset of two envs that must not change a bit of the other two,
+a snapshot whose restores are reproducible, and pictures that are not blank. The task's own faults (`upstream_faults`)
+are recorded, and the remaining stages still run.
 """
 
 from __future__ import annotations
@@ -33,31 +33,31 @@ ACTIONS = 6
 RESET, KEPT = [1, 3], [0, 2]
 STEPS_AGAIN = 5
 ROUNDING = 1e-6
-"""PhysX keeps a root by its centre of mass: the last bit of a pose may change when it is put back."""
+"""Absolute. PhysX stores a root pose at its centre of mass, so a restore may change the last bit."""
 OBS_MODES = ("rgb+depth+segmentation", "rgb+segmentation", "sensor_data")
 
 
 @dataclass
 class Row:
-    """What came of one id; plain values, since it crosses a pipe as JSON."""
+    """Result for one id; plain values, since a pipe carries it as JSON."""
 
     env_id: str
     robot: str = ""
     outcome: str = ""
-    """``passed``, ``upstream`` (passed but for the task's own faults), ``download``, ``failed``."""
+    """``passed``, ``upstream`` (passed except for the task's own faults), ``download`` or ``failed``."""
     seconds: float = 0.0
     cameras: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     after_restore: list[float] = field(default_factory=list)
-    """The largest difference of a number of the state, `STEPS_AGAIN` steps after a restore: from the run that was
-    not interrupted, and from the run after a second restore."""
+    """Largest difference of any number of the state, `STEPS_AGAIN` steps after a restore: from the uninterrupted run, and
+    from the run after a second restore."""
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
 def exercise(env_id: str) -> Row:
-    """Raises nothing but what ends the process: a failure is a row that says where it came from."""
+    """Run all stages and return the row; an exception becomes a ``failed`` row that names its stage."""
     row = Row(env_id, _default_robots(env_id))
     begun = time.perf_counter()
     stage = ["make"]
@@ -90,7 +90,7 @@ def _made(env_id: str) -> TaskEnv:
 
 
 def obs_mode_of(task: type[BaseEnv]) -> str:
-    """The richest pictures that the task can give as an observation."""
+    """Return the task's observation mode with the most picture types."""
     supported = task.SUPPORTED_OBS_MODES
     return next(m for m in OBS_MODES if m in supported or (m == OBS_MODES[0] and "any_textures" in supported))
 
@@ -103,7 +103,7 @@ def _all_stages(env: TaskEnv, row: Row, stage: list[str]) -> None:
     _check_start(env.reset(seed=SEEDS).elapsed_steps, env)
     first = _states(env)
     env.reset(seed=SEEDS)
-    assert _states(env) == first, "the same seeds gave another start"
+    assert _states(env) == first, "the same seeds gave different initial states"
     _check_observed(env.obs, row)
 
     stage[0] = "step"
@@ -112,9 +112,9 @@ def _all_stages(env: TaskEnv, row: Row, stage: list[str]) -> None:
         assert np.isfinite(step.reward).all() and np.isfinite(step.poses[:, :, 0]).any(), "NaN"
     assert env.env.elapsed_steps.tolist() == [ACTIONS] * NUM_ENVS
     _check_observed(env.obs, row)
-    said = wrong_evaluate(env.env.evaluate(), NUM_ENVS)
-    if said is not None:
-        row.notes.append(f"evaluate() {said}")
+    wrong = wrong_evaluate(env.env.evaluate(), NUM_ENVS)
+    if wrong is not None:
+        row.notes.append(f"evaluate() {wrong}")
 
     stage[0] = "get_state"
     _or_its_fault(faults.get(stage[0]), env.env.get_state, row)
@@ -128,7 +128,7 @@ def _all_stages(env: TaskEnv, row: Row, stage: list[str]) -> None:
         after = _states(env)
         assert all(after[i] == before[i] for i in KEPT), "an env that was not reset changed"
         assert any(after[i] != before[i] for i in RESET), "nothing was reset"
-        assert torch.equal(_controllers(env), kept_controllers), "a controller was reset with its neighbour"
+        assert torch.equal(_controllers(env), kept_controllers), "a neighbour's controller was reset, too"
 
     if not _or_its_fault(faults.get(stage[0]), partial_reset, row):
         env.reset(seed=SEEDS)
@@ -138,20 +138,22 @@ def _all_stages(env: TaskEnv, row: Row, stage: list[str]) -> None:
     again = [_action(env, rng) for _ in range(STEPS_AGAIN)]
     snapshot = take_snapshot(env.env)
     at = _states(env)
-    went_on = _run(env, again)
+    uninterrupted = _run(env, again)
     restore_snapshot(env.env, snapshot)
-    assert _apart(_states(env), at) <= ROUNDING, "the restored state is another"
+    assert _largest_difference(_states(env), at) <= ROUNDING, "the restored state differs"
     once = _run(env, again)
     restore_snapshot(env.env, snapshot)
     twice = _run(env, again)
-    row.after_restore = [_apart(a, b) for a, b in ((went_on[-1], once[-1]), (once[-1], twice[-1]))]
+    row.after_restore = [
+        _largest_difference(a, b) for a, b in ((uninterrupted[-1], once[-1]), (once[-1], twice[-1]))
+    ]
 
     stage[0] = "pictures"
     _check_pictures(env, row)
 
 
 def _or_its_fault(fault: Fault | None, attempt: Callable[[], Any], row: Row) -> bool:
-    """True if `attempt` worked; False if it failed as `fault` says. Anything else is raised."""
+    """Return True if `attempt` worked, False if it failed at the line of `fault`; raise other errors."""
     try:
         attempt()
     except AssertionError:
@@ -165,7 +167,7 @@ def _or_its_fault(fault: Fault | None, attempt: Callable[[], Any], row: Row) -> 
         return False
     if fault is not None:
         raise RuntimeError(
-            f"{fault.stage} works: upstream mended {fault.file}; take it out of upstream_faults"
+            f"{fault.stage} works: upstream fixed {fault.file}; remove it from upstream_faults"
         )
     return True
 
@@ -175,8 +177,8 @@ def _states(env: TaskEnv) -> list[bytes]:
     return [system.pack() for system in px.systems]
 
 
-def _apart(some: list[bytes], others: list[bytes]) -> float:
-    """The largest difference between two states of all envs."""
+def _largest_difference(some: list[bytes], others: list[bytes]) -> float:
+    """Return the largest difference between two lists of packed states."""
     largest = 0.0
     for state, other in zip(some, others, strict=True):
         a, b = (np.frombuffer(packed, np.float32).astype(np.float64) for packed in (state, other))
@@ -185,7 +187,7 @@ def _apart(some: list[bytes], others: list[bytes]) -> float:
 
 
 def _controllers(env: TaskEnv) -> torch.Tensor:
-    """(kept envs, K) what the controllers of the envs that are not reset remember."""
+    """Return the controller state of the envs that are not reset, (len(KEPT), K)."""
     agent: Any = env.env.agent
     state = {} if agent is None else agent.get_controller_state()
     leaves = [leaf[KEPT].reshape(len(KEPT), -1) for leaf in pytree.tree_leaves(state)]
@@ -197,11 +199,11 @@ def _action(env: TaskEnv, rng: np.random.Generator) -> Any:
 
 
 def _run(env: TaskEnv, chosen: list[Any]) -> list[list[bytes]]:
-    seen = []
+    states = []
     for action in chosen:
         env.step(action)
-        seen.append(_states(env))
-    return seen
+        states.append(_states(env))
+    return states
 
 
 def _check_start(elapsed: np.ndarray, env: TaskEnv) -> None:
@@ -210,7 +212,7 @@ def _check_start(elapsed: np.ndarray, env: TaskEnv) -> None:
 
 
 def _check_observed(obs: Any, row: Row) -> None:
-    """ManiSkill's own observation: pictures of every env, each with something on it."""
+    """Assert that ManiSkill's observation has a picture of every env and that none is blank."""
     for camera, textures in obs.get("sensor_data", {}).items():
         for name, values in textures.items():
             assert values.shape[0] == NUM_ENVS and values.ndim == 4, f"{camera} {name}: {tuple(values.shape)}"
@@ -234,7 +236,7 @@ def _check_pictures(env: TaskEnv, row: Row) -> None:
 
 
 def _default_robots(env_id: str) -> str:
-    """What the class says that it takes, for a task that could not be made."""
+    """Return the class's default robots, for a task that could not be made."""
     spec = REGISTERED_ENVS[env_id]
     robots = robots_of(spec.cls, spec.default_kwargs)
     several = robots if isinstance(robots, (tuple, list)) else [robots]

@@ -1,13 +1,11 @@
-"""One env of a batch beside ManiSkill's own single CPU env: the same state, the same actions, step by step.
+"""Compare one env of a batch with ManiSkill's own single CPU env, step by step from the same state under the same actions.
 
-The two are built for the same seed, so that a task which builds another object for every seed builds
-the same one in both. Their states are then made the same to the last bit: ``set_state_dict`` rounds the root
-of an articulation (PhysX keeps it by its centre of mass), so both get the same packed state instead. What
-the task keeps on itself (a goal, a direction) is copied from the batch's row.
+Both are built with the same seed, so that a task whose objects depend on the seed builds the same ones in both. Then both
+unpack the same state, since ``set_state_dict`` rounds an articulation's root pose (PhysX stores it at the centre of mass).
+The task's own tensors (a goal, a direction) are copied from the batch's row.
 
-Compared after each control step: the packed state of PhysX byte for byte (poses, velocities, joints, drive
-targets), and to a tolerance the reward and all that ``evaluate`` returned, since torch sums a row of
-four in another order than a row of one.
+After each control step the packed PhysX states (poses, velocities, joints, drive targets) are compared byte for byte. The
+reward and ``evaluate``'s entries have a tolerance, since torch sums four rows in a different order than one.
 """
 
 from __future__ import annotations
@@ -29,42 +27,42 @@ from workbench.envs.partial_reset import active_controllers
 from workbench.envs.task_env import EnvOptions, default_reward_mode, make_env
 
 NUM_ENVS, PLACE = 4, 3
-"""RotateValveLevel1 builds its valves by the env's index, three kinds in turn: env 3 has the kind of env 0."""
+"""Batch size, and index of the compared env: RotateValveLevel1 repeats three kinds of valves, so env 3 equals env 0."""
 STEPS = 50
 TOLERANCE = 1e-5
 
 WITH_A_RENDERER = frozenset({"PushT-v1", "DrawTriangle-v1", "DrawSVG-v1", "TableTopFreeDraw-v1"})
-"""PushT recolours its table, whether or not anything can be drawn. The others make hundreds of render materials,
-and each takes 40 ms where no render device is kept alive."""
+"""PushT recolours its table, which needs a renderer. The others create hundreds of render materials, each of which
+takes 40 ms if no render device stays alive."""
 
 MOVED_BY_THE_TASK = {
     "SO100GraspCube-v1": ("camera_mount", "moved at random by torch's one generator, all rows from one draw"),
     "MS-AntWalk-v1": ("camera_mount", "_after_control_step reads the torso before the fetch, as on the GPU"),
     "MS-AntRun-v1": ("camera_mount", "_after_control_step reads the torso before the fetch, as on the GPU"),
 }
-"""A body without collision shapes that the task itself puts elsewhere in a batch, and why; not compared."""
+"""Bodies without collision shapes that the task places differently in a batch, and why; they are not compared."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What 50 steps side by side gave."""
+    """Result of `STEPS` steps side by side."""
 
     first_difference: int | None
-    """The first control step after which a byte of the packed state differed; None if none did."""
+    """First control step after which a byte of the packed state differed, or None."""
     first_contact: int | None
-    """The first control step after which two bodies of the env pushed each other."""
+    """First control step after which two bodies of the env touched, or None."""
     state_difference: float
-    """The largest absolute difference of a number of the state."""
+    """Largest absolute difference of any number of the state."""
     value_difference: float
-    """The largest absolute difference of the reward or an entry of evaluate()."""
+    """Largest absolute difference of the reward or an entry of evaluate()."""
     unbatched: tuple[str, ...]
-    """Entries of evaluate() that the task gives once for all envs; not compared."""
+    """Entries of evaluate() without a row per env; not compared."""
     ignored: str | None
-    """The body of `MOVED_BY_THE_TASK`."""
+    """The body from `MOVED_BY_THE_TASK`, if any; not compared."""
 
     @property
     def follows(self) -> bool:
-        """Equal as far as can be asked: all steps, or until two bodies touched."""
+        """Whether the states agree within `TOLERANCE` in all steps, or until two bodies touched."""
         same = self.first_difference is None or self.state_difference <= TOLERANCE
         touched = self.first_contact is not None and self.first_contact <= (self.first_difference or 0)
         return same and self.value_difference <= TOLERANCE or touched
@@ -97,10 +95,10 @@ def state_only(env_id: str, kwargs: dict[str, Any]) -> dict[str, Any]:
 
 
 def take_over(target: Any, target_row: int, source: Any, source_row: int, state: bytes | None = None) -> None:
-    """Give one env of `target` all that one env of `source` is: physics, the task's tensors, controllers.
+    """Copy physics state, the task's tensors and controller state of one env of `source` to one env of `target`.
 
-    What PhysX takes in is not to the last bit what it gave out, nor is it when it takes that in again. So
-    both envs take in the same bytes, and where several are to be equal, all must: `state`.
+    PhysX does not unpack exactly what it packed, and unpacking may change the last bits again. So both envs unpack
+    the same bytes: `state`, which must be the same for all envs that shall be equal.
     """
     state = _system(source, source_row).pack() if state is None else state
     _system(source, source_row).unpack(state)
@@ -125,12 +123,12 @@ def _copy_row(value: Any, there: Any, source: Any, source_row: int, target: Any,
 
 
 def _system(env: Any, row: int) -> Any:
-    """The CPU physics system of one env; a stock env has one."""
+    """Return the CPU physics system of one env; a stock env has only one."""
     return env.scene.px.systems[row] if env.scene.gpu_sim_enabled else env.scene.px
 
 
 def packed(env: Any, row: int, without: str | None = None) -> bytes:
-    """The packed state of one env, with zeros for the body that is called `without`."""
+    """Return the packed state of one env, with zeros for the body named `without`."""
     system = _system(env, row)
     state = np.frombuffer(system.pack(), np.float32).copy()
     for i, body in enumerate(system.rigid_dynamic_components):
@@ -151,7 +149,7 @@ def flat_action(env: Any, flat: np.ndarray) -> Any:
 
 
 def compare(env_id: str, num_envs: int = NUM_ENVS, place: int = PLACE, seed: int = 0) -> Comparison:
-    """Step env `place` of a batch and a stock env side by side; the neighbours do something else."""
+    """Step env `place` of a batch and a stock env side by side; the other envs get different actions."""
     batch, stock = batch_of(env_id, num_envs), stock_env(env_id)
     try:
         batch.reset(seed=[seed + i for i in range(num_envs)], options={"reconfigure": True})
@@ -196,11 +194,11 @@ def _side_by_side(env_id: str, batch: BaseEnv, stock: BaseEnv, place: int, seed:
 
 
 def _difference(mine: Any, its: Any, place: int, num_envs: int, unbatched: set[str]) -> float:
-    """The largest difference between the row `place` of each value and the single env's."""
+    """Return the largest difference between row `place` of each value and the single env's value."""
     ours, spec = pytree.tree_flatten_with_path(mine)
     theirs, their_spec = pytree.tree_flatten(its)
     if spec != their_spec:
-        raise AssertionError(f"evaluate() returned other entries: {spec} and {their_spec}")
+        raise AssertionError(f"evaluate() returned different entries: {spec} and {their_spec}")
     largest = 0.0
     for (path, value), single in zip(ours, theirs, strict=True):
         value, single = torch.as_tensor(value), torch.as_tensor(single)

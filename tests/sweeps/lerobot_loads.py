@@ -1,11 +1,11 @@
-"""Let the real ``lerobot`` read a dataset that ``workbench export`` wrote, and say what it found.
+"""Read a dataset that ``workbench export`` wrote with the real ``lerobot``, and print a summary.
 
-lerobot pins other versions of torch and of much else than the workbench, so it lives in an environment of its own:
+lerobot pins other versions of torch and of other packages than the workbench, so it needs its own environment:
 
     python -m venv lerobot-env && lerobot-env/bin/pip install lerobot==0.4.4
     lerobot-env/bin/python tests/sweeps/lerobot_loads.py DATASET
 
-Every frame of every episode is asked for, films decoded; the first and last of each are held against the table.
+Every frame of every episode is read and its video decoded; the first and last frame of each are compared with the table.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def main(folder: Path, backend: str) -> None:
         for key in dataset.meta.video_keys:
             height, width, _ = dataset.meta.features[key]["shape"]
             assert tuple(item[key].shape) == (3, height, width), item[key].shape
-            # Statistics of the films and the decoded frames are about the same pictures.
+            # The videos' statistics must describe the decoded frames.
             mean = np.asarray(dataset.meta.stats[key]["mean"]).reshape(3)
             assert np.abs(np.asarray(item[key]).mean(axis=(1, 2)) - mean).max() < 0.2
     shifts = {"action": [0.0, 1 / dataset.fps], "observation.state": [-1 / dataset.fps, 0.0]}

@@ -1,11 +1,11 @@
-"""Half an hour before a page that plays while its file is saved again and again: does it go on showing what is so?
+"""Save a task's file again and again while a page plays it: does the page keep showing the current state?
 
     python tests/sweeps/many_saves.py [--saves 30] [--every 10] [--num-envs 16] [--pictures FOLDER]
 
-A real Chromium looks at the Reward tab of ``tasks/push_cube.py`` while good versions are saved, some with a syntax error,
-some with a reward that is NaN in every third env, and some for which all envs are built anew. Between two saves it is
-looked several times whether the curve of the reward is drawn, in the pixels of the canvas; and after each, what the
-server and its worker hold. The last lines count the looks at an empty chart, and say how much the server grew.
+A real Chromium shows the Reward tab of ``tasks/push_cube.py`` while versions are saved: good ones, some with a syntax error,
+some with a reward that is NaN in every third env, and some that rebuild all envs. Between two saves the canvas's pixels are
+checked several times for the reward curve; after each save a line prints the memory of the server, its processes and
+the page. The last line counts the checks with an empty chart and prints the server's growth.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from tests.drive.page import TASK, browser_at, page_on
 from workbench.machine.doctor import find_chromium
 
 Kind = Literal["good", "NaN", "rebuilding", "broken"]
-LOOKS = 4
-"""Between two saves."""
-MEANT = "return reward\n"
+CHART_CHECKS = 4
+"""Checks of the chart between two saves."""
+RETURN_REWARD = "return reward\n"
 SCENE = "CUBE_HALF_SIZE = 0.02\n"
 
 
@@ -41,7 +41,7 @@ class Options:
     """Seconds between two saves."""
     num_envs: int = 16
     pictures: Path | None = None
-    """Where a picture of the page after each save goes."""
+    """Folder for a screenshot of the page after each save."""
 
 
 def kind_of(number: int) -> Kind:
@@ -53,14 +53,14 @@ def kind_of(number: int) -> Kind:
 
 
 def version(text: str, number: int) -> str:
-    """The file as it is saved for the so-manieth time; the scene is that of the last save that rebuilt it."""
-    assert MEANT in text and SCENE in text
+    """Return the file's text for save `number`; its scene is that of the last rebuilding save."""
+    assert RETURN_REWARD in text and SCENE in text
     kind, scene = kind_of(number), sum(kind_of(n) == "rebuilding" for n in range(number + 1))
     text = text.replace(SCENE, f"CUBE_HALF_SIZE = {0.02 + 1e-4 * scene:.4f}\n", 1)
     reward = f"reward = reward + {number} * 1e-6\n        "
     if kind == "NaN":
         reward += "reward[::3] = torch.nan\n        "
-    text = text.replace(MEANT, reward + MEANT, 1)
+    text = text.replace(RETURN_REWARD, reward + RETURN_REWARD, 1)
     return text + (f"\ndef broken(:  # {number}\n" if kind == "broken" else "")
 
 
@@ -68,7 +68,7 @@ def megabytes(process: psutil.Process) -> float:
     return process.memory_info().rss / 2**20
 
 
-def held(page: Page, pid: int) -> str:
+def memory_of(page: Page, pid: int) -> str:
     server = psutil.Process(pid)
     workers = server.children(recursive=True)
     heap = page.evaluate("performance.memory?.usedJSHeapSize ?? 0") / 2**20
@@ -79,7 +79,7 @@ def held(page: Page, pid: int) -> str:
 def main(options: Options) -> None:
     chromium = find_chromium()
     assert chromium is not None
-    empty, looks = 0, 0
+    empty, checks = 0, 0
     with tempfile.TemporaryDirectory() as name:
         file = Path(shutil.copy(TASK, name))
         good = file.read_text()
@@ -98,22 +98,25 @@ def main(options: Options) -> None:
             for number in range(options.saves):
                 kind, saved_at = kind_of(number), time.monotonic()
                 file.write_text(version(good, number))
-                seen = []
-                for look in range(1, LOOKS + 1):
+                column_counts = []
+                for check in range(1, CHART_CHECKS + 1):
                     page.wait_for_timeout(
-                        max(0.0, 1000 * (saved_at + look * options.every / LOOKS - time.monotonic()))
+                        max(0.0, 1000 * (saved_at + check * options.every / CHART_CHECKS - time.monotonic()))
                     )
-                    seen.append(len(drawn(page)))
-                empty, looks = empty + sum(not columns for columns in seen), looks + len(seen)
+                    column_counts.append(len(drawn(page)))
+                empty, checks = (
+                    empty + sum(not columns for columns in column_counts),
+                    checks + len(column_counts),
+                )
                 print(
-                    f"{number + 1} {kind}: {seen} columns drawn | {held(page, opened.process.pid)}",
+                    f"{number + 1} {kind}: {column_counts} columns drawn | {memory_of(page, opened.process.pid)}",
                     flush=True,
                 )
                 if options.pictures is not None:
                     page.screenshot(path=options.pictures / f"save_{number + 1:02}_{kind}.png")
             after = megabytes(psutil.Process(opened.process.pid))
             print(
-                f"empty in {empty} of {looks} looks; the server went from {before:.0f} to {after:.0f} MB; console: {errors}"
+                f"empty in {empty} of {checks} checks; the server grew from {before:.0f} to {after:.0f} MB; console: {errors}"
             )
 
 

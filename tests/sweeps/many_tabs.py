@@ -1,11 +1,10 @@
-"""Twenty pages at once, one that reads nothing, one that comes and goes: does anything stall, does anything grow?
+"""Twenty pages at once, one that reads nothing, and one that reconnects: does anything stall or grow?
 
     python tests/sweeps/many_tabs.py [--tabs 19] [--seconds 120] [--reconnects 200] [--num-envs 16]
 
-``workbench open`` on the example task, which plays with its camera pictures before one real Chromium (its draw calls
-replaced by nothing, see `tests/benchmarks/page_rate.py`) and so many tabs without a browser. Each row says how
-soon a click has its effect in the real page, how often that page is updated, what the server's process does
-and holds, and how much each tab was sent.
+``workbench open`` plays the example task with camera pictures for one real Chromium (without draw calls, see
+`tests/benchmarks/page_rate.py`) and many tabs without a browser. Each row prints the latency of a click in the real page,
+its updates per second, the server's CPU, memory, threads and files, and the data sent to each tab.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ from workbench.machine.doctor import find_chromium, how_to_get_chromium
 @dataclass(frozen=True)
 class Options:
     tabs: int = 19
-    """Besides the real page."""
+    """Tabs in addition to the real page."""
     seconds: float = 120.0
-    """For which all play; a row after each quarter."""
+    """Time for which all tabs play; a row is printed after each quarter."""
     reconnects: int = 200
     num_envs: int = 16
     clicks: int = 10
@@ -50,12 +49,12 @@ class Scene:
     tabs: list[Tab]
 
     def row(self, what: str, seconds: float = 8.0) -> None:
-        """Let it play, and say how that went."""
+        """Play for `seconds` and print a row with the measurements."""
         clicks = play_to_pause(self.page, self.options.clicks)
         timed_click(self.page, "Play", "Pause")
         time.sleep(1.0)
         for process in (self.server, self.worker):
-            process.cpu_percent()  # counts from here
+            process.cpu_percent()  # starts the measurement
         before = [tab.megabytes for tab in self.tabs]
         applied, _ = self.page.evaluate(COUNT, seconds)
         cpu, theirs = self.server.cpu_percent(), self.worker.cpu_percent()
@@ -102,12 +101,12 @@ def main(options: Options) -> None:
             scene.tabs += [tabs.open() for _ in range(options.tabs)]
             for _ in range(4):
                 scene.row(f"with {options.tabs} more", options.seconds / 4)
-            deaf = open_deaf_tab(opened.url)
+            idle = open_deaf_tab(opened.url)
             scene.row("and one that reads nothing")
             began = time.monotonic()
             opened.wait_for_line("has read nothing", 60)
-            print(f"it was let go {time.monotonic() - began:.0f} s after that")
-            deaf.close()
+            print(f"the server closed it after {time.monotonic() - began:.0f} s")
+            idle.close()
             scene.row("without it")
             for tab in scene.tabs:
                 tabs.close(tab)
@@ -119,7 +118,7 @@ def main(options: Options) -> None:
                     while not tab.open:
                         time.sleep(0.01)
                     tabs.close(tab)
-                scene.row(f"after {(part + 1) * (options.reconnects // 4)} came and went", 4.0)
+                scene.row(f"after {(part + 1) * (options.reconnects // 4)} reconnects", 4.0)
             print("errors in the page:", errors or "none")
             print("printed:", *[line for line in opened.lines if "Closed" in line], sep="\n  ")
 

@@ -1,11 +1,11 @@
-"""Hundreds of reloads and dozens of worker deaths in one session: does anything grow, is anything left?
+"""Hundreds of reloads and dozens of worker deaths in one session: does anything grow or leak?
 
     python tests/sweeps/soak.py [--reloads 500] [--deaths 50] [--num-envs 4] [--no-spare]
 
-Versions of `tests/live/hazards.py`'s task are saved one after the other: one that can be put on the envs as they
-are, one with a wrong syntax, one for which all envs are built anew, one that raises in ``evaluate``. In between the worker dies, in one of several ways. After each tenth of
-it all a row says what the server and the worker hold: memory, threads, open files, child processes. The last
-lines say how much the server's figures grew from the first row to the last, and what was left at the end.
+Versions of `tests/live/hazards.py`'s task are saved in turn: one that only patches the envs, one with a syntax error, one
+that rebuilds all envs, one that raises in ``evaluate``. In between the worker dies in one of several ways. After each
+tenth a row prints the memory, threads, open files and child processes of the server and the worker. The last lines
+print the server's growth from the first row to the last, and what was left at the end.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from workbench.live.view import SessionView
 from workbench.task.description import TaskOptions
 
 DEATHS = ("segfault", "exit", "kill", "abort", "children")
-PATIENCE = 120.0
+TIMEOUT_SECONDS = 120.0
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Holds:
-    """What a process has."""
+class Resources:
+    """Memory, threads, open files and child processes of a process."""
 
     megabytes: float
     threads: int
@@ -51,7 +51,7 @@ class Holds:
     children: int
 
     @classmethod
-    def of(cls, pid: int) -> Holds:
+    def of(cls, pid: int) -> Resources:
         process = psutil.Process(pid)
         memory = process.memory_info().rss / 2**20
         return cls(memory, process.num_threads(), process.num_fds(), len(process.children(recursive=True)))
@@ -63,17 +63,19 @@ class Holds:
 
 
 def reach(session: Session, reached: Callable[[SessionView], bool], what: str) -> SessionView:
-    deadline, seen = time.monotonic() + PATIENCE, -1
+    deadline, serial = time.monotonic() + TIMEOUT_SECONDS, -1
     while time.monotonic() < deadline:
         view = session.view()
         if reached(view):
             return view
-        seen = session.wait(seen, timeout=0.2)
-    raise TimeoutError(f"{what} did not come: {session.view().state}, {session.view().problem}")
+        serial = session.wait(serial, timeout=0.2)
+    raise TimeoutError(
+        f"{what} did not come within {TIMEOUT_SECONDS:.0f} s: {session.view().state}, {session.view().problem}"
+    )
 
 
 def save(session: Session, file: Path, good: str, number: int, levels: Counter[str]) -> None:
-    """Save version `number` and see it loaded, which `levels` counts, or refused."""
+    """Save version `number` and wait until it is loaded, which `levels` counts, or refused."""
     before = session.view()
     if number % 4 == 1:
         file.write_text(good + f"\ndef broken(:  # {number}\n")
@@ -83,7 +85,7 @@ def save(session: Session, file: Path, good: str, number: int, levels: Counter[s
         changed = good.replace(
             '{"success"', f'{{"version": self.cube.pose.p[:, 0] * 0 + {number - number % 4}, "success"'
         )
-        scene = number if number % 4 == 2 else max(0, number - 2)  # of the scene that stands
+        scene = number if number % 4 == 2 else max(0, number - 2)  # the scene that is loaded
         changed = changed.replace("\nVERSION = 0\n", f"\nVERSION = {scene}\n")
         file.write_text(changed)
         view = reach(session, lambda v: v.task_serial > before.task_serial, f"version {number}")
@@ -96,19 +98,19 @@ def save(session: Session, file: Path, good: str, number: int, levels: Counter[s
 
 
 def die(session: Session, file: Path, number: int) -> float:
-    """Have the worker die, and the seconds until its version is back."""
+    """Let the worker die; return the seconds until its version runs again."""
     before = session.view()
     provoke(file, "evaluate", DEATHS[number % len(DEATHS)])
     session.do(Step())
     reach(session, lambda v: v.problem_serial > before.problem_serial, "the death")
     began = time.monotonic()
     calm(file)
-    reach(session, lambda v: v.task_serial > before.task_serial, "the version again")
+    reach(session, lambda v: v.task_serial > before.task_serial, "the version's reload")
     return time.monotonic() - began
 
 
 def main(options: Options) -> None:
-    ourselves = psutil.Process().pid
+    server = psutil.Process().pid
     with tempfile.TemporaryDirectory() as name:
         file = write_task(Path(name))
         good = file.read_text()
@@ -121,31 +123,33 @@ def main(options: Options) -> None:
         reach(session, lambda v: v.task is not None, "the first load")
         every = max(1, options.reloads // 10)
         per_death = max(1, options.reloads // max(1, options.deaths))
-        rows: list[Holds] = []
-        back: list[float] = []
+        rows: list[Resources] = []
+        recovery_seconds: list[float] = []
         levels: Counter[str] = Counter()
         for number in range(options.reloads):
             save(session, file, good, number, levels)
-            if number % per_death == per_death - 1 and len(back) < options.deaths:
+            if number % per_death == per_death - 1 and len(recovery_seconds) < options.deaths:
                 file.write_text(good)
                 reach(session, lambda v: v.problem is None and not v.stale, "the good version")
-                back.append(die(session, file, len(back)))
+                recovery_seconds.append(die(session, file, len(recovery_seconds)))
             if number % every == every - 1:
-                rows.append(Holds.of(ourselves))
-                worker = "none" if session.worker_pid is None else Holds.of(session.worker_pid)
+                rows.append(Resources.of(server))
+                worker = "none" if session.worker_pid is None else Resources.of(session.worker_pid)
                 print(
-                    f"{number + 1} reloads, {len(back)} deaths | server {rows[-1]} | worker {worker}",
+                    f"{number + 1} reloads, {len(recovery_seconds)} deaths | server {rows[-1]} | worker {worker}",
                     flush=True,
                 )
         session.close()
-    first, last, end = rows[0], rows[-1], Holds.of(ourselves)
+    first, last, end = rows[0], rows[-1], Resources.of(server)
     print(
         f"server from the first row to the last: {last.megabytes - first.megabytes:+.0f} MB, "
         f"{last.threads - first.threads:+d} threads, {last.files - first.files:+d} files"
     )
-    print(f"after the end: {end}; reloads that were good: {dict(levels)}")
-    if back:
-        print(f"back after a death: median {sorted(back)[len(back) // 2]:.2f} s, worst {max(back):.2f} s")
+    print(f"after the end: {end}; good reloads: {dict(levels)}")
+    if recovery_seconds:
+        print(
+            f"recovery after a death: median {sorted(recovery_seconds)[len(recovery_seconds) // 2]:.2f} s, worst {max(recovery_seconds):.2f} s"
+        )
 
 
 if __name__ == "__main__":

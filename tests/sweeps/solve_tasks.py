@@ -1,14 +1,14 @@
-"""`workbench solve` over ManiSkill's tabletop and control tasks and the examples, as a table.
+"""Run `workbench solve` on ManiSkill's tabletop and control tasks and on the examples, and write a table.
 
-    python -m tests.sweeps.solve_tasks                         all tasks, as far as they are not in solve_tasks.json yet
+    python -m tests.sweeps.solve_tasks                         all tasks that are not in solve_tasks.json yet
     python -m tests.sweeps.solve_tasks PickCube-v1 --seeds 4   some tasks
-    python -m tests.sweeps.solve_tasks PickCube-v1 --again     what is there of it is forgotten first
-    python -m tests.sweeps.solve_tasks --write                 what is there into web_assets/docs/reference/solved_tasks.md
+    python -m tests.sweeps.solve_tasks PickCube-v1 --again     delete the task's results first
+    python -m tests.sweeps.solve_tasks --write                 write the results into web_assets/docs/reference/solved_tasks.md
 
-Each episode is added to solve_tasks.json as soon as it is over, so a sweep that was stopped goes on. The table and its
-verdicts are made of that file. Tasks that need a download or have no dense reward are left out. Control tasks have no
-success: what planned episodes of `CONTROL_STEPS` steps earn stands beside what random and zero actions earn. Seconds are the
-processor's, of all threads and processes: the wall's would say how busy the machine was.
+Each episode is added to solve_tasks.json when it ends, so a stopped sweep can be resumed. The table and its verdicts come
+from that file. Tasks that need a download or have no dense reward are left out. Control tasks have no success: the table
+compares the reward of planned episodes of `CONTROL_STEPS` steps with random and zero actions. Times are CPU seconds of all
+threads and processes, since wall time depends on the machine's load.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ CONTROL_STEPS = 100
 CARTPOLE_STEPS = 300
 PLAIN = {"render_backend": "none"}
 OWN_CONTROL = ("tasks/swing_up.py", "tasks/locomotion.py")
-"""Examples without a success; an episode has as many steps as their time limit."""
+"""Examples without success; their episodes last until the time limit."""
 DRAWN = ("PushT-v1",)
 """Tasks that cannot be built without a renderer."""
 
@@ -52,37 +52,37 @@ DRAWN = ("PushT-v1",)
 @dataclass(frozen=True)
 class Options:
     tasks: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Ids, or files of `tasks/`; all if none are named."""
+    """Env ids or files of `tasks/`; all by default."""
     seeds: int | None = None
-    """16 if it is not given, and 2 for control tasks."""
+    """Seeds of each task; 16 by default, and 2 for control tasks."""
     workers: int = len(os.sched_getaffinity(0))
     again: bool = False
-    """Forget what is in the file of these tasks."""
+    """Delete the stored results of these tasks first."""
     write: bool = False
-    """Put what is in the file into the docs page, and run nothing."""
+    """Only write the stored results into the docs page."""
 
 
 @dataclass
 class Row:
-    """What came of one task."""
+    """Results of one task."""
 
     task: str
     mode: str = ""
     """Control mode."""
     episodes: list[dict[str, Any]] = field(default_factory=list)
-    """Planned ones, in the order of their seeds from 0 on: the fields of `PlannedEpisode`."""
+    """Planned episodes of seeds 0, 1, ... in order: the fields of `PlannedEpisode`."""
     seconds: float = 0.0
-    """The processor's for all of them, each opening of the task included."""
+    """CPU seconds of all episodes, including opening the task."""
     returns: dict[str, float] = field(default_factory=dict)
-    """Of a control task, the mean reward a step of random and of zero actions."""
+    """Mean reward per step of random and of zero actions; for control tasks only."""
     error: str = ""
     """Why it cannot be planned."""
     day: str = ""
-    """On which the last episode ran."""
+    """Date of the last episode."""
 
 
 def tasks() -> list[str]:
-    """Ids and files with a dense reward that need no download, control tasks last."""
+    """Return ids and files with a dense reward that need no download, control tasks last."""
     import mani_skill.envs  # noqa: F401  registers the ids
     from mani_skill.envs.sapien_env import BaseEnv
     from mani_skill.utils.registration import REGISTERED_ENVS
@@ -93,7 +93,7 @@ def tasks() -> list[str]:
     found: dict[str, list[str]] = {"tabletop": [], "control": []}
     for env_id, spec in REGISTERED_ENVS.items():
         kind = spec.cls.__module__.split(".")[-2]
-        # ManiSkill's humanoids declare a dense reward and have none.
+        # ManiSkill's humanoids declare a dense reward but do not implement it.
         has_one = spec.cls.compute_dense_reward is not BaseEnv.compute_dense_reward
         dense = has_one and default_reward_mode(spec.cls) in ("dense", "normalized_dense")
         if kind not in found or not dense or spec.asset_download_ids:
@@ -110,19 +110,19 @@ def tasks() -> list[str]:
 
 
 def is_control(task: str) -> bool:
-    """Whether it has no success."""
+    """Whether the task has no success."""
     return task.startswith("MS-") or task in OWN_CONTROL
 
 
-# --- running ---------------------------------------------------------------------------------------------
+# --- running ----------------------------------------------------------------------------------------
 
 
-class Known:
-    """The rows so far, in their file."""
+class StoredRows:
+    """The rows so far, stored in `FILE`."""
 
     def __init__(self) -> None:
-        told: dict[str, Any] = json.loads(FILE.read_text()) if FILE.exists() else {}
-        self.rows = {task: Row(**row) for task, row in told.items()}
+        rows: dict[str, Any] = json.loads(FILE.read_text()) if FILE.exists() else {}
+        self.rows = {task: Row(**row) for task, row in rows.items()}
 
     def of(self, task: str, again: bool) -> Row:
         if again:
@@ -133,8 +133,8 @@ class Known:
         replace_file(FILE, json.dumps({task: asdict(row) for task, row in self.rows.items()}).encode())
 
 
-def run(row: Row, options: Options, known: Known) -> None:
-    """The episodes that a row lacks; each is saved as soon as those before it are there."""
+def run(row: Row, options: Options, stored: StoredRows) -> None:
+    """Run the episodes that a row lacks; each is saved once all before it are done."""
     from workbench.episodes.reader.read_episode import read_episode
     from workbench.record.job import RecordProgress, record
     from workbench.record.job_worker import RecordOptions
@@ -143,8 +143,8 @@ def run(row: Row, options: Options, known: Known) -> None:
 
     control, task = is_control(row.task), row.task
     steps = (CARTPOLE_STEPS if "Cartpole" in task else CONTROL_STEPS) if task.startswith("MS-") else None
-    most = options.seeds or (CONTROL_SEEDS if control else SEEDS)
-    first, before, began = len(row.episodes), row.seconds, _processor_seconds()
+    seeds = options.seeds or (CONTROL_SEEDS if control else SEEDS)
+    first, before, began = len(row.episodes), row.seconds, _cpu_seconds()
     ended: dict[int, dict[str, Any]] = {}
 
     def on_progress(progress: RecordProgress) -> None:
@@ -156,69 +156,69 @@ def run(row: Row, options: Options, known: Known) -> None:
         while len(row.episodes) in ended:
             row.episodes.append(ended.pop(len(row.episodes)))
         row.day = date.today().isoformat()
-        known.save()
-        print(f"{task} seed {written.seed}: {_said(written.planned)}", flush=True)
+        stored.save()
+        print(f"{task} seed {written.seed}: {_outcome_text(written.planned)}", flush=True)
 
     with tempfile.TemporaryDirectory() as folder:
-        if first < most:
+        if first < seeds:
             plain = TaskOptions(num_envs=1, seed=first, env_kwargs={} if task in DRAWN else PLAIN)
             what = SolveOptions(
-                task, Path(folder), most - first, options.workers, False, steps, options=plain
+                task, Path(folder), seeds - first, options.workers, False, steps, options=plain
             )
             record(what.recording(), on_progress=on_progress)
-            # Here: a process that is not over is not in the sum.
-            row.seconds = before + _processor_seconds() - began
+            # Measure after the job: RUSAGE_CHILDREN counts only processes that have ended.
+            row.seconds = before + _cpu_seconds() - began
         for actions in ("random", "zero") if control and not row.returns else ():
-            # One: the hoppers fail where some of several envs are reset.
+            # One env, since the hoppers fail in partial resets.
             envs = TaskOptions(num_envs=1, env_kwargs=PLAIN)
             out = Path(folder, actions)
             plain_run = RecordOptions(
-                task, out, most, actions=actions, pictures=False, max_steps=steps, options=envs
+                task, out, seeds, actions=actions, pictures=False, max_steps=steps, options=envs
             )
             done = record(plain_run)
             row.returns[actions] = mean((one.total_reward or 0.0) / one.steps for one in done.written)
-    known.save()
+    stored.save()
 
 
-def _processor_seconds() -> float:
+def _cpu_seconds() -> float:
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(each.ru_utime + each.ru_stime for each in used)
 
 
-def _said(episode: PlannedEpisode) -> str:
+def _outcome_text(episode: PlannedEpisode) -> str:
     if episode.solved_at:
         return f"solved at step {episode.solved_at}"
     return f"{episode.steps} steps, {episode.reward.mean():.3f} a step, {episode.reward[-1]:.3f} at its end"
 
 
 def as_json(episode: PlannedEpisode) -> dict[str, Any]:
-    told = {
+    fields = {
         name: getattr(value, "tolist", lambda value=value: value)() for name, value in vars(episode).items()
     }
-    return {**told, "terms": {name: term.tolist() for name, term in episode.terms.items()}}
+    return {**fields, "terms": {name: term.tolist() for name, term in episode.terms.items()}}
 
 
-def from_json(told: dict[str, Any]) -> PlannedEpisode:
+def from_json(fields: dict[str, Any]) -> PlannedEpisode:
     kinds = {"success": np.bool_, "fail": np.bool_}
     rows = {
         name: np.array(value, kinds.get(name, np.float32))
-        for name, value in told.items()
+        for name, value in fields.items()
         if isinstance(value, list)
     }
-    terms = {name: np.array(term, np.float32) for name, term in told["terms"].items()}
-    return PlannedEpisode(**{**told, **rows, "terms": terms})
+    terms = {name: np.array(term, np.float32) for name, term in fields["terms"].items()}
+    return PlannedEpisode(**{**fields, **rows, "terms": terms})
 
 
-# --- the table -------------------------------------------------------------------------------------------
+# --- the table --------------------------------------------------------------------------------------
 
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
-    yield "| task | control mode | solved | control steps (median) | processor seconds a seed | what the rollouts told |"
+    yield "| task | control mode | solved | control steps (median) | CPU seconds per seed | verdicts |"
     yield "| --- | --- | ---: | ---: | ---: | --- |"
     for row in rows:
         if is_control(row.task):
             continue
-        episodes = [from_json(told) for told in row.episodes]
+        episodes = [from_json(fields) for fields in row.episodes]
         solved = [one.solved_at for one in episodes if one.solved_at]
         count = f"{len(solved)} of {len(episodes)}" if episodes else ""
         steps = f"{median(solved):g}" if solved else ""
@@ -227,10 +227,10 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
     if not control:
         return
     yield ""
-    yield "| control task | control mode | seeds | steps (median) | reward a step, planned | random | zero | processor seconds a seed |"
+    yield "| control task | control mode | seeds | steps (median) | reward per step, planned | random | zero | CPU seconds per seed |"
     yield "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"
     for row in control:
-        episodes = [from_json(told) for told in row.episodes]
+        episodes = [from_json(fields) for fields in row.episodes]
         planned = f"{mean(one.reward.mean() for one in episodes):.3f}" if episodes else row.error
         others = " | ".join(f"{row.returns[name]:.3f}" if row.returns else "" for name in ("random", "zero"))
         steps = f"{median(one.steps for one in episodes):g}" if episodes else ""
@@ -242,21 +242,21 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def _seconds(row: Row) -> str:
-    # None where a sweep was ended in the middle of a task.
+    # Empty if the sweep was stopped during the task.
     return f"{row.seconds / len(row.episodes):.0f}" if row.episodes and row.seconds else ""
 
 
 def _why(row: Row, episodes: Sequence[PlannedEpisode]) -> Iterator[str]:
-    """The verdicts, and what stood in the way of the seeds that none of them has."""
+    """Yield the verdicts, then the reasons for the unsolved seeds that no verdict covers."""
     if row.error:
         yield row.error
     verdicts = of_episodes(episodes)
     for one in verdicts:
         yield f"[{one.rule}](../rules/{one.rule}.md), {_seeds(one.seeds)}: {one.message}"
-    told = {seed for one in verdicts for seed in one.seeds}
+    covered = {seed for one in verdicts for seed in one.seeds}
     others: dict[str, list[int]] = {}
     for one in episodes:
-        if not one.solved_at and one.seed not in told:
+        if not one.solved_at and one.seed not in covered:
             others.setdefault(in_the_way(one, episodes), []).append(one.seed)
     for text, found in others.items():
         yield f"{_seeds(found)}: {text}"
@@ -282,19 +282,19 @@ def write(rows: Sequence[Row]) -> None:
 
 
 def main(options: Options) -> None:
-    known = Known()
+    stored = StoredRows()
     if options.write:
-        return write([known.rows[task] for task in tasks() if task in known.rows])
+        return write([stored.rows[task] for task in tasks() if task in stored.rows])
     for task in options.tasks or tasks():
-        row = known.of(task, options.again)
+        row = stored.of(task, options.again)
         if row.error and not options.tasks:
             continue
         row.error = ""
         try:
-            run(row, options, known)
+            run(row, options, stored)
         except Exception as error:
             row.error, row.day = f"{type(error).__name__}: {error}", date.today().isoformat()
-            known.save()
+            stored.save()
         print(*table([row]), sep="\n", flush=True)
 
 

@@ -1,13 +1,12 @@
-"""Every id in ManiSkill's registry, tried; and the page of the docs that says what came of it.
+"""Exercise every id in ManiSkill's registry, and write the docs page with the results.
 
     python tests/sweeps/task_ids.py                  all ids, and the page web_assets/docs/reference/task_ids.md
     python tests/sweeps/task_ids.py PickCube-v1 ...  some ids, printed
 
-A task may end the process or never return, so the ids are tried in a child process: a crash or a hang is one
-row, and the next id gets a new child. One child does many, because the first picture of a process costs the
-compilation of SAPIEN's shaders. In the child nothing can be asked (no standard input) and nothing fetched: an
-attempt to reach the network raises, and ManiSkill's folder for downloads is an empty one, so that the page does
-not depend on what this machine once downloaded.
+A task may crash or hang, so the ids run in a child process: a crash or a hang is one row, and the next id gets a new
+child. One child runs many ids, because the first picture of a process compiles SAPIEN's shaders. The child has no
+standard input, raises on network access, and has an empty ManiSkill download folder, so that the page does not depend on
+earlier downloads.
 """
 
 from __future__ import annotations
@@ -25,22 +24,22 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
 PAGE = REPOSITORY / "web_assets" / "docs" / "reference" / "task_ids.md"
-MARK = "task_ids row: "
-LIMIT = 900.0
-"""Seconds for one id: the slowest needs 60 alone on two cores, and the first compiles shaders besides."""
+ROW_PREFIX = "task_ids row: "
+LIMIT_SECONDS = 900.0
+"""Timeout for one id: the slowest needs 60 s on two idle cores, and the first also compiles shaders."""
 
 
-def sweep(ids: Sequence[str], limit: float = LIMIT) -> Iterator[dict]:
-    """A row for each id, in the order given; see `exercise_task.Row` and `_tried`."""
-    left = list(ids)
+def sweep(ids: Sequence[str], limit: float = LIMIT_SECONDS) -> Iterator[dict]:
+    """Yield a row for each id in the given order; see `exercise_task.Row` and `_tried`."""
+    remaining = list(ids)
     with tempfile.TemporaryDirectory() as nothing_downloaded:
-        while left:
-            child = _child(left, nothing_downloaded)
+        while remaining:
+            child = _child(remaining, nothing_downloaded)
             lines = _lines_of(child)
             try:
-                while left:
-                    row = _next_row(child, lines, left[0], limit)
-                    left.pop(0)
+                while remaining:
+                    row = _next_row(child, lines, remaining[0], limit)
+                    remaining.pop(0)
                     yield row
                     if row["outcome"] in ("crashed", "hung"):
                         break
@@ -77,17 +76,17 @@ def _lines_of(child: subprocess.Popen[str]) -> queue.Queue[str | None]:
 def _next_row(
     child: subprocess.Popen[str], lines: queue.Queue[str | None], env_id: str, limit: float
 ) -> dict:
-    """The row of `env_id`, made up if the child ended or said nothing for `limit` seconds."""
+    """Return the row of `env_id`, or a substitute if the child ended or sent nothing for `limit` seconds."""
     end = time.monotonic() + limit
     while True:
         try:
             line = lines.get(timeout=max(0.0, end - time.monotonic()))
         except queue.Empty:
-            return _no_row(env_id, "hung", f"nothing came back in {limit:.0f} s")
+            return _no_row(env_id, "hung", f"no result within {limit:.0f} s")
         if line is None:
             return _no_row(env_id, "crashed", f"the process ended with status {child.wait()}")
-        if line.startswith(MARK):
-            return json.loads(line.removeprefix(MARK))
+        if line.startswith(ROW_PREFIX):
+            return json.loads(line.removeprefix(ROW_PREFIX))
 
 
 def _no_row(env_id: str, outcome: str, note: str) -> dict:
@@ -108,14 +107,14 @@ def _no_row(env_id: str, outcome: str, note: str) -> dict:
 
 
 def try_here(ids: Sequence[str]) -> None:
-    """Print a row for each id."""
+    """Exercise each id and print its row."""
     refuse_the_network()
     import torch
 
-    # Four rows are too few to share: torch's threads cost more than they save.
+    # With four rows, torch's threads cost more than they save.
     torch.set_num_threads(1)
     for env_id in ids:
-        print(MARK + json.dumps(_tried(env_id)), flush=True)
+        print(ROW_PREFIX + json.dumps(_tried(env_id)), flush=True)
 
 
 def _tried(env_id: str) -> dict:
@@ -134,11 +133,11 @@ def _tried(env_id: str) -> dict:
 
 
 def refuse_the_network() -> None:
-    """From here on, what reaches for the network raises."""
+    """Raise on any network access from now on."""
 
     def hook(event: str, details: tuple) -> None:
         if event in ("socket.connect", "socket.getaddrinfo") and "AF_UNIX" not in repr(details[0]):
-            raise RuntimeError(f"something reached for the network: {event} {details[1:]}")
+            raise RuntimeError(f"network access refused: {event} {details[1:]}")
 
     sys.addaudithook(hook)
 
@@ -149,23 +148,23 @@ _HEAD = """# Every task of ManiSkill, batched on the CPU
 
 Made by `python tests/sweeps/task_ids.py` with mani_skill {mani_skill} and sapien {sapien}; do not edit.
 
-All {count} ids that mani_skill registers, each with {num_envs} envs and its cameras on: made, reset with seeds (twice:
-the same bits), {actions} random actions with pictures as the observation, a reset of envs 1 and 3 in which no bit of
-envs 0 and 2 may change, a snapshot and two restores, and pictures that show something. In the process that does
-it nothing can be downloaded, and nothing can be asked on standard input.
+All {count} ids that mani_skill registers, each with {num_envs} envs and its cameras on: two seeded resets with equal
+bits, {actions} random actions with pictures as the observation, a reset of envs 1 and 3 that must not change a bit of
+envs 0 and 2, a snapshot and two restores, and pictures that are not blank. The process has no network and no
+standard input.
 
 {totals}
 
-* **outcome**: *passed*; *its own fault*: passed, but for what the task itself does wrong in any batched
-  simulation, the GPU's too, named under *note* with the line that fails (the test checks that the
-  traceback goes through that very line); *download*: needs what is not in mani_skill's wheel.
-* **like stock**: env {place} of the {num_envs} beside ManiSkill's own single CPU env, from the same state under the same
-  actions, {steps} control steps. *Bit for bit*: not a byte of PhysX's packed state differed after any step, and rewards
+* **outcome**: *passed*; *its own fault*: passed, except for a fault of the task in any batched
+  simulation, including the GPU's, given under *note* with the line that fails (the test checks that the
+  traceback contains that line); *download*: needs assets that are not in mani_skill's wheel.
+* **like stock**: env {place} of the {num_envs} compared with ManiSkill's own single CPU env, from the same state under the same
+  actions, for {steps} control steps. *Bit for bit*: not a byte of PhysX's packed state differed after any step, and rewards
   and `evaluate()` were equal to the last digit.
-* **restored**: the largest difference of any number of the state {again} control steps after a restore, from the run that
-  was not interrupted, and in brackets from the run after a second restore. PhysX does not give out its contact
-  caches, so bodies that push each other go on a little differently; see the text of `workbench/envs/snapshots/snapshot.py`.
-* **seconds**: the whole row but for *like stock*, on {cores} CPU cores that also drew the pictures in software; only good for
+* **restored**: the largest difference of any number of the state {again} control steps after a restore, from the uninterrupted
+  run, and in brackets from the run after a second restore. PhysX does not expose its contact caches, so bodies in
+  contact continue slightly differently; see the docstring of `workbench/envs/snapshots/snapshot.py`.
+* **seconds**: the whole row except *like stock*, on {cores} CPU cores that also rendered the pictures in software; only for
   comparing rows.
 
 | id | robot | outcome | like stock | restored | seconds | note |
@@ -176,7 +175,7 @@ _WORDS = {"passed": "passed", "upstream": "its own fault", "download": "download
 
 
 def page(rows: Sequence[dict]) -> str:
-    """The docs page, in Markdown."""
+    """Return the docs page in Markdown."""
     from importlib.metadata import version
 
     from tests.sweeps.exercise_task import ACTIONS, NUM_ENVS, STEPS_AGAIN
@@ -203,7 +202,7 @@ def _totals(rows: Sequence[dict]) -> str:
     own = sum(row["outcome"] == "upstream" for row in rows)
     bits = sum(row["like_stock"].startswith("bit for bit") for row in rows)
     return (
-        f"{len(ships)} ids ship in the wheel. {len(works)} of them work, {own} of these but for a fault of the "
+        f"{len(ships)} ids ship in the wheel. {len(works)} of them work, {own} of these except for a fault of the "
         f"task itself. {bits} equal stock bit for bit. {len(rows) - len(ships)} need a download."
     )
 

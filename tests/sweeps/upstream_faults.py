@@ -1,7 +1,7 @@
-"""What is wrong in ManiSkill's own tasks (3.0.1), each with the line that fails and the thread that knows of it.
+"""Known faults of ManiSkill 3.0.1's own tasks, each with the line that fails and its upstream issue.
 
-Nothing here is excused by its exception alone: the traceback must go through the file, the function and the
-very source line that are named, so an entry whose fault upstream has mended, or moved, is found out.
+An exception is excused only if its traceback contains the listed file and source line, so an entry whose fault upstream
+has fixed or moved makes the sweep fail.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ _ROTATE = "tasks/dexterity/rotate_single_object_in_hand.py"
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that a built-in task does wrong when N envs are run at once, on the GPU as on the CPU."""
+    """One fault of a built-in task with several envs, on the GPU and on the CPU."""
 
     ids: tuple[str, ...]
     stage: str
     """``partial reset`` or ``get_state``."""
     file: str
-    """The end of the path of the file whose line fails."""
+    """End of the path of the file that fails."""
     line: str
-    """That line, as it stands in the source."""
+    """The source line that fails, stripped."""
     why: str
     upstream: str
-    """Issues and pull requests of mani-skill/ManiSkill, as far as any was found."""
+    """Issues and pull requests of mani-skill/ManiSkill, if any was found."""
 
 
 FAULTS = (
@@ -42,8 +42,8 @@ FAULTS = (
         "get_state",
         "utils/common.py",
         "return torch.hstack(states)",
-        "the valves, one an env, stay in the state registry beside the merged valve",
-        "#444, #517 (PR #676 gave tasks the means to mend it)",
+        "the per-env valves stay in the state registry next to the merged valve",
+        "#444, #517 (PR #676 gave tasks the means to fix it)",
     ),
     Fault(
         ("RotateSingleObjectInHandLevel1-v1",),
@@ -51,15 +51,15 @@ FAULTS = (
         _ROTATE,
         "torch.abs(new_pos[:, 2]) + self.hand_init_height + self.obj_heights",
         "self.obj_heights has a row for each env and is used without [env_idx]",
-        "#1067, #1373; PR #1377 mended the lines beside it",
+        "#1067, #1373; PR #1377 fixed the adjacent lines",
     ),
     Fault(
         ("RotateSingleObjectInHandLevel1-v1",),
         "get_state",
         "utils/common.py",
         "return torch.hstack(states)",
-        "the objects, one an env, stay in the state registry beside the merged object",
-        "#444, #517 (PR #676 gave tasks the means to mend it)",
+        "the per-env objects stay in the state registry next to the merged object",
+        "#444, #517 (PR #676 gave tasks the means to fix it)",
     ),
     Fault(
         ("MS-HopperStand-v1", "MS-HopperHop-v1"),
@@ -81,12 +81,12 @@ FAULTS = (
 
 
 def faults_of(env_id: str) -> dict[str, Fault]:
-    """By stage."""
+    """Return the faults of an id by stage."""
     return {fault.stage: fault for fault in FAULTS if env_id in fault.ids}
 
 
 def where_it_fails(fault: Fault, error: BaseException) -> str | None:
-    """``file.py:line`` if the traceback goes through the line that `fault` names, else None."""
+    """Return ``file.py:line`` if the traceback contains the line of `fault`, else None."""
     for frame in traceback.extract_tb(error.__traceback__):
         if frame.filename.endswith(fault.file) and frame.line == fault.line:
             return f"{fault.file.rsplit('/', 1)[1]}:{frame.lineno}"

@@ -1,4 +1,4 @@
-"""Tests here load task files: the process is restored after each."""
+"""Restores the process after each test here, because they load task files."""
 
 from __future__ import annotations
 

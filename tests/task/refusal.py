@@ -1,4 +1,4 @@
-"""Why a task is refused."""
+"""Loads a task that must be refused, and returns its problem."""
 
 from __future__ import annotations
 

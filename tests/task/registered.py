@@ -1,4 +1,4 @@
-"""The tables in which ManiSkill and gymnasium keep what decorators register: the process has one of each."""
+"""The process-wide registries of ManiSkill and gymnasium, which decorators fill."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ TABLES: tuple[dict[str, Any], ...] = (REGISTERED_ENVS, gym.registry, REGISTERED_
 
 
 def registered() -> list[dict[str, Any]]:
-    """What is in them now."""
+    """Copies of the registries' present content."""
     return [dict(table) for table in TABLES]

@@ -1,4 +1,4 @@
-"""What a person is told to do about a task that cannot be opened as it was requested."""
+"""Advice given for a task that cannot be opened as requested."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def written(folder: Path, line: str) -> Path:
 
 
 @pytest.mark.parametrize(("line", "code"), [(FOR_ONE, FOR_ONE), (FIRST_ROW, "    def evaluate(self):\n")])
-def test_a_task_that_is_written_for_one_env_is_told_the_option(line: str, code: str, tmp_path: Path) -> None:
+def test_a_task_written_for_one_env_gets_advice_to_use_one_env(line: str, code: str, tmp_path: Path) -> None:
     file = written(tmp_path, line)
     for several in (
         lambda: open_task(str(file), TaskOptions(4, env_kwargs=KWARGS)),
@@ -45,7 +45,7 @@ def test_a_task_that_is_written_for_one_env_is_told_the_option(line: str, code: 
     open_task(str(file), TaskOptions(1, env_kwargs=KWARGS)).env.close()
 
 
-def test_what_fails_with_one_env_too_is_not_told_so(tmp_path: Path) -> None:
+def test_a_task_that_also_fails_with_one_env_gets_no_such_advice(tmp_path: Path) -> None:
     for num_envs in (1, 4):
         with pytest.raises(TaskError) as caught:
             open_task(str(written(tmp_path, WRONG)), TaskOptions(num_envs, env_kwargs=KWARGS))

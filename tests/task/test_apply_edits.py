@@ -1,4 +1,4 @@
-"""Edits on real files: whole or not at all, with everything kept that a text does not show."""
+"""Edits on real files are applied completely or not at all; encoding, line ends and mode are kept."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def refusal(do: Callable[[SourceEdit], None], edit: SourceEdit) -> str:
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_line_ends_encoding_and_mode_stay(tmp_path: Path, encoding: str, end: str) -> None:
+def test_line_ends_encoding_and_mode_are_kept(tmp_path: Path, encoding: str, end: str) -> None:
     path = tmp_path / "task.py"
     head = "# -*- coding: latin-1 -*-\n" if encoding == "latin-1" else ""
     old = f"{head}# Größe\n{SOURCE}".replace("\n", end).encode(encoding)
@@ -54,7 +54,7 @@ def test_line_ends_encoding_and_mode_stay(tmp_path: Path, encoding: str, end: st
     assert os.listdir(tmp_path) == ["task.py"]
 
 
-def test_a_file_that_is_marked_read_only_is_left_also_by_root(tmp_path: Path) -> None:
+def test_a_read_only_file_is_not_edited_even_by_root(tmp_path: Path) -> None:
     path = tmp_path / "task.py"
     path.write_text(SOURCE)
     path.chmod(0o444)
@@ -77,10 +77,10 @@ def test_two_files_are_changed_together_or_not_at_all(tmp_path: Path) -> None:
     before = one.stat().st_ctime_ns
     assert "other.py was edited" in refusal(apply, edit)
     assert (one.read_text(), other.read_text()) == ("a = 1\n", "b = 3\n")
-    assert one.stat().st_ctime_ns == before, "it was not written, only to be taken back"
+    assert one.stat().st_ctime_ns == before, "it must not be written and then restored"
 
 
-def test_a_file_that_moved_on_is_left_as_it_is(tmp_path: Path) -> None:
+def test_a_file_changed_meanwhile_is_not_edited(tmp_path: Path) -> None:
     path = tmp_path / "task.py"
     path.write_text(SOURCE)
     edit = planned(path)
@@ -94,7 +94,7 @@ def test_a_file_that_moved_on_is_left_as_it_is(tmp_path: Path) -> None:
     assert path.read_text() == edit.new_text + "# more\n"
 
 
-def test_a_link_goes_on_leading_to_the_file(tmp_path: Path) -> None:
+def test_a_link_to_the_file_stays_a_link(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     path, link = tmp_path / "real" / "task.py", tmp_path / "task.py"
     path.write_text(SOURCE)
@@ -104,7 +104,7 @@ def test_a_link_goes_on_leading_to_the_file(tmp_path: Path) -> None:
     assert link.is_symlink() and path.read_text() == edit.new_text
 
 
-def test_an_installed_file_is_not_written_through_a_link(tmp_path: Path) -> None:
+def test_an_installed_file_is_not_edited_through_a_link(tmp_path: Path) -> None:
     path = tmp_path / "site-packages" / "tasks" / "task.py"
     path.parent.mkdir(parents=True)
     path.write_text(SOURCE)
@@ -113,9 +113,7 @@ def test_an_installed_file_is_not_written_through_a_link(tmp_path: Path) -> None
     assert path.read_text() == SOURCE
 
 
-def test_a_save_while_the_edit_is_written_is_not_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_save_during_the_edit_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "task.py"
     path.write_text(SOURCE)
     edit = planned(path)
@@ -136,7 +134,7 @@ def test_a_save_while_the_edit_is_written_is_not_lost(
     ("call", "number"),
     [("fsync", errno.ENOSPC), ("replace", errno.EIO), ("chmod", errno.EROFS), ("chown", errno.EIO)],
 )
-def test_an_edit_that_cannot_be_written_leaves_the_file_and_nothing_else(
+def test_a_failed_edit_leaves_the_file_unchanged_and_no_other_file(
     tmp_path: Path, call: str, number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "task.py"
@@ -156,7 +154,7 @@ def test_an_edit_that_cannot_be_written_leaves_the_file_and_nothing_else(
 
 
 @pytest.mark.parametrize("taken_back", [True, False])
-def test_of_two_files_the_first_is_taken_back_when_the_second_fails(
+def test_the_first_of_two_files_is_restored_when_the_second_fails(
     tmp_path: Path, taken_back: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, other = tmp_path / "one.py", tmp_path / "other.py"

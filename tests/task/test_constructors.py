@@ -1,4 +1,4 @@
-"""A constructor that forgets its parent's is told at its ``def``, on the page and by `workbench.make`."""
+"""A constructor that does not call its parent's is reported at its ``def``, on the page and by `workbench.make`."""
 
 from __future__ import annotations
 
@@ -72,7 +72,9 @@ class Forgotten(PushCubeEnv):
     ids=["task", "base", "robot"],
 )
 @pytest.mark.parametrize("rules", ["warn", "off"])
-def test_it_is_told_at_its_def(text: str, words: str, rules: str, tmp_path: Path) -> None:
+def test_a_wrong_constructor_is_reported_at_its_def(
+    text: str, words: str, rules: str, tmp_path: Path
+) -> None:
     file = tmp_path / "task.py"
     file.write_text(HEADER + text)
     options = TaskOptions(3, "cpu", env_kwargs={"render_backend": "none"}, rules=rules)  # type: ignore[arg-type]
@@ -87,7 +89,7 @@ def test_it_is_told_at_its_def(text: str, words: str, rules: str, tmp_path: Path
         assert words in str(made.value) and f"{file}:{problem.line}" in str(made.value)
 
 
-def test_one_that_does_not_hand_num_envs_on_is_opened_with_one_env_and_says_so(tmp_path: Path) -> None:
+def test_a_constructor_that_drops_num_envs_is_opened_with_one_env_and_reported(tmp_path: Path) -> None:
     file = tmp_path / "task.py"
     file.write_text(HEADER + LOST)
     with pytest.warns(RuleWarning, match="num_envs"):

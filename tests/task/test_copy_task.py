@@ -1,4 +1,4 @@
-"""An installed task copied into a folder of the user's: what leaned on its place is said otherwise, all else is the same."""
+"""Copying an installed task into a user's folder rewrites what depends on its location, and nothing else."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def installed(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_imports_ids_and_its_own_place_are_said_otherwise_and_nothing_else(installed: Path, end: str) -> None:
+def test_only_imports_ids_and_paths_of_its_own_are_rewritten(installed: Path, end: str) -> None:
     text, ids = copied_text(installed, TEXT.replace("\n", end), 2)
     assert text == COPIED.replace("\n", end)
     assert ids == (("Näh-Task-v1", "MyNäh-Task2-v1"), ("Other", "MyOther2"))
 
 
-def test_a_copy_is_never_written_over_another_file(installed: Path, tmp_path: Path) -> None:
+def test_a_copy_never_overwrites_a_file(installed: Path, tmp_path: Path) -> None:
     installed.write_text(TEXT)
     folder = tmp_path / "mine"
     with pytest.raises(CannotCopy, match="there is no folder"):
@@ -78,7 +78,7 @@ def test_a_copy_is_never_written_over_another_file(installed: Path, tmp_path: Pa
     assert sorted(path.name for path in folder.iterdir()) == ["task.py", "task_2.py", "task_3.py"]
 
 
-def test_every_file_of_maniskills_tasks_is_copied_with_few_lines_changed_or_refused_with_a_reason() -> None:
+def test_every_maniskill_task_file_is_copied_with_few_changes_or_refused_with_a_reason() -> None:
     copied = refused = 0
     for file in sorted(TASKS.rglob("*.py")):
         text = file.read_text()

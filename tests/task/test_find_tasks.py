@@ -1,4 +1,4 @@
-"""Task files are found by their text, in bounded time, and nothing of them runs."""
+"""Task files are found by their text, in bounded time, without running them."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_hidden_folders_environments_packages_and_links_are_left_out(tmp_path: P
     assert is_below(mine, work) and not is_below(work / "link.py", work)
 
 
-def test_a_file_that_does_not_parse_is_listed_if_it_is_a_task_that_somebody_is_writing(
+def test_a_file_that_does_not_parse_is_listed_if_it_looks_like_an_unfinished_task(
     tmp_path: Path,
 ) -> None:
     task(tmp_path / "broken.py", "class Push(BaseEnv):\n    def evaluate(self:\n")

@@ -1,4 +1,4 @@
-"""What a save changed and which level that asks for: on the example task, and on code that is hard to tell."""
+"""The changes in a save and the reload level they need: on the example task, and on difficult code."""
 
 from __future__ import annotations
 
@@ -73,13 +73,13 @@ def of_push_cube(old: str, new: str) -> Change:
         ("def compute_normalized_dense_reward", "def compute_normalised", "rebuilt", "reward mode"),
     ],
 )
-def test_an_edit_of_the_example_asks_for_its_level(old: str, new: str, level: str, says: str) -> None:
+def test_an_edit_of_the_example_gets_its_level(old: str, new: str, level: str, says: str) -> None:
     found = of_push_cube(old, new)
     assert found.level == level, found.reason
     assert says in found.reason
 
 
-def test_an_edit_of_two_things_is_told_as_two_and_gets_the_heavier_level() -> None:
+def test_two_edits_are_reported_separately_and_get_the_heavier_level() -> None:
     new = PUSH_CUBE.replace("torch.tanh(5 * distance)", "torch.tanh(6 * distance)").replace(
         "eye=[0.45,", "eye=[0.5,"
     )
@@ -89,7 +89,7 @@ def test_an_edit_of_two_things_is_told_as_two_and_gets_the_heavier_level() -> No
 
 
 def task(body: str, top: str = "") -> str:
-    """A file with a task class that has this body, and `top` above it."""
+    """The text of a file with a task class with this body, and `top` above the class."""
     head = (
         "import functools\nimport numpy as np\nimport torch\nfrom mani_skill.envs.sapien_env import BaseEnv\n"
     )
@@ -105,7 +105,7 @@ def compute_dense_reward(self, obs, action, info):
 """
 
 
-def test_a_plain_helper_of_the_reward_is_patched_and_one_of_the_scene_too_is_rebuilt() -> None:
+def test_a_helper_of_the_reward_is_patched_and_one_also_used_by_the_scene_rebuilds() -> None:
     top = "def scaled(x):\n    return {} * x\n"
     body = REWARD.format(of="scaled(1)")
     assert change(task(body, top.format(1)), task(body, top.format(2))).level == "patched"
@@ -114,7 +114,7 @@ def test_a_plain_helper_of_the_reward_is_patched_and_one_of_the_scene_too_is_reb
     assert (found.level, found.reason) == ("rebuilt", "scaled changed, which _load_scene uses")
 
 
-def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
+def test_references_are_followed_through_several_names() -> None:
     body = """
     def _load_scene(self, options):
         self.cube = self.scene.build(self._size())
@@ -206,7 +206,7 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
         ("def evaluate(self):\n    return {{'w': {n}}}\n", "from helpers import *\n", "import *"),
     ],
 )
-def test_code_that_may_keep_or_reach_the_old_version_is_rebuilt(hooks: str, top: str, says: str) -> None:
+def test_code_that_may_keep_the_old_version_alive_rebuilds(hooks: str, top: str, says: str) -> None:
     versions = [task(hooks.format(n=n), top.format()) for n in (1, 2)]
     found = change(versions[0], versions[1], helpers="def f():\n    return 1\n")
     assert found.level == "rebuilt", found
@@ -223,19 +223,19 @@ def test_code_that_may_keep_or_reach_the_old_version_is_rebuilt(hooks: str, top:
         "def _get_obs_extra(self, info):\n    obs = super()._get_obs_extra(info)\n    if self.flag:\n        obs['b'] = {n}\n    return obs\n",
     ],
 )
-def test_everyday_code_is_not_taken_for_a_memory(hooks: str) -> None:
+def test_ordinary_code_is_not_taken_for_stored_state(hooks: str) -> None:
     versions = [task(hooks.format(n=n), "TABLE = [1.0, 2.0]\n") for n in (1, 2)]
     found = change(versions[0], versions[1])
     assert found.level == "patched", found.reason
 
 
-def test_an_attribute_that_is_no_longer_written_but_still_read_is_rebuilt() -> None:
+def test_an_attribute_no_longer_written_but_still_read_rebuilds() -> None:
     body = "def _initialize_episode(self, env_idx, options):\n    {}\n\ndef evaluate(self):\n    return {{'g': self.goal}}\n"
     found = change(task(body.format("self.goal = 1")), task(body.format("pass")))
     assert found.level == "rebuilt" and "no longer writes goal" in found.reason
 
 
-def test_a_robot_of_the_file_is_what_the_env_was_built_of_though_nobody_names_it() -> None:
+def test_a_changed_robot_of_the_file_rebuilds_though_no_code_names_it() -> None:
     top = "from mani_skill.agents.base_agent import BaseAgent\n\n\nclass Robot(BaseAgent):\n    uid = 'mine'\n    def reach(self):\n        return {}\n"
     body = "SUPPORTED_ROBOTS = ['mine']\ndef evaluate(self):\n    return {'r': self.agent.tcp}\n"
     assert change(task(body, top.format(1)), task(body, top.format(2))).level == "rebuilt"
@@ -244,7 +244,7 @@ def test_a_robot_of_the_file_is_what_the_env_was_built_of_though_nobody_names_it
     )
 
 
-def test_another_order_of_an_enums_members_is_rebuilt() -> None:
+def test_reordered_enum_members_rebuild() -> None:
     members = "    A = enum.auto()\n", "    B = enum.auto()\n"
     body, head = (
         "def evaluate(self):\n    return {'m': Mode.A.value}\n",
@@ -254,7 +254,7 @@ def test_another_order_of_an_enums_members_is_rebuilt() -> None:
     assert found.level == "rebuilt" and "Mode" in found.reason
 
 
-def test_a_helper_beside_the_task_is_compared_too() -> None:
+def test_a_helper_module_beside_the_task_is_compared_too() -> None:
     texts = [
         {
             FILE: task(REWARD.format(of="far()"), "from beside import far\n"),
@@ -268,7 +268,7 @@ def test_a_helper_beside_the_task_is_compared_too() -> None:
     assert find_change(built[0], built[1], FILE, "Task", BASE_ENV).level == "rebuilt"
 
 
-def test_a_name_that_a_library_class_uses_while_it_builds_is_built_of() -> None:
+def test_a_name_used_by_a_library_class_while_building_rebuilds() -> None:
     body = "def _cube_color(self):\n    return {}\n"
     library = Inherited(BASE_ENV.names, frozenset({"_cube_color"}))
     assert change(task(body.format(1)), task(body.format(2)), inherited=library).level == "rebuilt"
@@ -276,7 +276,7 @@ def test_a_name_that_a_library_class_uses_while_it_builds_is_built_of() -> None:
 
 
 @pytest.mark.parametrize("hook", ["self.cube.pose.p", "torch.rand(3)", "self._batched_episode_rng.uniform()"])
-def test_cameras_that_depend_on_the_moment_are_rebuilt(hook: str) -> None:
+def test_cameras_that_depend_on_the_current_state_rebuild(hook: str) -> None:
     body = f"@property\ndef _default_sensor_configs(self):\n    return [Camera({hook}, {{}})]\n"
     assert change(task(body.replace("{}", "1")), task(body.replace("{}", "2"))).level == "rebuilt"
 
@@ -297,7 +297,7 @@ def test_a_file_that_cannot_be_read_is_no_error() -> None:
         ("import math", False),
     ],
 )
-def test_what_an_import_did_and_a_new_version_does_not_is_told_at_its_line(
+def test_an_import_side_effect_missing_in_the_new_version_is_reported_at_its_line(
     statement: str, has_one: bool
 ) -> None:
     def removed(old: str, new: str) -> str:

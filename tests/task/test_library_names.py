@@ -1,4 +1,4 @@
-"""A file of the author's that is called like a library: the library stays the library, and the author is told."""
+"""An author's file with the name of a library: imports still get the library, and the author is warned."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ TASK = """
 class NamedEnv(BaseEnv):
     pass
 """
-LATE = ("colorsys", "sched", "sympy", "jinja2")
-"""Of the standard library and of what we depend on, and not imported so far."""
+NOT_IMPORTED = ("colorsys", "sched", "sympy", "jinja2")
+"""Modules of the standard library and of our dependencies that are not imported yet."""
 
 
 @pytest.fixture
-def late() -> tuple[str, ...]:
-    for name in LATE:
+def not_imported() -> tuple[str, ...]:
+    for name in NOT_IMPORTED:
         for loaded in [key for key in sys.modules if key.partition(".")[0] == name]:
             del sys.modules[loaded]
-    return LATE
+    return NOT_IMPORTED
 
 
 def plant(write: Write, *names: str) -> None:
@@ -37,24 +37,24 @@ def plant(write: Write, *names: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_librarys_name_is_the_librarys_wherever_it_is_imported_late(
-    write: Write, late: tuple[str, ...]
+def test_a_librarys_name_gives_the_library_wherever_it_is_imported(
+    write: Write, not_imported: tuple[str, ...]
 ) -> None:
-    plant(write, "numpy", *late)
+    plant(write, "numpy", *not_imported)
     path = write("push.py", "import numpy, helper\n" + TASK, task=True)
     helper = write("helper.py", "SIZE = 1\n")
     task = load_task(str(path))
-    for name in late:
+    for name in not_imported:
         assert "RuntimeError" not in str(importlib.import_module(name).__file__)
         assert not str(importlib.import_module(name).__file__).startswith(str(path.parent))
     assert sys.modules[task.cls.__module__].helper.__file__ == str(helper), (
-        "other names are found beside the file"
+        "other names are found next to the file"
     )
     assert task.source_files == (path, helper)
 
 
 @pytest.mark.parametrize("name", ["sapien", "torch", "numpy", "random", "sympy", "mani_skill", "workbench"])
-def test_a_task_may_itself_be_called_like_a_library(write: Write, name: str) -> None:
+def test_a_task_file_may_have_the_name_of_a_library(write: Write, name: str) -> None:
     library = sys.modules.get(name)
     path = write(f"{name}.py", f"import {name}\nSEEN = {name}\n" + TASK, task=True)
     task = load_task(str(path))
@@ -83,12 +83,12 @@ def test_a_first_load_that_fails_leaves_no_folder_and_no_finder_behind(write: Wr
     assert (sys.path, sys.meta_path) == before
 
 
-def test_a_policy_imports_what_lies_beside_it_but_no_library(
-    write: Write, late: tuple[str, ...], capsys: pytest.CaptureFixture
+def test_a_policy_imports_modules_beside_it_but_never_in_place_of_a_library(
+    write: Write, not_imported: tuple[str, ...], capsys: pytest.CaptureFixture
 ) -> None:
-    plant(write, *late)
+    plant(write, *not_imported)
     write("gains.py", "GAIN = 3\n")
-    imports = "".join(f"import {name}\n" for name in late)
+    imports = "".join(f"import {name}\n" for name in not_imported)
     policy = write("own_policy.py", imports + "from gains import GAIN\ndef act(obs): return GAIN\n")
     before = list(sys.path), list(sys.meta_path)
     sys.modules.pop("gains", None)
@@ -96,5 +96,5 @@ def test_a_policy_imports_what_lies_beside_it_but_no_library(
     assert (sys.path, sys.meta_path) == before
     assert "colorsys.py has the name of a library" in capsys.readouterr().err
     load_policy(f"{policy}:act")
-    assert "colorsys" not in capsys.readouterr().err, "told once"
+    assert "colorsys" not in capsys.readouterr().err, "the warning is printed once"
     del sys.modules["gains"]

@@ -1,4 +1,4 @@
-"""A reference becomes a class, again and again, or the process is as it was."""
+"""Loading a task class, repeatedly; a failed load leaves the process unchanged."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class PushEnv(BaseEnv):
 """
 
 
-def test_a_file_gives_its_class_with_what_it_was_registered_with(write: Write) -> None:
+def test_a_file_gives_its_class_and_its_registration(write: Write) -> None:
     path = write("push.py", PUSH, task=True)
     task = load_task(str(path))
     assert (task.env_id, task.class_name, task.max_episode_steps) == ("AuthorPush-v1", "PushEnv", 7)
@@ -68,14 +68,14 @@ def test_a_registered_id_gives_the_built_in_class_and_its_source() -> None:
         (os.devnull, "not an ordinary file"),
     ],
 )
-def test_a_wrong_reference_is_refused_in_words(reference: str, words: str) -> None:
+def test_a_wrong_reference_is_refused_with_a_message(reference: str, words: str) -> None:
     problem = refused(reference)
     assert words in problem.message
     assert (problem.stage, problem.line) == ("import", None)
     assert len(problem.message) <= 500
 
 
-def test_of_several_classes_the_last_registered_one_is_taken_and_the_others_are_named(write: Write) -> None:
+def test_the_last_registered_class_is_loaded_and_the_others_are_named(write: Write) -> None:
     path = write(
         "push.py",
         """
@@ -129,7 +129,7 @@ def test_two_saves_of_the_same_size_within_a_second_are_two_versions(write: Writ
     assert not (path.parent / "__pycache__").exists()
 
 
-def test_a_new_version_is_what_the_tables_have_and_a_dropped_id_is_gone(write: Write) -> None:
+def test_the_registries_hold_the_new_version_and_no_dropped_id(write: Write) -> None:
     path = write("push.py", PUSH, task=True)
     first = load_task(str(path)).cls
     second = load_task(str(path))
@@ -146,7 +146,7 @@ def test_a_new_version_is_what_the_tables_have_and_a_dropped_id_is_gone(write: W
         )
 
 
-def test_a_built_in_id_is_taken_over_and_given_back(write: Write) -> None:
+def test_a_built_in_id_is_overridden_and_restored(write: Write) -> None:
     built_in = REGISTERED_ENVS["PickCube-v1"].cls
     path = write("push.py", PUSH.replace("AuthorPush-v1", "PickCube-v1"), task=True)
     task = load_task(str(path))
@@ -159,7 +159,7 @@ def test_a_built_in_id_is_taken_over_and_given_back(write: Write) -> None:
     assert gym.spec("PickCube-v1").max_episode_steps == 50
 
 
-def test_an_agent_in_the_file_is_the_new_one_after_a_save(write: Write) -> None:
+def test_an_agent_in_the_file_is_replaced_by_a_save(write: Write) -> None:
     robot = """
     from mani_skill.agents.registration import register_agent
     from mani_skill.agents.robots import Panda
@@ -180,7 +180,7 @@ def test_an_agent_in_the_file_is_the_new_one_after_a_save(write: Write) -> None:
 # --- modules beside the file ---------------------------------------------------------------------
 
 
-def test_edited_helpers_are_read_again_in_every_place_they_can_lie(write: Write) -> None:
+def test_edited_helpers_are_reloaded_wherever_they_are(write: Write) -> None:
     helpers = {
         "shapes.py": "from shapes import SIZE as a",
         "parts/__init__.py": "from parts import SIZE as b",
@@ -201,7 +201,7 @@ def test_edited_helpers_are_read_again_in_every_place_they_can_lie(write: Write)
     assert load_task(str(path)).source_hash != task.source_hash
 
 
-def test_a_helper_of_another_tasks_folder_is_not_taken(write: Write) -> None:
+def test_a_helper_of_another_tasks_folder_is_not_used(write: Write) -> None:
     write("one/helper.py", "WHERE = 1\n")
     write("two/helper.py", "WHERE = 2\n")
     text = "from helper import WHERE\n"
@@ -246,7 +246,7 @@ def test_a_module_imported_inside_a_hook_is_found_and_followed(write: Write) -> 
     assert load_task(str(path)).cls.size() == 2  # type: ignore[attr-defined]
 
 
-def test_given_texts_come_in_place_of_files_on_disk_even_of_missing_ones(write: Write) -> None:
+def test_given_texts_replace_files_on_disk_and_missing_files(write: Write) -> None:
     helper = write("helper.py", "SIZE = 1\n")
     lazy = write("lazy.py", "SIZE = 1\n")
     body = "    @staticmethod\n    def sizes():\n        import lazy\n        return helper.SIZE, lazy.SIZE\n"
@@ -309,7 +309,7 @@ def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_r
         ("x = '\0'\n", "syntax", "null byte", None),
     ],
 )
-def test_what_is_wrong_in_the_file_is_told_at_its_line(
+def test_an_error_in_the_file_is_reported_at_its_line(
     text: str, stage: str, message: str, code: str | None, write: Write
 ) -> None:
     write("helper.py", "SIZE = 1\n")
@@ -326,7 +326,7 @@ def test_what_is_wrong_in_the_file_is_told_at_its_line(
     assert len(problem.traceback.splitlines()) < 250
 
 
-def test_what_is_wrong_in_a_helper_is_told_at_the_helpers_line(write: Write) -> None:
+def test_an_error_in_a_helper_is_reported_at_the_helpers_line(write: Write) -> None:
     helper = write("helper.py", "SIZE = 1\nSIZE = = 2\n")
     path = write("push.py", "import helper\n" + PUSH, task=True)
     problem = refused(path)
@@ -364,7 +364,7 @@ def test_keyboard_interrupt_passes_through_and_leaves_no_trace(write: Write) -> 
     assert registered() == before
 
 
-def test_after_a_failed_load_all_is_as_it_was(write: Write) -> None:
+def test_a_failed_load_changes_nothing(write: Write) -> None:
     write("helper.py", "SIZE = 1\n")
     write("lazy.py", "SIZE = 1\n")
     body = """
@@ -397,7 +397,7 @@ def test_after_a_failed_load_all_is_as_it_was(write: Write) -> None:
     assert inspect.getsource(good.cls).startswith('@register_env("AuthorPush-v1"')
 
 
-def test_a_load_whose_class_cannot_be_built_is_taken_back(write: Write) -> None:
+def test_a_load_whose_class_cannot_be_built_is_undone(write: Write) -> None:
     helper = write("helper.py", "SIZE = 1\n")
     path = write("push.py", "import helper\n" + PUSH, task=True)
     good = load_task(str(path))
@@ -419,17 +419,17 @@ def test_a_load_whose_class_cannot_be_built_is_taken_back(write: Write) -> None:
     assert not undo_load(load_task("PickCube-v1"))
 
 
-def test_old_versions_are_let_go(write: Write) -> None:
+def test_old_versions_are_freed(write: Write) -> None:
     path = write("push.py", PUSH, task=True)
     versions = []
     for _ in range(5):
         versions.append(weakref.ref(load_task(str(path)).cls))
     gc.collect()
-    # The newest runs, and the one before it would come back if the newest were taken back.
+    # The newest version runs, and the previous one would return if the newest were undone.
     assert [version() is None for version in versions] == [True, True, True, False, False]
 
 
-def test_a_failed_save_leaves_an_id_with_the_file_that_took_it_since(write: Write) -> None:
+def test_a_failed_save_does_not_take_an_id_back_from_another_file(write: Write) -> None:
     one = write("one/push.py", PUSH, task=True)
     two = write("two/push.py", PUSH, task=True)
     load_task(str(one))
@@ -446,7 +446,7 @@ def test_a_failed_save_leaves_an_id_with_the_file_that_took_it_since(write: Writ
     assert undo_load(again) and registered() == before
 
 
-def test_what_a_failed_load_put_on_the_search_path_is_gone(write: Write, folder: Path) -> None:
+def test_a_failed_load_removes_its_search_path_entries(write: Write, folder: Path) -> None:
     head = "import sys\nsys.path.insert(0, 'first')\nsys.path.append('last')\nimport helper\n"
     path = write("push.py", head + "1 / 0\n")
     write("helper.py", "SIZE = 1\n")

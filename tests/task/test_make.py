@@ -1,4 +1,4 @@
-"""``workbench.make``: what ``gym.make`` gives, batched on the CPU."""
+"""``workbench.make`` returns what ``gym.make`` returns, batched on the CPU."""
 
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
 
@@ -32,7 +32,7 @@ TASKS = Path(__file__).resolve().parents[2] / "tasks"
 
 @pytest.fixture
 def tables_as_before() -> Iterator[None]:
-    """Files register their ids in the process."""
+    """Restore the registries: task files register their ids in the process."""
     tables: list[dict[str, Any]] = [REGISTERED_ENVS, gymnasium_registry]
     kept = [dict(table) for table in tables]
     yield
@@ -54,7 +54,7 @@ def plain(spec: Any) -> dict[str, Any]:
     return {key: value for key, value in vars(spec).items() if key not in made_by}
 
 
-def test_it_gives_what_gym_make_gives() -> None:
+def test_make_equals_gym_make() -> None:
     stock = gym.make("PickCube-v1", render_backend="none", obs_mode="state_dict")
     ours = workbench.make("PickCube-v1", **CPU, obs_mode="state_dict")
     assert wrappers_of(ours) == wrappers_of(stock)
@@ -90,7 +90,7 @@ def test_a_batch_has_the_spaces_and_the_results_of_a_batch() -> None:
 
 
 @pytest.mark.parametrize(("given", "steps"), [(None, 50), (3, 3), (-1, None)])
-def test_the_time_limit_is_the_registered_one_or_the_one_given(given: int | None, steps: int | None) -> None:
+def test_the_time_limit_is_the_registered_or_the_given_one(given: int | None, steps: int | None) -> None:
     env = workbench.make("MS-CartpoleBalance-v1", 2, max_episode_steps=given, **CPU)
     steps = 1000 if given is None else steps
     assert find_max_episode_steps_value(env) == steps
@@ -152,7 +152,7 @@ def test_the_kwargs_of_a_registration_are_used_and_overridden(tmp_path: Path, ta
     assert gym.spec("Registered-v3").max_episode_steps == 7  # gym.make knows the id of the file
 
 
-def test_the_spec_makes_such_an_env_again() -> None:
+def test_the_spec_makes_an_equal_env() -> None:
     env = workbench.make("PushCube-v1", 2, max_episode_steps=4, **CPU)
     again = gym.make(env.unwrapped.spec)
     assert again.unwrapped.num_envs == 2 and again.unwrapped.backend.sim_backend == SIM_BACKEND
@@ -162,7 +162,7 @@ def test_the_spec_makes_such_an_env_again() -> None:
         each.close()
 
 
-def test_threads_and_strictness_are_the_cores() -> None:
+def test_threads_and_strictness_reach_the_core() -> None:
     class Unbatched(REGISTERED_ENVS["PushCube-v1"].cls):
         def evaluate(self) -> dict[str, Any]:
             return {"success": torch.tensor([True])}
@@ -203,7 +203,7 @@ def test_every_option_of_an_env_reaches_it() -> None:
     env.close()
 
 
-def test_the_default_reward_is_stocks_or_where_stock_has_none_the_richest() -> None:
+def test_the_default_reward_is_stocks_or_else_the_richest() -> None:
     class OnlySparse(REGISTERED_ENVS["PushCube-v1"].cls):
         compute_dense_reward = BaseEnv.compute_dense_reward
         compute_normalized_dense_reward = BaseEnv.compute_normalized_dense_reward
@@ -213,7 +213,7 @@ def test_the_default_reward_is_stocks_or_where_stock_has_none_the_richest() -> N
     env.reset(seed=0)
     env.step(env.action_space.sample())
     env.close()
-    # The richest would be "sparse": stock takes the first.
+    # The richest mode would be "sparse", but stock takes the first.
     env = workbench.make("PlugCharger-v1", 2, **CPU)
     assert (
         env.unwrapped.reward_mode == REGISTERED_ENVS["PlugCharger-v1"].cls.SUPPORTED_REWARD_MODES[0] == "none"
@@ -249,7 +249,7 @@ def test_the_default_reward_is_stocks_or_where_stock_has_none_the_richest() -> N
         ("PickCube-v1", 2, {**CPU, "num_robots": 3}, WrongOption, "num_robots"),
     ],
 )
-def test_what_cannot_be_is_refused_with_a_word_on_what_to_do(
+def test_invalid_options_are_refused_with_advice(
     task: Any, num_envs: Any, kwargs: dict[str, Any], error: type[Exception], says: str
 ) -> None:
     with pytest.raises(error, match=says):
@@ -272,7 +272,7 @@ class Mine(PushCubeEnv):
 def test_a_type_error_in_a_constructor_has_its_authors_frame_and_line(
     tmp_path: Path, tables_as_before: None
 ) -> None:
-    """gymnasium makes another exception of it, which begins in gymnasium."""
+    """gymnasium raises another exception in its place, whose traceback starts in gymnasium."""
     file = tmp_path / "mine.py"
     file.write_text(IN_THE_CONSTRUCTOR)
     with pytest.raises(TypeError) as caught:

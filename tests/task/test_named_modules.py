@@ -1,4 +1,4 @@
-"""``package.module:ClassName`` and ``--import``: found without running anything, opened and followed like a file."""
+"""``package.module:ClassName`` and ``--import`` are found without running code, and opened and watched like a file."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ REFERENCE = "lab_of_mine.tasks:MinimalEnv"
 
 
 @pytest.fixture(autouse=True)
-def nothing_for_good(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """An import is for the rest of the process: not of this one."""
+def undo_imports(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Undo imports, which would stay for the rest of the process."""
     monkeypatch.setattr(library_names, "_permanent_folder", False)
     names = set(sys.modules)
     yield
@@ -48,7 +48,7 @@ def nothing_for_good(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture(params=["package", "no __init__.py"])
 def lab(request: pytest.FixtureRequest, write: Write, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package in the folder where the command is started."""
+    """A package in the current folder."""
     if request.param == "package":
         for name in ("", "tasks/", "robots/"):
             write(f"lab_of_mine/{name}__init__.py", "")
@@ -59,7 +59,7 @@ def lab(request: pytest.FixtureRequest, write: Write, folder: Path, monkeypatch:
     return folder / "lab_of_mine"
 
 
-def test_it_is_found_without_being_imported(lab: Path) -> None:
+def test_a_module_is_found_without_importing_it(lab: Path) -> None:
     for file in lab.rglob("*.py"):
         file.write_text("raise SystemExit('it ran')\n")
     assert named_file(REFERENCE) == lab / "tasks" / "__init__.py"
@@ -72,7 +72,7 @@ def test_it_is_found_without_being_imported(lab: Path) -> None:
     assert named_file("lab_of_mine.tasks.nowhere:MinimalEnv") is None
 
 
-def test_its_class_opens_and_is_followed_with_the_whole_package(lab: Path) -> None:
+def test_the_class_opens_and_its_whole_package_is_watched(lab: Path) -> None:
     task = load_task(REFERENCE)
     minimal, arm = lab / "tasks" / "minimal.py", lab / "robots" / "arm.py"
     assert (task.env_id, task.class_name, task.max_episode_steps) == ("LabOfMine-v1", "MinimalEnv", 7)
@@ -93,7 +93,7 @@ def test_its_class_opens_and_is_followed_with_the_whole_package(lab: Path) -> No
     assert undo_load(again)
 
 
-def test_the_current_folder_goes_ahead_of_no_library(
+def test_the_current_folder_hides_no_library(
     write: Write, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("json", "torch", "colorsys"):
@@ -111,7 +111,7 @@ def test_the_current_folder_goes_ahead_of_no_library(
     assert not str(sys.modules["colorsys"].__file__).startswith(str(folder))
 
 
-def test_an_import_gives_the_ids_that_the_package_registers(lab: Path) -> None:
+def test_an_import_provides_the_ids_that_the_package_registers(lab: Path) -> None:
     problem = refused("LabOfMine-v1")
     assert "--import" in problem.message
     import_modules(("lab_of_mine.tasks",))
@@ -119,7 +119,7 @@ def test_an_import_gives_the_ids_that_the_package_registers(lab: Path) -> None:
     assert (task.class_name, task.file, task.followed) == ("MinimalEnv", lab / "tasks" / "minimal.py", False)
 
 
-def test_a_recording_brings_no_import(lab: Path) -> None:
+def test_a_recording_triggers_no_import(lab: Path) -> None:
     for named in (
         RecordedTask(REFERENCE),
         RecordedTask("LabOfMine-v1", REFERENCE),

@@ -1,4 +1,4 @@
-"""New tasks from templates and installed tasks: their names, what is refused, and that nothing is written over."""
+"""New tasks from templates and installed tasks: their names, refusals, and that no file is overwritten."""
 
 from __future__ import annotations
 
@@ -26,9 +26,7 @@ pytestmark = pytest.mark.thorough
 
 
 @pytest.mark.parametrize("template", TEMPLATES, ids=lambda template: template.name)
-def test_a_template_is_an_example_with_other_names_and_nothing_else(
-    tmp_path: Path, template: Template
-) -> None:
+def test_a_template_is_an_example_with_only_the_names_changed(tmp_path: Path, template: Template) -> None:
     made = write_new_task("stack_two", template.name, tmp_path)
     assert (made.env_id, made.class_name, made.reference) == ("StackTwo-v1", "StackTwoEnv", "stack_two.py")
     (example,) = (file for file in example_tasks() if file.name == template.example)
@@ -43,13 +41,13 @@ def test_a_template_is_an_example_with_other_names_and_nothing_else(
     assert (loaded.env_id, loaded.class_name) == ("StackTwo-v1", "StackTwoEnv")
 
 
-def test_a_task_of_maniskill_is_copied_with_its_class_wherever_it_is_named(tmp_path: Path) -> None:
+def test_a_copied_maniskill_task_has_its_class_renamed_everywhere(tmp_path: Path) -> None:
     made = write_new_task("lift_it", "PickCube-v1", tmp_path)
     task = read_task_file(made.file)
     assert task is not None and task.classes[0] == "LiftItEnv" and task.ids[0] == "LiftIt-v1"
     tree = ast.parse(made.file.read_text())
     assert "PickCubeEnv" not in {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-    # The file has tasks for other robots too, the last of which it would open with.
+    # The file also has tasks for other robots; the last of them would be opened by default.
     assert len(task.ids) > 1 and made.reference == "lift_it.py:LiftItEnv"
     assert all(uid.startswith("LiftIt") for uid in task.ids)
     loaded = load_task(f"{made.file}:LiftItEnv")
@@ -83,7 +81,7 @@ def test_a_name_that_is_invalid_or_taken_is_refused_with_what_to_do(
     assert (tmp_path / "taken.py").read_text() == "mine"
 
 
-def test_a_file_that_appears_at_the_last_moment_is_not_written_over(
+def test_a_file_that_appears_at_the_last_moment_is_not_overwritten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sync = os.fsync

@@ -1,4 +1,4 @@
-"""An exception becomes the author's line, hook and words."""
+"""An exception is reported with the author's line, the hook and a message."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def caught(
 
 
 def of_a_library(text: str, **names: Any) -> Callable[[], object]:
-    """The function that `text` defines, as an installed package has it."""
+    """The function that `text` defines, as if it came from an installed package."""
     exec(compile(text, "/x/site-packages/library.py", "exec"), names)
     return next(reversed(names.values()))
 
@@ -124,7 +124,7 @@ class PushEnv(BaseEnv):
         ("unprintable", 0, "step", "its __str__ raised RuntimeError", "raise Odd"),
     ],
 )
-def test_the_place_is_the_innermost_line_of_the_authors_and_the_stage_is_the_hooks(
+def test_the_place_is_the_authors_innermost_line_and_the_stage_is_the_hook(
     method: str, args: int, stage: str, message: str, code: str, task: LoadedTask
 ) -> None:
     env = task.cls()
@@ -137,7 +137,7 @@ def test_the_place_is_the_innermost_line_of_the_authors_and_the_stage_is_the_hoo
     assert problem.message.partition(":")[0].split(" ")[0] in problem.traceback or method == "unprintable"
 
 
-def test_an_error_of_a_librarys_that_comes_from_the_authors_has_the_authors_line(task: LoadedTask) -> None:
+def test_a_library_error_caused_by_the_authors_code_has_the_authors_line(task: LoadedTask) -> None:
     env = task.cls()
 
     call = of_a_library(
@@ -151,10 +151,10 @@ def test_an_error_of_a_librarys_that_comes_from_the_authors_has_the_authors_line
     )
 
 
-def test_where_no_line_of_the_authors_ran_it_is_the_hook_that_gave_the_wrong_thing(task: LoadedTask) -> None:
+def test_where_no_author_line_ran_the_hook_with_the_wrong_result_is_blamed(task: LoadedTask) -> None:
     env = task.cls()
 
-    # What ManiSkill does with evaluate() -> None.
+    # ManiSkill fails like this when evaluate() returns None.
     get_info = of_a_library("def get_info(): dict(**None)")
     problem = caught(get_info, task.source_files, "step", type(env))
     assert (problem.stage, problem.code) == ("evaluate", "def evaluate(self):")
@@ -170,7 +170,7 @@ def test_endless_recursion_and_endless_messages_are_bounded(task: LoadedTask) ->
     long = caught(env.long, task.source_files)  # type: ignore[attr-defined]
     assert len(long.message) <= 500 and "\n" not in long.message
     assert len(long.traceback) < 20_000
-    # The end of a traceback is what is read first.
+    # People read the end of a traceback first.
     assert deep.traceback.splitlines()[-1].startswith("RecursionError")
 
 

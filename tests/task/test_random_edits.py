@@ -1,4 +1,4 @@
-"""Saves of random edits: whatever level one gets, the env then does what one that is made of the text does."""
+"""Random edits: whatever reload level a save gets, the env then behaves like an env newly made from the text."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ OPTIONS = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})
 
 
 def numbers(text: str) -> list[ast.Constant]:
-    """Lengths, factors and bounds of a task; an int only where something is multiplied by it."""
+    """Lengths, factors and bounds of a task. An int is included only where it is a factor."""
     tree = ast.parse(text)
     factors = {id(node.left) for node in ast.walk(tree) if isinstance(node, ast.BinOp)}
     found = [node for node in ast.walk(tree) if isinstance(node, ast.Constant)]
@@ -40,7 +40,7 @@ def numbers(text: str) -> list[ast.Constant]:
 
 
 def edited(text: str, rng: random.Random) -> str:
-    """With one or two other numbers, and a line more somewhere."""
+    """Return the text with one or two numbers changed and one line added."""
     lines = text.splitlines(keepends=True)
     for node in rng.sample(numbers(text), rng.randint(1, 2)):
         line = lines[node.lineno - 1]
@@ -55,7 +55,7 @@ def edited(text: str, rng: random.Random) -> str:
 
 
 def played(env: TaskEnv) -> Iterator[StepResult]:
-    """An episode that begins as its seeds say."""
+    """Play an episode from a seeded reset."""
     rng = np.random.default_rng(0)
     yield env.reset(seed=[3, 4])
     for _ in range(3):
@@ -63,7 +63,7 @@ def played(env: TaskEnv) -> Iterator[StepResult]:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
-def test_after_each_save_the_env_does_what_a_new_one_of_that_text_does(seed: int, tmp_path: Path) -> None:
+def test_after_each_save_the_env_behaves_like_a_new_one(seed: int, tmp_path: Path) -> None:
     rng, text, levels = random.Random(seed), TEXT, []
     file, other = tmp_path / "push.py", tmp_path / "new.py"
     file.write_text(text)
@@ -91,12 +91,12 @@ def test_after_each_save_the_env_does_what_a_new_one_of_that_text_does(seed: int
             new.env.close()
     finally:
         opened.env.close()
-    assert seed or len(set(levels)) > 1, "not each save builds the scene again"
+    assert seed or len(set(levels)) > 1, "not every save may rebuild the scene"
 
 
 @settings(max_examples=15)
 @given(st.lists(st.integers(0, TEXT.count("\n") - 1), min_size=1, max_size=5))
-def test_lines_between_statements_are_no_change(places: list[int]) -> None:
+def test_blank_lines_and_comments_are_no_change(places: list[int]) -> None:
     lines = TEXT.splitlines(keepends=True)
     outside = [
         at

@@ -1,4 +1,4 @@
-"""The names of mani_skill and gymnasium that `registry` relies on, so that an upgrade fails loudly."""
+"""The names in mani_skill and gymnasium that `registry` relies on; an incompatible upgrade fails here."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from workbench.task import registry
 THIS_FILE = __file__
 
 
-def test_the_tables_are_the_ones_that_upstream_reads() -> None:
+def test_the_registries_are_those_that_upstream_reads() -> None:
     ours = [id(table) for table in registry._TABLES]
     assert ours == [
         id(env_registration.REGISTERED_ENVS),
@@ -29,10 +29,10 @@ def test_the_tables_are_the_ones_that_upstream_reads() -> None:
         id(assets.DATA_GROUPS),
     ]
     assert agents.REGISTERED_AGENTS is agent_registration.REGISTERED_AGENTS
-    assert ours == [id(table) for table in TABLES], "what the tests here look at"
+    assert ours == [id(table) for table in TABLES], "TABLES must be the registries that the tests check"
 
 
-def test_registering_writes_only_the_tables_that_are_kept() -> None:
+def test_registering_writes_only_the_restored_registries() -> None:
     before = registered()
     registrations = registry.Registrations()
     with registry.registering(lambda file: file == THIS_FILE, registrations):
@@ -57,7 +57,7 @@ def test_registering_writes_only_the_tables_that_are_kept() -> None:
     assert registered() == before
     registrations.redo()
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is Task
-    # A second save that fails to load.
+    # The second save fails to load.
     registrations.undo()
     registrations.redo()
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is Task
@@ -66,21 +66,21 @@ def test_registering_writes_only_the_tables_that_are_kept() -> None:
 
 
 def _registered(env_id: str, *, override: bool = False) -> tuple[registry.Registrations, type[BaseEnv]]:
-    """One load that registers one task."""
+    """Register one task, as one load does."""
     registrations = registry.Registrations()
     with registry.registering(lambda file: file == THIS_FILE, registrations):
         cls = env_registration.register_env(env_id, override=override)(type("Task", (BaseEnv,), {}))
     return registrations, cls
 
 
-def test_taking_a_load_back_leaves_what_a_newer_one_put_under_the_name() -> None:
+def test_undoing_a_load_keeps_a_newer_registration_of_the_name() -> None:
     before = registered()
     first, old = _registered("AuthorRegistry-v1")
     second, new = _registered("AuthorRegistry-v1")
     assert [one.name for one in second.replaced()] == ["AuthorRegistry-v1"] and first.replaced() == ()
     first.undo()
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is new
-    # The failed load that came between has no part in the name either.
+    # The failed load in between has no part in the name either.
     first.redo()
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is new
     second.undo()
@@ -89,7 +89,7 @@ def test_taking_a_load_back_leaves_what_a_newer_one_put_under_the_name() -> None
     assert registered() == before
 
 
-def test_a_name_that_one_load_takes_twice_is_refused_with_both_places() -> None:
+def test_a_name_registered_twice_in_one_load_is_refused_with_both_places() -> None:
     before = registered()
     registrations = registry.Registrations()
     elsewhere = compile(
@@ -109,9 +109,9 @@ def test_a_name_that_one_load_takes_twice_is_refused_with_both_places() -> None:
         with pytest.raises(registry.DuplicateName) as there:
             functions["register"](env_registration.register_env, second)
         env_registration.register_env("AuthorRegistry-v1", override=True)(second)
-    told = f"'AuthorRegistry-v1' is registered twice: in line {line} (First) of {THIS_FILE} and in line "
-    assert str(here.value).startswith(told) and str(here.value).count(THIS_FILE) == 1
-    assert str(there.value) == f"{told}2 (Second) of /another/file.py. Give one of them another id."
+    beginning = f"'AuthorRegistry-v1' is registered twice: in line {line} (First) of {THIS_FILE} and in line "
+    assert str(here.value).startswith(beginning) and str(here.value).count(THIS_FILE) == 1
+    assert str(there.value) == f"{beginning}2 (Second) of /another/file.py. Give one of them another id."
     assert [made.cls.__name__ for made in registrations.made] == ["Other", "First", "Second"]
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is second
     registrations.undo()

@@ -1,4 +1,4 @@
-"""What a step's hooks may return, and what is said when they return something else."""
+"""Valid and invalid return values of the hooks of a step, and the messages for the invalid ones."""
 
 from __future__ import annotations
 
@@ -56,16 +56,16 @@ def check(task: LoadedTask, evaluate: object, reward: object = None, num_envs: i
         ({}, None),
         ({"success": YES, "fail": ~YES, "distance": torch.rand(N, 3)}, torch.ones(N)),
         ({"success": YES}, YES.clone()),  # ManiSkill's own sparse reward
-        # Told by a rule, and no reason not to show it.
+        # A rule reports this; the task can still be shown.
         ({"success": YES.float(), "fail": YES.int()}, torch.zeros(N)),
         ({"parts": {"arm": torch.zeros(N, 2)}, "instruction": "push"}, None),
-        # Only success and fail are asked for a row for each env.
+        # Only success and fail must have a row per env.
         ({"best": None, "stage": 2, "distance": 0.5, "progress": torch.tensor(0.5)}, None),
         ({"goal": torch.zeros(3, N), "parts": {"arm": torch.zeros(1), 7: object()}, 1: YES}, torch.zeros(N)),
         ({"reward_terms": {"reach": torch.tensor(0.5), "push": None}}, torch.zeros(N)),
     ],
 )
-def test_what_upstream_takes_is_let_through(evaluate: dict, reward: object, task: LoadedTask) -> None:
+def test_values_that_upstream_accepts_are_accepted(evaluate: dict, reward: object, task: LoadedTask) -> None:
     assert check(task, evaluate, reward) is None
 
 
@@ -80,7 +80,9 @@ def test_what_upstream_takes_is_let_through(evaluate: dict, reward: object, task
         ({"fail": Mute()}, "'fail' as Mute (<Mute, whose repr raises ValueError>)"),
     ],
 )
-def test_a_wrong_evaluate_is_told_at_its_def(evaluate: object, words: str, task: LoadedTask) -> None:
+def test_a_wrong_result_of_evaluate_is_reported_at_its_def(
+    evaluate: object, words: str, task: LoadedTask
+) -> None:
     problem = check(task, evaluate, torch.zeros(N))
     assert problem is not None
     assert problem.message.startswith("evaluate() returned ") and words in problem.message
@@ -98,7 +100,7 @@ def test_a_wrong_evaluate_is_told_at_its_def(evaluate: object, words: str, task:
         (torch.zeros(N, dtype=torch.complex64), "complex64"),
     ],
 )
-def test_a_wrong_reward_is_told_at_its_def(reward: object, words: str, task: LoadedTask) -> None:
+def test_a_wrong_reward_is_reported_at_its_def(reward: object, words: str, task: LoadedTask) -> None:
     problem = check(task, {"success": YES}, reward)
     assert problem is not None
     assert words in problem.message
@@ -106,7 +108,7 @@ def test_a_wrong_reward_is_told_at_its_def(reward: object, words: str, task: Loa
     assert problem.message.startswith("compute_dense_reward() returned ")
 
 
-def test_a_class_put_in_front_of_the_tasks_hides_nothing(task: LoadedTask) -> None:
+def test_a_subclass_in_front_of_the_tasks_class_hides_no_problem(task: LoadedTask) -> None:
     batched = type("Batched", (task.cls,), {})
     problem = check_step_returns(batched, N, None, None, task.source_files)
     assert problem is not None and problem.code == "def evaluate(self):"
@@ -119,7 +121,7 @@ dtypes = st.sampled_from([torch.bool, torch.int32, torch.float32, torch.float64]
 @given(shape=shapes, dtype=dtypes, num_envs=st.integers(1, 5))
 def test_exactly_the_batched_shapes_pass(shape: tuple[int, ...], dtype: torch.dtype, num_envs: int) -> None:
     value = torch.zeros(shape, dtype=dtype)
-    # One number is a row of one env, as in ManiSkill.
+    # With one env, a single number counts as its row, as in ManiSkill.
     a_row_each = shape == (num_envs,) or value.numel() == num_envs == 1
     passes = {
         key: check_step_returns(object, num_envs, {key: value}, None, ()) is None
@@ -128,5 +130,5 @@ def test_exactly_the_batched_shapes_pass(shape: tuple[int, ...], dtype: torch.dt
     assert passes == {"success": a_row_each and not dtype.is_complex, "other": True}
     reward = check_step_returns(object, num_envs, {}, value, ()) is None
     assert reward == a_row_each
-    told = wrong_reward(value, num_envs, {}) is not None
-    assert told == (not a_row_each or not dtype.is_floating_point)
+    refused = wrong_reward(value, num_envs, {}) is not None
+    assert refused == (not a_row_each or not dtype.is_floating_point)

@@ -1,4 +1,4 @@
-"""A robot's file on a real env: it moves, and a save brings the robot in anew."""
+"""A robot file on a real env: the robot moves, and a save rebuilds it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class MyPanda(Panda):
 """
 
 
-def test_a_robot_stands_in_the_scene_and_is_built_anew_by_a_save(tmp_path: Path) -> None:
+def test_a_robot_stands_in_the_scene_and_is_rebuilt_by_a_save(tmp_path: Path) -> None:
     file = tmp_path / "my_panda.py"
     file.write_text(ROBOT)
     request = Load(str(file), TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"}))
@@ -57,7 +57,7 @@ def test_a_robot_stands_in_the_scene_and_is_built_anew_by_a_save(tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("child_process")
-def test_a_record_of_it_has_no_return_and_says_in_which_scene_it_stands_and_how_long(tmp_path: Path) -> None:
+def test_a_recording_of_a_robot_file_has_no_return_and_reports_scene_and_length(tmp_path: Path) -> None:
     file = tmp_path / "my_panda.py"
     file.write_text(ROBOT.replace("my_panda", "its_panda"))
     options = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})

@@ -1,4 +1,4 @@
-"""A file that has a robot and no task: the robot is shown in an empty scene, and its author is told so."""
+"""A file with a robot and no task: the robot is shown in an empty scene, and a message says so."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SmallPanda(Panda):
 """
 
 
-def test_it_opens_in_an_empty_scene_and_says_so(write: Write) -> None:
+def test_a_robot_file_opens_in_an_empty_scene_with_a_message(write: Write) -> None:
     file = write("arms.py", ROBOTS)
     task = load_task(str(file))
     assert (task.env_id, task.chosen, task.others) == ("Empty-v1", "SmallPanda", ("TallPanda",))
@@ -41,7 +41,7 @@ def test_it_opens_in_an_empty_scene_and_says_so(write: Write) -> None:
 
 
 @pytest.mark.parametrize("text", ["raise SystemExit\n", "1 / 0\n"])
-def test_a_version_that_fails_leaves_the_robot_that_was(write: Write, text: str) -> None:
+def test_a_version_that_fails_keeps_the_previous_robot(write: Write, text: str) -> None:
     from mani_skill.agents.registration import REGISTERED_AGENTS
 
     file = write("arms.py", ROBOTS)

@@ -1,4 +1,4 @@
-"""The rules in the workbench: told with the author's file and line, by degrees, and gone when the file is mended."""
+"""Rules in the running workbench: reported with the author's file and line, by degree, and cleared by a fix."""
 
 from __future__ import annotations
 
@@ -99,8 +99,8 @@ KWARGS: dict[str, Any] = {"obs_mode": "state", "render_backend": "none"}
 
 def opened(reference: str, rules: Any = None, found: list[Finding] | None = None) -> Iterator[OpenedTask]:
     options = TaskOptions(num_envs=4, backend="cpu", env_kwargs=KWARGS, rules=rules)
-    heard: list[Finding] = [] if found is None else found
-    task = open_task(reference, options, on_finding=heard.append)
+    reported: list[Finding] = [] if found is None else found
+    task = open_task(reference, options, on_finding=reported.append)
     try:
         yield task
     finally:
@@ -123,15 +123,15 @@ def problem_of(body: str, folder: Path, rules: Any = None) -> Problem:
 @pytest.mark.parametrize(
     ("body", "stage", "words"),
     [
-        (SHRUNK, "reset", "self.target is left with a row for each of the 1 envs"),
+        (SHRUNK, "reset", "self.target now has rows for only 1 of"),
         (REWARD, "returns", "compute_dense_reward() returned a float32 tensor of shape (4, 1)"),
         (OBSERVATION, "returns", "_get_obs_extra() returned 'goal' as a float32 tensor of shape (3,)"),
     ],
 )
-def test_what_cannot_go_on_is_told_at_the_authors_line(
+def test_a_breach_that_stops_is_reported_at_the_authors_line(
     body: str, stage: str, words: str, tmp_path: Path
 ) -> None:
-    """What is done to other envs, and what ManiSkill or the page can do nothing with."""
+    """Changes to other envs, and values that ManiSkill or the page cannot use."""
     problem = problem_of(body, tmp_path)
     assert words in problem.message
     assert (problem.stage, problem.file) == (stage, str((tmp_path / "task.py").resolve()))
@@ -149,43 +149,43 @@ def test_what_cannot_go_on_is_told_at_the_authors_line(
         (HIDES, "not-applied", "The pose of 'cube'"),
     ],
 )
-def test_what_the_task_can_live_with_is_a_row_and_the_task_opens(
+def test_a_breach_that_warns_is_a_row_and_the_task_opens(
     body: str, rule: str, words: str, tmp_path: Path
 ) -> None:
-    file, told = write(body, tmp_path), []
-    for task in opened(file, found=told):
+    file, findings = write(body, tmp_path), []
+    for task in opened(file, found=findings):
         task.env.step(hold_action(task.env.parts, 4))
         rules = task.env.broken_rules
         assert rules is not None
         row = next(row for row in rules.rows if row.rule == rule)
         assert words in row.message and row.degree == "warn"
         assert row.file == file and "# the fault" in row.code and row.first_step == 0
-        assert [finding.message for finding in told] == [row.message for row in rules.rows]
+        assert [finding.message for finding in findings] == [row.message for row in rules.rows]
         of_resets = rule in ("rows-rewritten", "stepped-in-reset")
-        assert row.count > 1 or of_resets, "a rule broken at each step is one row"
+        assert row.count > 1 or of_resets, "a rule broken at every step is one row"
 
 
 @pytest.mark.parametrize(
     ("reward", "kind"),
     [
-        # As UnitreeG1Stand-v1 in its sparse mode.
+        # UnitreeG1Stand-v1 in its sparse mode does this.
         ("torch.arange(self.num_envs) % 2 == 1", "bool"),
         ("torch.arange(self.num_envs) % 2", "int64"),
         ("(torch.arange(self.num_envs) % 2).to(torch.uint8)", "uint8"),
     ],
 )
-def test_a_reward_of_whole_numbers_opens_is_told_and_is_recorded(
+def test_an_integer_reward_opens_is_reported_and_is_recorded(
     child_process: None, reward: str, kind: str, tmp_path: Path
 ) -> None:
-    """Stock ManiSkill hands it on, and so does `workbench.make`."""
-    file, told = write(STANDS.format(reward=reward), tmp_path), []
+    """Stock ManiSkill passes it on, and so does `workbench.make`."""
+    file, findings = write(STANDS.format(reward=reward), tmp_path), []
     options = TaskOptions(num_envs=2, backend="cpu", env_kwargs=KWARGS)
     wanted = RecordOptions(file, tmp_path / "out", 2, pictures=False, max_steps=3, options=options)
-    recorded = record(wanted, on_finding=told.append)
-    (finding,) = told
+    recorded = record(wanted, on_finding=findings.append)
+    (finding,) = findings
     assert (finding.rule, finding.degree, finding.file) == ("reward-rows", "warn", file)
     assert "# the fault" in finding.code and f"a {kind} tensor of shape (2,)" in finding.message
-    assert ".float()" in finding.message, "what to write instead"
+    assert ".float()" in finding.message, "the message must say what to write instead"
     episodes = [read_episode(episode.path) for episode in recorded.written]
     assert [episode.reward.tolist() for episode in episodes] == [[0.0] * 3, [1.0] * 3]
     with pytest.raises(TaskError, match=rf"returned a {kind} tensor"):
@@ -193,21 +193,23 @@ def test_a_reward_of_whole_numbers_opens_is_told_and_is_recorded(
 
 
 @pytest.mark.parametrize("body", [LOST, BEHIND, REWRITTEN])
-def test_rules_that_are_to_stop_stop_at_the_line(body: str, tmp_path: Path) -> None:
+def test_rules_set_to_stop_stop_at_the_line(body: str, tmp_path: Path) -> None:
     problem = problem_of(body, tmp_path, rules="stop")
     assert "# the fault" in (problem.code or "") and "--rules warn" in problem.message
 
 
-def test_an_installed_task_is_told_of_and_never_stopped_unless_that_is_asked_for() -> None:
+def test_an_installed_task_is_reported_and_stopped_only_on_request() -> None:
     @register_env("InstalledTaskOfATest-v1", override=True)
     class Lost(PickCubeEnv):
         def _before_control_step(self) -> None:
             self.cube.set_pose(Pose.create_from_pq(torch.rand((self.num_envs, 3))))
 
-    told: list[Finding] = []
-    for _ in opened("InstalledTaskOfATest-v1", found=told):
+    findings: list[Finding] = []
+    for _ in opened("InstalledTaskOfATest-v1", found=findings):
         pass
-    assert any("The pose of 'cube' in envs 0, 1, 2, 3 was set and not applied" in one.message for one in told)
+    assert any(
+        "The pose of 'cube' in envs 0, 1, 2, 3 was set and not applied" in one.message for one in findings
+    )
     with pytest.raises(TaskError, match="was set and not applied"):
         next(opened("InstalledTaskOfATest-v1", rules="stop"))
 
@@ -216,7 +218,7 @@ def test_an_installed_task_is_told_of_and_never_stopped_unless_that_is_asked_for
 
 
 class Desk:
-    """An author's file and the version of it that runs."""
+    """An author's file and its running version."""
 
     def __init__(self, folder: Path, body: str) -> None:
         self.file = folder / "task.py"
@@ -263,7 +265,7 @@ def rule_ids(desk: Desk) -> list[str]:
     return sorted(row.rule for row in desk.rows())
 
 
-def test_a_row_leaves_at_once_when_its_function_is_mended_and_follows_its_line_otherwise(desk: Desk) -> None:
+def test_a_row_follows_its_line_and_is_cleared_when_its_function_is_fixed(desk: Desk) -> None:
     assert rule_ids(desk) == ["not-applied", "rows-rewritten"]
     before = {row.rule: row for row in desk.rows()}
     mended = REWRITTEN.replace("torch.rand((self.num_envs, 2))  # the fault", "None")
@@ -272,12 +274,12 @@ def test_a_row_leaves_at_once_when_its_function_is_mended_and_follows_its_line_o
     assert row.rule == "not-applied" and row.line == (before["not-applied"].line or 0) + 3
     assert "# the fault" in row.code
     desk.step()
-    assert desk.rows()[0].count == row.count + 1, "the same row, broken once more"
+    assert desk.rows()[0].count == row.count + 1, "the same row with one more breach"
     desk.reset(2)
     assert rule_ids(desk) == ["not-applied"]
 
 
-def test_a_row_whose_fault_is_mended_elsewhere_leaves_at_the_next_occasion(desk: Desk) -> None:
+def test_a_row_fixed_elsewhere_is_cleared_at_the_next_check(desk: Desk) -> None:
     applies = LOST.replace(
         "        self.lift()\n",
         "        self.lift()\n        self.scene._gpu_apply_all()\n        self.scene._gpu_fetch_all()\n",
@@ -290,7 +292,7 @@ def test_a_row_whose_fault_is_mended_elsewhere_leaves_at_the_next_occasion(desk:
     assert rule_ids(desk) == ["rows-rewritten"], "still broken"
 
 
-def test_a_version_that_is_not_taken_changes_no_row(desk: Desk) -> None:
+def test_a_rejected_version_changes_no_row(desk: Desk) -> None:
     before = desk.rows()
     with pytest.raises(TaskError):
         desk.save(LOST + REWRITTEN + "\n    def evaluate(self):\n        return nothing_of_this_name\n")
@@ -301,7 +303,7 @@ def test_a_version_that_is_not_taken_changes_no_row(desk: Desk) -> None:
 
 
 @pytest.mark.slow
-def test_the_page_keeps_the_mark_until_the_file_is_mended(child_process: None, tmp_path: Path) -> None:
+def test_the_page_keeps_the_mark_until_the_file_is_fixed(child_process: None, tmp_path: Path) -> None:
     file, events = tmp_path / "task.py", []
     counts = STANDS.format(reward="torch.arange(self.num_envs) % 2 == 1")
     file.write_text(TASK.format(body=LOST + counts))
@@ -327,10 +329,10 @@ def test_the_page_keeps_the_mark_until_the_file_is_mended(child_process: None, t
         session.do(PlayRun())
         wait_until(session, lambda view: bool(view.rules and view.rules.rows[0].count > count + 3), "a count")
         session.do(PauseRun())
-        told = [finding.rule for event in events for finding in event.new]
-        assert told == ["not-applied", "reward-rows"], "told once"
+        findings = [finding.rule for event in events for finding in event.new]
+        assert findings == ["not-applied", "reward-rows"], "each rule is reported once"
         curves = session.view().curves
-        assert curves is not None and curves.newest.tolist() == [0.0, 1.0], "a truth is drawn as 1"
+        assert curves is not None and curves.newest.tolist() == [0.0, 1.0], "True is drawn as 1"
         assert not any(re.search("RuleWarning", text) for text in session.view().printed.texts)
         file.write_text(TASK.format(body=LOST.replace("self.cube.set_pose", "len")))
         wait_until(session, lambda view: view.rules is None and view.task_serial == 2, "the end of the mark")

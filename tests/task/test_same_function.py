@@ -1,4 +1,4 @@
-"""Where a line of one version of a file is in the next."""
+"""Maps a line of one version of a file to the next version."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def at(text: str, words: str) -> int:
         OLD.replace("LIMIT = 3\n", "OTHER = 5\n# three\nLIMIT = 3\n"),
     ],
 )
-def test_a_line_is_followed_where_only_what_is_around_it_changed(words: str, new: str) -> None:
+def test_a_line_is_followed_where_only_its_surroundings_changed(words: str, new: str) -> None:
     assert line_in(OLD, new, at(OLD, words)) == at(new, words)
 
 
@@ -58,11 +58,11 @@ def test_a_line_is_followed_where_only_what_is_around_it_changed(words: str, new
         ("self.up = 2", ""),
     ],
 )
-def test_a_function_that_says_something_else_has_no_such_line(words: str, new: str) -> None:
+def test_a_changed_function_has_no_matching_line(words: str, new: str) -> None:
     assert line_in(OLD, new, at(OLD, words)) is None
 
 
-def test_of_equal_lines_the_one_at_the_same_place_is_meant() -> None:
+def test_of_equal_lines_the_one_at_the_same_place_is_chosen() -> None:
     old = OLD.replace("self.up = 2  # twice", "self.up = 1")
     new = "import torch\n\n\n" + old.replace("class Task", "# the task\nclass Task")
     for line in (i for i, text in enumerate(old.splitlines(), 1) if "self.up = 1" in text):

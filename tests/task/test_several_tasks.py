@@ -1,4 +1,4 @@
-"""A file with several tasks: one that works is opened, the others can be chosen, also when the one that was tried fails."""
+"""A file with several tasks: one that works is opened, and the others can be chosen even after a failure."""
 
 # pyright: reportOptionalMemberAccess=false
 
@@ -22,7 +22,7 @@ BROKEN = '    def _load_scene(self, options):\n        raise ValueError("no cube
 
 
 def tasks(*names: str, broken: tuple[str, ...]) -> str:
-    """A file in which these are registered in this order, with a base class that they have in common."""
+    """The text of a file that registers these tasks in this order, with a common base class."""
     text = (TASKS / "minimal.py").read_text()
     text = text.replace('@register_env("WorkbenchMinimal-v1", max_episode_steps=50)\n', "")
     for name in names:
@@ -52,7 +52,7 @@ def test_the_first_that_opens_is_opened_and_named(file: Path) -> None:
     assert f"{file}:" in notice and "TwoEnv is open in its place" in notice
 
 
-def test_where_a_certain_task_is_wanted_the_others_are_named_and_none_is_opened(file: Path) -> None:
+def test_if_the_requested_task_fails_the_others_are_named_and_none_is_opened(file: Path) -> None:
     file.write_text(tasks("OneEnv", "TwoEnv", broken=("TwoEnv",)))
     for reference, any_task in ((str(file), False), (f"{file}:TwoEnv", True)):
         with pytest.raises(TaskError) as caught:
@@ -70,7 +70,7 @@ def test_where_a_certain_task_is_wanted_the_others_are_named_and_none_is_opened(
 
 
 @pytest.mark.slow
-def test_the_chooser_stays_while_the_one_that_was_tried_fails(
+def test_the_task_chooser_stays_while_the_chosen_task_fails(
     child_process: None, file: Path, tmp_path: Path
 ) -> None:
     file.write_text(tasks("OneEnv", "TwoEnv", broken=("TwoEnv",)))

@@ -1,4 +1,4 @@
-"""What opening a task file would run is found without running it, and only that runs where a recording named the file."""
+"""The code that opening a task file would run is found without running it; for a recording's file only that code runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TASK = "from mani_skill.envs.sapien_env import BaseEnv\nclass Lift(BaseEnv):\n  
 
 
 def lay(folder: Path, **texts: str) -> Path:
-    """These modules, ``a__b`` for ``a/b.py``; every one but task.py leaves a mark when it runs. Returns task.py."""
+    """Write these modules, ``a__b`` for ``a/b.py``. Each except task.py creates a marker file when run. Returns task.py."""
     for name, text in texts.items():
         path = folder / f"{name.replace('__', '/')}.py"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ def recorded(file: Path) -> RecordedTask:
         ("from pack import *", {"pack/__init__.py", "pack/one.py"}),
         ("import chain", {"chain.py", "alone.py"}),
         ("import numpy, json", set()),
-        # Within a package a name is the package's own, also one that a library has.
+        # Within a package, the package's own module wins over a library of that name.
         ("import bag", {"bag/__init__.py", "bag/random.py"}),
     ],
 )
@@ -73,9 +73,7 @@ def test_modules_are_found_by_their_imports(tmp_path: Path, imports: str, found:
         "exec(open('other.py').read())",
     ],
 )
-def test_where_names_are_computed_all_that_lies_beside_counts_and_that_is_said(
-    tmp_path: Path, text: str
-) -> None:
+def test_computed_imports_count_all_neighbour_files_and_are_reported(tmp_path: Path, text: str) -> None:
     (tmp_path / ".venv").mkdir()
     (tmp_path / ".venv" / "hidden.py").write_text("")
     content = read_content(lay(tmp_path, task=text, other="", deep__er=""))
@@ -83,7 +81,7 @@ def test_where_names_are_computed_all_that_lies_beside_counts_and_that_is_said(
     assert any("task.py:" in what and "other code" in what for what in content.unseen)
 
 
-def test_the_hash_is_of_what_the_texts_say_wherever_they_lie(tmp_path: Path) -> None:
+def test_the_hash_depends_on_the_texts_and_not_on_their_location(tmp_path: Path) -> None:
     here = lay(tmp_path / "here", task="import alone")
     (tmp_path / "here" / "alone.py").write_text("A = 1\n")
     there = tmp_path / "there" / "task.py"
@@ -97,7 +95,7 @@ def test_the_hash_is_of_what_the_texts_say_wherever_they_lie(tmp_path: Path) -> 
     assert read_content(here).hash != read_content(there).hash
 
 
-def test_what_is_no_ordinary_file_of_text_is_refused_at_once(tmp_path: Path) -> None:
+def test_files_that_are_not_ordinary_text_are_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.py")
     (tmp_path / "zero.py").symlink_to("/dev/zero")
     (tmp_path / "long.py").write_bytes(b"#" * (17 << 20))
@@ -111,7 +109,7 @@ def test_what_is_no_ordinary_file_of_text_is_refused_at_once(tmp_path: Path) -> 
     assert "cannot be parsed as Python" in read_content(tmp_path / "deep.py").unseen[0]
 
 
-def test_what_was_agreed_to_is_what_runs(tmp_path: Path) -> None:
+def test_only_the_approved_code_runs(tmp_path: Path) -> None:
     file = lay(tmp_path, task=f"import alone, far.near\n{TASK}", alone="A = 1", far__near="", json="")
     agreed = recorded(file)
     evil = f"open({str(tmp_path / 'evil.ran')!r}, 'w').close()"
@@ -121,15 +119,15 @@ def test_what_was_agreed_to_is_what_runs(tmp_path: Path) -> None:
     before = list(sys.path)
     loaded = load_task(agreed)
     assert ran(tmp_path) == {"task", "alone", "near"} and loaded.class_name == "Lift"
-    assert sys.path == before, "what else lies in that folder could be imported"
+    assert sys.path == before, "other files in that folder could be imported"
 
 
-def test_what_nobody_agreed_to_does_not_run_however_it_is_imported(tmp_path: Path) -> None:
+def test_unapproved_code_does_not_run_however_it_is_imported(tmp_path: Path) -> None:
     hidden = "get = globals()['__builtins__']; get = get if isinstance(get, dict) else vars(get)\nget['__imp' + 'ort__']('other')"
     file = lay(tmp_path, task=f"{TASK}{hidden}", other="")
     with pytest.raises(TaskError, match="not among the files that you approved"):
         load_task(recorded(file))
-    # Also where an earlier task has put the folder on the path.
+    # An earlier task may have put the folder on the path.
     sys.path.insert(0, str(tmp_path))
     try:
         with pytest.raises(TaskError, match="other"):
@@ -142,7 +140,7 @@ def test_what_nobody_agreed_to_does_not_run_however_it_is_imported(tmp_path: Pat
 @pytest.mark.parametrize(
     "name", ["{file}", "{file}:Lift", "task.py", "../task.py", "no.such.module:Lift-v0", ""]
 )
-def test_without_an_agreement_only_a_registered_id_is_opened(
+def test_without_approval_only_a_registered_id_is_opened(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = lay(tmp_path, task=TASK)
@@ -155,7 +153,7 @@ def test_without_an_agreement_only_a_registered_id_is_opened(
     assert load_task(RecordedTask("PickCube-v1")).class_name == "PickCubeEnv"
 
 
-def test_what_is_refused_for_a_recording_is_found_for_a_task_that_a_person_opens_after_it(
+def test_a_module_refused_for_a_recording_is_found_for_a_task_opened_later(
     tmp_path: Path,
 ) -> None:
     hidden = "__builtins__['__imp' + 'ort__']('other')"

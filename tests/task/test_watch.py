@@ -1,4 +1,4 @@
-"""Saves, as editors make them, become one call each with the last content on disk."""
+"""Each save by an editor gives one call with the final content on disk."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from workbench.task.watch import SourceWatcher
 
 pytestmark = pytest.mark.thorough
 
-PATIENCE = 20.0
-"""Seconds to wait for what must come. Nothing is asserted of how soon it does."""
+TIMEOUT_SECONDS = 20.0
+"""Timeout for expected calls; no test asserts how soon they come."""
 
 
 class Calls:
-    """What a watcher said, with the content of the files at that moment."""
+    """Records the calls of a watcher, with the content of the files at that moment."""
 
     def __init__(self) -> None:
         self.queue: queue.Queue[dict[str, str | None]] = queue.Queue()
@@ -30,17 +30,17 @@ class Calls:
         self.queue.put({path.name: path.read_text() if path.exists() else None for path in paths})
 
     def next(self) -> dict[str, str | None]:
-        return self.queue.get(timeout=PATIENCE)
+        return self.queue.get(timeout=TIMEOUT_SECONDS)
 
     def until(self, expected: dict[str, str | None]) -> int:
-        """Take calls until one is `expected`; how many it took."""
+        """Take calls until one is `expected`; returns how many were taken."""
         for number in range(1, 100):
             if self.next() == expected:
                 return number
         raise AssertionError("too many calls")
 
-    def nothing_before(self, last: Path) -> bool:
-        """Whether a save of another followed file is the next that is told."""
+    def comes_next(self, last: Path) -> bool:
+        """Save another watched file; returns whether that save is the next call."""
         last.write_text(f"{last.read_text()}# again\n")
         return self.next() == {last.name: last.read_text()}
 
@@ -59,7 +59,7 @@ def watcher(calls: Calls) -> Iterator[SourceWatcher]:
 
 @pytest.fixture
 def last(tmp_path: Path) -> Path:
-    """A followed file in a folder of its own, whose save is told after all that is told of the others."""
+    """A watched file in its own folder, whose save is reported after those of the other files."""
     path = tmp_path / "beside" / "last.py"
     path.parent.mkdir()
     path.write_text("")
@@ -90,33 +90,31 @@ def backup_and_create(path: Path, text: str) -> None:
 
 def delete_and_create(path: Path, text: str) -> None:
     path.unlink()
-    time.sleep(0.05)  # an editor takes its time, and the file is seen to be gone
+    time.sleep(0.05)  # an editor takes that long, so the watcher sees that the file is missing
     path.write_text(text)
 
 
 @pytest.mark.parametrize("save", [write, rename_over, backup_and_create, delete_and_create])
-def test_every_way_of_saving_is_seen_again_and_again(
+def test_every_way_of_saving_is_seen_repeatedly(
     save: Callable[[Path, str], None], file: Path, last: Path, calls: Calls
 ) -> None:
     for number in (1, 2, 3):
         save(file, f"a = {number}\n")
         assert calls.next() == {"task.py": f"a = {number}\n"}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
-def test_only_new_content_of_followed_files_counts(file: Path, last: Path, calls: Calls) -> None:
+def test_only_new_content_of_watched_files_counts(file: Path, last: Path, calls: Calls) -> None:
     os.utime(file)
     file.with_name("other.py").write_text("b = 1\n")
     file.write_text(file.read_text())
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
-def test_a_file_that_stays_away_is_told_once_and_so_is_its_return(
-    file: Path, last: Path, calls: Calls
-) -> None:
+def test_a_deleted_file_is_reported_once_and_so_is_its_return(file: Path, last: Path, calls: Calls) -> None:
     file.unlink()
     assert calls.next() == {"task.py": None}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
     file.write_text("a = 0\n")
     assert calls.next() == {"task.py": "a = 0\n"}
 
@@ -127,7 +125,7 @@ def test_a_save_that_truncates_first_is_not_seen_empty(file: Path, last: Path, c
         time.sleep(0.12)  # so that it is seen empty
         opened.write("a = 1\n")
     assert calls.next() == {"task.py": "a = 1\n"}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
 def test_a_folder_deleted_and_made_again_is_watched_again(
@@ -145,7 +143,7 @@ def test_a_folder_deleted_and_made_again_is_watched_again(
         calls.until({"task.py": None})
 
 
-def test_what_was_saved_between_the_reading_and_the_following_is_not_lost(
+def test_a_save_between_reading_and_watching_is_not_lost(
     watcher: SourceWatcher, last: Path, calls: Calls, tmp_path: Path
 ) -> None:
     path = tmp_path / "task.py"
@@ -153,10 +151,10 @@ def test_what_was_saved_between_the_reading_and_the_following_is_not_lost(
     watcher.follow([path], {str(path): "a = 0\n"})
     assert calls.next() == {"task.py": "a = 1\n"}
     watcher.follow([path, last], {str(path): "a = 1\n"})
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
-def test_files_in_several_folders_are_followed_and_left(
+def test_files_in_several_folders_are_watched_and_released(
     watcher: SourceWatcher, last: Path, calls: Calls, tmp_path: Path
 ) -> None:
     one, two = tmp_path / "one.py", tmp_path / "below" / "two.py"
@@ -171,18 +169,18 @@ def test_files_in_several_folders_are_followed_and_left(
     two.write_text("a = 2\n")
     one.write_text("a = 2\n")
     assert calls.next() == {"one.py": "a = 2\n"}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
-def test_a_save_that_a_file_system_says_nothing_of_is_seen_by_reading(
+def test_a_save_without_a_file_system_event_is_seen_by_polling(
     file: Path, last: Path, calls: Calls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # As a network mount that answers with what it was told some seconds ago.
+    # A network mount may answer with attributes cached some seconds ago.
     monkeypatch.setattr(watch, "_status", lambda path: ())
     for number in (1, 2):
         file.write_text(f"a = {number}\n")
         assert calls.next() == {"task.py": f"a = {number}\n"}
-    assert calls.nothing_before(last)
+    assert calls.comes_next(last)
 
 
 Many = Callable[[int, int], list[Path]]
@@ -190,8 +188,8 @@ Many = Callable[[int, int], list[Path]]
 
 @pytest.fixture
 def many(watcher: SourceWatcher, tmp_path: Path, calls: Calls, monkeypatch: pytest.MonkeyPatch) -> Many:
-    """Follow files in several folders, the first one saved last, of which so many are looked at each time. None is read
-    unless a look says so."""
+    """Watch files in several folders, the first one saved last; each poll checks only some of them, and reads a file
+    only if its attributes changed."""
 
     def follow(newest: int, turn: int) -> list[Path]:
         for name, value in (("READ_SECONDS", 1e6), ("NEWEST", newest), ("TURN", turn)):
@@ -222,7 +220,7 @@ def test_a_call_that_raises_is_logged_and_the_next_save_is_seen(
     watcher = SourceWatcher(on_change)
     watcher.follow([path])
     for number in (1, 2):
-        # At once: between emptying and writing the file may be seen as empty, and then again.
+        # Rename at once: an emptied file could be seen as one more save.
         (tmp_path / "next.txt").write_text(f"a = {number}\n")
         (tmp_path / "next.txt").replace(path)
         assert calls.next() == {"task.py": f"a = {number}\n"}
@@ -230,7 +228,7 @@ def test_a_call_that_raises_is_logged_and_the_next_save_is_seen(
     assert "of the listener's" in caplog.text
 
 
-def test_it_stops_from_outside_and_from_its_own_call(tmp_path: Path) -> None:
+def test_a_watcher_can_be_stopped_from_outside_and_from_its_callback(tmp_path: Path) -> None:
     path = tmp_path / "task.py"
     path.write_text("a = 0\n")
     calls = Calls()
@@ -247,7 +245,9 @@ def test_it_stops_from_outside_and_from_its_own_call(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["pipe", "device", "large", "loop"])
-def test_what_is_no_file_any_more_counts_as_gone_and_is_followed_on(tmp_path: Path, what: str) -> None:
+def test_a_path_that_is_no_longer_a_file_counts_as_missing_and_stays_watched(
+    tmp_path: Path, what: str
+) -> None:
     file, other = tmp_path / "task.py", tmp_path / "other"
     file.write_text("x = 1\n")
     seen: queue.Queue[set[Path]] = queue.Queue()
@@ -263,15 +263,15 @@ def test_what_is_no_file_any_more_counts_as_gone_and_is_followed_on(tmp_path: Pa
         with other.open("wb") as large:
             large.truncate(2**40)
     other.replace(file)
-    assert seen.get(timeout=PATIENCE) == {file}
+    assert seen.get(timeout=TIMEOUT_SECONDS) == {file}
     other.write_text("x = 2\n")
     other.replace(file)
-    assert seen.get(timeout=PATIENCE) == {file}
+    assert seen.get(timeout=TIMEOUT_SECONDS) == {file}
     watcher.stop()
 
 
 @pytest.mark.parametrize("save", [rename_over, delete_and_create])
-def test_of_many_files_one_that_was_renamed_or_made_is_seen_by_its_folder(
+def test_a_renamed_or_created_file_among_many_is_seen_by_its_folder(
     save: Callable[[Path, str], None], many: Many, calls: Calls
 ) -> None:
     for number, file in enumerate(many(0, 0)):

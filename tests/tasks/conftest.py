@@ -1,4 +1,4 @@
-"""The example tasks, imported as anybody would, and made with stock ManiSkill."""
+"""The example tasks, imported as a user would, and made with stock ManiSkill."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ IDS = {
     "two_robots": "WorkbenchTwoRobots-v1",
 }
 ROBOTS = ("workbench_pen_arm", "workbench_pendulum")
-"""Those that the examples register."""
+"""Robots that the examples register."""
 LOGGED = {"locomotion": {"Currently ManiSkill does not support loading plane geometries from MJCFs"}}
-"""What ManiSkill logs of an example that cannot help it: the robot's file has a floor."""
+"""Unavoidable log lines by example: the robot's file contains a floor."""
 
 
 def import_file(name: str) -> None:
@@ -52,7 +52,7 @@ def forget_examples() -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def example_tasks() -> Iterator[None]:
-    # Another test may have left an edited version, which ManiSkill would not replace.
+    # ManiSkill would not replace an edited version that another test left registered.
     forget_examples()
     for name in IDS:
         import_file(name)
@@ -77,7 +77,7 @@ def make(example_tasks: None) -> Iterator[Callable[..., gym.Env]]:
 
 @pytest.fixture
 def mani_skill_log() -> Iterator[list[str]]:
-    """Lines that ManiSkill logs; its logger (whose name ends in a space) does not propagate."""
+    """Yield the lines that ManiSkill logs; its logger, whose name ends in a space, does not propagate."""
     lines: list[str] = []
     handler = logging.Handler()
     handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]

@@ -1,4 +1,4 @@
-"""What holds for every example task: in stock ManiSkill, and with the workbench."""
+"""Every example task works in stock ManiSkill and with the workbench."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ pytestmark = pytest.mark.thorough
 
 Make = Callable[..., Any]
 EXAMPLES = ("push_cube", "minimal")
-"""Those that a reader begins with; the other files of `IDS` have one idea each."""
+"""The examples that a reader starts with; the other files of `IDS` show one idea each."""
 REWARD_MODES = {"push_cube": ("normalized_dense", "dense", "sparse", "none"), "minimal": ("sparse", "none")}
 WITH_REWARD = [(name, mode) for name, modes in REWARD_MODES.items() for mode in modes]
 
 
 @pytest.mark.parametrize(("name", "mode"), WITH_REWARD)
-def test_random_steps_give_batched_finite_numbers_in_every_reward_mode(
+def test_random_steps_return_finite_batched_numbers_in_every_reward_mode(
     name: str, mode: str, make: Make
 ) -> None:
     env = make(name, reward_mode=mode, obs_mode="state")
@@ -41,18 +41,18 @@ def test_random_steps_give_batched_finite_numbers_in_every_reward_mode(
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_no_episode_starts_decided(name: str, make: Make) -> None:
+def test_no_episode_starts_with_success_or_failure(name: str, make: Make) -> None:
     env = make(name)
     for seed in range(10):
         _, info = env.reset(seed=seed)
         assert not info["success"].any() and not info.get("fail", torch.zeros(1)).any()
 
 
-# --- one idea a file --------------------------------------------------------------------------------
+# --- all examples --------------------------------------------------------------------------------
 
 
 def numbers(found: Any) -> list[torch.Tensor]:
-    """The leaves of an observation or an action."""
+    """Return the leaves of an observation or an action as tensors."""
     if isinstance(found, dict):
         return [leaf for each in found.values() for leaf in numbers(each)]
     return [torch.as_tensor(found)]
@@ -63,7 +63,7 @@ def test_every_example_is_listed() -> None:
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_stock_maniskill_makes_and_steps_it_without_a_warning(
+def test_stock_maniskill_makes_and_steps_each_example_without_a_warning(
     name: str, make: Make, mani_skill_log: list[str]
 ) -> None:
     env = make(name, obs_mode="state_dict")
@@ -78,7 +78,7 @@ def test_stock_maniskill_makes_and_steps_it_without_a_warning(
 
 @pytest.mark.filterwarnings("ignore:.*which exists already")  # the class that the fixture imported
 @pytest.mark.parametrize("name", IDS)
-def test_the_workbench_steps_several_envs_of_it_and_resets_one(name: str) -> None:
+def test_the_workbench_steps_several_envs_of_each_example_and_resets_one(name: str) -> None:
     env: Any = workbench.make(
         FOLDER / f"{name}.py",
         num_envs=2,

@@ -1,4 +1,4 @@
-"""The walking robot: what its reward pays for, and when it has failed."""
+"""The walking robot's failure condition."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mani_skill.utils.structs import Pose
 Make = Callable[..., Any]
 
 
-def test_a_robot_on_its_back_has_failed_and_one_that_stands_has_not(make: Make) -> None:
+def test_a_robot_fails_on_its_back_but_not_while_it_stands(make: Make) -> None:
     env = make("locomotion")
     env.reset(seed=0)
     for _ in range(40):

@@ -1,4 +1,4 @@
-"""The tutorial's task: solvable, honest about what it tells a policy, and to be seen in pictures."""
+"""The tutorial's task is solvable, reports correct values, and is visible in its pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Make = Callable[..., Any]
 
 
 def scripted_push(env: Any, seed: int) -> tuple[dict, list[float]]:
-    """Go behind the cube, down, and forward, with ``pd_ee_delta_pos``; the last info, and all rewards.
+    """Move behind the cube, down and forward with ``pd_ee_delta_pos``; return the last info and all rewards.
 
     One unit of an action is 0.1 m.
     """
@@ -50,12 +50,12 @@ def test_a_scripted_push_succeeds_on_every_seed(make: Make) -> None:
         assert info["success"].all() and info["cube_to_goal"] < 0.1
         assert rewards[-1] == 1.0
         assert max(rewards[:-1]) < 0.9 and min(rewards) >= 0
-        # Dense: most of the way each step is worth more than the one before.
+        # A dense reward rises in most steps.
         better = [later > earlier for earlier, later in zip(rewards, rewards[1:], strict=False)]
         assert sum(better) > 0.8 * len(better)
 
 
-def test_a_cube_beside_the_table_has_failed_and_earns_nothing(make: Make) -> None:
+def test_a_cube_that_fell_off_the_table_fails_and_earns_nothing(make: Make) -> None:
     env = make("push_cube", control_mode="pd_joint_delta_pos")
     base = env.unwrapped
     env.reset(seed=0)
@@ -69,7 +69,7 @@ def test_a_cube_beside_the_table_has_failed_and_earns_nothing(make: Make) -> Non
     assert info["cube_height"] < -0.1
 
 
-def test_what_evaluate_says_is_what_the_poses_say(make: Make) -> None:
+def test_evaluate_agrees_with_the_poses(make: Make) -> None:
     env = make("push_cube")
     _, info = env.reset(seed=5)
     cube, goal = env.unwrapped.cube.pose.p, env.unwrapped.goal.pose.p
@@ -80,7 +80,7 @@ def test_what_evaluate_says_is_what_the_poses_say(make: Make) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_sensor_camera_sees_cube_and_target_and_nothing_far_away(
+def test_the_sensor_camera_sees_cube_and_goal_and_no_background(
     seed: int, make: Make, renderer: None
 ) -> None:
     env = make("push_cube", render_backend=RENDER_BACKEND, obs_mode="rgb+depth+segmentation")
@@ -91,6 +91,6 @@ def test_the_sensor_camera_sees_cube_and_target_and_nothing_far_away(
         seen = data["segmentation"] == actor.per_scene_id.reshape(-1, 1, 1, 1)
         assert seen.sum() > pixels
     depth = data["depth"]
-    assert 0 < depth.min() and depth.max() < 1500, "millimetres; 0 is nothing"
+    assert 0 < depth.min() and depth.max() < 1500, "depth in millimetres, where 0 means background"
     blue = data["rgb"][(data["segmentation"] == base.cube.per_scene_id.reshape(-1, 1, 1, 1))[..., 0]].float()
     assert (blue[:, 2] > blue[:, 0] + 40).all()

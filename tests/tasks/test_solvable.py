@@ -1,4 +1,4 @@
-"""Examples that a hand has to work for: a scripted policy succeeds from every seed, and earns most when it does."""
+"""On manipulation examples a scripted policy succeeds from every seed, with the maximum reward on success."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def two_robots(actions: torch.Tensor) -> Any:
         pytest.param("two_robots", solvers.lift_bar, two_robots, marks=pytest.mark.slow),
     ],
 )
-def test_a_script_succeeds_from_every_seed_and_earns_most_then(
+def test_a_scripted_policy_succeeds_from_every_seed_with_maximum_reward(
     make_batch: Callable[[str], Any], name: str, policy: Policy, as_action: Callable[[torch.Tensor], Any]
 ) -> None:
     env = make_batch(name)

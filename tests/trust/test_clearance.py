@@ -1,4 +1,4 @@
-"""Which code of a recording may run, who is asked, and where the answers are kept: on real recordings, running nothing."""
+"""Which code of a recording may run, when the user is asked, and where answers are stored; runs no recorded code."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ pytestmark = pytest.mark.thorough
 TEXT = "import helper\nclass Push: ...\n"
 
 
-class Person:
-    """Answers as it is told, and keeps what it was asked."""
+class Answering:
+    """Gives a fixed answer and records the questions."""
 
     def __init__(self, answer: Consent = Consent.NO) -> None:
         self.answer, self.asked = answer, list[TrustQuestion]()
@@ -48,13 +48,13 @@ def own_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def another_user(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From now on this is an installation that made none of the recordings."""
+    """Switch to an installation that made none of the recordings."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(folder))
 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """The .json of a recording, with its task file and a module beside it."""
+    """The .json of a recording, with its task file and a module next to it."""
     folder = tmp_path / "work"
     folder.mkdir()
     (folder / "push.py").write_text(TEXT)
@@ -85,7 +85,7 @@ def as_recorded(recording: Path) -> CodeToRun:
 
 
 def asked(wanted: CodeToRun, answer: Consent = Consent.NO) -> list[TrustQuestion]:
-    person = Person(answer)
+    person = Answering(answer)
     try:
         Clearances(ask=person).clear(wanted)
     except NotCleared:
@@ -99,10 +99,10 @@ def edit(recording: Path, **values: Any) -> None:
     recording.write_text(json.dumps(document))
 
 
-# --- who is asked ------------------------------------------------------------------------------------
+# --- when the user is asked ------------------------------------------------------------------------------------
 
 
-def test_what_was_recorded_here_is_not_asked_about_also_with_another_text_today(recording: Path) -> None:
+def test_a_local_recording_needs_no_question_even_if_its_file_has_changed(recording: Path) -> None:
     assert made_here(info_of(recording)) is InstallationSeal.CONTENT_AND_PLACE
     file = recording.parents[1] / "push.py"
     file.write_text(f"{TEXT}# edited since\n")
@@ -112,15 +112,13 @@ def test_what_was_recorded_here_is_not_asked_about_also_with_another_text_today(
     assert asked(todays(recording)) == [] and asked(as_recorded(recording)) == []
 
 
-def test_what_was_recorded_elsewhere_is_asked_about_with_file_hash_and_modules(
-    child_process: None, foreign: Path
-) -> None:
+def test_a_foreign_recording_asks_with_file_hash_and_modules(child_process: None, foreign: Path) -> None:
     file = foreign.parents[1] / "push.py"
     (question,) = asked(todays(foreign))
     assert question.file == str(file) and not question.trusted_before and not question.followed
     assert [one.name for one in question.modules] == ["helper.py"]
     assert [one.text for one in question.files] == [TEXT, "A = 1\n"]
-    file.write_bytes(TEXT.replace("\n", "\r\n").encode())  # the same text, and other bytes
+    file.write_bytes(TEXT.replace("\n", "\r\n").encode())  # the same text in other bytes
     (question,) = asked(todays(foreign))
     paths = (file, file.with_name("helper.py"))
     said = subprocess.run(["sha256sum", *paths], capture_output=True, text=True, check=True).stdout
@@ -129,16 +127,18 @@ def test_what_was_recorded_elsewhere_is_asked_about_with_file_hash_and_modules(
     assert (question.file, question.task, question.recorded_text) == ("push.py", "Push-v1", True)
 
 
-def test_without_anybody_to_ask_the_answer_is_no(foreign: Path) -> None:
+def test_without_a_user_to_ask_the_answer_is_no(foreign: Path) -> None:
     for wanted in (todays(foreign), as_recorded(foreign)):
         with pytest.raises(NotCleared, match=r"push\.py .* was not allowed to run") as refused:
             Clearances().clear(wanted)
         assert refused.value.question is not None
         assert Clearances(all_trusted=True).clear(wanted)
-    assert TrustStore().trusts(read_content(foreign.parents[1] / "push.py")) is False, "--trust keeps nothing"
+    assert TrustStore().trusts(read_content(foreign.parents[1] / "push.py")) is False, (
+        "--trust stores nothing"
+    )
 
 
-def test_a_file_that_a_person_named_is_not_asked_about(foreign: Path) -> None:
+def test_a_file_named_by_the_user_needs_no_question(foreign: Path) -> None:
     file = foreign.parents[1] / "push.py"
     assert Clearances(lambda: [file]).clear(todays(foreign)) == str(file)
     assert Clearances().clear(CodeToRun("any_file.py", info_of(foreign))) == "any_file.py"
@@ -147,9 +147,9 @@ def test_a_file_that_a_person_named_is_not_asked_about(foreign: Path) -> None:
     )
 
 
-def test_an_answer_is_kept_by_what_the_texts_say(foreign: Path, tmp_path: Path) -> None:
+def test_an_answer_applies_to_the_same_texts_anywhere(foreign: Path, tmp_path: Path) -> None:
     file, helper = foreign.parents[1] / "push.py", foreign.parents[1] / "helper.py"
-    clearances = Clearances(ask=Person(Consent.ONCE))
+    clearances = Clearances(ask=Answering(Consent.ONCE))
     cleared = clearances.clear(todays(foreign))
     assert isinstance(cleared, RecordedTask) and cleared.approved == {str(file): TEXT, str(helper): "A = 1\n"}
     clearances.clear(todays(foreign))
@@ -166,7 +166,7 @@ def test_an_answer_is_kept_by_what_the_texts_say(foreign: Path, tmp_path: Path) 
     file.write_text(f"{TEXT}import zebra\n")
     found = since(foreign)
     assert found == {"push.py": Since.CHANGED, "helper.py": Since.SAME, "zebra.py": Since.NEW}
-    assert list(found) == ["push.py", "zebra.py", "helper.py"], "what is new first"
+    assert list(found) == ["push.py", "zebra.py", "helper.py"], "new files come first"
     file.write_text("class Push: ...\n")
     assert since(foreign) == {"push.py": Since.CHANGED} and asked(todays(foreign))[0].gone == ("helper.py",)
     file.write_text(TEXT)
@@ -174,31 +174,33 @@ def test_an_answer_is_kept_by_what_the_texts_say(foreign: Path, tmp_path: Path) 
 
 
 def since(recording: Path) -> dict[str, Since]:
-    """What became of each file since it was trusted, as the only question about it says."""
+    """Change of each file since it was trusted, from the only question about the recording."""
     (question,) = asked(todays(recording))
     assert question.trusted_before and not question.nothing_known
     return {Path(one.name).name: one.since for one in question.files}
 
 
-def test_that_a_file_is_followed_is_a_question_of_its_own(foreign: Path, tmp_path: Path) -> None:
+def test_following_a_file_is_a_separate_question(foreign: Path, tmp_path: Path) -> None:
     live = replace(todays(foreign), followed=True)
     (question,) = asked(todays(foreign), Consent.ALWAYS)
     assert not question.followed and not question.agreed
     (question,) = asked(live)
     assert question.followed and question.agreed and not question.trusted_before
-    person = Person(Consent.ONCE)
+    person = Answering(Consent.ONCE)
     clearances = Clearances(ask=person)
     assert isinstance(clearances.clear(live), RecordedTask) and clearances.clear(live)
-    assert len(person.asked) == 1, "until the program ends"
+    assert len(person.asked) == 1, "the answer holds until the program ends"
     assert len(asked(live, Consent.ALWAYS)) == 1 and asked(live) == []
     copy = tmp_path / "copy"
     shutil.copytree(foreign.parents[1], copy)
     there = todays(copy / "recordings" / foreign.name)
-    assert asked(there) == [] and len(asked(replace(there, followed=True))) == 1, "its saves are others"
+    assert asked(there) == [] and len(asked(replace(there, followed=True))) == 1, (
+        "saves of this copy were not agreed to"
+    )
     assert Clearances(all_trusted=True).clear(live)
 
 
-def test_an_answer_to_a_file_that_has_changed_meanwhile_runs_nothing(foreign: Path) -> None:
+def test_an_answer_about_a_file_that_changed_meanwhile_runs_nothing(foreign: Path) -> None:
     file = foreign.parents[1] / "push.py"
 
     def ask(question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
@@ -210,7 +212,9 @@ def test_an_answer_to_a_file_that_has_changed_meanwhile_runs_nothing(foreign: Pa
 
 
 @pytest.mark.parametrize("env_id", ["/w/evil.py", "evil.py:Evil", "..\\evil"])
-def test_a_path_in_place_of_an_id_is_never_opened_and_what_to_do_is_said(foreign: Path, env_id: str) -> None:
+def test_a_path_instead_of_an_id_is_never_opened_and_the_refusal_has_advice(
+    foreign: Path, env_id: str
+) -> None:
     wanted = CodeToRun(RecordedTask(env_id), info_of(foreign))
     with pytest.raises(NotCleared, match="never opened: .* with --task FILE"):
         Clearances(all_trusted=True).clear(wanted)
@@ -224,7 +228,7 @@ def test_a_path_in_place_of_an_id_is_never_opened_and_what_to_do_is_said(foreign
         {"env_kwargs": {"model": "evil.urdf"}},
     ],
 )
-def test_arguments_from_elsewhere_name_no_files(
+def test_foreign_arguments_cannot_name_files(
     foreign: Path, values: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(foreign.parent)
@@ -233,7 +237,7 @@ def test_arguments_from_elsewhere_name_no_files(
     edit(foreign, **values)
     for wanted in (todays(foreign), as_recorded(foreign), CodeToRun(str(file), info_of(foreign))):
         with pytest.raises(NotCleared, match="names files for its env to read .* --trust") as refused:
-            Clearances(ask=Person(Consent.ALWAYS)).clear(wanted)
+            Clearances(ask=Answering(Consent.ALWAYS)).clear(wanted)
         assert refused.value.trust_helps
         Clearances(all_trusted=True).clear(wanted)
     with pytest.raises(SceneError, match="numbers and curves only"):
@@ -254,7 +258,7 @@ def test_arguments_from_elsewhere_name_no_files(
         {"made_here": {"content": "0" * 64, "place": "0" * 64}},
     ],
 )
-def test_an_edited_recording_has_lost_its_seal(recording: Path, values: dict[str, Any]) -> None:
+def test_an_edited_recording_loses_its_seal(recording: Path, values: dict[str, Any]) -> None:
     assert json.loads(recording.read_bytes())["workbench"]["made_here"]["content"]
     edit(recording, **values)
     assert made_here(info_of(recording)) is InstallationSeal.NO
@@ -262,9 +266,7 @@ def test_an_edited_recording_has_lost_its_seal(recording: Path, values: dict[str
         assert len(asked(as_recorded(recording))) == 1
 
 
-def test_one_that_comes_back_with_another_file_beside_it_is_asked_about(
-    recording: Path, tmp_path: Path
-) -> None:
+def test_a_returned_recording_with_a_changed_file_next_to_it_asks(recording: Path, tmp_path: Path) -> None:
     back = tmp_path / "back"
     shutil.copytree(recording.parents[1], back)
     returned = back / "recordings" / recording.name
@@ -272,14 +274,14 @@ def test_one_that_comes_back_with_another_file_beside_it_is_asked_about(
     assert made_here(info_of(returned)) is InstallationSeal.CONTENT
     cleared = Clearances().clear(todays(returned))
     assert isinstance(cleared, RecordedTask) and cleared.file == str(back / "push.py"), (
-        "it says what was recorded here"
+        "it has the text that was recorded here"
     )
     (back / "helper.py").write_text("evil\n")
     assert len(asked(todays(returned))) == 1
     assert asked(as_recorded(returned)) == []
 
 
-def test_a_journal_that_came_with_a_folder_from_elsewhere_is_recovered_without_a_seal(
+def test_a_foreign_journal_is_recovered_without_a_seal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for who, is_ours in (("config", True), ("another", False)):
@@ -293,7 +295,7 @@ def test_a_journal_that_came_with_a_folder_from_elsewhere_is_recovered_without_a
         assert (made_here(info_of(files.json)) is not InstallationSeal.NO) is is_ours
 
 
-def test_a_side_file_that_could_be_imported_does_not_get_beside_the_recorded_text(recording: Path) -> None:
+def test_an_importable_side_file_is_not_placed_next_to_the_recorded_code(recording: Path) -> None:
     folder = recording.parents[1]
     for name in ("mesh.obj", "numpy.py", "json.cpython-311-x86_64-linux-gnu.so"):
         (folder / name).write_text("")
@@ -304,11 +306,11 @@ def test_a_side_file_that_could_be_imported_does_not_get_beside_the_recorded_tex
     assert beside == {"push.py", "helper.py", "mesh.obj"}
 
 
-# --- where it is kept --------------------------------------------------------------------------------
+# --- storage of the key and of the answers --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("key", ["", "no key\n", None])
-def test_without_its_key_a_recording_is_anybodys_and_the_next_has_a_new_one(
+def test_without_the_key_a_recording_is_foreign_and_the_next_gets_a_new_key(
     recording: Path, key: str | None, tmp_path: Path
 ) -> None:
     path = user_folder() / KEY_FILE
@@ -328,7 +330,7 @@ def test_without_its_key_a_recording_is_anybodys_and_the_next_has_a_new_one(
         "[" * 100_000,
     ],
 )
-def test_a_broken_store_trusts_nothing_is_told_once_and_is_kept_aside(
+def test_a_broken_store_trusts_nothing_is_reported_once_and_backed_up(
     foreign: Path, store: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     content = read_content(foreign.parents[1] / "push.py")
@@ -343,9 +345,7 @@ def test_a_broken_store_trusts_nothing_is_told_once_and_is_kept_aside(
     assert (user_folder() / f"{STORE_FILE}.broken").read_text() == store
 
 
-def test_a_store_that_others_may_write_to_trusts_nothing(
-    foreign: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_store_writable_by_others_trusts_nothing(foreign: Path, caplog: pytest.LogCaptureFixture) -> None:
     content = read_content(foreign.parents[1] / "push.py")
     TrustStore().trust(content)
     (user_folder() / STORE_FILE).chmod(0o666)
@@ -355,7 +355,7 @@ def test_a_store_that_others_may_write_to_trusts_nothing(
     assert not TrustStore().trusts(content)
 
 
-# --- a file that a person chose from a list -----------------------------------------------------------
+# --- a file that was chosen from a list -----------------------------------------------------------
 
 
 def listed(tmp_path: Path, text: str = TEXT) -> Path:
@@ -366,15 +366,15 @@ def listed(tmp_path: Path, text: str = TEXT) -> Path:
     return folder / "push.py"
 
 
-def test_a_listed_file_is_asked_about_once_with_its_text_and_its_modules(tmp_path: Path) -> None:
-    file, person = listed(tmp_path), Person(Consent.ALWAYS)
+def test_a_listed_file_asks_once_with_its_text_and_modules(tmp_path: Path) -> None:
+    file, person = listed(tmp_path), Answering(Consent.ALWAYS)
     cleared = Clearances(ask=person).clear_file(file, "Push")
     assert isinstance(cleared, RecordedTask)
     assert str(cleared) == f"{file}:Push" and cleared.approved == read_content(file).texts
     (question,) = person.asked
     assert question.listed and question.followed and not question.recorded_text
     assert [one.name for one in question.files] == [str(file), "helper.py"] and question.files[0].text == TEXT
-    # In a later run too.
+    # Also in a later run.
     Clearances(ask=person).clear_file(file)
     assert len(person.asked) == 1
     listed(tmp_path, TEXT + "# another\n")
@@ -382,8 +382,8 @@ def test_a_listed_file_is_asked_about_once_with_its_text_and_its_modules(tmp_pat
     assert len(person.asked) == 2 and person.asked[1].files[0].since is Since.CHANGED
 
 
-def test_a_no_opens_nothing_and_once_lasts_for_this_run(tmp_path: Path) -> None:
-    file, person = listed(tmp_path), Person(Consent.NO)
+def test_no_opens_nothing_and_once_lasts_for_this_run(tmp_path: Path) -> None:
+    file, person = listed(tmp_path), Answering(Consent.NO)
     clearances = Clearances(ask=person)
     with pytest.raises(NotCleared, match="was not allowed to run"):
         clearances.clear_file(file)

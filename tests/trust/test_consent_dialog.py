@@ -1,4 +1,4 @@
-"""The window that asks whether code may run, on a real server without a browser."""
+"""The dialog that asks whether code may run, on a real server without a browser."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def about(name: str) -> TrustQuestion:
 def asked(
     dialog: TrustDialog, question: TrustQuestion = PLAIN, stopped: Callable[[], bool] = lambda: False
 ) -> Future[Consent]:
-    """Ask on a thread of its own, as whatever wants to run code does."""
+    """Ask on a separate thread, as code loading does."""
     future: Future[Consent] = Future()
     threading.Thread(target=lambda: future.set_result(dialog.ask(question, stopped)), daemon=True).start()
     return future
@@ -54,7 +54,7 @@ def dialog(panels: Panels) -> TrustDialog:
 @pytest.mark.parametrize(
     ("label", "answer"), [(DO_NOT, Consent.NO), (ONCE, Consent.ONCE), (ALWAYS, Consent.ALWAYS)]
 )
-def test_a_press_is_the_answer_and_the_window_goes(
+def test_a_press_answers_and_closes_the_dialog(
     dialog: TrustDialog, panels: Panels, label: str, answer: Consent
 ) -> None:
     future = asked(dialog)
@@ -64,7 +64,7 @@ def test_a_press_is_the_answer_and_the_window_goes(
     assert not panels.shows(label) and panels.html() == ""
 
 
-def test_only_the_first_answer_counts_and_none_comes_before_its_question(
+def test_only_the_first_answer_counts_and_none_before_its_question(
     dialog: TrustDialog, panels: Panels
 ) -> None:
     future = asked(dialog)
@@ -83,16 +83,18 @@ def test_only_the_first_answer_counts_and_none_comes_before_its_question(
     assert second.result(20) is Consent.NO and len(panels.client.notices) == 3
 
 
-def test_enter_in_a_window_that_opens_runs_nothing(dialog: TrustDialog, panels: Panels) -> None:
+def test_enter_in_a_newly_opened_dialog_runs_nothing(dialog: TrustDialog, panels: Panels) -> None:
     future = asked(dialog, replace(PLAIN, more=2))
     window_with(panels, "/home/me/push.py")
     others = "Don't run the other 2 either"
-    assert [one.text for one in panels.buttons()] == [DO_NOT, others, ONCE, ALWAYS], "the first has the focus"
+    assert [one.text for one in panels.buttons()] == [DO_NOT, others, ONCE, ALWAYS], (
+        "the first button has the focus"
+    )
     panels.press(others)
     assert future.result(20) is Consent.NONE
 
 
-def test_questions_come_one_after_the_other(dialog: TrustDialog, panels: Panels) -> None:
+def test_questions_are_shown_one_after_the_other(dialog: TrustDialog, panels: Panels) -> None:
     futures = {name: asked(dialog, about(name)) for name in ("a.py", "b.py", "c.py")}
     order = []
     for _ in futures:
@@ -104,7 +106,7 @@ def test_questions_come_one_after_the_other(dialog: TrustDialog, panels: Panels)
     assert set(order) == set(futures)
 
 
-def test_a_page_that_is_rebuilt_shows_the_question_again(dialog: TrustDialog, panels: Panels) -> None:
+def test_a_rebuilt_page_shows_the_question_again(dialog: TrustDialog, panels: Panels) -> None:
     future = asked(dialog)
     window_with(panels, "/home/me/push.py")
     with panels.server.atomic():
@@ -114,7 +116,7 @@ def test_a_page_that_is_rebuilt_shows_the_question_again(dialog: TrustDialog, pa
     assert future.result(20) is Consent.ONCE
 
 
-def test_what_is_withdrawn_and_what_is_asked_at_the_end_is_a_no(dialog: TrustDialog, panels: Panels) -> None:
+def test_a_withdrawn_question_or_one_during_close_is_answered_no(dialog: TrustDialog, panels: Panels) -> None:
     stop = threading.Event()
     future = asked(dialog, PLAIN, stop.is_set)
     window_with(panels, "/home/me/push.py")
@@ -126,26 +128,32 @@ def test_what_is_withdrawn_and_what_is_asked_at_the_end_is_a_no(dialog: TrustDia
     assert future.result(20) is Consent.NO and asked(dialog).result(20) is Consent.NO
 
 
-def test_the_window_says_what_would_run_and_escapes_it() -> None:
+def test_the_dialog_shows_the_code_that_would_run_escaped() -> None:
     many = tuple(CodeFile(f"m{k}.py", f"{k:012}", f"# {k}\n") for k in range(300))
     evil = CodeFile("/w/<script>.py", "0123456789ab", "x = '</pre><script>alert(1)</script>\u202e'\n")
-    said = question_html(TrustQuestion("Push-v1", False, (evil, *many), ("<b>",)))
-    assert "<script>" not in said and "<b><" not in said and "&lt;script&gt;.py" in said
-    assert "&lt;/pre&gt;" in said and "\\u202e" in said, "the text, escaped"
-    assert all(one.name in said and one.hash in said and one.text in said for one in many)
-    assert "It imports from beside it (300)" in said and "trusted" not in said and "every save" not in said
+    dialog_html = question_html(TrustQuestion("Push-v1", False, (evil, *many), ("<b>",)))
+    assert "<script>" not in dialog_html and "<b><" not in dialog_html and "&lt;script&gt;.py" in dialog_html
+    assert "&lt;/pre&gt;" in dialog_html and "\\u202e" in dialog_html, "the text is escaped"
+    assert all(
+        one.name in dialog_html and one.hash in dialog_html and one.text in dialog_html for one in many
+    )
+    assert (
+        "It imports these modules next to it (300)" in dialog_html
+        and "trusted" not in dialog_html
+        and "every save" not in dialog_html
+    )
     held = (CodeFile("push.py", "0" * 12, ""), HELPER)
-    said = question_html(TrustQuestion("<i>Push</i>-v1", True, held))
-    assert "&lt;i&gt;Push" in said and "hold the text of their task" in said
-    assert "what it may import (1)" in said and "It imports" not in said
+    dialog_html = question_html(TrustQuestion("<i>Push</i>-v1", True, held))
+    assert "&lt;i&gt;Push" in dialog_html and "hold the text of their task" in dialog_html
+    assert "the modules that it may import (1)" in dialog_html and "It imports" not in dialog_html
 
 
-def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
+def test_changes_since_trust_was_given_are_marked_per_file() -> None:
     other = CodeFile("new.py", "1" * 12, "", Since.NEW)
     files = (PUSH, replace(HELPER, since=Since.CHANGED), other)
-    said = question_html(replace(PLAIN, files=files, trusted_before=True, gone=("old.py",)))
-    main, helper, new = said.split("<details>")[1:]
+    dialog_html = question_html(replace(PLAIN, files=files, trusted_before=True, gone=("old.py",)))
+    main, helper, new = dialog_html.split("<details>")[1:]
     assert "wb-tag" not in main and ">changed<" in helper and ">new<" in new
-    assert "Changes since then are marked; gone since: old.py" in said
-    said = question_html(replace(PLAIN, trusted_before=True))
-    assert "It is not known which of them has changed" in said
+    assert "Changes since then are marked; gone since: old.py" in dialog_html
+    dialog_html = question_html(replace(PLAIN, trusted_before=True))
+    assert "It is not known which of them has changed" in dialog_html

@@ -1,4 +1,4 @@
-"""A folder of recordings from elsewhere: nothing of the code that it names or holds runs before a person says so."""
+"""A folder of foreign recordings: no code that it names or contains runs before the user agrees."""
 
 # pyright: reportOptionalMemberAccess=false
 
@@ -47,7 +47,7 @@ HELPER = "OPENED = open(__file__ + '.ran', 'a').write('x')\n"
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a task, a module that leaves a mark when it is imported, and two episodes of it."""
+    """A folder with a task, a module that leaves a mark when imported, and two episodes of the task."""
     folder = tmp_path_factory.mktemp("elsewhere")
     (folder / "push_cube.py").write_text(TEXT.replace("import torch\n", "import torch\nimport marks\n", 1))
     (folder / "marks.py").write_text(HELPER)
@@ -60,7 +60,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def foreign(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The same in the hands of an installation that recorded none of it."""
+    """The same folder on an installation that recorded none of it."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     folder = tmp_path / "foreign"
     shutil.copytree(recorded, folder)
@@ -69,7 +69,7 @@ def foreign(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def ran(folder: Path) -> bool:
-    """Whether the task was imported since this was asked last, here or as its recordings hold it."""
+    """Whether the task, from the folder or from its recordings, was imported since the last call."""
     marks = [
         *folder.glob("*.ran"),
         *(Path(os.environ.get("TMPDIR", "/tmp")).glob("workbench-recorded-*/*.ran")),
@@ -96,7 +96,7 @@ def made_by_maniskill(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stock(made_by_maniskill: Path, tmp_path: Path) -> Path:
-    """The .json of a pair of ManiSkill's own; beside it a file that leaves a mark when it runs."""
+    """The .json of a ManiSkill .h5/.json pair; next to it is a file that leaves a mark when it runs."""
     for name in ("demos.h5", "demos.json"):
         shutil.copy(made_by_maniskill / name, tmp_path)
     (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'evil_ran')!r}, 'w').write('ran')\n")
@@ -109,7 +109,7 @@ def name_evil(pair: Path) -> None:
     pair.write_text(json.dumps(document))
 
 
-def test_a_path_in_place_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Path, tmp_path: Path) -> None:
+def test_a_path_instead_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Path, tmp_path: Path) -> None:
     name_evil(stock)
     mark = tmp_path / "evil_ran"
     library = Library(tmp_path)
@@ -118,7 +118,7 @@ def test_a_path_in_place_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Pa
         library.watch()
         (row,) = until(lambda: library.view().rows, "its row")
         review.open((row.id,))
-        until(lambda: "no env" in "".join(one.scene for one in review.view().opened), "the word for it")
+        until(lambda: "no env" in "".join(one.scene for one in review.view().opened), "the explanation")
     finally:
         review.close()
         library.close()
@@ -128,7 +128,7 @@ def test_a_path_in_place_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Pa
 @pytest.mark.parametrize(
     "named", ["{file}", "{file}:Evil", "./evil.py", "evil.py", "evil:Evil-v0", "~/evil.py"]
 )
-def test_no_form_of_a_name_in_a_recording_is_a_file(
+def test_no_notation_of_a_name_in_a_recording_opens_a_file(
     tmp_path: Path, named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mark = tmp_path / "evil_ran"
@@ -141,13 +141,11 @@ def test_no_form_of_a_name_in_a_recording_is_a_file(
     assert not mark.exists()
 
 
-# --- judging -----------------------------------------------------------------------------------------
+# --- rescoring -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("recorded_source", [False, True])
-def test_judging_in_a_program_runs_nothing_that_nobody_agreed_to(
-    foreign: Path, recorded_source: bool
-) -> None:
+def test_rescoring_in_a_program_runs_no_code_without_consent(foreign: Path, recorded_source: bool) -> None:
     what = RescoreOptions((foreign / "recordings",), recorded_source=recorded_source)
     with pytest.raises(NotTrusted) as refused:
         rescore_all(what)
@@ -159,31 +157,29 @@ def test_judging_in_a_program_runs_nothing_that_nobody_agreed_to(
 def run(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> tuple[int, str]:
     with pytest.raises(SystemExit) as ended:
         main(["rescore", *arguments])
-    told = capfd.readouterr()
-    return int(ended.value.code or 0), told.out + told.err
+    printed = capfd.readouterr()
+    return int(ended.value.code or 0), printed.out + printed.err
 
 
 @pytest.mark.slow
-def test_without_a_terminal_it_is_refused_with_an_exit_code_that_is_its_own(
+def test_without_a_terminal_it_is_refused_with_its_own_exit_code(
     foreign: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     recordings = str(foreign / "recordings")
     for more in ([], ["--recorded-source"]):
-        code, told = run([recordings, *more], capfd)
+        code, printed = run([recordings, *more], capfd)
         assert code == Exit.NOT_TRUSTED == 4 and not ran(foreign)
-        assert "--trust" in told and "push_cube.py" in told
+        assert "--trust" in printed and "push_cube.py" in printed
     (foreign / "numpy.py").write_text("A = 1\n")
-    code, told = run([recordings, "--trust"], capfd)
+    code, printed = run([recordings, "--trust"], capfd)
     assert code == 0 and ran(foreign)
-    assert told.count(f"{foreign / 'numpy.py'} has the name of a library") == 1
-    assert run([recordings], capfd)[0] == Exit.NOT_TRUSTED, "--trust is for one run"
+    assert printed.count(f"{foreign / 'numpy.py'} has the name of a library") == 1
+    assert run([recordings], capfd)[0] == Exit.NOT_TRUSTED, "--trust applies to one run"
     assert run([recordings, "--task", str(foreign / "push_cube.py")], capfd)[0] == 0 and ran(foreign)
 
 
 @pytest.mark.slow
-def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
-    foreign: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_in_a_terminal_it_asks_and_stores_the_answer(foreign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keyboard, terminal = pty.openpty()
 
     def rescored(typed: str) -> tuple[int, str]:
@@ -195,34 +191,34 @@ def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
                 main(["rescore", str(foreign / "recordings")])
             monkeypatch.undo()
             monkeypatch.setenv("XDG_CONFIG_HOME", str(foreign.parent / "config"))
-        told = b""
+        printed = b""
         while select.select([keyboard], [], [], 0.2)[0]:
-            told += os.read(keyboard, 100_000)
-        return int(ended.value.code or 0), told.decode()
+            printed += os.read(keyboard, 100_000)
+        return int(ended.value.code or 0), printed.decode()
 
     for no in ("n", "", "perhaps"):
-        code, told = rescored(no)
+        code, printed = rescored(no)
         assert code == Exit.NOT_TRUSTED and not ran(foreign)
-    assert "marks.py" in told and str(foreign / "push_cube.py") in told and "Run it?" in told
-    assert HELPER.strip() not in told
-    code, told = rescored("show\nn")
-    assert code == Exit.NOT_TRUSTED and not ran(foreign) and HELPER.strip() in told
-    code, told = rescored("a")
-    assert code == 0 and ran(foreign) and "Run it?" in told
-    code, told = rescored("n")
-    assert code == 0 and ran(foreign) and "Run it?" not in told
+    assert "marks.py" in printed and str(foreign / "push_cube.py") in printed and "Run it?" in printed
+    assert HELPER.strip() not in printed
+    code, printed = rescored("show\nn")
+    assert code == Exit.NOT_TRUSTED and not ran(foreign) and HELPER.strip() in printed
+    code, printed = rescored("a")
+    assert code == 0 and ran(foreign) and "Run it?" in printed
+    code, printed = rescored("n")
+    assert code == 0 and ran(foreign) and "Run it?" not in printed
     (foreign / "marks.py").write_text(HELPER + "# changed\n")
-    code, told = rescored("n")
+    code, printed = rescored("n")
     assert code == Exit.NOT_TRUSTED and not ran(foreign)
-    changed = next(line for line in told.splitlines() if "marks.py" in line)
-    unchanged = next(line for line in told.splitlines() if "push_cube.py" in line)
+    changed = next(line for line in printed.splitlines() if "marks.py" in line)
+    unchanged = next(line for line in printed.splitlines() if "push_cube.py" in line)
     assert "changed since" in changed and "changed since" not in unchanged
     os.close(keyboard)
     os.close(terminal)
 
 
 @pytest.mark.slow
-def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorded: Path) -> None:
+def test_on_a_page_it_asks_and_no_skips_only_that_recording(foreign: Path, recorded: Path) -> None:
     asked: list[TrustQuestion] = []
     answers = iter([Consent.NO, Consent.ONCE])
 

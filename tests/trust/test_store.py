@@ -1,4 +1,4 @@
-"""What a user has said may run: kept across programs, and lost neither to a full disk nor to an unreadable store."""
+"""The user's consents persist across programs, and neither a full disk nor an unreadable store loses them."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "workbench" / STORE_FILE
 
 
-def test_what_is_trusted_is_known_to_the_next_program_and_nothing_else_is() -> None:
+def test_only_consents_are_known_to_the_next_program() -> None:
     TrustStore().trust(content("one"))
     TrustStore().trust(content("two"), followed=True)
     later = TrustStore()
     assert later.trusts(content("one")) and not later.follows(content("one"))
     assert later.trusts(content("two")) and later.follows(content("two"))
-    # The same text elsewhere may run; its saves there were not agreed to.
+    # The same text in another file may run; saves of that file were not agreed to.
     elsewhere = content("two", "/other/push.py")
     assert later.trusts(elsewhere) and not later.follows(elsewhere)
     assert not later.trusts(content("three"))
 
 
-def test_once_is_until_the_program_ends(store: Path) -> None:
+def test_once_lasts_until_the_program_ends(store: Path) -> None:
     kept = TrustStore()
     kept.trust_once(content("one"))
     kept.trust_once(content("two"), followed=True)
@@ -45,7 +45,7 @@ def test_once_is_until_the_program_ends(store: Path) -> None:
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_an_answer_that_cannot_be_kept_counts_in_this_run_and_takes_no_other_away(
+def test_an_answer_that_cannot_be_stored_counts_in_this_run_and_removes_no_other(
     store: Path, call: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     TrustStore().trust(content("one"))
@@ -60,15 +60,15 @@ def test_an_answer_that_cannot_be_kept_counts_in_this_run_and_takes_no_other_awa
         for text in ("two", "three"):
             kept.trust(content(text))
     assert all(kept.trusts(content(text)) for text in ("one", "two", "three"))
-    (told,) = [record.message for record in caplog.records]  # once
-    assert "asked again in the next run" in told and "No space left" in told
+    (warning,) = [record.message for record in caplog.records]  # once
+    assert "asked again in the next run" in warning and "No space left" in warning
     assert store.read_bytes() == before and not TrustStore().trusts(content("two"))
     assert sorted(path.name for path in store.parent.iterdir()) == [STORE_FILE, f"{STORE_FILE}.lock"]
     kept.trust(content("four"))
     assert TrustStore().trusts(content("four")) and TrustStore().trusts(content("one"))
 
 
-def test_a_store_that_cannot_be_read_just_now_is_not_written_over(
+def test_a_temporarily_unreadable_store_is_not_overwritten(
     store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     TrustStore().trust(content("one"))

@@ -100,8 +100,8 @@ DOES: frozenset[type[Command]] = frozenset(
 PANELS_PERIOD_SECONDS = 0.06
 """Interval at which the panels are drawn while the envs play, every second frame; numbers cannot be read faster."""
 PICTURES_HINT = (
-    "Exact ones are SAPIEN's own; fast ones take a fraction of the time without a graphics card, of simplified meshes. "
-    "Auto: fast while something moves, exact when it stands still. What this page records is exact."
+    "Exact pictures are SAPIEN's own. Fast pictures show simplified meshes and take a fraction of the time without a graphics "
+    "card. Auto: fast while something moves, exact when it stands still. This page records exact pictures only."
 )
 PANEL_WIDTH_PIXELS = 372
 ENVS_WIDTHS_PIXELS = 220, 640

@@ -28,8 +28,8 @@ from workbench.pictures.camera_conventions import angle_between
 Other = Literal["file", "before", "kept"]
 NAMES: dict[Other, str] = {"file": "as in the file", "before": "as in the file before", "kept": "saved as A"}
 OTHER_HINT = (
-    "The placement to compare with the camera's current one. The file before: as it was before the last change of this "
-    "camera that was saved."
+    "The placement to compare with the camera's current one. As in the file before: its placement before the last "
+    "saved change."
 )
 PICTURE_PIXELS = 256
 """Longer side of each picture."""
@@ -85,7 +85,7 @@ class CameraCompare(PagePart[SessionView]):
         in_file = camera.info.settings if self._other == "file" else self._before.get(camera.key)
         other = self._kept_of(camera) if self._other == "kept" else in_file
         if other is None:
-            raise Refused("The file has placed this camera in one way since the page was opened.")
+            raise Refused("The file's placement of this camera has not changed since the page was opened.")
         self._asked = (camera.key, now, other, NAMES[self._other])
         self._pair.asked(self._session.view().of(StudioView).results.compared)
         self._session.happen(ComparisonWanted(other))

@@ -78,7 +78,7 @@ def do_edit(studio: Studio, command: Command, run: Run) -> Change:
 def apply_to_edits(studio: Studio, event: object, run: Run) -> Change:
     """The studio after an event about the file. Edits are made one after another.
 
-    Placements change when the version with the edit is loaded; none is lost.
+    Placements change only when the version with the edit is loaded.
     """
     match event:
         case EditWanted(request=request):
@@ -255,7 +255,7 @@ def plan_in_copy(studio: Studio, run: Run) -> Change:
 def _with_placements(
     studio: Studio, request: EditRequest, in_file: CameraSettings | None
 ) -> tuple[Studio, bool]:
-    """Update the placements after an edit was made or reverted; none is lost.
+    """Update the placements after an edit was made or reverted, and keep those that the file does not have.
 
     Args:
         in_file: the camera's settings in the loaded version; None if there is no such camera.
@@ -298,7 +298,7 @@ def edit_failed_to_load(studio: Studio) -> Studio:
     if not shown.loading or shown.edit is None:
         return studio
     undone = shown.stage == "undone"
-    hint = "it has the change; revert it if that is the reason"
+    hint = "the camera's change is in it; revert the change if that is the reason"
     if undone:
         hint = "the camera's change was reverted"
     does = "does" if len(shown.edit.changes) == 1 else "do"

@@ -125,7 +125,7 @@ def _override_edit(
         raise RefusedEdit(owner_text, whole)
     if info.varies:
         reason = (
-            f"{owner_text}; the task's own code moves it besides, so one pose in the file would not place it"
+            f"{owner_text}; the task's own code also moves it, so one pose in the file would not place it"
         )
         raise RefusedEdit(reason, whole)
     return members.plan_override(

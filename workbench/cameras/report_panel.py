@@ -199,8 +199,8 @@ class CameraReportPanel(PagePart[SessionView]):
             before=results.measuring,
             new=new,
             over=over,
-            how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: each as it is, "
-            "without the robot if that is in it, and of each object alone",
+            how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: of the whole scene, "
+            "without the robot if it is in view, and of each object alone",
             unit=unit,
             moments=moments,
             headline=headline(report, unit),

@@ -93,9 +93,7 @@ HANDLES = (
 AXES = "The axes along which it is moved and rotated. The camera's own: red is forward, green left, blue up."
 SNAP = "Dragging moves and rotates in steps of this size."
 SIZE = "Size of the preview above. The camera keeps its own."
-VARIES = (
-    "Its pose differs between envs, or the task moves it: the placement here applies to all envs until then."
-)
+VARIES = "Its pose differs between envs, or the task moves it. A placement here applies to all envs until the task moves it again."
 IN_ITS_EYE = "You are at its position. Move the view to see its handles."
 
 

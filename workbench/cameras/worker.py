@@ -552,7 +552,7 @@ def _with_classes_of(
 
 
 def _changed_attributes(before: Mapping[str, str], after: Mapping[str, str], owner: Any) -> dict[str, Any]:
-    """The attributes of an object for which the new text sets another value, with that value.
+    """The attributes of `owner` that the new text sets to another value, with the new values.
 
     The attributes of a live env come from the text that built it, and a camera's pose may depend on one.
     """

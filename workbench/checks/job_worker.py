@@ -161,9 +161,9 @@ class _Given:
     ) -> None:
         """
         Args:
-            runs: of the file, as `find_actions` gives them.
-            here: where a policy is found.
-            episodes: which of those of the whole check.
+            runs: the runs of the file, as `find_actions` gives them.
+            here: folder in which a policy is found.
+            episodes: indices of the episodes, counted over the whole check.
 
         Raises:
             TaskError: the policy cannot be imported.

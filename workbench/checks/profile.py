@@ -115,7 +115,7 @@ class ProfileJobs:
         """
         Args:
             process: where a job runs.
-            happen: takes what a job comes to.
+            happen: handles the events of a job.
         """
         self._process, self._happen = process, happen
         self._jobs = Jobs(lambda: None, self._failed)

@@ -66,7 +66,7 @@ def _mistakes(comment: Silence) -> Iterator[str]:
         yield "the comment names no rule, as in off[reward-rows]"
     elif not comment.reason:
         named = ", ".join(sorted(comment.rules))
-        yield f"off[{named}] silences nothing until a reason stands behind it"
+        yield f"off[{named}] silences nothing until a reason follows it"
 
 
 def _silences(result: RuleResult, file: str, line: int) -> bool:

@@ -259,15 +259,15 @@ def _changed(checks: Checks, **values: Any) -> Checks:
 class CheckJobs:
     """Performs the effects: one check at a time. Used on the loop, but for `close`.
 
-    Nothing of it runs in the worker that plays. The process gives way to whatever a person waits for; a group that was cut
-    short is asked again without the rules that are known.
+    The checks run in `process`, never in the worker that plays. They yield to jobs that a person waits for; a group that
+    was interrupted is requested again without the rules that already have a result.
     """
 
     def __init__(self, process: Background, happen: Callable[[CheckEvent], object]) -> None:
         """
         Args:
-            process: where it runs; other jobs come first.
-            happen: takes what the check comes to.
+            process: where the checks run; other jobs come first.
+            happen: handles the events of the check.
         """
         self._process, self._happen = process, happen
         self._jobs = Jobs(self._on_progress, self._failed)

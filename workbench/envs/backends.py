@@ -131,7 +131,7 @@ def choose_backend(wanted: Backend, render: bool) -> ChosenBackend:
 
 
 def unused_gpu_text(wanted: Backend) -> str | None:
-    """Notice that ``auto`` does not simulate on the GPU that there is; None if there is nothing to notice."""
+    """Notice that ``auto`` simulates on the CPU although GPU simulation is available; else None."""
     if wanted != "auto" or why_no_gpu_simulation() is not None:
         return None
     return (
@@ -161,8 +161,8 @@ def give_brdf_table(camera: sapien.render.RenderCameraComponent) -> None:
 
     Otherwise SAPIEN computes the table for the first picture of the process, from 268 million samples: 5 to 19 s on a
     software driver. With this table the first picture takes 0.1 s, and is the same to the bit. The table is that of the
-    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU, SAPIEN's own takes no time and is
-    left.
+    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN computes its
+    own at once, so it is kept.
     """
     scene = camera.entity.scene
     if not scene.render_system.device.is_cuda():
@@ -196,8 +196,8 @@ def keep_render_device(device: str) -> None:
     except RuntimeError as error:
         if _kept and _exists(name):
             raise RuntimeError(
-                f"SAPIEN has one render device in a process, and this one renders on {next(iter(_kept))!r}: "
-                f"{name!r} can be had in another process only."
+                f"SAPIEN allows one render device per process, and this process renders on {next(iter(_kept))!r}: "
+                f"use another process for {name!r}."
             ) from error
         raise RuntimeError(
             f"SAPIEN cannot render on {name!r}: {error}. It needs a Vulkan driver: a GPU's own, or Mesa's "

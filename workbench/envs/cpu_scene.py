@@ -207,7 +207,7 @@ class BatchedCpuScene(ManiSkillScene):
     def degree_of(
         self, camera: sapien.render.RenderCameraComponent, asked: PictureDegree | None = None
     ) -> PictureDegree:
-        """The degree in which a picture is drawn if `asked` (None: the scene's own) is requested.
+        """The degree of a picture for which `asked` (None: the scene's own) is requested.
 
         Always exact where the camera's quaternion is not of unit length (``look_at`` straight down): SAPIEN turns and zooms
         such a picture, so it is unknown what is out of view.

@@ -299,8 +299,8 @@ class ResetWatch:
         if not envs:
             rule = "rows-lost"
             message = (
-                f"self.{shown} is left with a row for each of the {len(self._chosen)} envs that are being reset, where "
-                f"it had one for each of {total}: write `self.{path}[env_idx] = ...` instead of replacing it."
+                f"self.{shown} now has rows for only {len(self._chosen)} of {total} envs, those being reset: write "
+                f"`self.{path}[env_idx] = ...` instead of replacing it."
             )
         else:
             rule = "rows-rewritten"

@@ -168,8 +168,8 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
             _set_ee_action_of_each_env(self, action)
 
     def check_frame(stock: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Skip the check that refuses frames which GPU simulation lacks: nightly builds ask ``scene.gpu_sim_enabled`` for it,
-        3.0.1 the device."""
+        """Skip ManiSkill's check of frames that GPU simulation does not support. To detect GPU simulation, nightly builds read
+        ``scene.gpu_sim_enabled``; release 3.0.1 reads the device."""
 
         @wraps(stock)
         def check(self: Any) -> None:

@@ -42,7 +42,7 @@ class Layout:
         return json.dumps([[name, dtype.str, shape] for name, dtype, shape in self.key])
 
     def check(self, bodies: int, actions: int) -> None:
-        """Raise ValueError if its rows do not fit a scene of so many bodies and actions, or hold anything but numbers."""
+        """Raise ValueError if its rows do not fit a scene with this many bodies and actions, or hold anything but numbers."""
         shapes = {name: shape for name, _, shape in self.key}
         if shapes["poses"] != (bodies, 7):
             raise ValueError(

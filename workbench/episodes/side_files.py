@@ -80,7 +80,7 @@ def side_files_text(task: str | None, recorded: Mapping[str, str]) -> str:
     it = "it is" if len(recorded) == 1 else "they are"
     now = f"{it} as then" if not changed else "; ".join(f"{name} {what}" for name, what in changed[:3])
     if len(changed) > 3:
-        now += f"; nor are {len(changed) - 3} more as they were"
+        now += f"; {len(changed) - 3} more differ too"
     return f"The task also reads {names}, which the recording does not hold: {now}."
 
 

@@ -83,8 +83,8 @@ class Cluster:
                 # Ray's own message is a traceback: leave it out.
                 why = str(error) if isinstance(error, ClusterLost) else f"Ray raised {type(error).__name__}"
                 raise PoolError(
-                    f"the Ray cluster ended before the job: {why}. Finished results are kept. Start the cluster again, and then "
-                    "this command; a job with --job FILE resumes after them"
+                    f"the Ray cluster ended before the job: {why}. Finished results are kept. Start the cluster again "
+                    "and repeat this command; with --job FILE it continues after the finished results"
                 ) from error
 
 

@@ -208,7 +208,7 @@ def in_words(rows: Sequence[LibraryRow]) -> str:
 def job_text(job: JobStatus, now: float) -> str:
     """State of a job, as the end of a sentence."""
     if job.is_silent(now):
-        return ", ended without a word: the same command goes on, if it was given --job"
+        return ", ended without a message: the same command resumes it if it had --job"
     if job.state == "stopped":
         return ", stopped"
     if job.state == "failed":

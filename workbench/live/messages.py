@@ -107,7 +107,7 @@ class Settings:
     plan: PlanOptions = PlanOptions()
     """How actions are planned while `action_source` is ``solve``."""
     solve_all: bool = False
-    """Plan for every env in turn. If False, plan for the selected env only; the others keep their last action."""
+    """Plan for every env in turn. If False, plan for the selected env only; the others hold still."""
     traced: str = ""
     """Name of the body whose path in the rollouts is shown; empty for the robot's tool."""
     selected_env: int = 0
@@ -145,7 +145,7 @@ class FollowPlan:
     """Number of the `PlanWanted` that this answers."""
     env_idx: tuple[int, ...]
     actions: NDArray[np.float32]
-    """(S, n, A) actions for S control steps of these n envs; the other envs keep their last action."""
+    """(S, n, A) actions for S control steps of these n envs; the other envs hold still."""
 
 
 @dataclass(frozen=True)

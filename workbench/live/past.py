@@ -143,7 +143,7 @@ class Past:
         return self.seek(at)
 
     def seek_step(self, env: int, step: int) -> Past:
-        """Go to a control step of this env's shown episode, through its jumps back; or to the nearest kept one."""
+        """Go to a control step of this env's shown episode, or to the nearest kept one; jumps back do not end an episode."""
         episode_backwards = self.history.episode_backwards(env, self.history.segment_at(env, self.at)[1])
         serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in episode_backwards}
         if not serials:
@@ -268,8 +268,8 @@ class Past:
         )
 
     def episode(self, env: int) -> tuple[int, int]:
-        """Serials of the first and the last moment of this env's episode that contains the shown moment. Moments in between
-        that the env later went back over are included."""
+        """Serials of the first and the last moment of this env's episode that contains the shown moment. The moments in
+        between that it abandoned by going back are included."""
         end = self.history.segment_at(env, self.at)[1]
         begin = min((moment.serial for moment, _ in self.history.episode_backwards(env, end)), default=end)
         return begin, end

@@ -214,7 +214,7 @@ class Run:
         return None if self.kept is None else self.kept.strip(self.env, low, high)
 
     def episode_ticks(self) -> tuple[int, int] | None:
-        """First and last tick of the selected env's episode that contains the shown moment, through its jumps back."""
+        """First and last tick of the selected env's episode that contains the shown moment; jumps back do not end an episode."""
         if self.kept is None:
             return None
         begin, end = self.kept.episode(self.env)

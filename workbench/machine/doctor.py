@@ -127,7 +127,7 @@ def print_report(findings: Sequence[DoctorFinding], console: Console | None = No
     elif failed:
         console.print("The workbench cannot run here yet.", style="red")
     elif any(finding.ok is None for finding in findings):
-        console.print("The workbench runs here, with less where it says so.")
+        console.print("The workbench runs here, with the limitations listed above.")
     else:
         console.print("The workbench runs here.", style="green")
 

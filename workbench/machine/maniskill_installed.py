@@ -47,8 +47,8 @@ def lines_if_lacking(what: str, arguments: Sequence[str] | None = None) -> tuple
     if found := installed_maniskills():
         name, version = next(iter(found.items()))
         return (
-            f"{what} needs ManiSkill: {name} {version} is installed in {sys.prefix} without its files, which went when "
-            "another distribution of it was removed.",
+            f"{what} needs ManiSkill: {name} {version} is installed in {sys.prefix} without its files, which were "
+            "deleted when another distribution of it was removed.",
             f"Type: {pip_command('uninstall', name)} && {pip_command('install', f'{name}=={version}')}",
         )
     command = command_to_install("mani_skill", arguments)

@@ -222,7 +222,7 @@ class SearchSpace:
         if not self.objects:
             raise ValueError("name at least one object that must be seen")
         if self.candidates < 1 or self.best < 1:
-            raise ValueError("a search draws at least one placement and offers at least one")
+            raise ValueError(f"candidates and best must be at least 1, not {self.candidates} and {self.best}")
         intrinsic_of(self.lens)
 
 

@@ -85,13 +85,11 @@ def findings_of_shaders(cameras: Iterable[CameraInfo]) -> list[Finding]:
 
 
 def here_without_ray_tracing() -> str:
-    """What this machine does with ray traced cameras, as a sentence; empty where it traces rays."""
+    """What this machine does with ray traced cameras, as a sentence; empty if it can trace rays."""
     why = why_no_ray_tracing()
     if why is None:
         return ""
-    return (
-        f"That needs a GPU driver with ray tracing, and {why}: here its pictures have shader_pack 'default'."
-    )
+    return f"Ray tracing needs a GPU driver that supports it, and {why}: here the camera renders with shader_pack 'default'."
 
 
 def segmentation_names(env: Any) -> dict[int, str]:
@@ -179,7 +177,7 @@ def begin_pictures(
     require_env(env_index, env.num_envs)
     kinds = {kind for _, kind, _ in requests}
     if len(kinds) > 1:
-        raise ValueError("pictures of sensors and of human cameras cannot be started together")
+        raise ValueError("pictures of sensors and of human cameras cannot be rendered together")
     cameras = cameras_of(env)
     for name, kind, modalities in requests:
         _check(name, kind, modalities, cameras)

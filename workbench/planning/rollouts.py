@@ -198,8 +198,8 @@ class RolloutPlanner:
                 continue
             other = sorted(name for name in {*bodies, *wanted} if bodies.get(name) != wanted.get(name))
             raise NotAlike(
-                f"{', '.join(other)}: different in each env. A plan is tried in envs that are built alike, which is impossible "
-                "for a randomly built scene: build the same bodies in each env, and place them at random"
+                f"{', '.join(other)}: different in each env. Rollouts need envs with identical bodies: build the same bodies in "
+                "each env, and randomise only their poses"
             )
 
     def plan(self, snapshot: Snapshot, env: int, traced: int | None = None) -> Plan:

@@ -113,7 +113,7 @@ def exploited(episodes: PlannedEpisodes) -> RewardVerdict | None:
     return RewardVerdict(
         "reward-exploited",
         f"{len(found)} of {len(episodes.all)} episodes earned {rate:.3f} a step at their end without success, and successful "
-        f"ones {episodes.at_success:.3f} at theirs{said}",
+        f"ones {episodes.at_success:.3f} at success{said}",
         _seeds(found),
     )
 

@@ -124,7 +124,7 @@ def record(
 
 
 def collect(what: RecordOptions, known: Mapping[int, Written | None]) -> Recorded:
-    """Combine the results of these episodes to a recording. Runs nothing.
+    """Combine the results of these episodes into one result. Runs nothing.
 
     Args:
         what: options as completed by `with_given_actions`.

@@ -76,8 +76,8 @@ class SceneProcess:
         if named := paths_in_arguments(info):
             # Opening a row must not make an env read files that a recording names: native code may parse them.
             raise SceneError(
-                f"It names files for {info.task} to read ({', '.join(named[:3])}), which is not done for looking at it, so "
-                "there are numbers and curves only."
+                f"It names files for {info.task} to read ({', '.join(named[:3])}). Opening a recording does not read "
+                "them, so there are numbers and curves only."
             )
         kwargs = {name: value for name, value in info.env_kwargs.items() if name not in _NOT_PASSED_ON}
         question = MakeScene(

@@ -12,7 +12,7 @@ MAX_HORIZON_SECONDS = 3.0
 
 
 class ChoosePlannedEnvs(Command, frozen=True):
-    """Plan for the selected env while the others keep their last action, or for all envs in turn."""
+    """Plan for the selected env while the others hold still, or for all envs in turn."""
 
     envs: Literal["selected", "all"]
 

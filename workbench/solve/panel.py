@@ -50,7 +50,7 @@ SAVE_SOLVED = "Save the solved episode"
 TOOL = "the robot's tool"
 BETTER_MODE = "pd_ee_delta_pose"
 USE_MODE = "Plan in end-effector control (resets the envs)"
-USE_MODE_HINT = "Makes the envs anew with this control mode, in which plans are found soonest"
+USE_MODE_HINT = "Rebuilds the envs with this control mode, in which plans are found soonest"
 MAX_NAMED_ENVS = 4
 """Maximum number of newly solved envs that are named."""
 CHART_HEIGHT_PIXELS = 150
@@ -129,7 +129,7 @@ class SolvePanel(PagePart[SessionView]):
             SetNoise,
             "noise",
             step=0.05,
-            hint="Of candidates around the plan, of half the range of each action.",
+            hint="Standard deviation of the candidates around the plan, as a share of half the range of each action.",
         )
         self._temperature = slider(
             server,
@@ -155,8 +155,7 @@ class SolvePanel(PagePart[SessionView]):
             ShowRollouts,
             "on",
             True,
-            hint="What was tried, as lines in the 3-D view: each is the way that a body takes in one rollout. The best is "
-            "bright.",
+            hint="Draw the path of a body in each rollout as a line in the 3-D view. The best is bright.",
         )
         self._traced = choice(
             server,
@@ -165,7 +164,7 @@ class SolvePanel(PagePart[SessionView]):
             "body",
             {TOOL: ""},
             "",
-            hint="The body whose ways are drawn, from the next plan on.",
+            hint="The body whose paths are drawn, from the next plan on.",
         )
         self._look_at = slider(
             server,
@@ -333,14 +332,14 @@ def solve_html(solve: SolveView, rows: EnvRows | None, env: int, link: LinkTo = 
     returns: list[tuple[str, str, float]] = []
     if plan is not None:
         returns = [
-            ("best rollout", "Of all that were tried, the one that earns most", plan.returns[0]),
+            ("best rollout", "The rollout that earns most", plan.returns[0]),
             (
                 "last plan, carried on",
-                "What was planned a step ago, without what was learned since: it is always tried too",
+                "The previous plan, unchanged: one rollout always tries it",
                 plan.returns[plan.plan],
             ),
-            ("holding still", "The robot stays as it is: that is always tried too", plan.returns[plan.hold]),
-            ("worst rollout", "Of all that were tried, the one that earns least", plan.returns[-1]),
+            ("holding still", "The robot holds still: one rollout always tries it", plan.returns[plan.hold]),
+            ("worst rollout", "The rollout that earns least", plan.returns[-1]),
         ]
     return render(
         "solve",

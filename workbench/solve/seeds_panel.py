@@ -28,7 +28,7 @@ from workbench.solve.seeds import RUNNING, SeedsView
 
 TITLE = "Solve many seeds"
 SOLVE, STOP_SOLVING = "Solve", "Stop solving"
-HINT = f"From 0 on. That no rule is broken says something from {MIN_SEEDS} seeds on."
+HINT = f"Seeds are counted from 0. With fewer than {MIN_SEEDS}, problems of the reward may not show."
 
 
 class SolveSeedsPanel(PagePart[SessionView]):

@@ -96,7 +96,7 @@ class Project:
         read: ast.AST,
         concerns: Callable[[str, str], bool] = lambda path, owner: True,
     ) -> str | None:
-        """The place of a reader of a binding other than `read` in the file `reader`, as text; None if there is none.
+        """Text with the place of another reader of the binding than `read` in the file `reader`; None if there is none.
 
         Args:
             concerns: returns whether an object of a class (file and name) may have the binding as an attribute. On other

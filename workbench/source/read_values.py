@@ -407,7 +407,7 @@ class ValueReader:
         try:
             key = self.part(file, node.slice).value
         except Unknown as exc:
-            raise Unknown(f"`{code}` depends on what only the running task knows") from exc
+            raise Unknown(f"`{code}` depends on a value that only the running task has") from exc
         where, base, others = file, node.value, None
         for _ in range(_MAX_NAME_CHAIN):
             if isinstance(base, _NAME_NODES):

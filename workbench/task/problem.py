@@ -297,10 +297,10 @@ def check_step_returns(
 
 
 def problem_from_return(cls: type, hook: str, message: str, source_files: Collection[Path]) -> Problem:
-    """The problem that `hook` of `cls` returned something wrong, described by `message`.
+    """Problem for a wrong return value of `hook` of `cls`; `message` describes it.
 
-    A reward's place is the reward hook that the author defined: ManiSkill calls the normalized one, which may call the
-    author's dense one.
+    For a reward, file and line are those of the reward hook that the author defined: ManiSkill calls the normalized hook,
+    which may call the author's dense one.
     """
     hooks = _REWARD_HOOKS if hook in _REWARD_HOOKS else (hook,)
     found = hook_definition(cls, hooks, source_files)

@@ -139,7 +139,7 @@ class SourceWatcher:
         return {path: _status(path) for path in paths}
 
     def _changes(self) -> set[Path]:
-        """Files whose content differs from the known one, which is updated."""
+        """Files whose content has changed since the last call; stores the new content."""
         deadline = time.monotonic() + GONE_SECONDS
         while not self._stopped.is_set():
             with self._lock:

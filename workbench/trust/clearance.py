@@ -21,8 +21,8 @@ HASH_CHARACTERS = 12
 MAX_NAME_CHARACTERS = 400
 """Maximum length of a shown name."""
 FOLLOWED = (
-    "While it is open live, every save of this file and of the modules beside it runs without asking, whoever saves it. "
-    "Rescore uses the file as it is then."
+    "While it is open live, every save of this file and of the modules next to it runs without asking, whoever saves it. "
+    "Rescore uses the file as it is at that time."
 )
 """Warning before continuing live with a file that a recording references."""
 
@@ -268,7 +268,7 @@ class Clearances:
             return None
         return (
             f"a recording of {_printable(info.task)} that was not made here names files for its env to read "
-            f"({', '.join(named[:3])}), which it may only with --trust on the command line"
+            f"({', '.join(named[:3])}), which needs --trust on the command line"
         )
 
     def _without_asking(self, code: CodeToRun) -> TaskName | NotCleared | _Undecided:

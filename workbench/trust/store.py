@@ -61,7 +61,7 @@ class TrustStore:
             return any((e.hash, e.file, e.followed) == key for e in self._all())
 
     def trusted_before(self, content: TaskContent) -> Mapping[str, str] | None:
-        """`TaskContent.file_sums` of the last trusted other text of this file; None if there is none.
+        """`TaskContent.file_sums` of the newest other trusted text of this file; None if there is none.
 
         Empty if the hashes were dropped.
         """

@@ -1,4 +1,4 @@
-"""Tests here load task files: the process is restored after each."""
+"""Restore the process after each test: tests here load task files."""
 
 from __future__ import annotations
 

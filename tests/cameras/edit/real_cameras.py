@@ -1,4 +1,4 @@
-"""The judge of these tests: ManiSkill itself, asked what the cameras of a source text are."""
+"""Ground truth for these tests: ManiSkill's own cameras, built by running a source text."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def unit(quaternion: Sequence[float]) -> tuple[float, float, float, float]:
 
 
 def planned(plan: Callable[..., SourceEdit], *given: object) -> SourceEdit | RefusedEdit:
-    """What comes of a plan."""
+    """Return the result of a plan."""
     try:
         return plan(*given)
     except RefusedEdit as refused:
@@ -62,18 +62,18 @@ def planned(plan: Callable[..., SourceEdit], *given: object) -> SourceEdit | Ref
 
 @contextmanager
 def modules(sources: Mapping[str, str], **names: Any) -> Iterator[dict[str, Any]]:
-    """The sources executed as modules, with `names` in the first."""
-    made = {PurePath(path).stem: types.ModuleType(PurePath(path).stem) for path in sources}
+    """Execute the sources as modules, with `names` defined in the first."""
+    loaded = {PurePath(path).stem: types.ModuleType(PurePath(path).stem) for path in sources}
     for path in sources:
-        made[PurePath(path).stem].__file__ = path
-    before = {name: sys.modules.get(name) for name in made}
-    vars(made[PurePath(FILE).stem]).update(names)
+        loaded[PurePath(path).stem].__file__ = path
+    before = {name: sys.modules.get(name) for name in loaded}
+    vars(loaded[PurePath(FILE).stem]).update(names)
     try:
         for path in sorted(sources, key=lambda path: path == FILE):
             name = PurePath(path).stem
-            sys.modules[name] = made[name]
-            exec(compile(sources[path].removeprefix("\ufeff"), path, "exec"), vars(made[name]))
-        yield vars(made[PurePath(FILE).stem])
+            sys.modules[name] = loaded[name]
+            exec(compile(sources[path].removeprefix("\ufeff"), path, "exec"), vars(loaded[name]))
+        yield vars(loaded[PurePath(FILE).stem])
     finally:
         for name, module in before.items():
             if module is None:
@@ -83,7 +83,7 @@ def modules(sources: Mapping[str, str], **names: Any) -> Iterator[dict[str, Any]
 
 
 def real_configs(sources: Mapping[str, str], class_name: str = "Task") -> dict[tuple[str, str], CameraConfig]:
-    """Every camera of the class, by hook and name, made by its own code."""
+    """Return every camera of the class by hook and name, built by the class's own code."""
     with modules(sources) as names:
         task = names[class_name]()
         return {
@@ -95,7 +95,7 @@ def real_configs(sources: Mapping[str, str], class_name: str = "Task") -> dict[t
 
 
 def run_class(sources: Mapping[str, str], class_name: str = "Task") -> HookCameras:
-    """As a worker runs the hooks of an env: of an object of the class, made by these texts."""
+    """Run the hooks of an object of the class from these sources, as a worker does with an env's hooks."""
     try:
         with recording_calls(sources) as recorded, modules(sources) as names:
             cls = names[class_name]
@@ -118,13 +118,13 @@ def run_as(class_name: str) -> RunHooks:
 
 
 def key_of(source: str, uid: str = "cam") -> CameraKey:
-    """Of the one camera of that name."""
+    """Return the key of the only camera named `uid`."""
     ((hook, _),) = [key for key in real_configs({FILE: source}) if key[1] == uid]
     return KINDS[hook], uid
 
 
 def looking(eye: Sequence[float], target: Sequence[float]) -> tuple[float, float, float, float]:
-    """The orientation of ManiSkill's own look_at, made of unit length."""
+    """Return the orientation of ManiSkill's own look_at, normalized."""
     return unit(sapien_utils.look_at(list(eye), list(target)).raw_pose[0, 3:].tolist())
 
 
@@ -160,7 +160,7 @@ def real_settings(
 
 
 def close(a: CameraSettings, b: CameraSettings, tolerance: float = 1e-6) -> bool:
-    """Equal but for what single precision does to a pose; q and -q are one orientation."""
+    """Return whether both are equal up to single precision; q and -q are the same orientation."""
     sign = 1 if sum(x * y for x, y in zip(a.quaternion, b.quaternion, strict=True)) >= 0 else -1
     apart = [x - y for x, y in zip(a.position, b.position, strict=True)]
     apart += [x - sign * y for x, y in zip(a.quaternion, b.quaternion, strict=True)]

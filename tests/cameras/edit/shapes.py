@@ -1,7 +1,7 @@
-"""Ways in which authors write cameras: ManiSkill's own tasks and robots, and what people make of them.
+"""Ways in which authors write cameras, from ManiSkill's tasks and robots and from variations of them.
 
-Each is a file with a class ``Task`` whose camera ``cam`` is to be edited. `WRITTEN` can be; `REFUSED` cannot, for
-the reason that goes with it.
+Each is a file with a class ``Task`` whose camera ``cam`` a test edits. Edits of `WRITTEN` succeed; edits of `REFUSED`
+are refused for the reason given with it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ WRITTEN: dict[str, str] = {
         return [CameraConfig("cam", pose, 128, 128, np.pi / 2, 0.01, 100)]
         """
     ),
-    "an argument a line, with remarks": _hook(
+    "one argument per line, with comments": _hook(
         """\
         return [
             # replicated from the xml file
@@ -51,7 +51,7 @@ WRITTEN: dict[str, str] = {
         ]
         """
     ),
-    "an argument a line, no last comma": _hook(
+    "one argument per line, no trailing comma": _hook(
         """\
         return [
             CameraConfig(
@@ -64,7 +64,7 @@ WRITTEN: dict[str, str] = {
         ]
         """
     ),
-    "other names for the libraries": _hook(
+    "libraries imported under other names": _hook(
         """\
         return [Cam("cam", su.look_at(eye=[0.3, 0, 0.6], target=[-0.1, 0, 0.1]), 128, 128, np.deg2rad(90.0))]
         """,
@@ -88,7 +88,7 @@ WRITTEN: dict[str, str] = {
         )
         """
     ),
-    "a pose of nothing": _hook('return [CameraConfig("cam", sapien.Pose(), 128, 128, 1.2)]\n'),
+    "a default pose": _hook('return [CameraConfig("cam", sapien.Pose(), 128, 128, 1.2)]\n'),
     "Pose.create_from_pq in a robot": _hook(
         """\
         return [
@@ -199,7 +199,7 @@ WRITTEN: dict[str, str] = {
         }
         """
     ),
-    "configs with names of their own": _hook(
+    "configs in variables": _hook(
         """\
         room = CameraConfig("cam", sapien_utils.look_at([2.5, -2.5, 3], [0.0, 0.0, 0]), 512, 512, 1)
         robot_pose = sapien_utils.look_at([2, 0, 1], [0, 0, -1])
@@ -218,7 +218,7 @@ WRITTEN: dict[str, str] = {
         return CameraConfig("cam", pose, 512, 512, 1, 0.01, 100)
         """
     ),
-    "a name used for one after the other": _hook(
+    "a variable reused for a second camera": _hook(
         """\
         pose = sapien_utils.look_at([0.3, 0, 0.6], [0, 0, 0])
         first = CameraConfig("cam", pose, 128, 128, 1.0)
@@ -271,7 +271,7 @@ WRITTEN: dict[str, str] = {
         )
         """
     ).replace("    ", "\t"),
-    "letters of other alphabets": _hook(
+    "non-ASCII letters": _hook(
         """\
         größe = 128  # Größe — 像素
         return [CameraConfig("cam", sapien.Pose([0.5, 0, 0.5]), größe, größe, 1.0)]  # kamera ✓
@@ -385,7 +385,7 @@ REFUSED: dict[str, tuple[str, str]] = {
         ).replace('    robot_uids = "panda"', '    robot_uids = str("panda")'),
         "only the running task knows",
     ),
-    "a look_at of one's own": (
+    "a custom look_at": (
         _hook(
             """\
             return [CameraConfig("cam", look_at([0.3, 0, 0.6], [0, 0, 0]), 128, 128, 1.0)]

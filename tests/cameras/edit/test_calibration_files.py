@@ -1,4 +1,4 @@
-"""Cameras in the files of other programs: read by OpenCV itself, and read back."""
+"""Calibration files for other programs: OpenCV reads ours, and we read ours and theirs."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from workbench.pictures.camera_conventions import LookAt
 
 POSE = frames.pose_from_look_at(LookAt((0.5, -0.4, 0.7), (0.0, 0.1, 0.05), 0.2))
 PLAIN = CameraSettings((0, 0, 0), (1, 0, 0, 0), 0.9, None, 320, 240, 0.01, 10.0, "minimal")
-STANDING = CameraToExport(("sensor", "base: camera/1"), frames.with_pose(PLAIN, POSE))
-RIDING = CameraToExport(
+FIXED = CameraToExport(("sensor", "base: camera/1"), frames.with_pose(PLAIN, POSE))
+MOUNTED = CameraToExport(
     ("sensor", "base: camera 1"),
     CameraSettings(
         (0.1, 0, 0), (1, 0, 0, 0), None, ((200, 0, 150), (0, 210, 110), (0, 0, 1)), 320, 240, 0.01, 5, "rt"
@@ -45,25 +45,25 @@ def assert_same_pose(a: Any, b: Any, atol: float = 1e-9) -> None:
 
 
 @pytest.mark.thorough
-def test_json_says_every_number_and_is_read_back() -> None:
-    text = cameras_as_json([STANDING, RIDING])
-    told = json.loads(text)
-    first, second = told["cameras"]
+def test_json_holds_every_number_and_survives_a_round_trip() -> None:
+    text = cameras_as_json([FIXED, MOUNTED])
+    exported = json.loads(text)
+    first, second = exported["cameras"]
     assert_allclose(first["intrinsic"], frames.intrinsic_from_fov(0.9, 320, 240))
     assert_allclose(first["extrinsic_opencv"], frames.opencv_extrinsic(POSE))
-    assert_allclose(second["model_matrix_opengl"], frames.opengl_model_matrix(RIDING.pose_in_env))
+    assert_allclose(second["model_matrix_opengl"], frames.opengl_model_matrix(MOUNTED.pose_in_env))
     assert (second["mount"], second["position_in_mount"]) == ("panda/panda_hand", [0.1, 0, 0])
-    assert set(told["conventions"]) <= {"length", "fov"} | set(first), "what is explained is there"
-    assert len(text.splitlines()) < 80, "a row of a matrix is a line"
-    for found, camera in zip(find_poses(text), (STANDING, RIDING), strict=True):
+    assert set(exported["conventions"]) <= {"length", "fov"} | set(first), "every explained key must exist"
+    assert len(text.splitlines()) < 80, "a matrix row must be one line"
+    for found, camera in zip(find_poses(text), (FIXED, MOUNTED), strict=True):
         assert_same_pose(camera_pose(found), camera.pose_in_env)
 
 
 def test_opencv_reads_its_yaml(tmp_path: Path) -> None:
     path = tmp_path / "cameras.yaml"
-    path.write_text(cameras_as_opencv_yaml([STANDING, RIDING]))
+    path.write_text(cameras_as_opencv_yaml([FIXED, MOUNTED]))
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    for key, camera in [("sensor_base__camera_1", STANDING), ("sensor_base__camera_1_", RIDING)]:
+    for key, camera in [("sensor_base__camera_1", FIXED), ("sensor_base__camera_1_", MOUNTED)]:
         node = storage.getNode(key)
         assert int(node.getNode("image_width").real()) == 320
         assert_allclose(node.getNode("camera_matrix").mat(), frames.intrinsic_of(camera.settings), rtol=1e-12)
@@ -79,7 +79,7 @@ def test_opencv_reads_its_yaml(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["yaml", "json"])
-def test_what_opencv_wrote_is_read(tmp_path: Path, suffix: str) -> None:
+def test_files_written_by_opencv_are_read(tmp_path: Path, suffix: str) -> None:
     extrinsic = frames.matrix_of(POSE, "opencv", "world_to_camera")
     rvec, _ = cv2.Rodrigues(extrinsic[:3, :3])
     path = tmp_path / f"calibration.{suffix}"
@@ -103,7 +103,9 @@ def test_what_opencv_wrote_is_read(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize(
     "write", [str, repr, lambda m: json.dumps(m.tolist()), lambda m: repr(m[:3].tolist())]
 )
-def test_a_pasted_matrix_is_read_as_the_person_says(convention: Any, direction: Any, write: Any) -> None:
+def test_a_pasted_matrix_is_read_in_the_chosen_convention(
+    convention: Any, direction: Any, write: Any
+) -> None:
     matrix = frames.matrix_of(POSE, convention, direction)
     (found,) = find_poses(write(matrix))
     assert found.stated is None
@@ -125,7 +127,7 @@ def test_a_pasted_matrix_is_read_as_the_person_says(convention: Any, direction: 
         "%YAML:1.0\nT: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n   data: [1.,0,0,0, 0,1.,0,0, 0,1e-12,1.,2.]",
     ],
 )
-def test_many_ways_to_write_one_pose_are_read(text: str) -> None:
+def test_many_formats_of_one_pose_are_read(text: str) -> None:
     (found,) = find_poses(text)
     assert_same_pose(camera_pose(found, "maniskill", "camera_to_world"), (0, 0, 2, 1, 0, 0, 0))
 
@@ -143,12 +145,12 @@ def test_many_ways_to_write_one_pose_are_read(text: str) -> None:
         ("9" * 300_000, "characters"),
     ],
 )
-def test_a_text_without_a_pose_is_refused_in_words(text: str, says: str) -> None:
+def test_a_text_without_a_pose_is_refused_with_a_reason(text: str, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         find_poses(text)
 
 
-def test_a_matrix_that_is_no_rotation_is_refused_in_words() -> None:
+def test_a_matrix_that_is_no_rotation_is_refused_with_a_reason() -> None:
     (mirrored,) = find_poses("1 0 0 0  0 1 0 0  0 0 -1 0  0 0 0 1")
     with pytest.raises(ValueError, match="mirror image"):
         camera_pose(mirrored, "opencv", "world_to_camera")
@@ -157,7 +159,7 @@ def test_a_matrix_that_is_no_rotation_is_refused_in_words() -> None:
 
 
 @given(st.text(max_size=300) | st.text('0123456789.,:-[]{}!%&*\n eE"RtvecTrows', max_size=300))
-def test_any_text_gives_poses_or_a_sentence(text: str) -> None:
+def test_any_text_gives_poses_or_a_value_error(text: str) -> None:
     try:
         for found in find_poses(text):
             assert found.matrix.shape == (4, 4)

@@ -1,4 +1,4 @@
-"""Edits of cameras, however they are written: the file parses, ManiSkill then makes what was asked for, and nothing else moves."""
+"""Edits of cameras in any style: the file parses, ManiSkill builds the requested camera, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ SENSOR = "_default_sensor_configs"
 KEY: CameraKey = ("sensor", "cam")
 LIST = WRITTEN["a list, positional to the end"]
 WHY_NOT = {
-    "edit": "smaller than what is written|is given by [*] or",
+    "edit": "smaller than the precision|is given by [*] or",
     "add": "2 returns",
     "duplicate": "is in no list or dict",
     "rename": "$.",
     "remove": "by hand",
 }
-"""Why an edit of a form that can be written may be refused; a renaming never is."""
+"""Allowed reasons to refuse an edit of a camera in `WRITTEN`, by kind of edit; a rename is never refused."""
 Cameras = dict[tuple[str, str], CameraSettings]
 metres = st.floats(-4, 4)
 points = st.tuples(metres, metres, metres)
@@ -58,7 +58,7 @@ quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q)
 
 @st.composite
 def poses(draw: st.DrawFn) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Level ones, rolled ones, and such as look straight up or down, or almost."""
+    """Draw level poses, rolled poses, and poses that look straight or almost straight up or down."""
     eye, kind = draw(points), draw(st.sampled_from(("level", "any", "vertical")))
     if kind == "any":
         return eye, draw(quaternions)
@@ -74,7 +74,7 @@ def poses(draw: st.DrawFn) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 @st.composite
 def changes(draw: st.DrawFn, before: CameraSettings) -> CameraSettings:
-    """Another pose, another lens, or both."""
+    """Draw settings with a new pose, a new lens or a new size, or several of them."""
     after = before
     what = draw(st.sets(st.sampled_from(("pose", "lens", "size")), min_size=1))
     if "pose" in what:
@@ -99,7 +99,7 @@ def same_cameras(a: Cameras, b: Cameras) -> bool:
 
 
 def near_enough(written: CameraSettings, wanted: CameraSettings) -> bool:
-    """0.1 mm and 0.01 degree."""
+    """Return whether both agree to the precision that is written into files: 0.1 mm and 0.01 degrees."""
     return (
         math.dist(written.position, wanted.position) <= 2e-4
         and angle_between(written.quaternion, wanted.quaternion) <= math.radians(0.011)
@@ -113,14 +113,12 @@ def near_enough(written: CameraSettings, wanted: CameraSettings) -> bool:
 @pytest.mark.parametrize("name", WRITTEN)
 @settings(max_examples=tries(4, 10))
 @given(data=st.data(), what=st.sampled_from(["edit", "edit", "add", "duplicate", "rename", "remove"]))
-def test_a_file_says_what_was_asked_for_and_nothing_else_moves(
-    name: str, data: st.DataObject, what: str
-) -> None:
+def test_an_edit_changes_only_the_requested_camera(name: str, data: st.DataObject, what: str) -> None:
     source = WRITTEN[name]
     now = cameras(source)
     ((hook, _),) = [key for key in now if key[1] == "cam"]
     key, before = (KINDS[hook], "cam"), now[hook, "cam"]
-    if windows := data.draw(st.booleans(), "line ends of Windows"):
+    if windows := data.draw(st.booleans(), "Windows line endings"):
         source = source.replace("\n", "\r\n")
     after = data.draw(changes(before), "after")
     assume(changed_fields(before, after))
@@ -153,13 +151,13 @@ def test_a_file_says_what_was_asked_for_and_nothing_else_moves(
     else:
         wanted = {key: value for key, value in now.items() if key[1] != "cam"}
     assert found.keys() == wanted.keys() and all(close(found[key], wanted[key]) for key in wanted), given.diff
-    if what in ("edit", "add", "rename"):  # a copy brings its own
+    if what in ("edit", "add", "rename"):  # a duplicate copies comments, too
         assert comments(given.new_text.replace("\r\n", "\n")) == comments(source.replace("\r\n", "\n"))
     assert given.new_text.count("\n") == given.new_text.count("\r\n") or not windows
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_edited_safely_is_refused_with_reason_and_snippet(name: str) -> None:
+def test_an_unsafe_edit_is_refused_with_reason_and_snippet(name: str) -> None:
     source, reason = REFUSED[name]
     before = real_settings({FILE: source}, "cam")
     ((hook, _),) = [key for key in real_configs({FILE: source}) if key[1] == "cam"]
@@ -169,7 +167,7 @@ def test_what_cannot_be_edited_safely_is_refused_with_reason_and_snippet(name: s
     assert isinstance(plan, RefusedEdit), plan.diff
     assert reason in plan.reason
     assert ast.parse(plan.snippet)
-    # What it gives to copy is the camera that was asked for.
+    # The snippet builds the requested camera.
     task = f"{source}\n\nclass Copied(Base):\n    _sensor_configs = [{plan.snippet}]\n"
     assert near_enough(real_settings({FILE: task}, "cam", class_name="Copied"), after)
 
@@ -177,12 +175,12 @@ def test_what_cannot_be_edited_safely_is_refused_with_reason_and_snippet(name: s
 @pytest.mark.parametrize(
     ("name", "change", "text"),
     [
-        ("an argument a line, with remarks", {"fov": math.radians(48.6)}, "fov=48.6 * np.pi / 180,"),
+        ("one argument per line, with comments", {"fov": math.radians(48.6)}, "fov=48.6 * np.pi / 180,"),
         ("euler angles in degrees", {"fov": math.radians(48.6)}, "np.radians(48.6)"),
         ("arithmetic with a height", {"position": (0.3512, 0, 0.9)}, "eye = [0.3512, 0, TABLE + 0.7]"),
     ],
 )
-def test_the_number_that_a_person_would_change_is_changed(
+def test_an_edit_changes_the_number_that_an_author_would_change(
     name: str, change: dict[str, Any], text: str
 ) -> None:
     before = real_settings({FILE: WRITTEN[name]}, "cam")
@@ -191,7 +189,7 @@ def test_the_number_that_a_person_would_change_is_changed(
     assert isinstance(plan, SourceEdit) and text in plan.new_text
 
 
-def test_a_second_edit_goes_on_from_the_first_and_writes_the_target_that_was_placed() -> None:
+def test_a_second_edit_builds_on_the_first_and_the_placed_target_is_written() -> None:
     source, point = LIST, (1.5, 0.25, 0.3)
     before = real_settings({FILE: source}, "cam")
     eye = before.position
@@ -206,7 +204,7 @@ def test_a_second_edit_goes_on_from_the_first_and_writes_the_target_that_was_pla
 
 
 @pytest.mark.parametrize("kind", ["sensor", "human"])
-def test_a_hook_is_made_where_there_is_none(kind: CameraKind) -> None:
+def test_a_missing_hook_is_added(kind: CameraKind) -> None:
     source = "from __future__ import annotations\n\nclass Task:\n    eye = 1\n\n\nx = 2\n"
 
     def add(text: str, name: str) -> SourceEdit | RefusedEdit:
@@ -221,14 +219,14 @@ def test_a_hook_is_made_where_there_is_none(kind: CameraKind) -> None:
     assert isinstance(twice, RefusedEdit) and "already" in twice.reason
 
 
-def test_what_cannot_be_added_to_or_taken_out_is_refused() -> None:
+def test_impossible_additions_and_removals_are_refused() -> None:
     def add(text: str, class_name: str = "Task", name: str = "added") -> SourceEdit | RefusedEdit:
         key = ("sensor", name)
         return planned(plan_add, {FILE: text}, FILE, class_name, key, NEW, run_as(class_name))
 
     plan = add(REFUSED["a comprehension"][0])
     assert isinstance(plan, RefusedEdit) and 'CameraConfig(\n    "added"' in plan.snippet
-    parent = WRITTEN["a pose of nothing"] + "\n\nclass Child(Task):\n    pass\n"
+    parent = WRITTEN["a default pose"] + "\n\nclass Child(Task):\n    pass\n"
     library = "from mani_skill.envs.tasks import PickCubeEnv\n\n\nclass Task(PickCubeEnv):\n    pass\n"
     loop = REFUSED["a loop with a plain name"][0]
     for refused, reason in (

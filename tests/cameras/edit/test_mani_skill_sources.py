@@ -1,4 +1,4 @@
-"""ManiSkill's own tasks and robots as authors' files: every camera in them is edited, or refused for a known reason."""
+"""With ManiSkill's tasks and robots as authors' files, every camera is edited, or refused for a known reason."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TASK = "/author/task.py"
 
 
 class Anything:
-    """A task that has whatever a hook asks it for: links to mount cameras on, an agent."""
+    """Stand-in for a task: has any attribute that a hook reads, such as an agent or links to mount cameras on."""
 
     robot_uids = "panda"
     domain_randomization = False
@@ -47,7 +47,7 @@ class Anything:
 
 
 def hook_results(path: Path, text: str) -> dict[tuple[str, int], dict[str, CameraConfig]]:
-    """What each hook in the file returns, by its name and how many of that name came before."""
+    """Return each hook's cameras by the hook's name and its index among hooks of that name in the file."""
     tree = ast.parse(text)
     top = [s for s in tree.body if isinstance(s, (ast.Import, ast.ImportFrom)) or _constant(s)]
     module = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
@@ -65,7 +65,7 @@ def hook_results(path: Path, text: str) -> dict[tuple[str, int], dict[str, Camer
             count = sum(name == node.name for name, _ in found)
             try:
                 found[node.name, count] = parse_cameras(names[node.name](Anything()))
-            except (TypeError, ValueError):  # numbers that only a real task has
+            except (TypeError, ValueError):  # the hook needs numbers that only a real task has
                 found[node.name, count] = {}
     return found
 
@@ -76,7 +76,7 @@ def _constant(statement: ast.stmt) -> bool:
 
 
 def ran(path: Path, text: str, hook: tuple[str, int]) -> HookCameras:
-    """What one hook makes, as a worker would tell of it."""
+    """Return one hook's cameras in the form in which a worker reports them."""
     with recording_calls({TASK: text}) as recorded:
         configs = hook_results(path, text)[hook]
     return HookCameras(
@@ -85,7 +85,7 @@ def ran(path: Path, text: str, hook: tuple[str, int]) -> HookCameras:
 
 
 def kinds_of_cameras() -> Iterator[Any]:
-    """One of each way of writing, whatever the numbers."""
+    """Yield one camera for each way of writing, ignoring numbers."""
     seen: set[str] = set()
     for path in FILES:
         functions = {}
@@ -101,7 +101,7 @@ def kinds_of_cameras() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("path", "first_line"), list(kinds_of_cameras()))
-def test_each_camera_is_edited_right(path: Path, first_line: int) -> None:
+def test_each_camera_is_edited_correctly(path: Path, first_line: int) -> None:
     text = path.read_text()
     function = next(n for n in ast.walk(ast.parse(text)) if getattr(n, "lineno", 0) == first_line)
     lines = range(first_line, getattr(function, "end_lineno", 0) + 1)

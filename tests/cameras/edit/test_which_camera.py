@@ -1,4 +1,4 @@
-"""Which call is meant, in which file, and what is said when that cannot be told."""
+"""An edit finds the right call in the right file, or is refused with a reason."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def edited_line(plan: SourceEdit | RefusedEdit) -> int:
     return line
 
 
-def test_two_of_one_name_and_value_are_told_apart_by_the_place() -> None:
+def test_cameras_of_equal_name_and_value_are_distinguished_by_their_place() -> None:
     source = TWO.replace("512, 512", "128, 128").replace('f"{name}"', '"cam"')
     before = real_settings({FILE: source}, "cam", "_default_sensor_configs")
     for class_name, line in (("Task", LINE), ("Other", LINE + 11)):
@@ -75,7 +75,7 @@ def test_two_of_one_name_and_value_are_told_apart_by_the_place() -> None:
         {"height": 2.5},
     ],
 )
-def test_what_is_no_camera_never_reaches_the_file(change: dict[str, Any]) -> None:
+def test_invalid_camera_settings_are_never_written(change: dict[str, Any]) -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     plan = planned(
         plan_edit, {FILE: TWO}, ("sensor", "cam"), before, dataclasses.replace(before, **change), run_class
@@ -83,8 +83,8 @@ def test_what_is_no_camera_never_reaches_the_file(change: dict[str, Any]) -> Non
     assert isinstance(plan, RefusedEdit) and not plan.snippet
 
 
-def told(ran: HookCameras, **changes: Any) -> RunHooks:
-    """A worker that says something else of the camera."""
+def forged_report(ran: HookCameras, **changes: Any) -> RunHooks:
+    """Run hooks as a worker that reports `changes` for the camera."""
     key: CameraKey = ("sensor", "cam")
     return lambda sources: HookCameras(
         {**ran.cameras, key: dataclasses.replace(ran.cameras[key], **changes)}, ran.owners
@@ -100,7 +100,7 @@ def told(ran: HookCameras, **changes: Any) -> RunHooks:
     ],
 )
 @pytest.mark.parametrize("of", ["call", "argument", "read", "part"])
-def test_a_worker_that_lies_about_places_changes_nothing(place: Place, reason: str, of: str) -> None:
+def test_a_worker_that_reports_false_places_changes_nothing(place: Place, reason: str, of: str) -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     ran = run_class({FILE: TWO})
     trace = ran.cameras["sensor", "cam"].trace
@@ -119,7 +119,9 @@ def test_a_worker_that_lies_about_places_changes_nothing(place: Place, reason: s
         vector = dataclasses.replace(pose.parts["p"], parts={**pose.parts["p"].parts, "2": item})
         lie = dataclasses.replace(pose, parts={**pose.parts, "p": vector})
         trace = dataclasses.replace(trace, parts={**trace.parts, "pose": lie})
-    plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), told(ran, trace=trace))
+    plan = planned(
+        plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), forged_report(ran, trace=trace)
+    )
     assert isinstance(plan, RefusedEdit) and reason in plan.reason
 
 
@@ -160,7 +162,7 @@ def test_a_constant_of_another_file_is_changed_there() -> None:
     assert plan.settings == real_settings(sources | {plan.file: plan.new_text}, "cam")
 
 
-def test_a_constant_that_another_file_reads_is_left_as_it_is() -> None:
+def test_a_constant_that_another_file_reads_stays_unchanged() -> None:
     sources = {
         FILE: IMPORTING,
         "/author/places.py": PLACES,
@@ -173,7 +175,7 @@ def test_a_constant_that_another_file_reads_is_left_as_it_is() -> None:
     assert any("more.py" in note for note in plan.notes)
 
 
-def test_a_change_of_two_files_is_one_plan_with_both() -> None:
+def test_one_plan_can_change_two_files() -> None:
     sources = {FILE: IMPORTING, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
     after = dataclasses.replace(higher(before), height=100)
@@ -188,7 +190,7 @@ def test_a_change_of_two_files_is_one_plan_with_both() -> None:
     assert plan.settings == real_settings(sources | new, "cam")
 
 
-def test_what_an_argument_of_the_env_decides_is_left_alone_and_said() -> None:
+def test_settings_that_env_arguments_override_are_left_alone_with_a_note() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     running = dataclasses.replace(before, width=640, height=480)
     plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), running, higher(running), run_class)
@@ -201,7 +203,7 @@ def test_what_an_argument_of_the_env_decides_is_left_alone_and_said() -> None:
     assert isinstance(plan, RefusedEdit) and "gym.make" in plan.reason
 
 
-def test_an_intrinsic_takes_the_place_of_a_fov_and_back() -> None:
+def test_an_intrinsic_replaces_a_fov_and_back() -> None:
     source = HEADER + dedent(
         """\
         class Task(Base):
@@ -226,7 +228,7 @@ def test_an_intrinsic_takes_the_place_of_a_fov_and_back() -> None:
         assert real_settings({FILE: back.new_text}, uid) == back.settings == before
 
 
-def test_a_change_that_another_camera_would_make_too_is_refused() -> None:
+def test_a_change_that_would_also_change_another_camera_is_refused() -> None:
     source = HEADER + dedent(
         """\
         from places import EYE as ONE

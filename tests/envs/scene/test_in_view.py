@@ -1,4 +1,4 @@
-"""Boxes and triangles outside a camera's view, against where their points fall in its picture."""
+"""View culling agrees with the pixels on which the points of boxes and triangles fall."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from workbench.envs.rendering.in_view import cut_to_view, is_outside, outside_an
 
 @pytest.fixture
 def camera(renderer: None) -> Any:
-    made = sapien.render.RenderCameraComponent(40, 30)
-    made.set_perspective_parameters(0.1, 10.0, 30.0, 35.0, 15.0, 20.0, 0.0)  # type: ignore[call-arg]
-    return made
+    component = sapien.render.RenderCameraComponent(40, 30)
+    component.set_perspective_parameters(0.1, 10.0, 30.0, 35.0, 15.0, 20.0, 0.0)  # type: ignore[call-arg]
+    return component
 
 
 def test_a_point_is_in_view_where_its_pixel_is_in_the_picture(camera: Any) -> None:
@@ -25,12 +25,12 @@ def test_a_point_is_in_view_where_its_pixel_is_in_the_picture(camera: Any) -> No
     x, y, z = points.T
     k = camera.get_intrinsic_matrix()
     column, row = k[0, 2] - k[0, 0] * y / x, k[1, 2] - k[1, 1] * z / x
-    seen = (x > 0.1) & (column > 0) & (column < 40) & (row > 0) & (row < 30)
+    visible = (x > 0.1) & (column > 0) & (column < 40) & (row > 0) & (row < 30)
     planes = planes_of(camera)
     boxes = np.stack([points, points], axis=1).astype(np.float32)
     outside, inside = outside_and_inside(boxes, np.tile(planes, (2000, 1, 1)))
-    np.testing.assert_array_equal(outside, ~inside, "a box without a size")
-    assert seen.any() and not (outside & seen).any()
+    np.testing.assert_array_equal(outside, ~inside, "a box of zero size is either outside or inside")
+    assert visible.any() and not (outside & visible).any()
     np.testing.assert_array_equal([is_outside(point[None], planes) for point in points], outside)
     nearly = (x > 0.09) & (column > -2) & (column < 42) & (row > -2) & (row < 32)
     assert outside[~nearly].all()

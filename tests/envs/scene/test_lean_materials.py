@@ -1,4 +1,4 @@
-"""Bodies drawn without the textures that are the same everywhere: the same picture, also after the author changed something."""
+"""Lean copies replace uniform textures by constants and render the same image, and are dropped when the author changes a material."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ pytestmark = pytest.mark.usefixtures("renderer")
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[Any]:
-    made = batched("PullCube-v1", obs_mode="rgb", sensor_configs={"width": 256, "height": 256})
-    yield made
-    made.close()
+    env = batched("PullCube-v1", obs_mode="rgb", sensor_configs={"width": 256, "height": 256})
+    yield env
+    env.close()
 
 
 def body_of(env: Any, name: str) -> Any:
@@ -34,7 +34,7 @@ def body_of(env: Any, name: str) -> Any:
 
 @pytest.fixture
 def table(env: Any) -> Iterator[tuple[Any, LeanBody]]:
-    """ManiSkill's, of a file whose metal is 1 everywhere, and the lean one beside it."""
+    """ManiSkill's table, whose metallic texture is 1 everywhere, and its lean copy on the same entity."""
     body = body_of(env, "table-workspace")
     lean = LeanMaterials().lean_copy(body)
     assert lean is not None
@@ -55,18 +55,18 @@ def materials_of(body: Any) -> list[Any]:
     return [part.material for shape in body.render_shapes for part in shape.parts]
 
 
-def test_the_picture_is_the_same_to_the_bit_with_a_texture_less(
-    env: Any, table: tuple[Any, LeanBody]
-) -> None:
+def test_a_lean_copy_renders_the_same_image_bit_for_bit(env: Any, table: tuple[Any, LeanBody]) -> None:
     body, lean = table
     before = picture(env)
     with shown(((body, lean.component),)):
         np.testing.assert_array_equal(picture(env), before)
     with shown(((body, None),)):
-        assert (picture(env) != before).mean() > 0.1, "the table is in view"
+        assert (picture(env) != before).mean() > 0.1, "the table is not in view"
     wood, own = materials_of(body)[0], materials_of(lean.component)[0]
     assert wood.metallic_texture is not None and own.metallic_texture is None and own.metallic == 1.0
-    assert own.roughness_texture == wood.roughness_texture, "it differs from place to place"
+    assert own.roughness_texture == wood.roughness_texture, (
+        "the roughness texture is not uniform and must stay"
+    )
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_the_picture_is_the_same_to_the_bit_with_a_texture_less(
     ],
     ids=str,
 )
-def test_it_is_not_for_a_body_whose_material_the_author_changes_later(
+def test_a_lean_copy_is_invalid_after_the_author_changes_the_material(
     table: tuple[Any, LeanBody], changed: dict[str, Any]
 ) -> None:
     body, lean = table
@@ -92,7 +92,7 @@ def test_it_is_not_for_a_body_whose_material_the_author_changes_later(
             setattr(wood, name, sapien.render.RenderTexture2D(value, "R8G8B8A8Unorm") if texture else value)
         assert not lean.is_like_exact()
         if "metallic_texture" in changed:
-            assert LeanMaterials().lean_copy(body) is None, "nothing of it is the same everywhere"
+            assert LeanMaterials().lean_copy(body) is None, "no texture is uniform any more"
     finally:
         for name, value in was.items():
             setattr(wood, name, value)

@@ -1,4 +1,4 @@
-"""Other objects in other envs: ``scene_idxs``, ``Actor.merge``, ``Link.merge``, ``Articulation.merge``."""
+"""Objects that differ by env: ``scene_idxs``, ``Actor.merge``, ``Link.merge``, ``Articulation.merge``."""
 
 # ManiSkill annotates an env's members as the widest thing they may be, and vectors as tuples.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -63,7 +63,7 @@ def mixed() -> Iterator[Any]:
     env.close()
 
 
-def test_every_env_does_what_a_stock_env_with_its_objects_does() -> None:
+def test_each_env_equals_a_stock_env_with_its_objects() -> None:
     def look(env: Any) -> dict[str, torch.Tensor]:
         return {
             "thing": env.thing.get_state(),
@@ -81,7 +81,7 @@ def test_every_env_does_what_a_stock_env_with_its_objects_does() -> None:
     follow(Mixed, 4, look=look).close()
 
 
-def test_a_partial_reset_reaches_the_right_parts_of_a_merged_actor(mixed: Any) -> None:
+def test_a_partial_reset_writes_the_right_parts_of_a_merged_actor(mixed: Any) -> None:
     mixed.reset(seed=[0, 1, 2, 3])
     for _ in range(5):
         mixed.step(None)
@@ -93,7 +93,7 @@ def test_a_partial_reset_reaches_the_right_parts_of_a_merged_actor(mixed: Any) -
     assert torch.equal(mixed.thing.pose.p[[1, 2], 2], torch.full((2,), 0.2))
 
 
-def test_the_state_of_merged_structs_comes_back(mixed: Any) -> None:
+def test_the_state_of_merged_structs_survives_a_round_trip(mixed: Any) -> None:
     mixed.reset(seed=[0, 1, 2, 3])
     state = mixed.get_state_dict()
     assert state["actors"].keys() == {"thing"}
@@ -109,7 +109,7 @@ def test_the_state_of_merged_structs_comes_back(mixed: Any) -> None:
 
 
 def test_drive_targets_of_parts_of_a_merged_articulation() -> None:
-    """Set through the parts: ManiSkill 3.0.1's merged joint cannot (it has no ``articulation`` to ask)."""
+    """Targets are set on the parts, since ManiSkill 3.0.1's merged joint has no ``articulation``."""
 
     class Driven(Mixed):
         def _load_scene(self, options: dict) -> None:

@@ -1,4 +1,4 @@
-"""Meshes that are kept on disk."""
+"""Reduced meshes and their disk cache."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from workbench.envs.scene.mesh_levels import deviation, from_afar, reduced_mesh
 from workbench.envs.scene.shapes import Mesh
 
 
-def test_a_reduced_mesh_is_read_from_disk_the_next_time_and_made_again_from_a_broken_file(
+def test_a_reduced_mesh_is_cached_and_a_corrupt_file_is_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -21,27 +21,27 @@ def test_a_reduced_mesh_is_read_from_disk_the_next_time_and_made_again_from_a_br
     mesh = Mesh(
         sphere.vertices.astype(np.float32), sphere.faces.astype(np.uint32), sphere.vertices.astype(np.float32)
     )
-    made = reduced_mesh(mesh, 400)
-    assert 200 < len(made.faces) <= 800
-    assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 0.05
-    assert made.normals is not None
-    np.testing.assert_allclose(np.linalg.norm(made.normals, axis=1), 1, atol=0.02)
+    reduced = reduced_mesh(mesh, 400)
+    assert 200 < len(reduced.faces) <= 800
+    assert np.abs(np.linalg.norm(reduced.vertices, axis=1) - 1).max() < 0.05
+    assert reduced.normals is not None
+    np.testing.assert_allclose(np.linalg.norm(reduced.normals, axis=1), 1, atol=0.02)
     (file,) = tmp_path.rglob("*.npz")
     written = file.read_bytes()
     for content in (written, b"no file of ours", b""):
         file.write_bytes(content)
         again = reduced_mesh(mesh, 400)
-        np.testing.assert_array_equal(again.vertices, made.vertices)
-        np.testing.assert_array_equal(again.faces, made.faces)
-        np.testing.assert_array_equal(again.normals, made.normals)
+        np.testing.assert_array_equal(again.vertices, reduced.vertices)
+        np.testing.assert_array_equal(again.faces, reduced.faces)
+        np.testing.assert_array_equal(again.normals, reduced.normals)
     assert reduced_mesh(mesh, 100) is not None and len(list(tmp_path.rglob("*.npz"))) == 2
 
 
-def test_a_mesh_from_afar_has_few_triangles_near_its_surface_and_is_kept(
+def test_a_distant_mesh_has_few_triangles_near_the_surface_and_is_cached(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    # Loose pieces, as screws are, which a collapse of edges alone keeps.
+    # Small separate parts, such as screws, which edge collapse alone would keep.
     balls = [trimesh.creation.icosphere(subdivisions=2, radius=0.004) for _ in range(15)]
     for number, ball in enumerate(balls):
         ball.apply_translation((0.1 * np.cos(number), 0.1 * np.sin(number), 0.0))
@@ -54,7 +54,7 @@ def test_a_mesh_from_afar_has_few_triangles_near_its_surface_and_is_kept(
     assert from_afar(mesh, 0.0) is mesh
 
 
-def test_simple_and_textured_meshes_stay_from_afar_as_they_are() -> None:
+def test_simple_and_textured_meshes_are_not_reduced_for_distance() -> None:
     disc = trimesh.creation.cylinder(0.1, 0.0005, sections=32)
     thin = Mesh(disc.vertices.astype(np.float32), disc.faces.astype(np.uint32))
     assert from_afar(thin, 0.1) is thin

@@ -1,4 +1,4 @@
-"""Normals: sharp at edges, smooth elsewhere, and on few triangles such that these look like the many."""
+"""Normals are sharp at edges and smooth elsewhere; reduced meshes are shaded like the full mesh."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def shared(mesh: trimesh.Trimesh) -> tuple[NDArray[np.float32], NDArray[np.uint3
 
 
 def strip(x: NDArray, z: NDArray, tilt: NDArray) -> Mesh:
-    """A profile in x and z, drawn out along y, with normals tilted by so many radians from up to the side."""
+    """Extrude a profile (x, z) along y, with normals tilted from +z towards +x by `tilt` radians."""
     count, k = len(x), np.arange(len(x) - 1)
     points = np.concatenate([np.stack([x, np.full(count, y), z], axis=1) for y in (-1.0, 1.0)])
     normals = np.tile(np.stack([np.sin(tilt), np.zeros(count), np.cos(tilt)], axis=1), (2, 1))
@@ -26,14 +26,14 @@ def strip(x: NDArray, z: NDArray, tilt: NDArray) -> Mesh:
 
 
 def tile() -> Mesh:
-    """Flat for a length of one, then bent down by 30 degrees within a tenth."""
+    """A strip that is flat for a length of 1 and then bends down by 30 degrees over a length of 0.1."""
     bend = np.linspace(0, np.deg2rad(30), 20)
     x, z = 1 + 0.2 * np.sin(bend), 0.2 * np.cos(bend) - 0.2
     return strip(np.concatenate([[0, 0.5], x]), np.concatenate([[0, 0], z]), np.concatenate([[0, 0], bend]))
 
 
 def simple_tile() -> Mesh:
-    """The same as two faces, which meet in the middle of the bend."""
+    """`tile` reduced to two flat faces that meet in the middle of the bend."""
     x, _, z = tile().vertices[[0, 12, 21]].T
     flat = strip(x, z, np.zeros(3))
     return with_normals(Mesh(flat.vertices, flat.faces))
@@ -44,8 +44,8 @@ def degrees_from_up(mesh: Mesh) -> NDArray[np.float64]:
     return np.rad2deg(np.arccos(np.minimum(mesh.normals[:, 2], 1)))
 
 
-def test_a_flat_face_is_shaded_flat_although_the_surface_bends_where_it_ends() -> None:
-    """The surface itself is 15 degrees off there, and so would the face be shaded."""
+def test_a_flat_face_next_to_a_bend_is_shaded_flat() -> None:
+    """The surface is tilted by 15 degrees at the face's end and must not tilt the shading of the whole face."""
     exact, simple = tile(), simple_tile()
     assert len(simple.faces) == 4
     shaded = ShadedSurface(exact).shade(simple)
@@ -56,7 +56,7 @@ def test_a_flat_face_is_shaded_flat_although_the_surface_bends_where_it_ends() -
     assert off[shaded.vertices[:, 0] > 1.09].min() > 20
 
 
-def test_few_triangles_of_a_ball_are_shaded_round() -> None:
+def test_a_ball_of_few_triangles_is_shaded_round() -> None:
     fine, coarse = (trimesh.creation.icosphere(subdivisions=n) for n in (5, 1))
     shaded = ShadedSurface(Mesh(*shared(fine), np.asarray(fine.vertices, np.float32))).shade(
         with_normals(Mesh(*shared(coarse)))

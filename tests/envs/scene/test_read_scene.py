@@ -1,4 +1,4 @@
-"""What the browser is given to draw, against what ManiSkill's own renderer drew."""
+"""The geometry sent to the browser matches what ManiSkill's own renderer draws."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("renderer")
 EVERYTHING: dict[str, int] = {"max_faces": 10**9, "max_texels": 10**9}
 
 
-# --- what it looks like ----------------------------------------------------------------------------
+# --- appearance ----------------------------------------------------------------------------
 
 
 def painted(
@@ -40,8 +40,8 @@ def painted(
     k: NDArray,
     size: int,
 ) -> NDArray[np.int64]:
-    """(size, size) body index (or -1) of triangles painted from far to near, in pure numpy and PIL."""
-    fine = 4  # PIL also paints pixels that a triangle only touches; on a finer grid that matters less
+    """Paint triangles from far to near with numpy and PIL; return the body index of each pixel or -1, (size, size)."""
+    fine = 4  # PIL also paints pixels that a triangle only touches; a finer grid reduces this error
     to_camera = np.linalg.inv(sapien.Pose(pose[:3].tolist(), pose[3:].tolist()).to_transformation_matrix())
     triangles, depths, bodies = [], [], []
     for visual in visuals:
@@ -63,7 +63,7 @@ def painted(
     return np.asarray(image)[fine // 2 :: fine, fine // 2 :: fine].astype(np.int64)
 
 
-def test_silhouettes_are_those_of_the_renderer() -> None:
+def test_silhouettes_match_the_renderers() -> None:
     size = 512
     env = batched("PickCube-v1", 2, sensor_configs={"width": size, "height": size})
     env.step(None)
@@ -93,7 +93,7 @@ def test_silhouettes_are_those_of_the_renderer() -> None:
 def redrawn(
     geometry: SceneGeometry, poses: NDArray[np.float32], env: Any, shader: str, texture: str
 ) -> NDArray:
-    """`texture` of the env's human camera, in a scene made anew from env 0 of `geometry`."""
+    """Render `texture` of the env's human camera in a new scene built from env 0 of `geometry`."""
     scene = sapien.Scene(
         [sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device(RENDER_DEVICE))]
     )
@@ -132,8 +132,8 @@ def redrawn(
     return np.array(copy.get_picture(texture)[..., :3])
 
 
-def test_colours_and_textures_are_those_of_the_renderer() -> None:
-    """Albedo: colour before light, so that only colours, textures, uvs and shapes can differ."""
+def test_colours_and_textures_match_the_renderers() -> None:
+    """Compares albedo, the unlit colour, so only colours, textures, uvs and shapes can differ."""
     env = stock("PickCube-v1", human_render_camera_configs={"shader_pack": "default"})
     geometry = read_geometry(env, **EVERYTHING)
     textured = {v.name.split("/")[0] for v in geometry.visuals if v.material.texture is not None}
@@ -174,7 +174,7 @@ def test_equal_shapes_of_all_envs_are_one_visual() -> None:
     env.close()
 
 
-def test_shapes_that_differ_between_envs_are_each_drawn_in_their_own_env() -> None:
+def test_shapes_that_differ_between_envs_are_visuals_of_their_own_env() -> None:
     env = batched("PegInsertionSide-v1", 3)
     table = scene_index(env)
     geometry = read_geometry(env)
@@ -198,7 +198,7 @@ def test_every_mesh_is_sound(task: str) -> None:
         np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-3, err_msg=visual.name)
         assert (mesh.uvs is not None) == (visual.material.texture is not None)
         assert len(mesh.faces) <= 2000
-        # Faces look the way their normals do, or a browser would cull the side that is seen.
+        # Faces and normals must point the same way, or the browser culls the visible side.
         corner = mesh.vertices[mesh.faces].astype(float)
         across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         with_normal = np.einsum("ij,ij->i", across, mesh.normals[mesh.faces[:, 0]])

@@ -1,4 +1,4 @@
-"""Poses of all bodies as one array, against what ManiSkill's own structs say."""
+"""The pose array of all bodies equals the poses of ManiSkill's own structs."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from workbench.envs.scene.scene_index import read_poses, scene_index
 TASKS = ["PickCube-v1", "PegInsertionSide-v1"]
 
 
-def begun(env: Any) -> Any:
+def after_one_step(env: Any) -> Any:
     env.reset(seed=1)
     return env
 
 
-def assert_poses_are_those_of_the_structs(env: Any) -> None:
+def assert_poses_equal_the_structs(env: Any) -> None:
     table, poses = scene_index(env), read_poses(env)
     assert poses.shape == (env.num_envs, len(table.names), 7) and poses.dtype == np.float32
     checked = np.zeros(poses.shape[:2], bool)
@@ -43,24 +43,24 @@ def assert_poses_are_those_of_the_structs(env: Any) -> None:
 @pytest.mark.thorough
 @pytest.mark.parametrize("make", [stock, batched])
 @pytest.mark.parametrize("task", TASKS)
-def test_poses_are_those_of_maniskill(task: str, make: Any) -> None:
+def test_poses_equal_maniskills(task: str, make: Any) -> None:
     env = make(task)
     table = scene_index(env)
     assert len(set(table.names)) == len(table.names)
     for _ in range(3):
         env.step(torch.from_numpy(np.atleast_2d(env.action_space.sample())))
-        assert_poses_are_those_of_the_structs(env)
+        assert_poses_equal_the_structs(env)
     env.reset(seed=2)
-    # PegInsertionSide makes new pegs for every episode of a single env.
-    assert_poses_are_those_of_the_structs(env)
+    # PegInsertionSide builds new pegs for every episode of a single env.
+    assert_poses_equal_the_structs(env)
     env.close()
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("task", TASKS)
-def test_poses_are_those_of_the_physics(task: str) -> None:
-    """Against the entities themselves, which know nothing of ManiSkill's tensors."""
-    env = begun(batched(task, 4))
+def test_poses_equal_those_of_the_physics(task: str) -> None:
+    """Compares with SAPIEN's entities, which do not depend on ManiSkill's tensors."""
+    env = after_one_step(batched(task, 4))
     table = scene_index(env)
     env.step(torch.from_numpy(env.action_space.sample()))
     env.reset(options={"env_idx": torch.tensor([1, 3])})
@@ -72,8 +72,8 @@ def test_poses_are_those_of_the_physics(task: str) -> None:
     env.close()
 
 
-def test_a_hidden_body_is_where_it_would_be_seen() -> None:
-    env: Any = begun(batched("PickCube-v1", 4))
+def test_a_hidden_body_has_the_pose_it_would_be_shown_at() -> None:
+    env: Any = after_one_step(batched("PickCube-v1", 4))
     table = scene_index(env)
     goal = table.names.index("goal_site")
     shown = read_poses(env)
@@ -89,7 +89,7 @@ def test_a_hidden_body_is_where_it_would_be_seen() -> None:
 
 
 class SparseBodiesEnv(PushCubeEnv):
-    """A body that only envs 0 and 2 have, and a view over two bodies of the same env."""
+    """A body that only envs 0 and 2 have, and a merged view of two bodies of the same env."""
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
@@ -106,16 +106,16 @@ class SparseBodiesEnv(PushCubeEnv):
 
 
 def test_a_body_that_an_env_lacks_is_nan_there_only() -> None:
-    env = begun(batched(SparseBodiesEnv, 4))
+    env = after_one_step(batched(SparseBodiesEnv, 4))
     table = scene_index(env)
     missing = np.isnan(read_poses(env)).all(axis=-1)
     assert np.argwhere(missing).tolist() == [[1, table.names.index("rare")], [3, table.names.index("rare")]]
-    assert_poses_are_those_of_the_structs(env)
+    assert_poses_equal_the_structs(env)
     env.close()
 
 
-def test_a_scene_is_looked_over_once_and_a_new_one_anew() -> None:
-    env = begun(batched("PickCube-v1", 2))
+def test_a_scene_is_indexed_once_and_again_after_a_rebuild() -> None:
+    env = after_one_step(batched("PickCube-v1", 2))
     before = scene_index(env)
     env.step(torch.from_numpy(env.action_space.sample()))
     assert scene_index(env) is before
@@ -123,12 +123,12 @@ def test_a_scene_is_looked_over_once_and_a_new_one_anew() -> None:
     after = scene_index(env)
     assert after is not before and after.names == before.names
     assert not {id(e) for e in after.entities.ravel()} & {id(e) for e in before.entities.ravel()}
-    assert_poses_are_those_of_the_structs(env)
+    assert_poses_equal_the_structs(env)
     env.close()
 
 
-def test_what_is_known_of_a_scene_goes_with_it() -> None:
-    env = begun(batched("PickCube-v1", 2))
+def test_the_index_is_freed_with_its_scene() -> None:
+    env = after_one_step(batched("PickCube-v1", 2))
     scene, index = weakref.ref(env.scene), weakref.ref(scene_index(env))
     env.close()
     del env

@@ -16,7 +16,7 @@ from workbench.envs.scene.simplify import flat_rectangle, reduce_mesh
 
 
 def soup(mesh: trimesh.Trimesh) -> Mesh:
-    """Every triangle with vertices of its own, as exporters write it."""
+    """Give every triangle its own vertices, as some exporters do."""
     points = np.asarray(mesh.triangles, np.float32).reshape(-1, 3)
     normals = np.repeat(mesh.face_normals, 3, axis=0).astype(np.float32)
     return Mesh(points, np.arange(len(points), dtype=np.uint32).reshape(-1, 3), normals)
@@ -54,11 +54,11 @@ def test_texture_coordinates_survive_reduction_and_the_seam_stays_closed() -> No
     assert len(reduced.faces) <= 3000 and reduced.uvs is not None
     p = reduced.vertices
     true_v = np.arccos(p[:, 2] / np.linalg.norm(p, axis=1)) / np.pi
-    away = (true_v > 0.05) & (true_v < 0.95)  # at a pole every u is right
+    away = (true_v > 0.05) & (true_v < 0.95)  # at a pole u is arbitrary
     error = np.abs(reduced.uvs[:, 0] - np.arctan2(p[:, 1], p[:, 0]) / (2 * np.pi) % 1)[away]
     assert np.minimum(error, 1 - error).max() < 0.03
     np.testing.assert_allclose(reduced.uvs[:, 1], true_v, atol=0.03)
-    # No face may reach across the seam, where u jumps from 1 to 0.
+    # No face may cross the seam, where u jumps from 1 to 0.
     assert np.ptp(reduced.uvs[reduced.faces, 0], axis=1).max() < 0.5
 
 
@@ -68,8 +68,8 @@ def test_texture_coordinates_survive_reduction_and_the_seam_stays_closed() -> No
     arrays(np.uint32, (60, 3), elements=st.integers(0, 29)),
     st.integers(1, 100),
 )
-def test_any_triangles_give_a_sound_mesh(points: NDArray, faces: NDArray, limit: int) -> None:
-    """Degenerate and doubled faces, unused vertices, points in one place: files hold all of it."""
+def test_any_triangles_give_a_valid_mesh(points: NDArray, faces: NDArray, limit: int) -> None:
+    """Files contain degenerate and duplicate faces, unused vertices and coincident points."""
     for mesh in (reduce_mesh(with_normals(Mesh(points, faces)), limit), with_normals(Mesh(points, faces))):
         assert len(mesh.faces) and mesh.faces.max() < len(mesh.vertices)
         assert np.isfinite(mesh.vertices).all() and mesh.normals is not None
@@ -104,7 +104,7 @@ def test_a_flat_grid_becomes_two_triangles_with_the_same_texture(turned: bool) -
     np.testing.assert_allclose(across[:, 2], -400 if turned else 400, rtol=1e-5)
 
 
-def test_what_is_no_plain_rectangle_is_not_made_one() -> None:
+def test_only_plain_rectangles_become_two_triangles() -> None:
     bent = grid(20)
     bent.vertices[5, 2] += 0.1
     assert flat_rectangle(bent) is None

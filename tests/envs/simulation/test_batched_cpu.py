@@ -1,4 +1,4 @@
-"""The batched CPU core against ManiSkill's own single CPU env, as the reference."""
+"""The batched CPU core behaves like ManiSkill's own single CPU env."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportCallIssue=false
@@ -35,7 +35,7 @@ def pick_cubes() -> Iterator[BaseEnv]:
     env.close()
 
 
-def test_link_velocities_are_those_of_the_links(pick_cubes: BaseEnv) -> None:
+def test_link_velocities_equal_sapiens(pick_cubes: BaseEnv) -> None:
     pick_cubes.reset(seed=[0, 1, 2, 3])
     for _ in range(5):
         pick_cubes.step(pick_cubes.action_space.sample())
@@ -46,7 +46,7 @@ def test_link_velocities_are_those_of_the_links(pick_cubes: BaseEnv) -> None:
 
 @pytest.mark.filterwarnings("ignore:The pose of link")
 @pytest.mark.parametrize("rules", ["off", None])
-def test_a_root_that_was_set_stays_set_when_the_velocity_of_a_link_is_read_before_it_is_applied(
+def test_reading_a_link_velocity_before_apply_keeps_a_root_pose_that_was_set(
     rules: Degree | None,
 ) -> None:
     env = batched("PickCube-v1", 2, rules)
@@ -77,7 +77,7 @@ def test_a_pose_with_nan_is_refused_with_the_name_of_the_body(pick_cubes: BaseEn
     pick_cubes.scene._gpu_fetch_all()
 
 
-def test_a_velocity_of_what_the_task_moves_itself_is_not_given_to_physx(pick_cubes: BaseEnv) -> None:
+def test_a_velocity_of_a_kinematic_actor_is_not_passed_to_physx(pick_cubes: BaseEnv) -> None:
     pick_cubes.reset(seed=[0, 1, 2, 3])
     for actor in (pick_cubes.goal_site, pick_cubes.cube):
         actor.set_linear_velocity(torch.full((4, 3), 0.5))
@@ -88,7 +88,7 @@ def test_a_velocity_of_what_the_task_moves_itself_is_not_given_to_physx(pick_cub
 
 def test_every_env_has_its_own_ground() -> None:
     class DropsACube(REGISTERED_ENVS["PickCube-v1"].cls):
-        """The cube falls beside the table, onto the floor that the table scene builds 0.92 m below."""
+        """The cube falls past the table onto the floor, which the table scene builds 0.92 m below."""
 
         def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
             super()._initialize_episode(env_idx, options)
@@ -107,7 +107,7 @@ def test_every_env_has_its_own_ground() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
-def test_what_is_written_into_the_tensors_and_applied_is_what_physx_has() -> None:
+def test_values_written_to_tensors_and_applied_reach_physx() -> None:
     env = batch_of(ThrowsAFreeChain, 3)
     env.reset(seed=[0, 1, 2])
     px, rng = env.scene.px, np.random.default_rng(0)
@@ -126,7 +126,7 @@ def test_what_is_written_into_the_tensors_and_applied_is_what_physx_has() -> Non
     env.scene._gpu_apply_all()
     px.gpu_apply_articulation_qf()
     px.gpu_apply_articulation_target_velocity()
-    px.packs()  # targets are written before the next step, or before it is packed
+    px.packs()  # targets are written before the next step or pack
     for i in range(3):
         body, root, chain = env.falls._bodies[i], env.free._objs[i], env.chain._objs[i]
         for moved, row in ((body, written["falls"][i]), (root, written["free"][i])):

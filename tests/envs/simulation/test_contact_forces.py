@@ -1,4 +1,4 @@
-"""Contact impulses and the list of contacts, against stock ManiSkill's single env in the same state."""
+"""Contact impulses and the list of contacts equal those of stock ManiSkill's single env in the same state."""
 
 # ManiSkill annotates an env's members as the widest thing they may be, and vectors as tuples.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -21,7 +21,7 @@ from workbench.envs.inspect_env import Contact, list_contacts
 
 pytestmark = [
     pytest.mark.thorough,
-    # ManiSkill's own tasks break some: `env/test_strict.py` lists them.
+    # Some of ManiSkill's own tasks break rules: `tests/envs/test_strict.py` lists them.
     pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 
@@ -33,13 +33,13 @@ def task_class(env_id: str) -> Any:
 
 
 def same_impulses(ours: torch.Tensor, theirs: torch.Tensor, env: int) -> float:
-    """Equal to the last bit of a float32 (stock gives float64), and how large."""
+    """Assert equality to the last bit of float32 (stock returns float64), and return the largest magnitude."""
     assert torch.equal(ours[env], theirs[0].float()), (env, ours[env], theirs[0])
     return float(theirs.abs().max())
 
 
 def stack_cube(env: Any) -> None:
-    """Cube A lies on cube B, and on the table beside it, in the three envs at other places."""
+    """Place cube A across cube B and the table, at a different position in each of the three envs."""
     at = env.cubeB.pose.raw_pose.clone()
     at[:, :3] += torch.tensor([0.01, 0.0, 0.04])
     env.cubeA.set_pose(Pose.create(at))
@@ -104,7 +104,7 @@ def test_impulses_of_bodies_and_pairs_equal_the_stock_values(case: str) -> None:
                     felt_pairs += same_impulses(
                         pair, stock.scene.get_pairwise_contact_impulses(theirs, their_other), env
                     )
-    assert felt_bodies > 0.01 and felt_pairs > 0.01, "nothing touched: the test proved nothing"
+    assert felt_bodies > 0.01 and felt_pairs > 0.01, "no contacts, so the test proved nothing"
     for env in (batch, *stocks):
         env.close()
 
@@ -125,16 +125,16 @@ def test_net_forces_on_the_feet_of_a_legged_robot_equal_the_stock_values() -> No
             for i, foot in enumerate(feet):
                 one_by_one = stock.agent.robot.links_map[foot].get_net_contact_forces()
                 torch.testing.assert_close(forces[env, i], one_by_one[0].float(), atol=1e-4, rtol=1e-6)
-    assert felt > 1.0, "no foot touched the ground: the test proved nothing"
+    assert felt > 1.0, "no foot touched the ground, so the test proved nothing"
     for env in (batch, *stocks):
         env.close()
 
 
-# --- the list --------------------------------------------------------------------------------------
+# --- the list of contacts ---------------------------------------------------------------------------
 
 
 class Pile(Bare):
-    """A box on a floor, and another on it that hangs over."""
+    """A box on a floor, and a second box on top of it that overhangs."""
 
     def _load_scene(self, options: dict) -> None:
         self.floor = box(self, "floor", [3, 3, 0.1], None, "static")
@@ -174,7 +174,7 @@ def equal(ours: Contact, theirs: Contact) -> bool:
     )
 
 
-def test_the_list_is_that_of_a_stock_env(piles: tuple[Any, list[Any]]) -> None:
+def test_the_list_of_contacts_equals_that_of_a_stock_env(piles: tuple[Any, list[Any]]) -> None:
     batch, stocks = piles
     for env, stock in enumerate(stocks):
         ours, theirs = list_contacts(batch, env), list_contacts(stock, 0)

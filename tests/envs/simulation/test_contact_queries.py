@@ -1,4 +1,4 @@
-"""What queries of contact impulses answer, over bare systems of boxes; `test_contacts` compares with stock ManiSkill."""
+"""Contact impulse queries on plain PhysX systems of boxes; `test_contact_forces` compares with stock ManiSkill."""
 
 # SAPIEN annotates vectors as arrays, and its objects by what they are in C++.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
@@ -17,7 +17,7 @@ from workbench.envs.simulation.contact_queries import ContactReader
 
 @dataclass(frozen=True)
 class Pile:
-    """A box lies on the ground and another on it."""
+    """A box on the ground, and a second box on top of it."""
 
     scene: sapien.Scene
     system: physx.PhysxCpuSystem
@@ -56,7 +56,7 @@ def reader_of(piles: list[Pile]) -> ContactReader:
 
 
 def impulse_on(pile: Pile, body: object, by: object = None) -> np.ndarray:
-    """What stock ManiSkill sums: of every contact of the body, with the sign of an impulse on it."""
+    """Sum the impulses on `body` over all its contacts (with `by` only, if given), as stock ManiSkill does."""
     total = np.zeros(3)
     for contact in pile.system.get_contacts():
         first, second = contact.bodies
@@ -74,7 +74,7 @@ def net(reader: ContactReader, *bodies: physx.PhysxRigidBaseComponent) -> np.nda
     return query.cuda_impulses.torch().numpy().copy()
 
 
-def test_a_query_is_answered_anew_and_not_added_to(piles: list[Pile]) -> None:
+def test_a_second_answer_replaces_the_first(piles: list[Pile]) -> None:
     reader = reader_of(piles)
     query, pairs = (
         reader.create_body_query([piles[0].high]),
@@ -91,46 +91,46 @@ def test_a_query_is_answered_anew_and_not_added_to(piles: list[Pile]) -> None:
         assert np.array_equal(pairs.cuda_impulses.torch()[0].numpy(), expected)
 
 
-def test_a_new_query_counts_what_was_not_read_before_it(piles: list[Pile]) -> None:
+def test_a_new_query_reads_contacts_that_no_earlier_query_needed(piles: list[Pile]) -> None:
     reader, first = reader_of(piles), piles[0]
     lower = reader.create_pair_query([(first.low, first.ground)])
     reader.answer(lower)
     assert np.array_equal(net(reader, first.high)[0], np.float32(impulse_on(first, first.high)))
 
 
-def test_a_step_is_noticed_once_it_is_told(piles: list[Pile]) -> None:
-    for tell in (ContactReader.invalidate, ContactReader.stepped):
+def test_a_query_reads_new_contacts_after_stepped_or_invalidate(piles: list[Pile]) -> None:
+    for notify in (ContactReader.invalidate, ContactReader.stepped):
         reader, first = reader_of(piles), piles[0]
         query = reader.create_body_query([first.high])
         reader.answer(query)
         first.high.set_linear_velocity([0, 0, 5])
         first.system.step()
-        tell(reader)
+        notify(reader)
         reader.answer(query)
-        assert not query.cuda_impulses.torch().any(), "nothing holds it up any more"
+        assert not query.cuda_impulses.torch().any(), "the box has lost contact"
 
 
-def test_what_is_carried_stands_for_one_systems_list_until_its_next_step(piles: list[Pile]) -> None:
+def test_carried_contacts_replace_one_systems_list_until_its_next_step(piles: list[Pile]) -> None:
     first, second = piles
     reader = reader_of(piles)
     own = net(reader, first.high, second.high)
     touch = np.float32([1, 2, 3])
     query = reader.create_body_query([first.high, first.low, second.high])
 
-    def asked() -> list[list[float]]:
+    def impulses() -> list[list[float]]:
         reader.answer(query)
         return query.cuda_impulses.torch().tolist()
 
-    held = own[1].tolist()
+    second_impulse = own[1].tolist()
     reader.carry(0, [((id(first.high), id(first.low)), touch)])
-    assert asked() == [[1, 2, 3], [-1, -2, -3], held], "the other system's own list goes on to count"
+    assert impulses() == [[1, 2, 3], [-1, -2, -3], second_impulse], "the other system keeps its own list"
     reader.invalidate()
-    assert asked()[0] == [1, 2, 3], "that a pose was written is no step"
+    assert impulses()[0] == [1, 2, 3], "invalidate must keep carried contacts"
     reader.stepped(but=[0])
-    assert asked()[0] == [1, 2, 3], "this system stood still"
+    assert impulses()[0] == [1, 2, 3], "this system did not step"
     reader.carry(1, [])
-    assert asked() == [[1, 2, 3], [-1, -2, -3], [0, 0, 0]]
+    assert impulses() == [[1, 2, 3], [-1, -2, -3], [0, 0, 0]]
     reader.stepped(but=[1])
-    assert asked()[0] == own[0].tolist() and asked()[2] == [0, 0, 0]
+    assert impulses()[0] == own[0].tolist() and impulses()[2] == [0, 0, 0]
     reader.stepped()
-    assert asked()[2] == held
+    assert impulses()[2] == second_impulse

@@ -1,4 +1,4 @@
-"""Pictures draw bodies where they are: also those that a task has just moved, applied and fetched or not."""
+"""Images show bodies at their current poses, whether or not a task's last writes were applied and fetched."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
@@ -30,14 +30,14 @@ pytestmark = [
 ]
 MODE = "rgb+segmentation"
 N = 2
-AWAY = 50.0
+AWAY_METRES = 50.0
 SENSOR = ("base_camera", "sensor", ("rgb", "segmentation"))
 ON_CUBE = ("on_cube", "sensor", ("rgb", "segmentation"))
 HUMAN = ("render_camera", "human", ("rgb",))
 
 
 class Pushing(PushCubeEnv):
-    """PushCube; with a camera on the cube."""
+    """PushCube with an additional camera on the cube."""
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -54,14 +54,14 @@ class Pushing(PushCubeEnv):
 
 
 class Hiding(Pushing):
-    """Hides the cube of every env but the first in `evaluate`, far away."""
+    """``evaluate`` moves the cube far away in every env but the first."""
 
     def evaluate(self) -> dict:
-        found = super().evaluate()
+        result = super().evaluate()
         pose = self.obj.pose.raw_pose.clone()
-        pose[1:, 2] = AWAY
+        pose[1:, 2] = AWAY_METRES
         self.obj.set_pose(Pose.create(pose))
-        return found
+        return result
 
 
 @pytest.fixture(scope="module")
@@ -92,20 +92,20 @@ def drawn(env: Any, *requests: Any) -> list[Any]:
     return [take_pictures(env, e, requests) for e in range(N)]
 
 
-def moved_for_good(env: Any, poses: torch.Tensor) -> None:
+def move_applied_and_fetched(env: Any, poses: torch.Tensor) -> None:
     env.obj.set_pose(Pose.create(poses))
     env.scene._gpu_apply_all()
     env.scene._gpu_fetch_all()
 
 
-def test_a_cube_that_evaluate_hides_is_in_no_picture(hiding: Any, pushing: Any) -> None:
+def test_a_cube_that_evaluate_moves_away_is_in_no_image(hiding: Any, pushing: Any) -> None:
     obs, _ = hiding.reset(seed=3)
     data = obs["sensor_data"]["base_camera"]
     assert has_cube(hiding, data["segmentation"]) == [True, False]
-    # The same as of an env whose cube is there by physics.
+    # Compare with an env whose cube was moved there in the simulation.
     pose = pushing.obj.pose.raw_pose.clone()
-    pose[1:, 2] = AWAY
-    moved_for_good(pushing, pose)
+    pose[1:, 2] = AWAY_METRES
+    move_applied_and_fetched(pushing, pose)
     truth = pushing.get_obs(pushing.evaluate())["sensor_data"]
     for camera, textures in obs["sensor_data"].items():
         for texture, picture in textures.items():
@@ -117,27 +117,27 @@ def test_a_cube_that_evaluate_hides_is_in_no_picture(hiding: Any, pushing: Any) 
     )
 
 
-def test_what_the_page_draws_of_it_agrees(hiding: Any) -> None:
-    """Its pictures, its 3-D scene and what it says of a camera."""
+def test_images_poses_and_camera_reports_agree_on_the_moved_cube(hiding: Any) -> None:
+    """Covers the page's images, 3-D scene and camera report."""
     obs, _ = hiding.reset(seed=3)
-    people = hiding.render_rgb_array()
+    human_images = hiding.render_rgb_array()
     poses = read_poses(hiding)
-    assert (poses[:, scene_index(hiding).names.index("cube"), 2] > AWAY / 2).tolist() == [False, True]
+    assert (poses[:, scene_index(hiding).names.index("cube"), 2] > AWAY_METRES / 2).tolist() == [False, True]
     for e, (sensor, on_cube) in enumerate(drawn(hiding, SENSOR, ON_CUBE)):
         for picture in (sensor, on_cube):
             data = obs["sensor_data"][picture.camera]
             np.testing.assert_array_equal(picture.rgb, data["rgb"][e])
             np.testing.assert_array_equal(picture.segmentation, data["segmentation"][e, ..., 0])
-        assert (on_cube.pose[2] > AWAY / 2) == (e == 1)
+        assert (on_cube.pose[2] > AWAY_METRES / 2) == (e == 1)
         (human,) = take_pictures(hiding, e, [HUMAN])
-        np.testing.assert_array_equal(human.rgb, people[e])
+        np.testing.assert_array_equal(human.rgb, human_images[e])
     report = join_reports(
         [measure_placement(hiding, e, placement_of(hiding, ("sensor", "base_camera"), e)) for e in range(N)]
     )
     cube = next(seen for seen in report.objects if seen.name == "cube")
     assert (cube.pixels > 0).tolist() == [True, False]
     observed = step_pictures(_task(hiding, obs), range(N), [ON_CUBE])
-    assert [picture.pose[2] > AWAY / 2 for picture in observed] == [False, True]
+    assert [picture.pose[2] > AWAY_METRES / 2 for picture in observed] == [False, True]
 
 
 def _task(env: Any, obs: Any) -> TaskEnv:
@@ -146,7 +146,7 @@ def _task(env: Any, obs: Any) -> TaskEnv:
     return task
 
 
-# --- the moments: written, applied, stepped, fetched ---------------------------------------------------
+# --- states that are written, applied, stepped or fetched -------------------------------------------
 
 
 def write_pose(env: Any) -> None:
@@ -161,7 +161,7 @@ def write_and_apply(env: Any) -> None:
 
 
 def step_alone(env: Any) -> None:
-    """The arm moves in the simulation, not in the tensors."""
+    """Step the simulation without a fetch: the arm moves, the tensors do not change."""
     env.agent.robot.set_qvel(torch.ones_like(env.agent.robot.qvel))
     env.scene._gpu_apply_all()
     for _ in range(5):
@@ -196,5 +196,7 @@ def test_bodies_are_drawn_where_they_are(change: Callable[[Any], None], pushing:
         (wanted,) = take_pictures(pushing, e, [SENSOR], poses[e])
         np.testing.assert_array_equal(picture.segmentation, wanted.segmentation)
         moved = not np.array_equal(picture.segmentation, before[e][0].segmentation)
-        assert moved == (change is not write_link), "that link has no shape"
+        assert moved == (change is not write_link), (
+            "only a write to a link without shapes may leave the image"
+        )
     assert pushing.scene.px.packs() == packs

@@ -1,4 +1,4 @@
-"""Drive targets that an author sets: where, and of which joints and envs."""
+"""Drive targets that an author sets in different hooks, for some joints and envs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ N = 4
 
 
 class Door(PushCubeEnv):
-    """With a hinge that is driven."""
+    """PushCube with a door on a driven hinge."""
 
     where = ""
     one_joint = False
@@ -64,24 +64,24 @@ class Door(PushCubeEnv):
             door.set_joint_drive_targets(torch.full((rows, 1), 0.5), joints=[self.hinge])
 
 
-def made(**attributes: Any) -> TaskEnv:
+def door_task(**attributes: Any) -> TaskEnv:
     task = type("Door", (Door,), attributes)
     return TaskEnv(batched(task, N))
 
 
 @pytest.mark.parametrize(("one_joint", "velocity"), [(True, True), (False, False)])
-def test_a_target_that_is_set_while_the_scene_is_built_is_told_with_the_hooks_to_set_it_in(
+def test_a_target_set_while_the_scene_is_built_warns_and_names_the_right_hooks(
     one_joint: bool, velocity: bool
 ) -> None:
     with pytest.warns(RuleWarning, match="'door' is set while the scene is built: .* in _after_reconfigure"):
-        made(where="_load_scene", one_joint=one_joint, velocity=velocity).close()
+        door_task(where="_load_scene", one_joint=one_joint, velocity=velocity).close()
 
 
 @pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
 @pytest.mark.parametrize("one_joint", [True, False])
 @pytest.mark.parametrize("where", ["_load_scene", "_after_reconfigure", "_initialize_episode"])
-def test_wherever_it_is_set_it_drives(where: str, one_joint: bool) -> None:
-    task = made(where=where, one_joint=one_joint)
+def test_a_target_set_in_any_hook_drives_the_joint(where: str, one_joint: bool) -> None:
+    task = door_task(where=where, one_joint=one_joint)
     env: Any = task.env
     task.reset(seed=0)
     task.reset(env_idx=[1, 2])

@@ -1,4 +1,4 @@
-"""Exported names of SAPIEN that stepping without the interpreter lock needs."""
+"""SAPIEN's exported symbols that stepping without the GIL needs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def falling_box() -> sapien.Scene:
     return scene
 
 
-def test_a_native_step_is_the_step_of_the_binding() -> None:
+def test_a_native_step_equals_the_bindings_step() -> None:
     native = stepping.native_step()
     assert native is not None, stepping.why_not_native()
     ours, theirs = falling_box(), falling_box()
@@ -26,4 +26,4 @@ def test_a_native_step_is_the_step_of_the_binding() -> None:
         theirs.physx_system.step()
     assert ours.physx_system.pack() == theirs.physx_system.pack()  # type: ignore[attr-defined]
     assert ours.pack_poses() == theirs.pack_poses()
-    assert ours.entities[0].pose.p[2] < 0.9, "nothing fell: the test proved nothing"
+    assert ours.entities[0].pose.p[2] < 0.9, "nothing fell, so the test proved nothing"

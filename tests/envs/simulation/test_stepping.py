@@ -1,4 +1,4 @@
-"""Threads and merged substeps: the same bits as env after env, and no hook that can tell."""
+"""Threads and merged substeps give the same bits as stepping envs one by one, and hooks see no difference."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportOptionalIterable=false
@@ -28,7 +28,7 @@ def trajectory(task: type[BaseEnv], threads: int, steps: int = 30, num_envs: int
     rng = np.random.default_rng(0)
     packs = []
     for _ in range(steps):
-        # Downwards, so that fingers, cube and table meet.
+        # Downwards, so that fingers, cube and table touch.
         action = rng.uniform(-1, 0.2, (num_envs, *env.single_action_space.shape)).astype(np.float32)
         env.step(action)
         packs.append(b"".join(system.pack() for system in env.scene.px.systems))
@@ -37,7 +37,7 @@ def trajectory(task: type[BaseEnv], threads: int, steps: int = 30, num_envs: int
 
 
 def watching(task: type[BaseEnv]) -> type[BaseEnv]:
-    """The task with a hook between substeps that counts them and reads a pose there."""
+    """Return the task with a hook between substeps, which prevents merging."""
 
     class Watches(task):
         seen = 0
@@ -51,23 +51,23 @@ def watching(task: type[BaseEnv]) -> type[BaseEnv]:
 @pytest.mark.parametrize(
     "env_id", [pytest.param("PickCube-v1", marks=pytest.mark.slow), "StackCube-v1", "MS-CartpoleBalance-v1"]
 )
-def test_threads_and_merged_substeps_change_no_bit(env_id: str) -> None:
+def test_threads_and_merged_substeps_give_the_same_bits(env_id: str) -> None:
     task = REGISTERED_ENVS[env_id].cls
-    alone = trajectory(watching(task), threads=1)
-    assert trajectory(task, threads=1) == alone, "merged substeps, one thread"
-    assert trajectory(task, threads=2) == alone, "merged substeps, two threads"
-    assert trajectory(task, threads=5) == alone, "merged substeps, five threads"
-    assert trajectory(watching(task), threads=3) == alone, "single substeps, three threads"
+    expected = trajectory(watching(task), threads=1)
+    assert trajectory(task, threads=1) == expected, "merged substeps, one thread"
+    assert trajectory(task, threads=2) == expected, "merged substeps, two threads"
+    assert trajectory(task, threads=5) == expected, "merged substeps, five threads"
+    assert trajectory(watching(task), threads=3) == expected, "single substeps, three threads"
 
 
-def test_a_hook_between_substeps_sees_every_one_of_them() -> None:
+def test_a_hook_between_substeps_sees_every_substep() -> None:
     heights: list[float] = []
 
-    class Looks(PICK_CUBE):
+    class ReadsHeight(PICK_CUBE):
         def _after_simulation_step(self) -> None:
             heights.append(float(self.cube._objs[0].pose.p[2]))
 
-    env = batched_class(Looks)(num_envs=2, **STATE_ONLY)
+    env = batched_class(ReadsHeight)(num_envs=2, **STATE_ONLY)
     env.reset(seed=[0, 1])
     pose = env.cube.pose.raw_pose.clone()
     pose[:, 2] = 1.5  # clear of the gripper
@@ -80,7 +80,7 @@ def test_a_hook_between_substeps_sees_every_one_of_them() -> None:
     assert all(later < earlier for earlier, later in zip(heights, heights[1:], strict=False)), heights
 
 
-def test_state_asked_for_in_the_middle_is_that_moment() -> None:
+def test_state_fetched_between_merged_substeps_is_current() -> None:
     env = batched_class(PICK_CUBE)(num_envs=2, **STATE_ONLY)
     env.reset(seed=[0, 1])
     px = env.scene.px
@@ -95,7 +95,7 @@ def test_state_asked_for_in_the_middle_is_that_moment() -> None:
     env.close()
 
 
-def test_an_error_in_a_control_step_leaves_no_substep_owed() -> None:
+def test_an_error_in_a_control_step_leaves_no_pending_substep() -> None:
     class Fails(PICK_CUBE):
         def _after_control_step(self) -> None:
             raise KeyError("the author's")

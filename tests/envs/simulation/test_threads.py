@@ -1,4 +1,4 @@
-"""The threads that step envs: each env once, errors given back, nothing left behind after a fork."""
+"""The threads that step envs run each env once, pass errors to the caller and survive a fork."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ shared = EnvThreads()
 
 @settings(max_examples=50)
 @given(count=st.integers(0, 40), threads=st.integers(1, 6))
-def test_every_env_is_done_once(count: int, threads: int) -> None:
+def test_every_env_is_run_once(count: int, threads: int) -> None:
     done: list[int] = []
     shared.run(done.append, count, threads)
     assert Counter(done) == Counter(range(count))
 
 
-def test_the_work_is_spread_over_threads() -> None:
+def test_work_is_spread_over_threads() -> None:
     meeting = threading.Barrier(3, timeout=60)
     names: set[str] = set()
 
     def job(_: int) -> None:
         names.add(threading.current_thread().name + str(threading.get_ident()))
-        meeting.wait()  # passes only if three threads are in it at once
+        meeting.wait()  # passes only if three threads wait at once
 
     shared.run(job, 3, 3)
     assert len(names) == 3
 
 
-def test_an_error_in_any_thread_reaches_the_caller_after_all_others_were_done() -> None:
-    """From each helper, and from the caller's own thread, which waits for the helpers."""
+def test_an_error_in_any_thread_reaches_the_caller_after_all_envs_ran() -> None:
+    """Covers each helper thread and the caller's own thread, which waits for the helpers."""
     meeting = threading.Barrier(3)
     failing, done = [0], []
 
     def job(index: int) -> None:
-        meeting.wait(timeout=60)  # three threads are in it
+        meeting.wait(timeout=60)  # waits for all three threads
         if threading.get_ident() == failing[0]:
             raise ValueError(f"env {index}")
         done.append(threading.get_ident())
@@ -58,7 +58,7 @@ def test_an_error_in_any_thread_reaches_the_caller_after_all_others_were_done() 
         assert len(done) == 2
 
 
-def test_two_callers_at_once_wait_for_each_other() -> None:
+def test_concurrent_callers_wait_for_each_other() -> None:
     sums = [0, 0]
 
     def caller(which: int) -> None:
@@ -75,7 +75,7 @@ def test_two_callers_at_once_wait_for_each_other() -> None:
     assert sums == [2000, 2000]
 
 
-def test_a_forked_child_gets_threads_of_its_own(child_process: None) -> None:
+def test_a_forked_child_gets_its_own_threads(child_process: None) -> None:
     env_threads().run(lambda _: None, 4, 2)
     child = os.fork()
     if child == 0:

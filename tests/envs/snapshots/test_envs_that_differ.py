@@ -1,4 +1,4 @@
-"""Envs of one batch with unlike things in them: whatever is done to some, each keeps to what it was given."""
+"""In a batch whose envs hold different objects, steps, resets and restores change only the chosen envs."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalIterable=false
@@ -32,7 +32,7 @@ N = 4
 
 
 class Unlike(Bare):
-    """A thing that is a box or a ball, a chain of two hinges in odd envs only, and a wall that the task moves by the env."""
+    """A merged box or ball, a two-hinge chain in odd envs only, and a wall that the task moves in each env."""
 
     def _load_scene(self, options: dict) -> None:
         self.floor = box(self, "floor", [3, 3, 0.1], sapien.Pose([0, 0, -0.1]), "static")
@@ -65,7 +65,7 @@ class Unlike(Bare):
                 sapien.Pose([0.5 + float(self.drawn_of(drawn, env_idx, env)), 0, 0.05])
             )
         self.best[env_idx] = drawn[:, 2]
-        self.target = self.best = self.best.clone()  # two names of one tensor
+        self.target = self.best = self.best.clone()  # two attributes, one tensor
 
     @staticmethod
     def drawn_of(drawn: torch.Tensor, env_idx: torch.Tensor, env: int) -> torch.Tensor:
@@ -76,8 +76,8 @@ class Unlike(Bare):
         return {}
 
 
-def moment(env: Any) -> list[tuple[Any, ...]]:
-    """All that each env is."""
+def env_states(env: Any) -> list[tuple[Any, ...]]:
+    """Return all state of each env: physics, poses, attributes, step count and generator."""
     packs, poses = [system.pack() for system in env.scene.px.systems], read_poses(env)
     return [
         (
@@ -101,7 +101,7 @@ def env() -> Iterator[Any]:
 
 
 CHOSEN = st.sets(st.integers(0, N - 1), min_size=1)
-DEEDS = st.one_of(
+OPERATIONS = st.one_of(
     st.tuples(st.just("step"), st.integers(1, 4)),
     st.tuples(st.just("reset"), CHOSEN),
     st.tuples(st.just("keep"), st.none()),
@@ -111,47 +111,47 @@ DEEDS = st.one_of(
 
 
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(DEEDS, min_size=3, max_size=9))
-def test_whatever_is_done_to_some_envs_each_is_what_it_was_given(env: Any, deeds: list[Any]) -> None:
+@given(st.lists(OPERATIONS, min_size=3, max_size=9))
+def test_operations_on_some_envs_leave_the_others(env: Any, operations: list[Any]) -> None:
     env.reset(seed=[0, 1, 2, 3])
-    kept, was = take_snapshot(env), moment(env)
-    for deed, of in deeds:
-        before = moment(env)
-        if deed == "step":
+    kept, was = take_snapshot(env), env_states(env)
+    for operation, of in operations:
+        before = env_states(env)
+        if operation == "step":
             for _ in range(of):
                 env.step(None)
-            assert all(now[4] == then[4] + of for now, then in zip(moment(env), before, strict=True))
+            assert all(now[4] == then[4] + of for now, then in zip(env_states(env), before, strict=True))
             continue
-        if deed == "reset":
+        if operation == "reset":
             env.reset(options={"env_idx": torch.tensor(sorted(of))})
             touched = dict.fromkeys(of)
-        elif deed == "keep":
-            kept, was, touched = take_snapshot(env), moment(env), {}
-        elif deed == "put back":
+        elif operation == "keep":
+            kept, was, touched = take_snapshot(env), env_states(env), {}
+        elif operation == "put back":
             restore_snapshot(env, kept, sorted(of))
             touched = {i: i for i in of}
         else:
             to, source = of
             restore_snapshot(env, kept, [to], source=source)
             touched = {to: source}
-        now = moment(env)
+        now = env_states(env)
         for i in range(N):
             if i not in touched:
-                # `evaluate` of a reset looks at all envs.
-                same = [k for k in range(6) if not (deed == "reset" and k == 3)]
-                assert [now[i][k] for k in same] == [before[i][k] for k in same], (deed, i)
+                # A reset's `evaluate` increments the visits (index 3) of all envs.
+                same = [k for k in range(6) if not (operation == "reset" and k == 3)]
+                assert [now[i][k] for k in same] == [before[i][k] for k in same], (operation, i)
             elif (source := touched[i]) is not None:
-                assert now[i][2:] == was[source][2:], (deed, i)
+                assert now[i][2:] == was[source][2:], (operation, i)
                 np.testing.assert_allclose(
                     np.frombuffer(now[i][0], np.float32), np.frombuffer(was[source][0], np.float32), atol=1e-6
                 )
                 np.testing.assert_allclose(
                     np.frombuffer(now[i][1], np.float32), np.frombuffer(was[source][1], np.float32), atol=1e-6
                 )
-        assert env.target is env.best, "two names of one tensor"
+        assert env.target is env.best, "both attributes must still hold the same tensor"
 
 
-def test_what_only_some_envs_have_is_read_of_those(env: Any) -> None:
+def test_bodies_that_some_envs_lack_are_read_only_where_they_exist(env: Any) -> None:
     env.reset(seed=[0, 1, 2, 3])
     for _ in range(3):
         env.step(None)
@@ -163,7 +163,7 @@ def test_what_only_some_envs_have_is_read_of_those(env: Any) -> None:
         if i % 2:
             np.testing.assert_array_equal(read["chain"].position, env.chain._objs[i // 2].qpos)
             np.testing.assert_array_equal(read["chain"].velocity, env.chain._objs[i // 2].qvel)
-    # Joints are compared where every env has them.
+    # Only joints that every env has are compared.
     assert joint_names(env) == ("hinge0",)
     joints = read_joints(env)
     assert joints is not None
@@ -173,7 +173,7 @@ def test_what_only_some_envs_have_is_read_of_those(env: Any) -> None:
     poses, names = read_poses(env), scene_index(env).names
     lacking = np.isnan(poses[:, names.index("chain/link1")]).all(axis=1)
     assert lacking.tolist() == [True, False, True, False]
-    for _ in range(2):  # what was read once is read again where the task has moved it
+    for _ in range(2):  # static poses are read again after the task has moved them
         walls = read_poses(env)[:, names.index("wall"), 0]
         assert len(set(walls.tolist())) == N and np.allclose(walls, [e.pose.p[0] for e in env.wall._objs])
         env.reset(options={"env_idx": torch.tensor([1, 2])})

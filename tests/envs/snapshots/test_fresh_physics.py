@@ -1,4 +1,4 @@
-"""An env gets a PhysX scene without a past, and everything that knew its bodies still knows them."""
+"""Renewed physics: an env gets a PhysX scene without history, and all references to its bodies stay valid."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
 
@@ -28,7 +28,7 @@ def packs(env: BaseEnv) -> list[bytes]:
 
 
 @pytest.mark.thorough
-def test_a_grasp_goes_the_same_way_whatever_was_touched_before() -> None:
+def test_a_restored_grasp_does_not_depend_on_earlier_contacts() -> None:
     env = batched(PICK_CUBE, 6)
     env.reset(seed=list(range(6)))
     state = env.get_state_dict()
@@ -54,7 +54,7 @@ def test_a_grasp_goes_the_same_way_whatever_was_touched_before() -> None:
         return states
 
     reference = run(list(range(6)))
-    assert env.agent.is_grasping(env.cube).any(), "nothing is held: the test would prove nothing"
+    assert env.agent.is_grasping(env.cube).any(), "nothing is grasped, so the test would prove nothing"
     for trial in range(6):
         for _ in range(trial):
             env.step(action(1.0 if trial % 2 else -1.0))
@@ -63,7 +63,7 @@ def test_a_grasp_goes_the_same_way_whatever_was_touched_before() -> None:
     env.close()
 
 
-def test_nothing_but_the_systems_is_new() -> None:
+def test_only_the_systems_are_replaced() -> None:
     env = batched(PICK_CUBE, 3)
     env.reset(seed=[0, 1, 2])
     for _ in range(3):
@@ -85,14 +85,14 @@ def test_nothing_but_the_systems_is_new() -> None:
     env.close()
 
 
-def test_a_step_is_as_long_as_before() -> None:
+def test_the_timestep_is_kept() -> None:
     slow = batched(PICK_CUBE, 2, sim_config={"sim_freq": 60, "control_freq": 20})
     renew_physics(slow.scene, [1])
     assert [system.timestep for system in slow.scene.px.systems] == [pytest.approx(1 / 60)] * 2
     slow.close()
 
 
-def test_gravity_is_that_of_the_env_and_the_processs_default_stays() -> None:
+def test_the_envs_gravity_and_the_processs_default_are_kept() -> None:
     light = batched(PICK_CUBE, 1, sim_config={"scene_config": {"gravity": np.array([0.0, 0.0, -1.0])}})
     other = batched(PICK_CUBE, 1)
     renew_physics(light.scene, [0])
@@ -103,7 +103,7 @@ def test_gravity_is_that_of_the_env_and_the_processs_default_stays() -> None:
 
 
 class Leash(PICK_CUBE):
-    """A ball that a drive pulls to the middle of the air."""
+    """A ball that a drive holds in mid-air."""
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
@@ -138,7 +138,7 @@ def test_a_drive_between_two_bodies_still_holds() -> None:
 
 
 class ManyShaders(PICK_CUBE):
-    """A minimal and a default camera on one link, and a default one for people, which is made last."""
+    """A minimal and a default sensor camera on one link, and a default human render camera, which is built last."""
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -170,7 +170,9 @@ def test_each_camera_keeps_its_shader(renderer: None) -> None:
 
     before = {name: picture.clone() for name, picture in pictures().items()}
     assert {"hand_default/rgb", "hand_minimal/depth"} <= before.keys()
-    assert not torch.equal(before["hand_default/rgb"], before["hand_minimal/rgb"]), "else nothing is proved"
+    assert not torch.equal(before["hand_default/rgb"], before["hand_minimal/rgb"]), (
+        "the shaders must differ, or the test proves nothing"
+    )
     renew_physics(env.scene, [0, 1])
     env.scene._gpu_fetch_all()
     again = pictures()

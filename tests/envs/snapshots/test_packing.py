@@ -1,4 +1,4 @@
-"""A packed snapshot unpacks as the snapshot, and unchanged parts are sent once."""
+"""A packed snapshot unpacks to an equal snapshot, and unchanged parts are sent once."""
 
 # A task's own attributes are not known to the checker.
 # pyright: reportAttributeAccessIssue=false
@@ -31,7 +31,7 @@ def task() -> Iterator[TaskEnv]:
 
 
 class Receiver:
-    """What a server does with the parts."""
+    """Stores and returns the parts of packed snapshots, as a server does."""
 
     def __init__(self) -> None:
         self.parts: dict[int, bytes] = {}
@@ -61,7 +61,7 @@ def step(task: TaskEnv, rng: np.random.Generator) -> None:
     task.step(actions.random_action(task.parts, N, rng))
 
 
-def test_every_snapshot_comes_back_as_it_was_whatever_happened_between(task: TaskEnv) -> None:
+def test_snapshots_survive_packing_after_any_changes(task: TaskEnv) -> None:
     rng, packer, receiver = np.random.default_rng(0), SnapshotPacker(), Receiver()
     task.reset(seed=0)
     for number in range(30):
@@ -76,7 +76,7 @@ def test_every_snapshot_comes_back_as_it_was_whatever_happened_between(task: Tas
             del task.env.best
         if number == 21:
             task.env.best = torch.zeros(N)
-        if number in (22, 26):  # the same bytes, of another type
+        if number in (22, 26):  # the same bytes with another dtype
             task.env.count = np.zeros(N, np.float32 if number == 22 else np.int32)
         if number == 24:
             torch.rand(1)
@@ -84,13 +84,13 @@ def test_every_snapshot_comes_back_as_it_was_whatever_happened_between(task: Tas
         snapshot = task.snapshot()
         packed = packer.pack(snapshot)
         assert same(unpack_snapshot(packed.body, receiver.take(packed)), snapshot), f"after step {number}"
-        # A receiver that keeps only what the newest snapshot needs must always have enough.
+        # A receiver may keep only the parts that the newest snapshot needs.
         receiver.parts = {key: receiver.parts[key] for key in receiver.keys}
     del task.env.best, task.env.count
 
 
-def test_what_touches_and_sleeps_is_of_its_own_env(task: TaskEnv) -> None:
-    """As it is where envs differ: one holds, one pushes two things, and one sleeps."""
+def test_contacts_and_sleep_flags_stay_with_their_env(task: TaskEnv) -> None:
+    """The envs differ: one holds an object, one pushes two, and one sleeps."""
     snapshot = task.snapshot()
     state = snapshot.simulation
     assert isinstance(state, CpuState)
@@ -107,7 +107,7 @@ def test_what_touches_and_sleeps_is_of_its_own_env(task: TaskEnv) -> None:
     assert same(unpack_snapshot(packed.body, Receiver().take(packed)), other)
 
 
-def test_of_a_step_only_what_moved_is_sent(task: TaskEnv) -> None:
+def test_after_a_step_only_changes_are_sent(task: TaskEnv) -> None:
     rng, packer = np.random.default_rng(0), SnapshotPacker()
     task.reset(seed=0)
     step(task, rng)
@@ -121,7 +121,7 @@ def test_of_a_step_only_what_moved_is_sent(task: TaskEnv) -> None:
     assert len(packed.body) < 0.2 * len(pickle.dumps(snapshot))
 
 
-def test_fewer_envs_and_more_again_come_back_as_they_were(task: TaskEnv) -> None:
+def test_snapshots_of_changing_sets_of_envs_survive_packing(task: TaskEnv) -> None:
     packer, receiver = SnapshotPacker(), Receiver()
     for chosen in ([0], [0, 1], [0, 1, 2, 3], [0, 1]):
         snapshot = task.snapshot(chosen)

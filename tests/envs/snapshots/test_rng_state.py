@@ -1,6 +1,6 @@
-"""Random generators that are read at every step, in full only when they were drawn from, and put back."""
+"""Random generators are read at every step, in full only after a draw, and restored."""
 
-# numpy says that ``get_state`` may give a dict, which it does for other algorithms only.
+# numpy annotates ``get_state`` as possibly a dict, which only other bit generators return.
 # pyright: reportArgumentType=false
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ def same(one: Any, other: Any) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-def assert_reads_true(reader: RngReader, kept: list[np.random.RandomState], purpose: str = "episode") -> None:
+def assert_reads_current_states(
+    reader: RngReader, kept: list[np.random.RandomState], purpose: str = "episode"
+) -> None:
     for state, generator in zip(reader.read(purpose, kept), kept, strict=True):
         assert same(state, generator.get_state())
 
@@ -42,7 +44,7 @@ DRAWS = {
 }
 
 
-# A normal number that is kept aside is put back, and taking it, which changes no byte of the key, is seen.
+# numpy caches a second normal number; restoring it and using it must be detected, though the key does not change.
 @example(
     [
         ("draw", 1, 0, "normal"),
@@ -62,44 +64,44 @@ DRAWS = {
         max_size=14,
     )
 )  # fmt: skip
-def test_what_is_read_is_what_each_generator_says(history: list[tuple[str, int, int, str]]) -> None:
-    reader, held = RngReader(), generators()
-    kept = [reader.read("episode", held)]
+def test_read_states_equal_the_generators(history: list[tuple[str, int, int, str]]) -> None:
+    reader, rngs = RngReader(), generators()
+    kept = [reader.read("episode", rngs)]
     for what, env, source, draw in history:
         if what == "draw":
-            DRAWS[draw](held[env])
+            DRAWS[draw](rngs[env])
         elif what == "keep":
-            kept.append(list(reader.read("episode", held)))
+            kept.append(list(reader.read("episode", rngs)))
         else:
             state = kept[-1][source]
-            reader.write("episode", held, [env], [state])
-            assert same(held[env].get_state(), state)
-        assert_reads_true(reader, held)
+            reader.write("episode", rngs, [env], [state])
+            assert same(rngs[env].get_state(), state)
+        assert_reads_current_states(reader, rngs)
 
 
-def test_states_go_into_the_generators_that_are_named_in_whichever_order() -> None:
-    reader, held = RngReader(), generators()
+def test_states_are_written_to_the_given_generators_in_any_order() -> None:
+    reader, rngs = RngReader(), generators()
     states = [g.get_state() for g in generators(5)[3:]]
-    untouched = held[1].get_state()
-    reader.write("episode", held, [2, 0], states)
+    untouched = rngs[1].get_state()
+    reader.write("episode", rngs, [2, 0], states)
     expected = [states[1], untouched, states[0]]
-    assert all(same(g.get_state(), state) for g, state in zip(held, expected, strict=True))
-    assert_reads_true(reader, held)
+    assert all(same(g.get_state(), state) for g, state in zip(rngs, expected, strict=True))
+    assert_reads_current_states(reader, rngs)
 
 
-def test_two_lists_of_generators_are_kept_apart_and_others_in_their_place_are_read_anew() -> None:
+def test_lists_of_generators_are_separate_and_replaced_ones_are_read_again() -> None:
     reader, episode, main = RngReader(), generators(), generators(5)[2:]
-    assert_reads_true(reader, episode)
-    assert_reads_true(reader, main, "main")
-    assert_reads_true(reader, episode)
+    assert_reads_current_states(reader, episode)
+    assert_reads_current_states(reader, main, "main")
+    assert_reads_current_states(reader, episode)
     episode[0] = np.random.RandomState(99)
-    assert_reads_true(reader, episode)
+    assert_reads_current_states(reader, episode)
     del episode
     gc.collect()
-    assert_reads_true(reader, generators(5)[1:4])
+    assert_reads_current_states(reader, generators(5)[1:4])
 
 
-def test_the_processs_generators_go_back_to_where_they_were() -> None:
+def test_the_processs_generators_are_restored() -> None:
     def draw() -> tuple[float, float, float, float]:
         return float(torch.rand(1)), float(np.random.rand()), float(np.random.normal()), random.random()
 
@@ -113,7 +115,7 @@ def test_the_processs_generators_go_back_to_where_they_were() -> None:
         assert draw() == first
         np.random.uniform()
         write_shared_rng(kept, CPU)
-        assert draw() == first, "what is kept is not drawn from"
+        assert draw() == first, "draws must not change the saved states"
         assert kept.torch_device is None
     finally:
         write_shared_rng(before, CPU)

@@ -1,4 +1,4 @@
-"""Snapshots: an episode goes on as it would have, in its own env, in others, and in an env made again."""
+"""Snapshots: a restored episode continues identically in its own env, in other envs and in a rebuilt batch."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
 # pyright: reportCallIssue=false
@@ -48,7 +48,7 @@ def packs(env: BaseEnv) -> list[bytes]:
 
 
 def after(env: BaseEnv, actions: list[np.ndarray]) -> list[list[bytes]]:
-    """The state of every env after each of the actions."""
+    """Step through the actions; return the state of every env after each."""
     states = []
     for action in actions:
         env.step(action)
@@ -80,7 +80,7 @@ PROPERTY = settings(max_examples=8, suppress_health_check=[HealthCheck.function_
     steps=st.integers(1, 5),
     chosen=st.sets(st.integers(0, N - 1), min_size=1),
 )
-def test_a_restored_episode_goes_the_same_way_every_time(
+def test_a_restored_episode_is_repeatable(
     stack: BaseEnv, seed: int, before: int, steps: int, chosen: set[int]
 ) -> None:
     stack.reset(seed=list(range(seed, seed + N)))
@@ -90,19 +90,19 @@ def test_a_restored_episode_goes_the_same_way_every_time(
     actions = random_actions(stack, steps, seed + 1)
     after(stack, actions)
 
-    def again() -> list[list[bytes]]:
+    def restore_and_run() -> list[list[bytes]]:
         report = restore_snapshot(stack, snapshot)
         assert not report.not_carried or len(subset) < N, report.not_carried
         assert [int(stack.elapsed_steps[i]) for i in subset] == [before] * len(subset)
         return after(stack, actions)
 
-    first, second = again(), again()
+    first, second = restore_and_run(), restore_and_run()
     for env in subset:
         assert [s[env] for s in first] == [s[env] for s in second]
 
 
-# The seed of the test above: without a new beginning the uninterrupted run goes another way.
-def test_from_an_exact_point_a_restore_goes_on_as_the_run_that_was_not_interrupted(stack: BaseEnv) -> None:
+# With this seed the uninterrupted run differs in envs without `begin_anew`.
+def test_after_begin_anew_a_restore_equals_the_uninterrupted_run(stack: BaseEnv) -> None:
     stack.reset(seed=list(range(218, 218 + N)))
     after(stack, random_actions(stack, 5, 218))
     begin_anew(stack, [1, 4, 5])
@@ -113,10 +113,10 @@ def test_from_an_exact_point_a_restore_goes_on_as_the_run_that_was_not_interrupt
     restored = after(stack, actions)
     same = [all(a[env] == b[env] for a, b in zip(live, restored, strict=True)) for env in range(N)]
     assert same[1] and same[4] and same[5]
-    assert not all(same), "nothing touches anything: the test would prove nothing"
+    assert not all(same), "no contacts, so the test would prove nothing"
 
 
-def test_an_exact_point_reads_back_also_where_physx_turns_a_root_by_a_last_bit() -> None:
+def test_a_snapshot_after_begin_anew_survives_physx_rounding_of_root_poses() -> None:
     env = batched("MS-HumanoidWalk-v1", 16)
     env.reset(seed=list(range(16)))
     rng = np.random.default_rng(0)
@@ -131,7 +131,7 @@ def test_an_exact_point_reads_back_also_where_physx_turns_a_root_by_a_last_bit()
     env.close()
 
 
-def test_whether_an_env_is_where_another_was_is_told_to_the_last_bit(pick: BaseEnv) -> None:
+def test_in_this_state_compares_to_the_last_bit(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 3, 0))
     begin_anew(pick, list(range(N)))
@@ -150,7 +150,7 @@ def test_whether_an_env_is_where_another_was_is_told_to_the_last_bit(pick: BaseE
     assert not in_this_state(pick, 2, snapshot, 2) and in_this_state(pick, 0, snapshot, 2)
 
 
-def test_an_env_has_the_seed_of_the_episode_that_it_goes_on_with(pick: BaseEnv) -> None:
+def test_a_restored_env_gets_the_seed_of_its_episode(pick: BaseEnv) -> None:
     env = TaskEnv(pick, 50)
     env.reset(seed=[20, 21, 22, 23, 24, 25])
     snapshot = take_snapshot(pick, [4, 1])
@@ -161,7 +161,7 @@ def test_an_env_has_the_seed_of_the_episode_that_it_goes_on_with(pick: BaseEnv) 
 
 @PROPERTY
 @given(seed=st.integers(0, 10_000), pairs=st.permutations(range(N)), count=st.integers(1, N))
-def test_a_state_goes_the_same_way_in_whichever_env_it_is_put(
+def test_a_state_continues_identically_in_any_env(
     stack: BaseEnv, seed: int, pairs: list[int], count: int
 ) -> None:
     stack.reset(seed=list(range(seed, seed + N)))
@@ -171,16 +171,16 @@ def test_a_state_goes_the_same_way_in_whichever_env_it_is_put(
     actions = random_actions(stack, 6, seed + 1)
     reference = after(stack, actions)
     targets, sources = sorted(pairs[:count]), pairs[:count]
-    moved = [action.copy() for action in actions]
-    for action, was in zip(moved, actions, strict=True):
+    permuted = [action.copy() for action in actions]
+    for action, was in zip(permuted, actions, strict=True):
         action[targets] = was[sources]
     restore_snapshot(stack, snapshot, targets, sources)
-    result = after(stack, moved)
+    result = after(stack, permuted)
     for target, source in zip(targets, sources, strict=True):
         assert [s[target] for s in result] == [s[source] for s in reference]
 
 
-def test_other_envs_are_not_touched(pick: BaseEnv) -> None:
+def test_a_restore_leaves_the_other_envs(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 5, 0))
     snapshot = take_snapshot(pick, [1, 4])
@@ -195,7 +195,7 @@ def test_other_envs_are_not_touched(pick: BaseEnv) -> None:
     assert pick.elapsed_steps.tolist() == [8, 5, 8, 8, 5, 8]
 
 
-def test_tensors_and_drawn_poses_are_those_of_the_restored_moment(pick: BaseEnv) -> None:
+def test_tensors_and_drawn_poses_equal_the_snapshots(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 5, 0))
     restore_snapshot(pick, take_snapshot(pick))
@@ -210,7 +210,7 @@ def test_tensors_and_drawn_poses_are_those_of_the_restored_moment(pick: BaseEnv)
     torch.testing.assert_close(now, velocities, atol=1e-5, rtol=0)
 
 
-def test_what_was_evaluated_is_evaluated_again(pick: BaseEnv) -> None:
+def test_evaluate_returns_the_same_after_a_restore(pick: BaseEnv) -> None:
     env = TaskEnv(pick, 50)
     env.reset(seed=0)
     state = pick.get_state_dict()
@@ -219,35 +219,35 @@ def test_what_was_evaluated_is_evaluated_again(pick: BaseEnv) -> None:
     close = np.zeros((N, 8), np.float32)
     close[:, -1] = -1
     for _ in range(4):
-        held = env.step(close)
-    assert held.evaluate["is_grasped"].any(), "nothing is grasped: the test would prove nothing"
+        grasped = env.step(close)
+    assert grasped.evaluate["is_grasped"].any(), "nothing is grasped, so the test would prove nothing"
 
-    def pressed() -> torch.Tensor:
+    def finger_impulses() -> torch.Tensor:
         return pick.scene.get_pairwise_contact_impulses(pick.agent.finger1_link, pick.cube).clone()
 
-    impulses = pressed()
-    assert len(impulses.unique(dim=0)) == N, "each env has its own"
+    impulses = finger_impulses()
+    assert len(impulses.unique(dim=0)) == N, "impulses must differ by env"
     snapshot = env.snapshot()
     opened = -close
     for _ in range(6):
-        let_go = env.step(opened)
-    assert not let_go.evaluate["is_grasped"].all()
+        released = env.step(opened)
+    assert not released.evaluate["is_grasped"].all()
     restored, report = env.restore(snapshot)
     assert not report.not_carried
-    for name, value in held.evaluate.items():
+    for name, value in grasped.evaluate.items():
         assert np.array_equal(restored.evaluate[name], value), name
-    assert torch.equal(pressed(), impulses)
+    assert torch.equal(finger_impulses(), impulses)
     restore_snapshot(pick, snapshot, [1, 2], source=[4, 0])
-    assert torch.equal(pressed(), impulses[[0, 4, 0, 3, 4, 5]])
+    assert torch.equal(finger_impulses(), impulses[[0, 4, 0, 3, 4, 5]])
     env.restore(snapshot)
-    np.testing.assert_allclose(restored.poses, held.poses, atol=1e-6)
-    assert restored.elapsed_steps.tolist() == held.elapsed_steps.tolist()
+    np.testing.assert_allclose(restored.poses, grasped.poses, atol=1e-6)
+    assert restored.elapsed_steps.tolist() == grasped.elapsed_steps.tolist()
     assert not restored.reward.any() and restored.action is None
     later = env.step(close)
     assert later.elapsed_steps.tolist() == [5] * N
 
 
-def test_a_target_that_a_controller_goes_after_is_restored() -> None:
+def test_a_controllers_target_is_restored() -> None:
     env = batched("PickCube-v1", 3, control_mode="pd_joint_target_delta_pos")
     env.reset(seed=[0, 1, 2])
     actions = random_actions(env, 5, 0)
@@ -263,7 +263,7 @@ def test_a_target_that_a_controller_goes_after_is_restored() -> None:
     env.close()
 
 
-def test_the_next_unseeded_reset_draws_the_same_again(pick: BaseEnv) -> None:
+def test_after_a_restore_an_unseeded_reset_draws_the_same(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 2, 0))
     snapshot = take_snapshot(pick)
@@ -292,20 +292,20 @@ def test_the_next_unseeded_reset_draws_the_same_again(pick: BaseEnv) -> None:
         ([0], range(N), None, False),
     ],
 )
-def test_the_processs_generators_go_back_when_every_env_does_in_whichever_order(
+def test_the_processs_generators_are_restored_only_with_every_env(
     pick: BaseEnv, taken: Any, into: Any, source: Any, whole: bool
 ) -> None:
     pick.reset(seed=list(range(N)))
     snapshot = take_snapshot(pick, taken)
-    then = drawn_next()
-    moved = drawn_next(set_it_on=True)
+    at_snapshot = drawn_next()
+    advanced = drawn_next(advance=True)
     restore_snapshot(pick, snapshot, into, source)
-    assert drawn_next() == (then if whole else moved)
+    assert drawn_next() == (at_snapshot if whole else advanced)
 
 
-def drawn_next(set_it_on: bool = False) -> tuple[float, ...]:
-    """What torch, numpy and Python would draw next."""
-    if set_it_on:
+def drawn_next(advance: bool = False) -> tuple[float, ...]:
+    """Return the numbers that torch, numpy and Python would draw next; `advance` draws three first."""
+    if advance:
         for draw in (torch.rand, np.random.rand, lambda count: random.random()):
             draw(3)
     kept = torch.get_rng_state(), np.random.get_state(), random.getstate()
@@ -316,7 +316,7 @@ def drawn_next(set_it_on: bool = False) -> tuple[float, ...]:
     return drawn
 
 
-def test_while_some_envs_move_the_others_stay_as_they_are_and_the_processs_generators_go_on(
+def test_step_only_moves_the_chosen_envs_and_keeps_generator_progress(
     pick: BaseEnv,
 ) -> None:
     pick.reset(seed=list(range(N)))
@@ -329,8 +329,8 @@ def test_while_some_envs_move_the_others_stay_as_they_are_and_the_processs_gener
         pick.scene._gpu_apply_all()
         pick.scene._gpu_fetch_all()
         after(pick, random_actions(pick, 2, 1))
-        assert packs(pick)[2] != before[2], "somebody wrote to it"
-        drawn = drawn_next(set_it_on=True)
+        assert packs(pick)[2] != before[2], "the write to env 2 must change it"
+        drawn = drawn_next(advance=True)
     assert drawn_next() == drawn
     assert pick.elapsed_steps.tolist() == [3, 5, 3, 3, 5, 3]
     assert [now == was for now, was in zip(packs(pick), before, strict=True)] == [
@@ -342,7 +342,9 @@ def test_while_some_envs_move_the_others_stay_as_they_are_and_the_processs_gener
     assert [pack == was for pack, was in zip(packs(pick), now, strict=True)] == [i > 0 for i in range(N)]
     now = packs(pick)
     after(pick, random_actions(pick, 1, 3))
-    assert not any(pack == was for pack, was in zip(packs(pick), now, strict=True)), "all move again"
+    assert not any(pack == was for pack, was in zip(packs(pick), now, strict=True)), (
+        "all envs must move again"
+    )
 
 
 def test_joint_forces_are_restored() -> None:
@@ -357,13 +359,13 @@ def test_joint_forces_are_restored() -> None:
     restore_snapshot(env, snapshot, [1])
     forces = [articulation.qf.tolist() for articulation in robot._objs]
     assert forces == [[0.0] * robot.max_dof, [2.0] * robot.max_dof]
-    for _ in range(2):  # also where they have not changed since, in a PhysX scene that has none
+    for _ in range(2):  # the second restore: forces have not changed, but a new PhysX scene has none
         restore_snapshot(env, snapshot)
         assert [articulation.qf.tolist() for articulation in robot._objs] == [[2.0] * robot.max_dof] * 2
     env.close()
 
 
-def test_what_slept_sleeps(pick: BaseEnv) -> None:
+def test_sleeping_bodies_sleep_after_a_restore(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     cubes = [entity.find_component_by_type(type(pick.cube._bodies[0])) for entity in pick.cube._objs]
     cubes[2].put_to_sleep()
@@ -390,7 +392,7 @@ def test_a_hidden_object_keeps_its_true_pose(pick: BaseEnv) -> None:
 
 
 class EditedPickCube(PICK_CUBE):
-    """PickCube with the goal site gone by another name, a ball more, and no cube by the old name in ... none."""
+    """PickCube with an additional ball."""
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
@@ -399,7 +401,7 @@ class EditedPickCube(PICK_CUBE):
         )
 
 
-def test_a_rebuilt_env_goes_the_same_way(pick: BaseEnv) -> None:
+def test_an_episode_continues_identically_in_a_rebuilt_env(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 5, 0))
     snapshot = pickle.loads(pickle.dumps(take_snapshot(pick)))
@@ -416,7 +418,7 @@ def test_a_rebuilt_env_goes_the_same_way(pick: BaseEnv) -> None:
     rebuilt.close()
 
 
-def test_an_edited_task_gets_what_still_fits_by_name_and_says_what_does_not(pick: BaseEnv) -> None:
+def test_an_edited_task_gets_states_by_name_and_reports_the_rest(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 5, 0))
     snapshot = take_snapshot(pick)
@@ -451,7 +453,7 @@ def test_an_edited_task_gets_what_still_fits_by_name_and_says_what_does_not(pick
         ([], 0, ValueError, "empty"),
     ],
 )
-def test_what_is_no_list_of_envs_is_refused(
+def test_an_invalid_list_of_envs_is_refused(
     pick: BaseEnv, env_idx: Any, source: Any, error: type[Exception], words: str
 ) -> None:
     pick.reset(seed=0)
@@ -461,8 +463,8 @@ def test_what_is_no_list_of_envs_is_refused(
     assert packs(pick) == before
 
 
-def test_a_state_in_gpu_simulation_is_read_and_written_by_the_tensors(pick: BaseEnv) -> None:
-    """Here those of the CPU core, which are the same; what PhysX keeps beside them is not in it."""
+def test_gpu_states_are_read_and_written_through_tensors(pick: BaseEnv) -> None:
+    """Runs on the CPU core, whose tensors have the same interface; hidden PhysX state is not included."""
     pick.reset(seed=list(range(N)))
     for _ in range(3):
         pick.step(pick.action_space.sample())
@@ -472,8 +474,8 @@ def test_a_state_in_gpu_simulation_is_read_and_written_by_the_tensors(pick: Base
         pick.step(pick.action_space.sample())
     now = read_gpu_state(pick, list(range(N)))
     carried, missed = write_gpu_state(pick, [3, 0], state, [0, 1])
-    there = {"actor cube", "actor goal_site", "actor table-workspace", "articulation panda"}
-    assert (set(carried), missed) == (there, {})
+    names = {"actor cube", "actor goal_site", "actor table-workspace", "articulation panda"}
+    assert (set(carried), missed) == (names, {})
     found = read_gpu_state(pick, list(range(N)))
     for name, rows in found.states.items():
         for env, source, was in [(3, 1, before), (0, 3, before), (1, 1, now), (2, 2, now)]:

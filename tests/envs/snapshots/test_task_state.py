@@ -1,4 +1,4 @@
-"""What a task remembers on itself is found, carried by row, and named when it cannot be."""
+"""A task's own attributes are found, restored by row, and named when they cannot be."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
 
@@ -34,11 +34,13 @@ class Notes:
 
 
 class Remembers(PUSH_CUBE):
-    """PushCube that keeps all sorts of things on itself."""
+    """PushCube with attributes of many types."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.threshold = 0.02
-        self.reach_offset = torch.tensor([0.1, 0.2, 0.3, 0.4])  # as long as there are envs, and no buffer
+        self.reach_offset = torch.tensor(
+            [0.1, 0.2, 0.3, 0.4]
+        )  # one value per env by coincidence: a constant, not a buffer
         super().__init__(*args, **kwargs)
         self.weight = 1.5
 
@@ -75,7 +77,7 @@ class Remembers(PUSH_CUBE):
         return result
 
     def write(self, value: float) -> None:
-        """Give every buffer a value of its own in every env."""
+        """Write a different value into every env's row of every buffer."""
         rows = torch.arange(self.num_envs) + value
         self.best_distance = rows.clone()
         self.phases["reach"] = rows > value + 1
@@ -124,7 +126,7 @@ def fresh(env: Any) -> None:
     env.reset(seed=[0, 1, 2, 3])
 
 
-def test_all_buffers_go_back(env: Any) -> None:
+def test_all_buffers_are_restored(env: Any) -> None:
     env.write(1.0)
     before, snapshot = env.copied(), take_snapshot(env)
     env.write(50.0)
@@ -132,11 +134,11 @@ def test_all_buffers_go_back(env: Any) -> None:
     for name, value in env.buffers().items():
         assert torch.equal(value, before[name]), name
     assert "best_distance" in report.carried
-    assert list(report.not_carried) == ["recent"], "a deque cannot be kept, and is named"
+    assert list(report.not_carried) == ["recent"], "a deque cannot be carried and must be named"
     assert snapshot.omitted == {"recent": "a collections.deque"}
 
 
-def test_rows_of_chosen_envs_go_to_chosen_envs(env: Any) -> None:
+def test_rows_of_chosen_envs_are_restored_into_chosen_envs(env: Any) -> None:
     env.write(1.0)
     before, snapshot = env.copied(), take_snapshot(env, [1, 2])
     env.write(50.0)
@@ -148,7 +150,7 @@ def test_rows_of_chosen_envs_go_to_chosen_envs(env: Any) -> None:
         assert torch.equal(value, expected), name
 
 
-def test_what_describes_the_scene_stays_with_its_env(env: Any) -> None:
+def test_attributes_that_describe_the_scene_stay_with_their_env(env: Any) -> None:
     env.write(1.0)
     restore_snapshot(env, take_snapshot(env, [3]), range(N))
     assert env.object_heights.tolist() == [0, 1, 2, 3]
@@ -156,7 +158,7 @@ def test_what_describes_the_scene_stays_with_its_env(env: Any) -> None:
     assert env.best_distance.tolist() == [4.0] * N
 
 
-def test_what_was_not_written_yet_goes_back_to_how_it_was_built() -> None:
+def test_buffers_unwritten_at_the_snapshot_return_to_their_built_values() -> None:
     env = batched(Remembers, N)
     env.reset(seed=[0, 1, 2, 3])
     snapshot = take_snapshot(env)
@@ -167,7 +169,7 @@ def test_what_was_not_written_yet_goes_back_to_how_it_was_built() -> None:
     env.close()
 
 
-def test_what_describes_the_scene_and_was_changed_goes_back_to_how_it_was_built_in_that_env() -> None:
+def test_changed_scene_attributes_return_to_that_envs_built_values() -> None:
     env = batched(Remembers, N)
     env.reset(seed=[0, 1, 2, 3])
     snapshot = take_snapshot(env, [3])
@@ -177,7 +179,7 @@ def test_what_describes_the_scene_and_was_changed_goes_back_to_how_it_was_built_
     env.close()
 
 
-def test_what_holds_for_the_batch_goes_back_when_all_envs_do(env: Any) -> None:
+def test_batch_wide_attributes_are_restored_only_with_all_envs(env: Any) -> None:
     snapshot, count = take_snapshot(env), env.total_resets
     env.total_resets += 5
     report = restore_snapshot(env, snapshot, [0, 1])
@@ -190,7 +192,7 @@ def test_what_holds_for_the_batch_goes_back_when_all_envs_do(env: Any) -> None:
     assert env.total_resets == count
 
 
-def test_a_tensor_that_somebody_else_holds_is_not_written_to(env: Any) -> None:
+def test_a_tensor_with_other_references_is_not_written_to(env: Any) -> None:
     env.write(1.0)
     snapshot = take_snapshot(env)
     theirs = torch.full((N,), 9.0)
@@ -201,7 +203,7 @@ def test_a_tensor_that_somebody_else_holds_is_not_written_to(env: Any) -> None:
     assert env.best_distance.tolist() == [1.0, 9.0, 9.0, 9.0]
 
 
-def test_evaluating_the_restored_moment_does_not_count_in_any_env(env: Any) -> None:
+def test_evaluate_after_a_restore_leaves_all_counters(env: Any) -> None:
     task = TaskEnv(env, 50)
     task.reset(seed=0)
     env.write(1.0)
@@ -216,7 +218,7 @@ def test_evaluating_the_restored_moment_does_not_count_in_any_env(env: Any) -> N
 
 
 class Edited(Remembers):
-    """The same after an edit: a constant changed, a buffer gone, one of another shape, one more."""
+    """`Remembers` after an edit: constants changed, one buffer removed, one reshaped, one added."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""Many recordings as one file of demonstrations: loaded by ManiSkill's dataset class, and replayed by its own tool."""
+"""Export of many recordings to one demonstration file, which ManiSkill's dataset class loads and its own tool replays."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PUSHED = {"control_mode": "pd_ee_delta_pos", "render_backend": "none"}
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The .rrd of three episodes that succeed, and one that does not."""
+    """The .rrd files of three episodes that succeed and one that does not."""
     out, options = tmp_path_factory.mktemp("recorded"), TaskOptions(num_envs=3, seed=1, env_kwargs=PUSHED)
     pushed = RecordOptions("PushCube-v1", out, 3, actions=f"{PUSHER}:act", pictures=False, options=options)
     held = RecordOptions("PushCube-v1", out, 1, actions="hold", pictures=False, max_steps=3, options=options)
@@ -45,7 +45,7 @@ def export(*arguments: object) -> int:
 
 
 @pytest.mark.slow
-def test_maniskills_dataset_class_loads_what_was_recorded(recordings: list[Path], tmp_path: Path) -> None:
+def test_maniskills_dataset_class_loads_the_recorded_episodes(recordings: list[Path], tmp_path: Path) -> None:
     file = tmp_path / "demos.h5"
     assert export(*recordings, "--maniskill", file, "--only-successes") == 0
     data: Any = ManiSkillTrajectoryDataset(str(file), success_only=True)
@@ -63,7 +63,7 @@ def test_maniskills_dataset_class_loads_what_was_recorded(recordings: list[Path]
 
 
 @pytest.mark.slow
-def test_replay_trajectory_takes_them(recordings: list[Path], tmp_path: Path) -> None:
+def test_replay_trajectory_accepts_exported_recordings(recordings: list[Path], tmp_path: Path) -> None:
     file = tmp_path / "demos.h5"
     assert export(*recordings, "--maniskill", file, "--only-successes") == 0
     command = [sys.executable, "-m", "mani_skill.trajectory.replay_trajectory", "--traj-path", str(file)]
@@ -74,7 +74,7 @@ def test_replay_trajectory_takes_them(recordings: list[Path], tmp_path: Path) ->
     assert "3/3=100.00% demos saved" in done.stdout
 
 
-def test_nothing_that_is_there_is_written_over(
+def test_an_export_overwrites_no_file(
     recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "demos.json").write_text("mine")
@@ -86,24 +86,24 @@ def test_nothing_that_is_there_is_written_over(
     for path in recordings[3].parent.glob(f"{recordings[3].stem}.*"):
         shutil.copy(path, held)
     assert export(held, "--maniskill", tmp_path / "none.h5", "--only-successes") == 2
-    said = capsys.readouterr().err
+    printed = capsys.readouterr().err
     for words in (
         "exists already; give a file",
         "must end in .h5",
         "--lerobot FOLDER or --maniskill FILE.h5",
         "no episode",
     ):
-        assert words in said
+        assert words in printed
     assert [path.name for path in tmp_path.glob("*.*")] == ["demos.json"]
 
 
 OBSERVED = "PickCube-v1", 7
-"""Task and seed."""
+"""The observed task and its seed."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("obs_mode", ["rgb+depth+segmentation", "state+rgb"])
-def test_pictures_that_were_observed_are_as_maniskills_recorder_writes_them(
+def test_observed_pictures_are_stored_as_maniskills_recorder_stores_them(
     renderer: None, tmp_path: Path, obs_mode: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     task, seed = OBSERVED
@@ -127,7 +127,7 @@ def test_pictures_that_were_observed_are_as_maniskills_recorder_writes_them(
     assert any(name.startswith("sensor_data") for name in ours)
     for name, values in theirs.items():
         apart = np.abs(ours[name].astype(float) - values.astype(float))
-        # JPEG, and whole millimetres of one that rounds and one that cuts.
+        # Ours are JPEG; depth is whole millimetres: one side rounds, the other truncates.
         if name.endswith("rgb"):
             assert apart.mean() < 6
         else:
@@ -135,7 +135,7 @@ def test_pictures_that_were_observed_are_as_maniskills_recorder_writes_them(
     data: Any = ManiSkillTrajectoryDataset(str(tmp_path / "ours.h5"))
     assert data.obs["sensor_data"]["base_camera"]["rgb"].shape == (4, 128, 128, 3)
 
-    # ManiSkill's own file comes out as it went in.
+    # ManiSkill's own file is exported unchanged.
     assert export(tmp_path / "theirs.h5", "--maniskill", tmp_path / "again.h5") == 0
     for name, values in obs_of(tmp_path / "again.h5").items():
         np.testing.assert_allclose(values, theirs[name], atol=1e-6, err_msg=name)
@@ -148,7 +148,7 @@ def test_pictures_that_were_observed_are_as_maniskills_recorder_writes_them(
 
 
 def obs_of(file: Path) -> dict[str, Any]:
-    """Observations of the first trajectory by their paths."""
+    """Observations of the first trajectory, by path."""
     found: dict[str, Any] = {}
     with h5py.File(file) as opened:
         obs: Any = opened["traj_0/obs"]

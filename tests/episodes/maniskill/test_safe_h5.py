@@ -1,4 +1,4 @@
-"""HDF5 files that point elsewhere, or claim what they do not hold."""
+"""HDF5 files that point to other files, or claim more data than they hold, are refused."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def words(group: h5py.Group) -> None:
         (words, "not a plain number"),
     ],
 )
-def test_what_leads_out_of_the_file_or_claims_too_much_is_refused(
+def test_links_out_of_the_file_and_oversized_claims_are_refused(
     spoil: Callable[[h5py.Group], None], says: str, tmp_path: Path
 ) -> None:
     (tmp_path / "secret.txt").write_bytes(SECRET)
@@ -119,13 +119,13 @@ def test_what_leads_out_of_the_file_or_claims_too_much_is_refused(
         (row,) = read_found(tmp_path, scan_folder(tmp_path).found["theirs"])
         if spoil in (two_gigabytes, huge_chunks):
             assert row[0].problem is not None and says in row[0].problem
-        # Nothing of the size that was claimed was ever allocated.
+        # The claimed size was never allocated.
         assert tracemalloc.get_traced_memory()[1] < 50 << 20
     finally:
         tracemalloc.stop()
 
 
-def test_what_stands_in_its_own_file_is_read_also_by_soft_links_and_packed(tmp_path: Path) -> None:
+def test_soft_links_and_compressed_datasets_within_the_file_are_read(tmp_path: Path) -> None:
     def spoil(group: h5py.Group) -> None:
         values = np.zeros((4, 3000), np.float32)
         group.create_dataset("obs/state", data=values, compression="gzip", compression_opts=9, shuffle=True)
@@ -153,7 +153,7 @@ def test_what_stands_in_its_own_file_is_read_also_by_soft_links_and_packed(tmp_p
     assert read.reward.tolist() == [1, 1, 1]
 
 
-def test_one_dataset_under_many_names_is_not_read_for_ever(
+def test_one_dataset_under_many_names_is_read_in_bounded_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workbench.episodes.maniskill.safe_h5.MAX_BYTES", 1 << 20)
@@ -180,9 +180,9 @@ print(state.value)
 
 
 def test_no_plugin_is_loaded_and_the_environment_stays(child_process: None) -> None:
-    """A file may name a filter. Workers inherit the environment, and one that differs from the first one's is not forked."""
+    """A file may name a filter. Workers inherit the environment, and a worker whose environment differs is not forked."""
     environment = {name: value for name, value in os.environ.items() if name != "HDF5_PLUGIN_PRELOAD"}
-    said = subprocess.run(
+    printed = subprocess.run(
         [sys.executable, "-c", PLUGINS], capture_output=True, text=True, env=environment, check=True
     )
-    assert said.stdout == "0\n"
+    assert printed.stdout == "0\n"

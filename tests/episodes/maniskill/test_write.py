@@ -1,4 +1,4 @@
-"""Our .h5 and .json are what ManiSkill's RecordEpisode would have written, and what it wrote is read."""
+"""Our .h5 and .json match those of ManiSkill's RecordEpisode, and its files are read."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
 
 
 def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
-    """The .h5 of one episode from ManiSkill's wrapper, which asks git for its commit, and from ours."""
+    """The .h5 of one episode from ManiSkill's wrapper (which asks git for its commit) and from ours."""
     stock: Any = gym.make(task, num_envs=1, render_backend="none", **kwargs)
     env: Any = RecordEpisode(
         stock,
@@ -106,7 +106,7 @@ def tree(path: Path) -> dict[str, NDArray]:
     ("task", "obs_mode"),
     [("PickCube-v1", "state_dict"), ("PickCube-v1", "state"), ("MS-CartpoleBalance-v1", "state")],
 )
-def test_names_types_shapes_and_numbers_are_theirs(
+def test_names_types_shapes_and_numbers_match_record_episode(
     child_process: None, tmp_path: Path, task: str, obs_mode: str
 ) -> None:
     theirs, ours = record_both(task, tmp_path, obs_mode=obs_mode)
@@ -116,12 +116,12 @@ def test_names_types_shapes_and_numbers_are_theirs(
         assert found[name].dtype == values.dtype, name
         np.testing.assert_array_equal(found[name], values, err_msg=name)
 
-    said, document = (json.loads(path.with_suffix(".json").read_bytes()) for path in (theirs, ours))
-    assert document.keys() >= said.keys()
-    assert document["env_info"]["env_id"] == said["env_info"]["env_id"]
+    theirs_json, document = (json.loads(path.with_suffix(".json").read_bytes()) for path in (theirs, ours))
+    assert document.keys() >= theirs_json.keys()
+    assert document["env_info"]["env_id"] == theirs_json["env_info"]["env_id"]
     assert document["env_info"]["max_episode_steps"] == 50
-    (episode,), (expected_episode,) = document["episodes"], said["episodes"]
-    expected_episode["reset_kwargs"]["options"] = {}  # where nobody gave any, as in ours
+    (episode,), (expected_episode,) = document["episodes"], theirs_json["episodes"]
+    expected_episode["reset_kwargs"]["options"] = {}  # as in ours where no options were given
     assert episode == expected_episode
 
     dataset = ManiSkillTrajectoryDataset(str(ours), load_count=-1)
@@ -131,7 +131,7 @@ def test_names_types_shapes_and_numbers_are_theirs(
     assert len(states) == STEPS + 1
 
 
-def test_success_is_of_the_state_that_a_step_leads_to(
+def test_success_belongs_to_the_state_after_the_step(
     make_episode: Callable[..., Made], tmp_path: Path
 ) -> None:
     success = np.array([False, False, False, True])
@@ -141,8 +141,8 @@ def test_success_is_of_the_state_that_a_step_leads_to(
         assert group["success"][:].tolist() == [False, False, True]
 
 
-def test_long_columns_are_packed_and_read_the_same(make_episode: Callable[..., Made], tmp_path: Path) -> None:
-    """Longer than a piece of the journal and than a chunk of the file."""
+def test_long_columns_are_compressed_and_read_back(make_episode: Callable[..., Made], tmp_path: Path) -> None:
+    """The columns are longer than a batch of the journal and than a chunk of the file."""
     count = np.arange(3001, dtype=np.float32)
     states = np.stack([count, np.sin(count), np.zeros_like(count)] * 10, axis=1)
     files = make_episode(3000, env_states={"actors/cube": states}, reward=count[1:]).write(tmp_path)
@@ -159,7 +159,7 @@ def test_long_columns_are_packed_and_read_the_same(make_episode: Callable[..., M
     np.testing.assert_array_equal(found.poses[:, 1, 0], np.arange(3001))
 
 
-def test_theirs_is_read_as_ours_is(child_process: None, tmp_path: Path) -> None:
+def test_a_file_of_record_episode_is_read_like_ours(child_process: None, tmp_path: Path) -> None:
     theirs, ours = record_both("PickCube-v1", tmp_path, obs_mode="state_dict")
     found, expected = read_maniskill(theirs, "traj_0"), read_episode(ours)
     assert found.geometry is None and found.poses is None and found.cameras == []
@@ -175,7 +175,7 @@ def test_theirs_is_read_as_ours_is(child_process: None, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_their_cameras_are_read_too(recorded: Any, tmp_path: Path) -> None:
+def test_cameras_of_record_episode_are_read(recorded: Any, tmp_path: Path) -> None:
     """`recorded` is the same episode as plain arrays."""
     env: Any = gym.make(
         "PickCube-v1",
@@ -209,7 +209,7 @@ def test_their_cameras_are_read_too(recorded: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("suffix", "lost"), [(".rrd", "poses"), (".h5", "env_states"), (".json", "")])
-def test_a_file_that_was_cut_takes_only_its_own_with_it(
+def test_a_truncated_file_loses_only_its_own_data(
     make_episode: Callable[..., Made], tmp_path: Path, suffix: str, lost: str
 ) -> None:
     states = {"actors/cube": np.zeros((7, 13), np.float32)}
@@ -218,8 +218,8 @@ def test_a_file_that_was_cut_takes_only_its_own_with_it(
     file = path.with_suffix(suffix)
     file.write_bytes(file.read_bytes()[:-100])
     read = read_episode(path)
-    (said,) = read.broken_files
-    assert said.file == file.name
+    (broken,) = read.broken_files
+    assert broken.file == file.name
     np.testing.assert_array_equal(read.reward, made.reward)
     assert read.info == made.info
     assert (read.poses is None, not read.env_states) == (lost == "poses", lost == "env_states")

@@ -1,4 +1,4 @@
-"""Whatever a foreign recording's .json says, it is read to values that commands and the page can use, or named as damaged."""
+"""Any .json of a foreign recording gives values that commands and the page can use, or is reported as damaged."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ VALUES = st.one_of(
 
 
 def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The path of everything in a document."""
+    """The path of each value in a document."""
     if at:
         yield at
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -64,7 +64,7 @@ def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def put(document: Any, at: tuple[Any, ...], value: Any, as_name: bool) -> None:
-    """Replace what is at this path, or its name, if that is still there."""
+    """Replace the value at this path, or its name, if the path still exists."""
     *before, last = at
     try:
         for step in before:
@@ -79,7 +79,7 @@ def put(document: Any, at: tuple[Any, ...], value: Any, as_name: bool) -> None:
 
 @pytest.fixture(scope="module")
 def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The .json of a recording of ours with everything in it, and of one of ManiSkill's."""
+    """The .json of a workbench recording with all fields, and of a ManiSkill recording."""
     folder = tmp_path_factory.mktemp("ours")
     (folder / "push.py").write_text("reward = 1\n")
     episode = made(
@@ -109,7 +109,7 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def use(episode: Episode, path: Path) -> None:
-    """What commands and the page do with a recording before any of its code runs."""
+    """Do what commands and the page do with a recording before any of its code runs."""
     info = episode.info
     reference_of(info)
     options_of(info, 1)
@@ -135,7 +135,7 @@ def use(episode: Episode, path: Path) -> None:
     which=st.sampled_from(["ours", "ours", "theirs"]),
     changes=st.lists(st.tuples(st.integers(0, 10**6), VALUES, st.booleans()), min_size=1, max_size=4),
 )
-def test_a_document_of_any_values_is_read_or_named(
+def test_a_document_of_any_values_is_read_or_reported(
     child_process: None, originals: dict[str, Path], which: str, changes: list[tuple[int, Any, bool]]
 ) -> None:
     path = originals[which]
@@ -152,7 +152,7 @@ def test_a_document_of_any_values_is_read_or_named(
         try:
             sources = find_all_sources([path])
         except UnreadableRecording:
-            return  # it is another program's now
+            return  # the file now belongs to another program
         for source in sources:
             assert len(source.name) < 1000 and len(source.id) < 10_000
             try:

@@ -1,7 +1,7 @@
-"""Recordings with bytes that are others: each is a row or a sentence, in bounded time and memory.
+"""Fuzzed recordings: each becomes a row or an error message, in bounded time and memory.
 
-The real files of each kind are damaged in ways that are drawn from a seed: bytes changed, cut, doubled, numbers made
-huge. Longer behind the `slow` marker; ``WORKBENCH_FUZZ_SEED`` draws others.
+Real files of each kind are damaged in random ways from a seed: bytes changed, cut or doubled, numbers made huge.
+Tests marked `slow` run longer; ``WORKBENCH_FUZZ_SEED`` sets another seed.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from workbench.review.view import find_events
 pytestmark = pytest.mark.usefixtures("child_process")
 
 SEED = int(os.environ.get("WORKBENCH_FUZZ_SEED", "0"))
-MOST_SECONDS = 60.0
-"""Of one damaged recording, all in all; against hanging, not a measure."""
-MOST_GROWTH = 1 << 30
-"""Bytes that this process may have grown by; what it holds of a recording goes with it."""
+MAX_SECONDS = 60.0
+"""Limit for one damaged recording: it detects hangs and is no performance goal."""
+MAX_GROWTH_BYTES = 1 << 30
+"""Limit for the growth of this process; data of a closed recording must be freed."""
 HUGE = [b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\x00" * 8, b"\xff" * 8]
 
 
 @dataclass(frozen=True)
 class Original:
-    """A whole recording, and its files that are damaged."""
+    """An intact recording, and the names of its files to damage."""
 
     folder: Path
     files: tuple[str, ...]
 
 
 def record(folder: Path) -> Path:
-    """A recording of ours of six steps with a camera of all modalities."""
+    """Write a workbench recording of six steps with a camera of all modalities."""
     corner = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
     visual = Visual(
         "box", corner, Material((1.0, 0.5, 0.0, 1.0)), np.zeros(2, np.int32), np.array([0, 1], np.int32)
@@ -155,25 +155,27 @@ def damaged(content: bytes, rng: random.Random, is_text: bool) -> bytes:
 
 
 def look_at(folder: Path) -> list[str]:
-    """All that is shown of a folder; returns the sentences. Raises what is no sentence."""
-    said = []
+    """Read all that is shown of a folder; returns the error messages and raises any other error."""
+    messages = []
     for found, entries in reading.read_rows(folder, scan_folder(folder).found.values()):
         for facts, _ in entries:
-            said += [facts.problem] if facts.problem else []
+            messages += [facts.problem] if facts.problem else []
             path = folder / found.key
             try:
                 if facts.kind == "lerobot":
                     if facts.trajectory is not None:
-                        said += opened(reading.read_recording(Source(path.parents[1], facts.trajectory)))
+                        messages += opened(reading.read_recording(Source(path.parents[1], facts.trajectory)))
                 elif facts.trajectory is not None:
-                    said += opened(reading.read_recording(Source(path.with_suffix(".h5"), facts.trajectory)))
+                    messages += opened(
+                        reading.read_recording(Source(path.with_suffix(".h5"), facts.trajectory))
+                    )
                 else:
                     suffix = ".json" if ".json" in found.sizes else ".rrd" if ".rrd" in found.sizes else ".h5"
-                    said += opened(reading.read_recording(Source(path.with_suffix(suffix))))
+                    messages += opened(reading.read_recording(Source(path.with_suffix(suffix))))
             except (UnreadableRecording, OSError) as error:
                 assert str(error)
-                said.append(str(error))
-    return said
+                messages.append(str(error))
+    return messages
 
 
 def opened(episode: Episode) -> Iterator[str]:
@@ -189,8 +191,8 @@ def opened(episode: Episode) -> Iterator[str]:
 
 
 def fuzz(original: Original, folder: Path, count: int, seed: int) -> int:
-    """How many of the damaged ones could be told to be."""
-    told, process = 0, psutil.Process()
+    """Return how many of the damaged recordings were reported as damaged."""
+    reported, process = 0, psutil.Process()
     before = process.memory_info().rss
     shutil.copytree(original.folder, folder)
     for number in range(count):
@@ -201,22 +203,22 @@ def fuzz(original: Original, folder: Path, count: int, seed: int) -> int:
             path = folder / name
             path.write_bytes(damaged(path.read_bytes(), rng, path.suffix in (".json", ".notes")))
         began = time.monotonic()
-        told += bool(look_at(folder))
-        assert time.monotonic() - began < MOST_SECONDS, f"seed {seed}, number {number}"
-        assert process.memory_info().rss - before < MOST_GROWTH, f"seed {seed}, number {number}"
-    return told
+        reported += bool(look_at(folder))
+        assert time.monotonic() - began < MAX_SECONDS, f"seed {seed}, number {number}"
+        assert process.memory_info().rss - before < MAX_GROWTH_BYTES, f"seed {seed}, number {number}"
+    return reported
 
 
 @pytest.mark.parametrize(
     "kind", ["ours", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("alone", "theirs", "dataset"))]
 )
-def test_damaged_recordings_are_rows_and_sentences(
+def test_damaged_recordings_become_rows_and_messages(
     kind: str, originals: dict[str, Original], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original = originals[kind]
     shutil.copytree(original.folder, tmp_path / "whole")
     assert look_at(tmp_path / "whole") == []
-    # A byte can make HDF5 look through a group for ever (seen): then this is how long it takes.
+    # One changed byte can make HDF5 search a group forever; this timeout then ends the reading.
     monkeypatch.setattr(reading, "ROW_SECONDS", 4.0)
     monkeypatch.setattr(reading, "OPEN_SECONDS", 4.0)
     assert fuzz(original, tmp_path / "set", 10, SEED) > 1
@@ -225,7 +227,7 @@ def test_damaged_recordings_are_rows_and_sentences(
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("kind", ["ours", "alone", "theirs", "dataset"])
-def test_very_many_damaged_recordings_are_rows_and_sentences(
+def test_very_many_damaged_recordings_become_rows_and_messages(
     kind: str, originals: dict[str, Original], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reading, "ROW_SECONDS", 4.0)

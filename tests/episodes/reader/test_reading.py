@@ -1,4 +1,4 @@
-"""Recordings of others are read in a process that may do little else, and whatever ends it is a sentence."""
+"""Foreign recordings are read in a sandboxed process; if it ends, an error message says why."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def rows(folder: Path) -> dict[str, Facts]:
 
 
 def slow_json(path: Path) -> None:
-    """That takes its reader about a second."""
+    """Write a .json that takes the reader about a second."""
     path.write_text("[" + "[0,1,2,3,4,5,6,7,8,9]," * 1_500_000 + "0]")
 
 
@@ -41,7 +41,7 @@ def reader_of(folder: Path, episodes: bool) -> int:
     return reading._readers[folder, episodes]._pid
 
 
-def test_what_takes_too_long_is_given_up_and_the_others_are_read(
+def test_a_recording_that_times_out_is_skipped_and_the_others_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in "acd":
@@ -62,7 +62,7 @@ def test_what_takes_too_long_is_given_up_and_the_others_are_read(
 
 
 @pytest.mark.slow
-def test_reading_that_is_not_needed_any_more_is_given_up(tmp_path: Path) -> None:
+def test_a_cancelled_reading_stops(tmp_path: Path) -> None:
     whole = describe(tmp_path, "a")
     slow_json(tmp_path / "b.json")
     began = time.monotonic()
@@ -72,7 +72,7 @@ def test_reading_that_is_not_needed_any_more_is_given_up(tmp_path: Path) -> None
     assert rows(tmp_path)["a"].problem is None and whole.exists()
 
 
-def test_a_reader_that_crashes_is_a_row_and_another_one_reads_on(tmp_path: Path) -> None:
+def test_a_crash_of_the_reader_is_one_bad_row_and_another_reader_continues(tmp_path: Path) -> None:
     for name in "acd":
         describe(tmp_path, name)
     rows(tmp_path)
@@ -81,7 +81,7 @@ def test_a_reader_that_crashes_is_a_row_and_another_one_reads_on(tmp_path: Path)
 
     def crash() -> None:
         seen: list[int] = []
-        # The first is forgiven: it could have been anybody.
+        # The first crash is ignored: the recording may not be its cause.
         while len(seen) < 2 and not ended.wait(0.05):
             victim = reader_of(tmp_path, episodes=False)
             if victim not in seen and psutil.Process(victim).cpu_times().user > 0.1:
@@ -99,7 +99,7 @@ def test_a_reader_that_crashes_is_a_row_and_another_one_reads_on(tmp_path: Path)
     )
 
 
-def test_an_episode_is_what_reading_it_here_gives(recorded: Any, tmp_path: Path) -> None:
+def test_an_episode_equals_one_read_in_this_process(recorded: Any, tmp_path: Path) -> None:
     path = recorded.episode.write(tmp_path).json
     here, there = read_episode(path), reading.read_recording(Source(path))
     assert there.info == here.info and there.segmentation == here.segmentation
@@ -129,9 +129,7 @@ def test_an_episode_is_what_reading_it_here_gives(recorded: Any, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_pictures_go_on_where_the_reader_was_ended_and_where_the_file_is_gone(
-    recorded: Any, tmp_path: Path
-) -> None:
+def test_pictures_are_read_after_the_reader_or_the_file_is_gone(recorded: Any, tmp_path: Path) -> None:
     path = recorded.episode.write(tmp_path).json
     (camera, *_) = [c for c in reading.read_recording(Source(path)).cameras if c.rgb is not None]
     assert camera.rgb is not None
@@ -172,9 +170,7 @@ def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
     assert not alive
 
 
-def test_an_episode_that_claims_more_memory_than_there_may_be_is_refused(
-    recorded: Any, tmp_path: Path
-) -> None:
+def test_an_episode_that_claims_more_memory_than_the_limit_is_refused(recorded: Any, tmp_path: Path) -> None:
     path = recorded.episode.write(tmp_path).json
     whole = json.loads(path.read_text()) | {"workbench_checksum": None}
     for length, says in ((10**15, "steps"), (9_000_000, "numbers"), (-5, "steps"), ("many", "broken")):
@@ -212,14 +208,14 @@ print(tried(lambda: socket.create_connection(server.getsockname())), sep="|", en
 print(tried(lambda: os.kill(os.getppid(), 0)), tried(lambda: bytearray(2 << 30)), sep="|", end="|")
 print(tried(lambda: subprocess.run(["/bin/true"], check=True)), tried(lambda: open(f"/proc/{os.getppid()}/environ").read()), sep="|")
 """
-    said = subprocess.run(
+    ran = subprocess.run(
         python_command("-c", program, str(folder)),
         env=child_environment(OPENBLAS_NUM_THREADS="1"),
         capture_output=True,
         text=True,
     )
     no = "Permission denied"
-    assert said.stdout.strip().split("|") == [
+    assert ran.stdout.strip().split("|") == [
         "did", no, no, no, no, no, "Operation not permitted", "no memory", "did", no
-    ], said.stderr  # fmt: skip
+    ], ran.stderr  # fmt: skip
     assert (folder / "inside").read_text() == "inside"

@@ -1,4 +1,4 @@
-"""Which recordings files and folders are, and what each is called."""
+"""Files and folders are resolved to recordings with names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from workbench.episodes.reader.reading import find_all_sources
 from workbench.episodes.row import UnreadableRecording
 
 
-def test_each_is_found_once_by_name_whatever_names_it(child_process: None, tmp_path: Path) -> None:
+def test_each_recording_is_found_once_however_it_is_named(child_process: None, tmp_path: Path) -> None:
     second, first = describe(tmp_path, "b", id="two"), describe(tmp_path / "a", "z", id="one")
     describe(tmp_path / "c", "copy", id="one")
     theirs = write_h5(tmp_path)
@@ -26,7 +26,7 @@ def test_each_is_found_once_by_name_whatever_names_it(child_process: None, tmp_p
     assert find_all_sources([second.with_suffix(".h5")]) == (found[1],)
 
 
-def test_an_empty_folder_is_passed_over_beside_others_and_a_file_that_is_none_is_not(
+def test_an_empty_folder_is_skipped_and_a_file_that_is_no_recording_is_refused(
     child_process: None, tmp_path: Path
 ) -> None:
     folder, empty, other = tmp_path / "recordings", tmp_path / "empty", tmp_path / "notes.txt"

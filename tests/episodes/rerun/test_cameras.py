@@ -1,4 +1,4 @@
-"""The cameras of a recording see what ManiSkill's own matrices say that they see."""
+"""Recorded cameras agree with ManiSkill's own camera matrices."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def entities(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 
 
 def at(column: Column, state: int) -> NDArray:
-    """The value that the viewer shows at `state`: the latest row up to it."""
+    """The value that the viewer shows at `state`: the latest row up to that state."""
     if column.steps is None:
         return column.values[0][0]
     return column.values[np.searchsorted(column.steps, state, side="right") - 1][0]
 
 
 @pytest.mark.parametrize("camera", ["base_camera", "hand_camera"])
-def test_a_point_falls_on_the_pixel_where_opencv_puts_it(
+def test_a_point_projects_to_the_pixel_that_opencv_computes(
     recorded: Any, entities: dict[str, dict[str, Column]], camera: str
 ) -> None:
     read = entities[f"/world/cameras/{camera}"]
@@ -35,13 +35,13 @@ def test_a_point_falls_on_the_pixel_where_opencv_puts_it(
     for state in range(len(points)):
         rotation = Rotation.from_quat(at(read["Transform3D:quaternion"], state))
         in_camera = rotation.inv().apply(points[state] - at(read["Transform3D:translation"], state))
-        # Rerun keeps matrices by columns.
+        # Rerun stores matrices column-major.
         pixel = in_camera @ at(read["Pinhole:image_from_camera"], state).reshape(3, 3)
         extrinsic, intrinsic = recorded.extrinsic_cv[camera][state], recorded.intrinsic_cv[camera][state]
         expected = (points[state] @ extrinsic[:, :3].T + extrinsic[:, 3]) @ intrinsic.T
         np.testing.assert_allclose(pixel, expected, atol=2e-4)
         seen += int((expected[:, 2] > 0).sum())
-    assert seen > 0, "both points were behind the camera all the time"
+    assert seen > 0, "both points were always behind the camera"
 
 
 def test_the_pixel_of_the_cube_shows_the_cube(recorded: Any, entities: dict[str, dict[str, Column]]) -> None:
@@ -56,5 +56,5 @@ def test_the_pixel_of_the_cube_shows_the_cube(recorded: Any, entities: dict[str,
     shown = episode.cameras[0].segmentation[0, row, column]
     assert episode.segmentation[shown] == "cube"
     assert at(read["Pinhole:resolution"], 0).tolist() == [96, 96]
-    # RDF, right down forward, in rerun's numbering of directions.
+    # RDF (right, down, forward) in rerun's numbering of directions.
     assert at(read["Pinhole:camera_xyz"], 0).tolist() == [3, 2, 5]

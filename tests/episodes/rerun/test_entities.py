@@ -1,4 +1,4 @@
-"""No body of a recording lies below another one, whatever the task calls its bodies."""
+"""No body's entity is nested in another body's entity, whatever the bodies' names."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def entities(*names: str) -> tuple[str, ...]:
     return body_entities(SceneGeometry(1, names, ("dynamic",) * count, (False,) * count, ()))
 
 
-def test_bodies_go_by_their_names() -> None:
+def test_entities_are_named_after_bodies() -> None:
     assert entities("cube", "panda/panda_hand") == ("/world/cube", "/world/panda/panda_hand")
 
 
 @given(st.lists(NAME, max_size=6).map(tuple))
 @example(("a", "a/b", "a_", "a_/b"))
 @example(("", "/", "unnamed"))
-def test_entities_are_apart(names: tuple[str, ...]) -> None:
+def test_no_entity_is_nested_in_another(names: tuple[str, ...]) -> None:
     found = entities(*names)
     assert len(set(found)) == len(names)
     for one in found:

@@ -1,4 +1,4 @@
-"""Pictures of a recording are read when they are looked at."""
+"""Pictures of a recording are read lazily."""
 
 from __future__ import annotations
 
@@ -29,21 +29,19 @@ def brightness(episode: Episode, index: int) -> int:
     return int(np.rint(track.rgb[index].mean()))
 
 
-def test_pictures_of_a_file_that_is_damaged_while_it_is_open_are_an_error(tmp_path: Path) -> None:
+def test_reading_pictures_of_a_file_damaged_while_open_is_an_error(tmp_path: Path) -> None:
     rrd = write(tmp_path, made(9)).with_suffix(".rrd")
     intact, damaged = read_episode(rrd), read_episode(rrd)
     assert brightness(intact, 4) == pytest.approx(80, abs=3)
     with rrd.open("r+b") as file:
         file.write(bytes(rrd.stat().st_size))
-    assert brightness(intact, 5) == pytest.approx(100, abs=3), "its neighbours came with it"
+    assert brightness(intact, 5) == pytest.approx(100, abs=3), "its neighbours were read with it"
     with pytest.raises(OSError, match="damaged"):
         brightness(damaged, 4)
 
 
 @pytest.mark.parametrize("part", np.linspace(0.3, 0.9, 7))
-def test_of_an_rrd_that_is_damaged_somewhere_the_rest_is_read_or_it_is_refused(
-    tmp_path: Path, part: float
-) -> None:
+def test_a_damaged_rrd_is_read_in_part_or_refused(tmp_path: Path, part: float) -> None:
     rrd = tmp_path / "alone.rrd"
     write(tmp_path, made(9)).with_suffix(".rrd").rename(rrd)
     with rrd.open("r+b") as file:
@@ -57,15 +55,15 @@ def test_of_an_rrd_that_is_damaged_somewhere_the_rest_is_read_or_it_is_refused(
     assert episode.reward.tolist() == list(range(1, 10))
     (camera,) = episode.cameras
     lost = {name for name in ("rgb", "depth", "segmentation") if getattr(camera, name) is None}
-    told = " ".join(broken.sentence for broken in episode.broken_files)
-    assert lost == {name for name in ("rgb", "depth", "segmentation") if f"base_camera/{name}" in told}
+    sentences = " ".join(broken.sentence for broken in episode.broken_files)
+    assert lost == {name for name in ("rgb", "depth", "segmentation") if f"base_camera/{name}" in sentences}
 
 
 def test_damaged_pictures_do_not_cost_the_other_cameras(tmp_path: Path) -> None:
     rrd = tmp_path / "alone.rrd"
     write(tmp_path, made(9)).with_suffix(".rrd").rename(rrd)
     content = rrd.read_bytes()
-    place = content.index(b"\xff\xd8\xff\xe0")  # of the first JPEG
+    place = content.index(b"\xff\xd8\xff\xe0")  # the first JPEG
     rrd.write_bytes(content[:place] + bytes(64) + content[place + 64 :])
     episode = read_episode(rrd)
     track = camera_of(episode, rgb=False)
@@ -96,13 +94,13 @@ def test_pictures_of_several_chunks_are_read_in_any_order(
     assert all((segmentation[i] == 1).all() for i in order)
 
 
-def test_a_picture_here_and_there_is_of_the_state_that_it_was_taken_at(tmp_path: Path) -> None:
+def test_occasional_pictures_belong_to_the_states_they_were_taken_at(tmp_path: Path) -> None:
     episode = read_episode(write(tmp_path, made(10), every=3).with_suffix(".rrd"))
     assert camera_of(episode).frame.tolist() == [0, 3, 6, 9]
     assert [brightness(episode, i) for i in range(4)] == pytest.approx([0, 60, 120, 180], abs=3)
 
 
-def test_its_file_is_closed_when_a_recording_is_let_go_of(
+def test_the_file_is_closed_when_the_recording_is_freed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rrd = write(tmp_path, made(9)).with_suffix(".rrd")

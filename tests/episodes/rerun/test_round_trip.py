@@ -1,4 +1,4 @@
-"""What is read back from the file is what was in the episode, number by number."""
+"""An episode read back from its files equals the episode that was written, number by number."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def written(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Ma
 
 
 def assert_same(found: Episode, made: Made) -> None:
-    """All arrays of `found` but its meshes and pictures are those of `made`, type by type."""
+    """Assert that all arrays of `found` except meshes and pictures equal those of `made`, dtypes included."""
     assert found.poses is not None
     np.testing.assert_array_equal(found.poses, made.poses)
     for name in ("action", "reward", "terminated", "truncated"):
@@ -55,7 +55,7 @@ def scalars(entities: Entities, entity: str) -> tuple[NDArray, NDArray]:
 
 
 def every_step(column: Column) -> tuple[NDArray, NDArray]:
-    """With the rows that say nothing new, which are not in the file."""
+    """The column with the unchanged rows added back, which the file leaves out."""
     assert column.steps is not None
     steps = np.arange(column.steps[0], column.steps[-1] + 1)
     return steps, np.stack(column.values)[np.searchsorted(column.steps, steps, side="right") - 1]
@@ -65,7 +65,7 @@ def test_rerun_itself_finds_nothing_wrong(child_process: None, written: tuple[Ma
     assert verify_rrd(written[1]) is None
 
 
-def test_every_body_has_its_poses(written: tuple[Made, Path, Entities]) -> None:
+def test_the_poses_of_every_body_are_written(written: tuple[Made, Path, Entities]) -> None:
     episode, _, entities = written
     moved = 0
     for body, entity in enumerate(body_entities(episode.geometry)):
@@ -75,7 +75,7 @@ def test_every_body_has_its_poses(written: tuple[Made, Path, Entities]) -> None:
         )
         expected = episode.poses[:, body]
         if (expected == expected[0]).all():
-            assert translation.steps is None  # what never moved is written once
+            assert translation.steps is None  # a body that never moved is written once
             expected = expected[:1]
             places, turns = np.stack(translation.values), np.stack(quaternion.values)
         else:
@@ -88,7 +88,7 @@ def test_every_body_has_its_poses(written: tuple[Made, Path, Entities]) -> None:
     assert moved > 8, "the robot did not move, so this test compared nothing"
 
 
-def test_all_of_it_is_read_back(written: tuple[Made, Path, Entities], recorded: Any) -> None:
+def test_the_whole_episode_is_read_back(written: tuple[Made, Path, Entities], recorded: Any) -> None:
     made, path, _ = written
     found = read_episode(path)
     assert_same(found, made)
@@ -148,7 +148,7 @@ def test_numbers_are_exact(written: tuple[Made, Path, Entities]) -> None:
     np.testing.assert_array_equal(scalars(entities, "/episode/success")[1][:, 0], episode.evaluate["success"])
 
 
-def test_what_stays_as_it_was_is_not_written_again(make_episode: Callable[..., Made], tmp_path: Path) -> None:
+def test_unchanged_values_are_not_written_again(make_episode: Callable[..., Made], tmp_path: Path) -> None:
     episode = make_episode(
         9, evaluate={"success": np.arange(10) > 5, "level": np.array([0.0] * 4 + [np.nan] * 6)}
     )
@@ -156,7 +156,7 @@ def test_what_stays_as_it_was_is_not_written_again(make_episode: Callable[..., M
     entities, again = read_rrd(episode.write(tmp_path).rrd), read_episode(next(tmp_path.glob("*.json")))
     assert_same(again, episode)
     kept = {
-        "/evaluate/success": [0, 5, 6, 9],  # a curve through these is the curve through all
+        "/evaluate/success": [0, 5, 6, 9],  # the curve through these steps equals the curve through all
         "/evaluate/level": [0, 3, 4, 9],
         "/reward": [1, 9],
     }
@@ -166,9 +166,7 @@ def test_what_stays_as_it_was_is_not_written_again(make_episode: Callable[..., M
     np.testing.assert_array_equal(moved, [0, 1, 2, 3, 7, 8, 9])
 
 
-def test_an_rrd_that_somebody_was_sent_holds_all_but_the_states(
-    written: tuple[Made, Path, Entities], tmp_path: Path
-) -> None:
+def test_an_rrd_alone_holds_all_but_the_states(written: tuple[Made, Path, Entities], tmp_path: Path) -> None:
     made, path, _ = written
     alone = read_episode(Path(shutil.copy(path, tmp_path / "sent to me.rrd")))
     assert_same(dataclasses.replace(alone, env_states=made.env_states), made)
@@ -176,7 +174,7 @@ def test_an_rrd_that_somebody_was_sent_holds_all_but_the_states(
     assert alone.info == read_episode(path).info
 
 
-def test_sim_time_is_the_step_in_seconds(written: tuple[Made, Path, Entities]) -> None:
+def test_sim_time_is_the_time_of_the_step_in_seconds(written: tuple[Made, Path, Entities]) -> None:
     from rerun.chunk import RrdReader
 
     for chunk in RrdReader(written[1]).stream():
@@ -184,10 +182,10 @@ def test_sim_time_is_the_step_in_seconds(written: tuple[Made, Path, Entities]) -
             times = chunk.to_record_batch().column("sim_time").cast("int64").to_pylist()
             assert times == [50_000_000 * step for step in range(1, 9)]
             return
-    pytest.fail("/reward is not there")
+    pytest.fail("the file has no /reward")
 
 
-def test_events_name_the_moments(make_episode: Callable[..., Made], tmp_path: Path) -> None:
+def test_events_name_their_states(make_episode: Callable[..., Made], tmp_path: Path) -> None:
     episode = make_episode(
         5,
         evaluate={
@@ -209,11 +207,16 @@ def test_events_name_the_moments(make_episode: Callable[..., Made], tmp_path: Pa
         (5, "success"),
         (5, "truncated"),
     ]
-    told = read_properties(path)["episode"]
-    assert (told["success"], told["success_once"], told["fail"], told["fail_once"]) == (True,) * 4
+    properties = read_properties(path)["episode"]
+    assert (
+        properties["success"],
+        properties["success_once"],
+        properties["fail"],
+        properties["fail_once"],
+    ) == (True,) * 4
 
 
-def test_only_what_this_env_wears_is_written(make_episode: Callable[..., Made], tmp_path: Path) -> None:
+def test_only_visuals_of_this_env_are_written(make_episode: Callable[..., Made], tmp_path: Path) -> None:
     episode = make_episode()
     (visual,) = episode.geometry.visuals
     elsewhere = dataclasses.replace(visual, envs=np.array([0, 1], dtype=np.int32))
@@ -225,7 +228,7 @@ def test_only_what_this_env_wears_is_written(make_episode: Callable[..., Made], 
         episode.info = dataclasses.replace(episode.info, env_index=env)
         entities = read_rrd(episode.write(tmp_path).rrd)
         assert f"{bare}/0" not in entities
-        # Body 1 is one that the env lacks (NaN throughout): it gets neither pose nor mesh.
+        # The env lacks body 1 (NaN throughout), so it gets neither pose nor mesh.
         assert (f"{worn}/0" in entities) == (worn == "/world/floor")
         assert "/world/robot/hand" not in entities
 
@@ -242,7 +245,7 @@ EVALUATE = st.dictionaries(
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), steps=st.integers(0, 6), entries=EVALUATE, lost=st.integers(0, 9))
-def test_any_episode_comes_back(
+def test_any_episode_is_read_back(
     make_episode: Callable[..., Made], data: st.DataObject, steps: int, entries: Any, lost: int
 ) -> None:
     evaluate = {
@@ -277,7 +280,9 @@ def test_any_episode_comes_back(
         np.testing.assert_array_equal(read, values.reshape(steps + 1, -1).astype(np.float64))
 
 
-def test_cameras_of_one_name_and_far_depths(make_episode: Callable[..., Made], tmp_path: Path) -> None:
+def test_cameras_with_equal_names_and_far_depths_are_read_back(
+    make_episode: Callable[..., Made], tmp_path: Path
+) -> None:
     def track(kind: Any, ids: NDArray[np.int32]) -> Track:
         info = CameraInfo("eye", kind, 2, 2, 1.0, 0.01, 100.0, np.eye(3, dtype=np.float32), None, ("depth",))
         pose = np.array([[0, 0, 0, 1, 0, 0, 0]], dtype=np.float32)

@@ -1,4 +1,4 @@
-"""A recording opens in rerun's own viewer, and only this machine hears of it."""
+"""A recording opens in rerun's native viewer, which listens on the loopback address only and sends nothing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def file(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def headless(file: Path) -> Iterator[ViewerClient]:
-    """Rerun's viewer without a window; `ViewerClient.spawn` would listen on every address."""
+    """Rerun's viewer without a window. `ViewerClient.spawn` would listen on every address."""
     port = free_port()
     command = [
         *rerun_command(),
@@ -95,35 +95,33 @@ def test_the_native_viewer_shows_the_whole_layout(headless: ViewerClient, file: 
         pixels = np.asarray(Image.open(picture).convert("RGB"))
         assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > colours, f"{name} is blank"
     scene = np.asarray(Image.open(tmp_path / "Scene.png").convert("RGB")).astype(int)
-    # Goal (pure green) and cube (red) are small and near the middle, where the eye looks at the robot.
+    # Goal (pure green) and cube (red) are small and near the middle of the view.
     green = (scene[..., 1] > 150) & (scene[..., [0, 2]].max(axis=-1) < 60)
     assert 20 < green.sum() < green.size / 20
     rows, columns = np.nonzero(green)
     assert 0.2 < rows.mean() / scene.shape[0] < 0.8 and 0.2 < columns.mean() / scene.shape[1] < 0.8
 
 
-def test_a_window_without_a_screen_is_refused(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opening_a_window_without_a_display_is_refused(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(RuntimeError, match="There is no display here"):
         open_window([file])
 
 
-def test_a_window_that_cannot_open_is_said_and_leaves_no_process(
+def test_a_window_that_cannot_open_is_reported_and_leaves_no_process(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setenv("DISPLAY", ":4711")  # nobody is there
+    monkeypatch.setenv("DISPLAY", ":4711")  # no X server has this number
     before = psutil.Process().children()
     with pytest.raises(RuntimeError, match="ended with"):
-        # Rerun listens before it looks for its display, so it may be either of the two that finds out.
+        # Rerun listens before it opens its display, so either of the two may report the failure.
         open_window([file]).wait()
     assert psutil.Process().children() == before
 
 
-def test_rerun_is_told_to_send_no_statistics(
-    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reruns_telemetry_is_turned_off(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, folder in (("HOME", ""), ("XDG_CONFIG_HOME", "config"), ("XDG_DATA_HOME", "data")):
         monkeypatch.setenv(name, str(tmp_path / folder))
     monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")

@@ -1,4 +1,4 @@
-"""An .rrd is whole whatever the process and the disk around its writer are like, or it is an error."""
+"""An .rrd is written completely or fails with an error, whatever the disk, other threads or the user's rerun do."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from workbench.episodes.writing.journal import JournalReader
 Maker = Callable[..., Made]
 
 
-def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
+def test_a_disk_that_is_full_at_any_byte_raises_a_disk_error(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
-    """Also where the last byte that fits is part of the blueprint or of the index."""
+    """This holds too where the last byte that fits belongs to the blueprint or the index."""
     episode = make_episode(30, action=np.random.default_rng(0).random((30, 1)).astype(np.float32))
     writer = episode.writer(tmp_path)
     for row in episode.rows():
@@ -68,10 +68,10 @@ def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
         except OSError as error:
             assert error.errno == errno.EFBIG, room
         else:
-            # Where what is compressed says when it was written, two files differ by some bytes: this one found room.
+            # Compressed data contains the time of writing, so two files differ by some bytes: this file just fitted.
             assert room > whole - 128 and size <= room and verify_rrd(path) is None, (room, size, whole)
             fitted += 1
-    assert fitted < 8, "the last bytes were hardly ever too many"
+    assert fitted < 8, "the full disk was rarely hit"
     assert len(os.listdir("/proc/self/fd")) == before
     assert size_with_room(whole + 4096) > 0
     assert verify_rrd(path) is None
@@ -79,19 +79,19 @@ def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
     writer.discard()
 
 
-def test_whoever_has_turned_rerun_off_still_gets_the_whole_recording(
+def test_a_recording_is_complete_even_if_the_user_disabled_rerun(
     child_process: None, make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RERUN", "off")
     episode = make_episode()
-    # Blueprints are kept by the task's name.
+    # Blueprints are stored by the task's name.
     episode.info = dataclasses.replace(episode.info, task="NobodyElses-v1")
     files = episode.write(tmp_path)
     assert len(RrdReader(files.rrd).blueprints()) == 1
     assert os.environ["RERUN"] == "off"
 
 
-def test_a_viewer_that_reads_from_the_beginning_gets_the_blueprint_first(
+def test_the_blueprint_comes_first_in_the_file(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
     path = make_episode(300).write(tmp_path).rrd
@@ -108,7 +108,7 @@ def test_a_viewer_that_reads_from_the_beginning_gets_the_blueprint_first(
     assert "make_active: true, make_default: true" in recording and "/world" in recording
 
 
-def test_episodes_of_one_process_are_different_recordings_with_equal_content(
+def test_episodes_of_one_process_are_separate_recordings_with_equal_content(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
     episode = make_episode(5)
@@ -124,7 +124,7 @@ def test_episodes_of_one_process_are_different_recordings_with_equal_content(
         assert other.keys() == first.keys()
         for entity, columns in first.items():
             assert other[entity].keys() == columns.keys()
-            if entity.startswith(("/__properties", "/logs")):  # with the seed in them
+            if entity.startswith(("/__properties", "/logs")):  # they contain the seed
                 continue
             for name, column in columns.items():
                 again = other[entity][name]
@@ -134,7 +134,7 @@ def test_episodes_of_one_process_are_different_recordings_with_equal_content(
         assert verify_rrd(path) is None
 
 
-def test_threads_that_write_at_once_write_whole_files_and_leave_no_threads(
+def test_concurrent_threads_write_complete_files_and_leave_no_threads(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
     def some(number: int) -> list[Path]:
@@ -155,10 +155,10 @@ def test_threads_that_write_at_once_write_whole_files_and_leave_no_threads(
     until(lambda: own_threads() == 0, "the threads of rerun's streams have ended")
 
 
-def test_a_process_that_is_forked_meanwhile_does_not_hold_the_file_open(
+def test_a_process_forked_during_writing_does_not_hold_the_file_open(
     child_process: None, make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As PyTorch's workers are, in the process that records."""
+    """PyTorch's data loader forks such workers in the process that records."""
     forked = []
 
     def chunks(episode: Episode) -> Iterator[Chunk]:
@@ -181,10 +181,10 @@ def test_a_process_that_is_forked_meanwhile_does_not_hold_the_file_open(
     assert verify_rrd(path) is None
 
 
-def test_what_the_user_logs_with_rerun_meanwhile_stays_theirs(
+def test_the_users_own_rerun_logs_do_not_mix_with_the_recording(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
-    """An env that is recorded may log with rerun itself: to a stream, to one of its thread, and to the global recording."""
+    """A recorded env may itself log with rerun: to a stream, to a thread-local one, and to the global recording."""
 
     def log_and_record(name: str, log: Callable[[str, rr.TextLog], None]) -> None:
         for step in range(5):
@@ -206,7 +206,7 @@ def test_what_the_user_logs_with_rerun_meanwhile_stays_theirs(
         log_and_record("global", rr.log)
         rr.disconnect()
     finally:
-        rr.set_global_data_recording(None)  # the tests after this one have the same process
+        rr.set_global_data_recording(None)  # later tests run in the same process
     own.disconnect()
     wanted = {f"/{when}/{step}" for when in ("before", "after") for step in range(5)}
     for name in ("own", "thread", "global"):

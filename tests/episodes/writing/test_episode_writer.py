@@ -1,4 +1,4 @@
-"""A recording is there, whole, under a name of its own, or it is not there at all; and whoever records goes on."""
+"""A recording is written completely under a unique name or not at all, and the recording program continues."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ Maker = Callable[..., Made]
 
 
 @contextmanager
-def little_room(size: int) -> Iterator[None]:
-    """A write that fails half way, as on a full disk."""
+def size_limit(size: int) -> Iterator[None]:
+    """Make writes fail half way, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -49,22 +49,31 @@ def wide(make_episode: Maker, steps: int = 3) -> Made:
 
 
 def left(folder: Path) -> list[str]:
-    """What lies in `folder`, and in the folder of the journals."""
+    """Names of the files in `folder` and in its folder of journals."""
     return sorted(
         os.path.relpath(Path(parent, name), folder) for parent, _, names in os.walk(folder) for name in names
     )
 
 
-def test_three_files_of_one_name_and_nothing_else(make_episode: Maker, tmp_path: Path) -> None:
+def test_an_episode_is_three_files_of_one_name_and_nothing_else(make_episode: Maker, tmp_path: Path) -> None:
     episode = make_episode(evaluate={"success": np.array([0, 0, 0, 1], bool)})
     files = episode.write(tmp_path / "a" / "b")
     assert sorted(os.listdir(tmp_path / "a" / "b")) == sorted(
         path.name for path in (files.rrd, files.h5, files.json)
     )
     assert files.rrd.stem == files.h5.stem == files.json.stem == episode_stem(episode.info)
-    said = json.loads(files.json.read_bytes())["workbench"]
-    assert said["id"] == episode.info.id and said["success"] is True and said["fail"] is None
-    assert (said["length"], said["return"], said["seed"], said["thumbnail"]) == (3, 0.0, 7, None)
+    description = json.loads(files.json.read_bytes())["workbench"]
+    assert (
+        description["id"] == episode.info.id
+        and description["success"] is True
+        and description["fail"] is None
+    )
+    assert (description["length"], description["return"], description["seed"], description["thumbnail"]) == (
+        3,
+        0.0,
+        7,
+        None,
+    )
 
 
 def test_an_episode_without_a_reward_has_no_return(make_episode: Maker, tmp_path: Path) -> None:
@@ -74,7 +83,7 @@ def test_an_episode_without_a_reward_has_no_return(make_episode: Maker, tmp_path
     assert read_properties(files.rrd)["episode"].get("return") is None
 
 
-def test_files_that_exist_are_never_written_over(make_episode: Maker, tmp_path: Path) -> None:
+def test_existing_files_are_never_overwritten(make_episode: Maker, tmp_path: Path) -> None:
     episode = make_episode()
     stem = episode_stem(episode.info)
     (tmp_path / f"{stem}.rrd").write_text("mine")
@@ -85,7 +94,7 @@ def test_files_that_exist_are_never_written_over(make_episode: Maker, tmp_path: 
     assert not (tmp_path / f"{stem}.h5").exists() and not (tmp_path / f"{stem}_2.rrd").exists()
 
 
-def test_threads_that_write_at_once_get_files_each(make_episode: Maker, tmp_path: Path) -> None:
+def test_concurrent_threads_each_write_their_own_files(make_episode: Maker, tmp_path: Path) -> None:
     written: list[EpisodeFiles] = []
     threads = []
     for steps in range(1, 5):
@@ -99,9 +108,7 @@ def test_threads_that_write_at_once_get_files_each(make_episode: Maker, tmp_path
     assert len(left(tmp_path)) == 12
 
 
-def test_rows_that_do_not_fit_are_refused_and_the_episode_goes_on(
-    make_episode: Maker, tmp_path: Path
-) -> None:
+def test_invalid_rows_are_refused_and_the_episode_continues(make_episode: Maker, tmp_path: Path) -> None:
     info = CameraInfo("eye", "sensor", 4, 3, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("rgb",))
     image, pose = np.zeros((3, 4, 3), np.uint8), np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
     track = Track(info, np.arange(4), np.tile(pose, (4, 1)), rgb=np.tile(image, (4, 1, 1, 1)))
@@ -140,7 +147,7 @@ def test_rows_that_do_not_fit_are_refused_and_the_episode_goes_on(
     assert found.length == 1 and len(found.cameras[0].frame) == 2 and found.evaluate == {}
 
 
-def test_an_episode_that_is_discarded_leaves_nothing(make_episode: Maker, tmp_path: Path) -> None:
+def test_a_discarded_episode_leaves_no_file(make_episode: Maker, tmp_path: Path) -> None:
     writer = make_episode().writer(tmp_path)
     for row in make_episode().rows():
         append(writer, row)
@@ -150,11 +157,9 @@ def test_an_episode_that_is_discarded_leaves_nothing(make_episode: Maker, tmp_pa
 
 
 @pytest.mark.parametrize("room", [0, 4000, 40_000])
-def test_a_disk_without_room_leaves_the_journal_or_nothing(
-    make_episode: Maker, tmp_path: Path, room: int
-) -> None:
+def test_a_full_disk_leaves_the_journal_or_nothing(make_episode: Maker, tmp_path: Path, room: int) -> None:
     episode = wide(make_episode)
-    with little_room(room):
+    with size_limit(room):
         with pytest.raises(RecordingError, match=r"Cannot record Made-v1 .*limit"):
             writer = episode.writer(tmp_path)
             for row in episode.rows():
@@ -164,20 +169,20 @@ def test_a_disk_without_room_leaves_the_journal_or_nothing(
             writer.close()
     assert {Path(name).parent.name for name in left(tmp_path)} <= {FOLDER}
     recovered = recover(tmp_path)
-    # Rows of 8 kB: what was written of them before the disk was full is an episode, if it is one step.
+    # Rows of 8 kB: those written before the disk was full are an episode if they hold at least one step.
     assert [read_episode(files.rrd).length for files in recovered] == ([1] if room == 40_000 else [])
     assert len(left(tmp_path)) == 3 * len(recovered)
     assert read_episode(episode.write(tmp_path).rrd).length == 3
 
 
-def test_writing_many_leaves_no_threads(make_episode: Maker, tmp_path: Path) -> None:
+def test_writing_many_episodes_leaves_no_threads(make_episode: Maker, tmp_path: Path) -> None:
     process = psutil.Process()
     make_episode().write(tmp_path)
     before = process.num_threads(), process.num_fds()
     for _ in range(10):
         make_episode().write(tmp_path)
     until_quiet = threading.Event()
-    for _ in range(100):  # the thread of the journals ends a moment after the last of them
+    for _ in range(100):  # the journal thread ends a moment after the last journal
         if process.num_threads() <= before[0]:
             break
         until_quiet.wait(0.1)
@@ -186,12 +191,12 @@ def test_writing_many_leaves_no_threads(make_episode: Maker, tmp_path: Path) -> 
 
 
 @given(task=st.text(max_size=200), seed=st.integers(-1, 2**31 - 1), env=st.integers(0, 5000))
-def test_names_are_safe_anywhere(task: str, seed: int, env: int) -> None:
+def test_file_names_are_safe_on_any_file_system(task: str, seed: int, env: int) -> None:
     stem = episode_stem(dataclasses.replace(INFO, task=task, seed=seed, env_index=env))
     assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,150}", stem)
 
 
-def test_a_row_holds_nothing_of_the_batch(make_episode: Maker, tmp_path: Path) -> None:
+def test_a_row_is_copied_from_the_batch(make_episode: Maker, tmp_path: Path) -> None:
     episode = make_episode()
     poses = episode.poses[0].copy()
     writer = episode.writer(tmp_path)

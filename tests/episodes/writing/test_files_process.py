@@ -1,4 +1,4 @@
-"""A process makes the same files as a thread; when it is killed nothing is lost and nothing is made twice."""
+"""The files subprocess writes the same files as a thread; when it is killed, no episode is lost or duplicated."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("child_process")
 
 @pytest.fixture(scope="module")
 def process() -> Iterator[FilesProcess]:
-    """Not to be killed."""
+    """A shared process that tests must not kill."""
     process = started()
     yield process
     process.close()
@@ -51,14 +51,14 @@ def pid_of(process: FilesProcess) -> int:
 
 
 def unread(process: FilesProcess) -> int:
-    """Bytes that it was sent and has not received."""
+    """Bytes that were sent to the process and that it has not received."""
     count = array("i", [0])
     fcntl.ioctl(process._end, termios.TIOCOUTQ, count)
     return count[0]
 
 
 def content(rrd: Path) -> dict[str, dict[str, object]]:
-    """All of it but rerun's random numbers."""
+    """The content of an .rrd without rerun's random ids."""
     return {
         entity: {
             name: (plain(column.steps), list(map(plain, column.values))) for name, column in columns.items()
@@ -72,7 +72,7 @@ def plain(value: object) -> object:
 
 
 def description(path: Path) -> object:
-    """All of it but what follows from those numbers."""
+    """The content of a .json without values that depend on those ids."""
     data = json.loads(path.read_text())
     for name in ("files", "made_here"):
         del data["workbench"][name]
@@ -85,7 +85,9 @@ def files_in(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("pictures", [False, True])
-def test_the_files_are_those_of_a_thread(tmp_path: Path, process: FilesProcess, pictures: bool) -> None:
+def test_the_process_writes_the_same_files_as_a_thread(
+    tmp_path: Path, process: FilesProcess, pictures: bool
+) -> None:
     episode = made(6, 4, env_kwargs={"sizes": (1, 2.5), "name": None}, reset_options={"k": [1]})
     by_process = appended(tmp_path / "process", episode, pictures).finish(process)
     by_thread = appended(tmp_path / "thread", episode, pictures).finish()
@@ -101,8 +103,8 @@ def test_the_files_are_those_of_a_thread(tmp_path: Path, process: FilesProcess, 
     assert files_in(tmp_path / "process") == [".h5", ".json", ".rrd"]
 
 
-def test_what_cannot_be_written_is_said_as_on_a_thread(tmp_path: Path, process: FilesProcess) -> None:
-    said = []
+def test_a_write_error_is_reported_as_on_a_thread(tmp_path: Path, process: FilesProcess) -> None:
+    messages = []
     for asked in (process, None):
         folder = tmp_path / "here"
         writer = appended(folder, made(3), pictures=False)
@@ -110,13 +112,15 @@ def test_what_cannot_be_written_is_said_as_on_a_thread(tmp_path: Path, process: 
         with pytest.raises(RecordingError) as error:
             writer.finish(asked)
         writer.discard()
-        said.append(str(error.value))
-    assert said[0] == said[1] and "here" in said[0]
-    assert appended(tmp_path, made(3), pictures=False).finish(process).json.is_file()  # it goes on
+        messages.append(str(error.value))
+    assert messages[0] == messages[1] and "here" in messages[0]
+    assert (
+        appended(tmp_path, made(3), pictures=False).finish(process).json.is_file()
+    )  # the process still works
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_the_episode_is_made_once(tmp_path: Path) -> None:
+def test_a_process_killed_at_any_moment_leaves_the_episode_exactly_once(tmp_path: Path) -> None:
     for wait in (0, 0.02):
         folder, process = tmp_path / str(wait), started()
         writer = appended(folder, made(20), pictures=True)
@@ -135,7 +139,7 @@ def test_killed_at_any_moment_the_episode_is_made_once(tmp_path: Path) -> None:
         process.close()
 
 
-def test_killed_before_it_could_say_that_it_is_done_the_files_are_its(tmp_path: Path) -> None:
+def test_files_finished_before_a_kill_are_used(tmp_path: Path) -> None:
     process = started()
     writer = appended(tmp_path, made(3, 2), pictures=False)
     journal_of(writer).finish()
@@ -146,8 +150,8 @@ def test_killed_before_it_could_say_that_it_is_done_the_files_are_its(tmp_path: 
     assert not process.is_ready
 
 
-def test_nobody_recovers_what_it_works_on(tmp_path: Path, process: FilesProcess) -> None:
-    """The writer's process may be killed meanwhile, which releases its own lock."""
+def test_a_journal_in_use_is_not_recovered_by_another_process(tmp_path: Path, process: FilesProcess) -> None:
+    """The writer's process may be killed meanwhile, which releases the writer's own lock."""
     writer = appended(tmp_path, made(3), pictures=False)
     path = journal_of(writer).path
     os.kill(pid_of(process), signal.SIGSTOP)
@@ -161,7 +165,7 @@ def test_nobody_recovers_what_it_works_on(tmp_path: Path, process: FilesProcess)
     waiting.close()
 
 
-def test_where_no_process_can_be_started_the_thread_makes_them(
+def test_if_no_process_can_be_started_a_thread_writes_the_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(*_: object, **__: object) -> None:
@@ -179,7 +183,7 @@ def written(folder: Path) -> EpisodeWriter:
 
 
 @pytest.mark.slow
-def test_it_ends_with_the_program_that_started_it(tmp_path: Path) -> None:
+def test_the_process_ends_with_the_program_that_started_it(tmp_path: Path) -> None:
     program = (
         "import os, time\n"
         "from workbench.episodes.writing.files_process import FilesProcess\n"

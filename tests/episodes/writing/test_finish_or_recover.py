@@ -1,4 +1,4 @@
-"""The end of an episode: whatever call of the system fails, its files are there or what was recorded of it is."""
+"""The end of an episode: whatever system call fails, either its files exist or its journal does."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def recorded(make_episode: Maker, folder: Path) -> EpisodeWriter:
         pytest.param("recover", errno.EROFS, marks=pytest.mark.slow),
     ],
 )
-def test_whatever_call_fails_the_next_try_makes_the_files_once(
+def test_whatever_call_fails_the_retry_writes_the_files_once(
     make_episode: Maker, tmp_path: Path, again: str, then: int
 ) -> None:
     writer = recorded(make_episode, tmp_path / "0")
@@ -65,7 +65,7 @@ def test_whatever_call_fails_the_next_try_makes_the_files_once(
         assert descriptors() == before, call
         recover(folder)
         if again == "recover" and call.startswith("pwrite"):
-            assert os.listdir(folder) == [], "its rows were nowhere but in memory"
+            assert os.listdir(folder) == [], "its rows were only in memory"
             continue
         (path,) = folder.glob("*.json")
         assert read_episode(path).length == 2 and read_episode(path).broken_files == (), call
@@ -74,7 +74,7 @@ def test_whatever_call_fails_the_next_try_makes_the_files_once(
 
 
 @pytest.mark.parametrize("then", [0, errno.EROFS])
-def test_whatever_call_fails_an_episode_that_is_begun_is_told_in_a_sentence(
+def test_whatever_call_fails_when_an_episode_begins_is_reported(
     make_episode: Maker, tmp_path: Path, then: int
 ) -> None:
     episode = make_episode(2)
@@ -82,7 +82,7 @@ def test_whatever_call_fails_an_episode_that_is_begun_is_told_in_a_sentence(
         episode.writer(tmp_path / "0").discard()
     for at, call in enumerate(calls, 1):
         folder, before = tmp_path / str(at), descriptors()
-        episode.geometry = make_episode().geometry  # whose meshes no other episode of the process has
+        episode.geometry = make_episode().geometry  # no other episode of the process shares its meshes
         with refused(at, then=then):
             try:
                 episode.writer(folder).discard()

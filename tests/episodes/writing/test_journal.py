@@ -1,4 +1,4 @@
-"""A journal holds whole states, whatever fails: calls of the system, its folder, what is still being encoded."""
+"""A journal holds complete states, whatever fails: system calls, its folder, or pictures still being encoded."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from workbench.episodes.writing.journal import Journal, JournalEntry, claim
 
 @pytest.fixture(autouse=True)
 def no_thread_writes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is written when is the test's affair."""
+    """Stop the journal thread, so that each test decides when to write."""
     keeper = type(journals._journal_threads)()
     monkeypatch.setattr(keeper, "watch", lambda journal: None)
     monkeypatch.setattr(journals, "_journal_threads", keeper)
@@ -34,7 +34,7 @@ def journal(tmp_path: Path) -> Iterator[Journal]:
 
 
 def rows(path: Path) -> list[bytes]:
-    """Those that were written together and follow each other are one."""
+    """Values of the rows in the file; consecutive rows that were written together are one value."""
     return [entry.value for entry in entries_of(path) if entry.kind == "row"]
 
 
@@ -42,7 +42,7 @@ def numbers(*values: int) -> list[bytes]:
     return [bytes([value]) for value in values]
 
 
-def test_an_error_of_the_disk_is_told_at_the_next_row_and_the_next_sync_makes_no_good_of_it(
+def test_a_disk_error_is_raised_at_the_next_row_and_a_later_sync_does_not_clear_it(
     journal: Journal,
 ) -> None:
     journal.append(JournalEntry("row", 0, b"0"))
@@ -60,10 +60,10 @@ def test_an_error_of_the_disk_is_told_at_the_next_row_and_the_next_sync_makes_no
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
 @pytest.mark.parametrize("then", [0, errno.EIO])
 @pytest.mark.parametrize("half", [0, 5])
-def test_what_could_not_be_written_is_written_once_there_is_room(
+def test_rows_that_could_not_be_written_are_written_once_there_is_room(
     journal: Journal, monkeypatch: pytest.MonkeyPatch, number: int, then: int, half: int
 ) -> None:
-    """Also where half of it was, and what is to take that back fails too."""
+    """This holds too where half of a row was written and truncating it fails."""
     journal.append(JournalEntry("row", 0, b"0"))
     journal.write()
     for value in numbers(1, 2):
@@ -74,16 +74,16 @@ def test_what_could_not_be_written_is_written_once_there_is_room(
             patch.setattr(os, "pwrite", lambda descriptor, view, at: write(descriptor, view[:half], at))
         with refused(2 if half else 1, ("pwrite",), number, then):
             journal.write()
-    with pytest.raises(OSError) as told:
+    with pytest.raises(OSError) as error:
         journal.append(JournalEntry("row", 0, b"not kept"))
-    assert told.value.errno == number
+    assert error.value.errno == number
     assert rows(journal.path) == [b"0"]
     journal.finish()
     assert rows(journal.path) == [b"0", b"".join(value * 3000 for value in numbers(1, 2))]
     assert journal.size == journal.path.stat().st_size
 
 
-def test_a_picture_that_could_not_be_made_is_told_and_costs_its_own_state_alone(journal: Journal) -> None:
+def test_a_failed_picture_is_reported_and_loses_only_its_own_state(journal: Journal) -> None:
     made: Future[list[JournalEntry]] = Future()
     made.set_exception(MemoryError("no room"))
     journal.append(JournalEntry("row", 0, b"0"))
@@ -94,7 +94,7 @@ def test_a_picture_that_could_not_be_made_is_told_and_costs_its_own_state_alone(
     assert entries_of(journal.path) == [JournalEntry("row", 0, b"0")]
 
 
-def test_rows_that_come_while_the_disk_fails_keep_their_order(
+def test_rows_appended_while_the_disk_fails_keep_their_order(
     journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> int:
@@ -111,9 +111,7 @@ def test_rows_that_come_while_the_disk_fails_keep_their_order(
     assert journal.size == journal.path.stat().st_size
 
 
-def test_one_process_writes_it_and_whoever_finds_it_later_has_it_alone(
-    tmp_path: Path, journal: Journal
-) -> None:
+def test_a_journal_has_one_writer_and_later_one_exclusive_claim(tmp_path: Path, journal: Journal) -> None:
     assert claim(journal.path) is None, "its writer lives"
     assert claim(tmp_path / "none.arrow") is None
     (tmp_path / "link.arrow").symlink_to(journal.path)
@@ -147,7 +145,7 @@ def test_threads_write_all_journals_and_end_with_the_last(
     before = set(threading.enumerate())
     three = [Journal(tmp_path / f"{k}.arrow") for k in range(3)]
     threads = set(threading.enumerate()) - before
-    assert threads and all(thread.daemon for thread in threads), "the end of a process waits for none"
+    assert threads and all(thread.daemon for thread in threads), "they must not delay the exit of a process"
     for journal in three:
         journal.append(JournalEntry("row", 0, b"x"))
     until(
@@ -161,9 +159,7 @@ def test_threads_write_all_journals_and_end_with_the_last(
         assert not thread.is_alive()
 
 
-def test_while_the_disk_hangs_in_a_sync_rows_are_written_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_are_still_written_while_a_sync_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journals, "_journal_threads", type(journals._journal_threads)())
     monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
     hangs, goes_on = threading.Event(), threading.Event()
@@ -189,7 +185,7 @@ def test_while_the_disk_hangs_in_a_sync_rows_are_written_on(
             journal.close()
 
 
-def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
+def test_pending_bytes_are_counted_until_they_are_written(journal: Journal) -> None:
     begin = journal.size
     made: Future[list[JournalEntry]] = Future()
     journal.append(JournalEntry("row", 0, b"0" * 100))

@@ -1,4 +1,4 @@
-"""What a killed process leaves becomes an episode, up to the last second, in a process of its own."""
+"""The journal of a killed process is recovered to an episode, up to the last second, in a subprocess."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ for episode in range(10**6):
     writer = EpisodeWriter(folder, info, geometry, {}, ("a",), (camera,))
     for k in range(steps + 1):
         append(writer, row(k))
-        # What the parent holds it to: this row was appended then.
+        # Tells the parent that this row was appended at this time.
         sys.stdout.write(f"{episode} {k} {time.time()}\\n")
         sys.stdout.flush()
-        time.sleep(0.002)  # so much as a step takes
+        time.sleep(0.002)  # about the duration of a step
     writer.finish()
     sys.stdout.write(f"{episode} finished\\n")
     sys.stdout.flush()
@@ -69,7 +69,7 @@ for episode in range(10**6):
     [(10**6, 1), *(pytest.param(steps, 6, marks=pytest.mark.slow) for steps in (60, 10**6))],
 )
 def test_a_killed_writer_loses_a_second_of_one_episode(tmp_path: Path, steps: int, kills: int) -> None:
-    """Killed at random moments: between rows, while files are made, and while they get their names."""
+    """The writer is killed at random moments: between rows, while files are written, and while they are renamed."""
     chance = random.Random(steps)
     for kill in range(kills):
         folder = tmp_path / str(kill)
@@ -110,7 +110,7 @@ def test_a_killed_writer_loses_a_second_of_one_episode(tmp_path: Path, steps: in
         assert recover(folder) == []
 
 
-def test_mending_is_done_by_a_process_that_bears_what_a_folder_brings(tmp_path: Path) -> None:
+def test_recovery_runs_in_a_process_that_survives_damaged_folders(tmp_path: Path) -> None:
     assert recover_confined(tmp_path / "none") == recover_confined(tmp_path) == ()
     begin(tmp_path, small(5, seed=8))
     for name in ("pipe.arrow", "pipe.scene"):
@@ -124,7 +124,7 @@ def test_mending_is_done_by_a_process_that_bears_what_a_folder_brings(tmp_path: 
 
 @pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
 @pytest.mark.parametrize("outside", [False, True])
-def test_mending_reads_nothing_outside_the_folder(tmp_path: Path, outside: bool) -> None:
+def test_recovery_reads_nothing_outside_the_folder(tmp_path: Path, outside: bool) -> None:
     folder, elsewhere = tmp_path / "recordings", tmp_path / "elsewhere"
     begin(folder, small(5, seed=8))
     if outside:

@@ -1,4 +1,4 @@
-"""Pictures that are encoded beside the steps come into the recording as if they had not been, and errors are still told."""
+"""Pictures encoded in the background are recorded as if encoded at once, and errors are still reported."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STATES = 7
 
 @pytest.fixture
 def seen(make_episode: Maker) -> Made:
-    """Every picture is one number, which tells it from all others."""
+    """An episode in which each picture is filled with its own number."""
     info = CameraInfo(
         "eye", "sensor", 40, 30, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("segmentation",)
     )
@@ -36,8 +36,8 @@ def seen(make_episode: Maker) -> Made:
 
 
 @pytest.fixture
-def held_back(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
-    """No picture is encoded before the event is set."""
+def encoding_blocked(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """Block the encoding of pictures until the event is set."""
     go, encode = threading.Event(), episode_writer.encode
 
     def wait(*args: Any) -> bytes:
@@ -56,16 +56,18 @@ def pictures_of(path: Path) -> list[int]:
     return [int(camera.segmentation[k][0, 0]) for k in range(len(camera.segmentation))]
 
 
-def test_steps_do_not_wait_for_their_pictures(seen: Made, held_back: threading.Event, tmp_path: Path) -> None:
+def test_steps_do_not_wait_for_their_pictures(
+    seen: Made, encoding_blocked: threading.Event, tmp_path: Path
+) -> None:
     writer = seen.writer(tmp_path)
     for row in seen.rows():
         append(writer, row)
-    assert not held_back.is_set()
-    held_back.set()
+    assert not encoding_blocked.is_set()
+    encoding_blocked.set()
     assert pictures_of(writer.finish().json) == list(range(STATES))
 
 
-def test_what_is_no_picture_is_refused_at_its_own_step(seen: Made, tmp_path: Path) -> None:
+def test_an_invalid_picture_is_refused_at_its_own_step(seen: Made, tmp_path: Path) -> None:
     writer = seen.writer(tmp_path)
     first, second, *_ = seen.rows()
     append(writer, first)
@@ -78,7 +80,7 @@ def test_what_is_no_picture_is_refused_at_its_own_step(seen: Made, tmp_path: Pat
     assert pictures_of(writer.finish().json) == [0, 1]
 
 
-def test_a_picture_that_cannot_be_encoded_is_told_and_what_came_before_it_is_kept(
+def test_an_encoding_error_is_reported_and_earlier_states_are_kept(
     seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     encode = episode_writer.encode
@@ -99,10 +101,10 @@ def test_a_picture_that_cannot_be_encoded_is_told_and_what_came_before_it_is_kep
     assert pictures_of(files.json) == [0, 1, 2, 3]
 
 
-def test_what_was_encoded_does_not_wait_any_more(
+def test_encoded_pictures_no_longer_count_as_waiting(
     seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """However many pictures there were: only where too many wait at once are they encoded by whoever brings them."""
+    """The total number does not matter: only when too many wait at once does the caller encode them."""
     picture = np.zeros((30, 40), np.int32)
     monkeypatch.setattr(episode_writer, "_pool", None)
     monkeypatch.setattr(episode_writer, "MAX_PENDING_BYTES", 2 * picture.nbytes)
@@ -116,7 +118,7 @@ def test_what_was_encoded_does_not_wait_any_more(
     for number in range(8):
         soon = episode_writer.encode_async([("picture/0/segmentation", number, "segmentation", picture)])
         assert [entry.number for entry in soon.result(60)] == [number]
-        # The last picture is done a moment before it is counted so.
+        # The last picture is done a moment before the count says so.
         until(
             lambda: episode_writer._pool is not None and episode_writer._pool._bytes == 0, "nothing to wait"
         )

@@ -1,4 +1,4 @@
-"""The files of an episode get their names together and for good, or none gets one: whatever call of the system fails."""
+"""The files of an episode get their final names together and durably, or none does, whatever system call fails."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SUFFIXES = (".rrd", ".h5", ".json")
 
 
 def made(folder: Path) -> list[Path]:
-    """Three finished files under their temporary names."""
+    """Write three finished files under their temporary names."""
     (folder / "made").mkdir(parents=True)
     paths = [folder / "made" / f"id{suffix}" for suffix in SUFFIXES]
     for path in paths:
@@ -29,19 +29,19 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("at", [1, 2, 3])
-def test_an_error_of_the_disk_is_told_of_whichever_file_it_is(tmp_path: Path, at: int) -> None:
+def test_a_disk_error_of_any_file_is_raised(tmp_path: Path, at: int) -> None:
     paths = made(tmp_path)
     before, threads = descriptors(), threading.active_count()
-    with refused(at, ("fsync",)) as calls, pytest.raises(OSError) as told:
+    with refused(at, ("fsync",)) as calls, pytest.raises(OSError) as error:
         sync_files(paths)
-    assert told.value.errno == errno.EIO
+    assert error.value.errno == errno.EIO
     assert sorted(calls) == ["fsync id.h5", "fsync id.json", "fsync id.rrd"]
     assert left_open(before) == [] and threading.active_count() <= threads
     sync_files(paths)
 
 
 @pytest.mark.parametrize("at", [1, 2, 3])
-def test_a_name_that_another_took_meanwhile_takes_the_others_back(
+def test_a_name_taken_meanwhile_undoes_the_other_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
     paths, link, done = made(tmp_path), os.link, []
@@ -64,7 +64,7 @@ def test_a_name_that_another_took_meanwhile_takes_the_others_back(
 def test_whatever_call_fails_all_three_have_names_or_none_has(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool, then: int
 ) -> None:
-    """Also where the folder itself cannot be made to last, and on a disk that has no links."""
+    """This holds too where the folder cannot be synced, and on a file system without hard links."""
 
     def refuse(*_: object) -> None:
         raise OSError(errno.EPERM, "Operation not permitted")
@@ -78,9 +78,9 @@ def test_whatever_call_fails_all_three_have_names_or_none_has(
     for at, call in enumerate(calls, 1):
         folder = tmp_path / str(at)
         paths, before = made(folder), descriptors()
-        with refused(at, then=then), pytest.raises(OSError) as told:
+        with refused(at, then=then), pytest.raises(OSError) as error:
             publish(paths, folder, "episode")
-        assert told.value.errno == errno.EIO, call
+        assert error.value.errno == errno.EIO, call
         assert left_open(before) == [], call
         if not then:
             assert names(folder) == [], call

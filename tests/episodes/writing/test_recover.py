@@ -1,4 +1,4 @@
-"""What a dead writer leaves becomes an episode, whatever fails meanwhile; nothing else is touched."""
+"""The journal of a dead writer is recovered to an episode, whatever fails meanwhile; no other file is touched."""
 
 from __future__ import annotations
 
@@ -30,8 +30,10 @@ Maker = Callable[..., Made]
 
 
 @pytest.mark.thorough
-def test_a_killed_writer_was_given_time_to_lose_nothing(make_episode: Maker, tmp_path: Path) -> None:
-    """Rows that were appended long ago are there though none came after them."""
+def test_a_killed_writer_loses_no_row_that_had_time_to_be_written(
+    make_episode: Maker, tmp_path: Path
+) -> None:
+    """Rows that were appended long ago are written though no further row followed."""
     episode = make_episode(5)
     writer = episode.writer(tmp_path)
     for k, row in enumerate(episode.rows()):
@@ -49,8 +51,8 @@ def test_a_killed_writer_was_given_time_to_lose_nothing(make_episode: Maker, tmp
     assert found.length == 5
 
 
-SCHEMA = 200
-"""Bytes with which a journal begins and that hold no data."""
+SCHEMA_BYTES = 200
+"""Length of a journal's schema, which precedes the data."""
 DAMAGE = st.one_of(
     st.tuples(st.just("cut"), st.floats(0, 1)),
     st.tuples(st.just("flip"), st.floats(0, 0.03) | st.floats(0, 0.999)),
@@ -61,10 +63,10 @@ DAMAGE = st.one_of(
 @pytest.mark.thorough
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(damage=DAMAGE, bit=st.integers(0, 7))
-def test_a_journal_that_is_cut_or_changed_anywhere_gives_its_whole_states_or_stays(
+def test_a_truncated_or_changed_journal_gives_its_complete_states_or_is_kept(
     make_episode: Maker, tmp_path: Path, damage: tuple[str, Any], bit: int
 ) -> None:
-    """A killed process cuts it, and after a power cut a file may be as long as it was meant to be, and hold something else."""
+    """A killed process truncates it; after a power failure it may have its full length but other content."""
     folder = Path(tempfile.mkdtemp(dir=tmp_path))
     episode = make_episode(6)
     writer = episode.writer(folder)
@@ -79,7 +81,7 @@ def test_a_journal_that_is_cut_or_changed_anywhere_gives_its_whole_states_or_sta
     (kind, where), whole = damage, len(ends)
     place = int(where * len(content)) if kind != "more" else 0
     if kind == "cut":
-        # At the end of a state, as often as in one.
+        # Half of the cuts are at the end of a state, half within one.
         place = ends[place % len(ends)] if bit % 2 else place
         del content[place:]
         whole = sum(end <= place for end in ends)
@@ -91,23 +93,25 @@ def test_a_journal_that_is_cut_or_changed_anywhere_gives_its_whole_states_or_sta
     try:
         recover(folder)
     except RecordingError:
-        assert kind == "flip" and place >= SCHEMA
+        assert kind == "flip" and place >= SCHEMA_BYTES
         left_over = [one for one in (folder / FOLDER).iterdir() if one.suffix in (".arrow", ".damaged")]
         assert [one.read_bytes() for one in left_over] == [bytes(content)]
         if left_over[0].suffix == ".damaged":
-            recover(folder)  # it was said once
+            recover(folder)  # it was already reported
             assert left_over[0].exists()
         return
     found = [read_episode(path) for path in folder.glob("*.json")]
     states = [len(one.poses) for one in found if one.poses is not None]
-    # All of it is there, or all but what stands last and cannot be told from what was being written.
-    assert states == ([whole] if whole > 1 else []) or (kind == "flip" and states == [6] and place >= SCHEMA)
-    for one in found if kind != "flip" else ():  # no checksum is in a journal
+    # All states are recovered, or all but the last entry, which may look like an unfinished write.
+    assert states == ([whole] if whole > 1 else []) or (
+        kind == "flip" and states == [6] and place >= SCHEMA_BYTES
+    )
+    for one in found if kind != "flip" else ():  # a journal has no checksums
         np.testing.assert_array_equal(one.poses, episode.poses[: states[0]])
         np.testing.assert_array_equal(one.action, episode.action[: states[0] - 1])
 
 
-def test_a_journal_without_a_step_is_cleared_away(make_episode: Maker, tmp_path: Path) -> None:
+def test_a_journal_without_a_step_is_removed(make_episode: Maker, tmp_path: Path) -> None:
     writer = make_episode().writer(tmp_path)
     append(writer, next(iter(make_episode().rows())))
     journal_of(writer).write()
@@ -120,7 +124,7 @@ def test_a_journal_without_a_step_is_cleared_away(make_episode: Maker, tmp_path:
     assert recover(tmp_path / "nowhere") == []
 
 
-def test_without_its_meshes_an_episode_is_recovered_bare(make_episode: Maker, tmp_path: Path) -> None:
+def test_an_episode_is_recovered_without_its_lost_meshes(make_episode: Maker, tmp_path: Path) -> None:
     episode = make_episode()
     writer = episode.writer(tmp_path)
     for row in episode.rows():
@@ -136,7 +140,7 @@ def test_without_its_meshes_an_episode_is_recovered_bare(make_episode: Maker, tm
     np.testing.assert_array_equal(found.poses, episode.poses)
 
 
-def test_files_of_another_folder_are_no_strays(tmp_path: Path) -> None:
+def test_files_of_another_folder_are_not_taken_for_leftovers(tmp_path: Path) -> None:
     folder, other = tmp_path / "recordings", tmp_path / "other"
     folder.mkdir()
     other.mkdir()
@@ -148,7 +152,7 @@ def test_files_of_another_folder_are_no_strays(tmp_path: Path) -> None:
 
 
 def left(episode: Made, folder: Path, **info: object) -> Path:
-    """The journal of `episode` as a writer leaves it that dies before it makes the files."""
+    """Write the journal of `episode` as left by a writer that dies before it writes the files; returns its path."""
     episode.info = dataclasses.replace(episode.info, **info)  # type: ignore[arg-type]
     writer = episode.writer(folder)
     for row in episode.rows():
@@ -159,17 +163,17 @@ def left(episode: Made, folder: Path, **info: object) -> Path:
 
 
 def lengths(folder: Path) -> dict[str, int]:
-    """Of each whole recording, by its id; there is nothing else in the folder."""
+    """Length of each complete recording, by its id; asserts that the folder holds nothing else."""
     found = {episode.info.id: episode.length for episode in map(read_episode, folder.glob("*.json"))}
     assert len(list(folder.iterdir())) == 3 * len(found), sorted(path.name for path in folder.iterdir())
     return found
 
 
 @pytest.mark.parametrize("named", [[".h5"], [".h5", ".rrd"]])
-def test_of_a_writer_that_died_between_two_names_only_what_it_named_itself_is_taken_back(
+def test_after_a_death_between_two_renames_only_the_writers_own_names_are_undone(
     make_episode: Maker, tmp_path: Path, named: list[str]
 ) -> None:
-    """The first name was another recording's, so it was at the second."""
+    """The first name belonged to another recording, so the writer was at its second choice."""
     left(make_episode(2), tmp_path, id="0", written_at="2026-11-21T12:00:00+00:00")
     (first,) = recover(tmp_path)
     journal = left(make_episode(4), tmp_path, id="1", written_at="2026-11-21T12:00:00+00:00")
@@ -183,7 +187,7 @@ def test_of_a_writer_that_died_between_two_names_only_what_it_named_itself_is_ta
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("then", [0, pytest.param(errno.EROFS, marks=pytest.mark.slow)])
-def test_whatever_call_fails_the_next_recovery_makes_each_episode_whole_and_once(
+def test_whatever_call_fails_the_next_recovery_completes_each_episode_once(
     make_episode: Maker, tmp_path: Path, then: int
 ) -> None:
     def begun(folder: Path) -> Path:
@@ -220,7 +224,7 @@ def not_a_state(make_episode: Maker, folder: Path) -> None:
     changed(left(make_episode(), folder, id="0"), "layout", lambda text: text.replace(b"<f4", b"<f8"))
 
 
-def of_a_camera_that_is_not_there(make_episode: Maker, folder: Path) -> None:
+def of_a_missing_camera(make_episode: Maker, folder: Path) -> None:
     path = left(make_episode(), folder, id="0")
     changed(path, "acted", lambda text: text, more=JournalEntry("camera/7", 0, bytes(28)))
 
@@ -236,7 +240,7 @@ def of_another_version(make_episode: Maker, folder: Path) -> None:
 def changed(
     path: Path, kind: str, change: Callable[[bytes], bytes], more: JournalEntry | None = None
 ) -> None:
-    """Write the journal again with another value of the entries of a kind, and one entry `more` before the last row."""
+    """Rewrite the journal with changed values of the entries of a kind, and one entry `more` before the last row."""
     entries = entries_of(path)
     path.unlink()
     journal = Journal(path)
@@ -251,9 +255,9 @@ def changed(
 
 @pytest.mark.parametrize(
     "broken",
-    [refused_by_rerun, not_a_state, of_a_camera_that_is_not_there, of_another_version],
+    [refused_by_rerun, not_a_state, of_a_missing_camera, of_another_version],
 )
-def test_one_that_cannot_be_an_episode_is_told_and_kept_and_the_others_are_made(
+def test_an_unrecoverable_journal_is_reported_and_kept_and_the_others_are_recovered(
     make_episode: Maker, tmp_path: Path, broken: Callable[[Maker, Path], None]
 ) -> None:
     broken(make_episode, tmp_path)

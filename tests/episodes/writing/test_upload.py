@@ -1,4 +1,4 @@
-"""Episodes that go to another place when they are over: whole ones only, each once, and no file stays here."""
+"""Episodes that are uploaded when they end: complete ones only, each once, and no local file stays."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from workbench.task.description import TaskOptions
 
 @pytest.fixture(scope="module")
 def bucket() -> Iterator[str]:
-    """An empty place of an S3 server on the loopback address."""
+    """Address of an empty prefix on an S3 server on the loopback address."""
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
@@ -58,7 +58,7 @@ def names(address: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_episodes_end_up_there_and_not_here(bucket: str, tmp_path: Path) -> None:
+def test_episodes_are_uploaded_and_not_kept_locally(bucket: str, tmp_path: Path) -> None:
     done = record(asked(tmp_path / "out", bucket, episodes=3))
     assert [one.address.partition("pushed/")[0] for one in done.written] == ["s3://demos/"] * 3
     stems = [one.path.stem for one in done.written]
@@ -83,7 +83,7 @@ class LateEnv(PushCubeEnv):
 """
 
 
-def test_a_later_success_that_came_first_is_removed_there_too(tmp_path: Path) -> None:
+def test_a_later_success_that_finished_first_is_removed_from_the_upload_too(tmp_path: Path) -> None:
     place, file = (tmp_path / "there").as_uri(), tmp_path / "late.py"
     file.write_text(FIRST_IS_LATE)
     (kept,) = record(replace(asked(tmp_path / "out", place, successes=1), task=str(file))).written
@@ -91,7 +91,7 @@ def test_a_later_success_that_came_first_is_removed_there_too(tmp_path: Path) ->
     assert names(place) == sorted(f"{kept.path.stem}{suffix}" for suffix in (".rrd", ".h5", ".json"))
 
 
-def test_what_another_worker_has_left_is_replaced(tmp_path: Path) -> None:
+def test_an_upload_left_by_a_dead_worker_is_replaced(tmp_path: Path) -> None:
     place = (tmp_path / "there").as_uri()
     what, run = asked(tmp_path / "out", place, episodes=2), uuid.uuid4().hex
     first = record(what, run=run)
@@ -100,7 +100,7 @@ def test_what_another_worker_has_left_is_replaced(tmp_path: Path) -> None:
         elsewhere = False
 
         def run(self, work: Work, scheduler: Scheduler) -> None:
-            # As where the first worker died before it said that the first episode is there.
+            # As if the first worker had died before it reported the first episode.
             scheduler.go_on({1: first.written[1]}, lambda number, written: None)
             ThisProcess().run(work, scheduler)
 
@@ -119,13 +119,13 @@ def _files(folder: Path) -> EpisodeFiles:
     return EpisodeFiles(rrd, h5, json_file, None, {})
 
 
-def test_the_json_is_the_last_so_half_an_upload_is_no_episode(tmp_path: Path) -> None:
+def test_the_json_is_uploaded_last_so_a_partial_upload_is_no_episode(tmp_path: Path) -> None:
     files, place = _files(tmp_path), tmp_path / "there"
     place.mkdir()
-    (place / files.h5.name).mkdir()  # cannot be written over
+    (place / files.h5.name).mkdir()  # a folder cannot be overwritten by a file
     with pytest.raises(RecordingError, match=r"Cannot upload Task_seed0001.*to file://"):
         upload_episode(files, place.as_uri())
-    assert not (place / files.json.name).exists() and files.json.exists(), "and nothing is lost here"
+    assert not (place / files.json.name).exists() and files.json.exists(), "the local file must not be lost"
 
 
 def test_only_the_episode_with_that_id_is_removed(tmp_path: Path) -> None:

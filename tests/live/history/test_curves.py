@@ -1,4 +1,4 @@
-"""The rows of numbers that curves and the strip under the slider are drawn from."""
+"""The data of the curves and of the strip under the slider."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_step_is_a_point_of_each_env_and_of_the_mean() -> None:
     assert line(steps.curves(2), SUCCESS)[1] == [0, 1, 0]
 
 
-def test_curves_that_were_taken_do_not_change() -> None:
+def test_a_later_step_does_not_change_curves_that_were_read() -> None:
     steps = StepCurves(N)
     steps.add(step(1, reach=[1, 1, 1]))
     curves = steps.curves(0)
@@ -76,7 +76,7 @@ INFINITE_AT_THE_END[:, -1] = np.inf
 @given(NUMBERS)
 @example(INFINITE_AT_THE_END)
 @settings(max_examples=15)
-def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
+def test_the_whole_run_fits_bounded_memory_and_keeps_each_peak_at_its_step(
     rewards: NDArray[np.float32],
 ) -> None:
     steps = StepCurves(2)
@@ -102,7 +102,7 @@ def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
     assert np.isnan(one).any() == lost.any()
 
 
-def test_entries_terms_and_joints_have_columns_by_their_names() -> None:
+def test_entries_terms_and_joints_are_columns_named_after_them() -> None:
     steps = StepCurves(N, joints=("hinge", "slide"))
     entries = {
         "height": np.arange(3.0),
@@ -128,7 +128,7 @@ def test_entries_terms_and_joints_have_columns_by_their_names() -> None:
     assert line(curves, Column(Group.EVALUATE, "mean"))[1] == [0.5]
 
 
-def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
+def test_a_value_that_is_not_one_number_per_env_has_no_curve_and_is_listed() -> None:
     steps = StepCurves(N)
     result = step(1, reach=[1, 2, 3], both=[[1, 2]] * N)
     mean, note = OtherEntry("float", numbers=np.array(0.5)), OtherEntry("str", ("none",))
@@ -144,7 +144,7 @@ def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
     assert steps.curves(0).no_curve == ()
 
 
-def test_columns_are_bounded_and_those_that_a_version_has_dropped_make_room() -> None:
+def test_columns_are_limited_and_dropped_ones_make_room() -> None:
     steps = StepCurves(N)
     steps.add(step(1, **{f"term{i}": [0] * N for i in range(MAX_COLUMNS + 5)}))
     kept = steps.curves(0).columns
@@ -154,7 +154,7 @@ def test_columns_are_bounded_and_those_that_a_version_has_dropped_make_room() ->
     assert line(steps.curves(0), REWARD) == ([1, 2], [1, 2])
 
 
-def test_rows_that_are_wanted_stay_with_their_numbers_and_a_missing_value_is_none() -> None:
+def test_requested_rows_keep_their_step_numbers_and_a_missing_value_is_nan() -> None:
     columns = Columns(2, first=50)
     for number in range(50, 5050):
         values = {"a": np.array([number, -number])}
@@ -167,5 +167,7 @@ def test_rows_that_are_wanted_stay_with_their_numbers_and_a_missing_value_is_non
         columns.between("c", 4400, 4402).shape == (3, 2) and np.isnan(columns.between("c", 4400, 4402)).all()
     )
     columns.write(5049, 4400, {"a": np.zeros(2)})
-    assert columns.between("a", 5048, 5049).tolist() == [[5048, -5048], [0, 0]], "the newest is written again"
+    assert columns.between("a", 5048, 5049).tolist() == [[5048, -5048], [0, 0]], (
+        "the newest row is overwritten"
+    )
     assert columns.between("a", 5049, 5048).shape == (0, 2)

@@ -1,4 +1,4 @@
-"""The table of envs against a plain reference that follows one env at a time."""
+"""The table of envs against a simple reference implementation for one env."""
 
 # The views are of a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false
@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.drive.session import Told, told_session
+from tests.drive.session import FakeWorkerSession, fake_worker_session
 from workbench.envs.outliers import OutlierKind
 from workbench.live.events import MomentShown
 from workbench.live.history.env_table import KEPT_REWARDS, Outcome
@@ -26,7 +26,7 @@ N = 3
 
 @dataclass
 class Episode:
-    """One env's episode, as one would follow it by hand."""
+    """One env's episode, tracked in the simplest way."""
 
     steps: int = 0
     rewards: list[float] = field(default_factory=list)
@@ -66,13 +66,13 @@ event = st.one_of(
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Told]:
-    with told_session(tmp_path_factory.mktemp("recordings")) as told:
-        yield told
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeWorkerSession]:
+    with fake_worker_session(tmp_path_factory.mktemp("recordings")) as fake:
+        yield fake
 
 
-def told_as(entries: list[dict[str, bool]]) -> dict[str, Any]:
-    """How a worker tells of these."""
+def entries_in_event(entries: list[dict[str, bool]]) -> dict[str, Any]:
+    """`evaluate` entries in a worker's event."""
     values = {name: np.array([entry[name] for entry in entries]) for name in entries[0]}
     found: dict[str, Any] = {"evaluate": {**values, "distance": np.zeros(N, np.float32)}}
     return found | {name: tuple(np.flatnonzero(values[name])) for name in ("success", "fail")}
@@ -80,8 +80,8 @@ def told_as(entries: list[dict[str, bool]]) -> dict[str, Any]:
 
 @settings(max_examples=40)
 @given(events=st.lists(event, max_size=25))
-def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(
-    shared: Told, events: list[tuple]
+def test_rows_equal_the_reference_for_each_env_and_in_the_past(
+    shared: FakeWorkerSession, events: list[tuple]
 ) -> None:
     session = shared.session
     shared.load("rebuilt")
@@ -110,7 +110,7 @@ def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(
                     last[env] = episodes[env]
                 episodes[env] = Episode()
                 episodes[env].see(entries[env])
-            shared.reset(np.flatnonzero(first).tolist(), **told_as(entries))
+            shared.reset(np.flatnonzero(first).tolist(), **entries_in_event(entries))
         else:
             tick += 1
             for env, episode in enumerate(episodes):
@@ -122,7 +122,7 @@ def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(
                 for name, flag in (("success", SUCCESS), ("fail", FAIL)):
                     if episode.first.get(name) == episode.steps:
                         flags[env][tick] = flags[env].get(tick, 0) | flag
-            shared.step(reward=first, truncated=tuple(np.flatnonzero(limits)), **told_as(entries))
+            shared.step(reward=first, truncated=tuple(np.flatnonzero(limits)), **entries_in_event(entries))
         seen.append(deepcopy((episodes, last)))
 
     assert session.view().curves.serial == tick
@@ -155,8 +155,8 @@ def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(
     session.happen(MomentShown(None))
 
 
-def test_an_env_that_was_put_back_nobody_knows_where_from_does_not_claim_to_know_its_return(
-    played: Told,
+def test_an_env_restored_from_an_unknown_moment_has_no_return(
+    played: FakeWorkerSession,
 ) -> None:
     played.back((0,), (0,), -7)
     rows = played.session.env_rows()
@@ -168,10 +168,10 @@ def test_an_env_that_was_put_back_nobody_knows_where_from_does_not_claim_to_know
     played.reset((0,))
     played.step()
     rows = played.session.env_rows()
-    assert rows.total.tolist() == [1, 10, 10] and rows.followed.all(), "a reset is followed again"
+    assert rows.total.tolist() == [1, 10, 10] and rows.followed.all(), "a reset makes it known again"
 
 
-def test_a_worker_that_comes_back_at_the_same_moment_begins_no_episode(played: Told) -> None:
+def test_a_worker_that_resumes_at_the_same_moment_starts_no_episode(played: FakeWorkerSession) -> None:
     taken = played.session.env_rows()
     before = np.copy(taken.total), np.copy(taken.rewards)
     played.resume()
@@ -184,79 +184,79 @@ def test_a_worker_that_comes_back_at_the_same_moment_begins_no_episode(played: T
     np.testing.assert_array_equal(before[1], taken.rewards)
 
 
-def test_the_rewards_of_a_long_episode_that_was_gone_back_in_are_its_newest(told: Told) -> None:
-    told.play(KEPT_REWARDS + 50)
-    assert told.session.env_rows().rewards[1].tolist() == [*range(51, KEPT_REWARDS + 51)]
-    told.back((0,), (0,), 119)
-    told.step()
-    assert told.session.env_rows().rewards[0].tolist() == [*range(21, 121)]
+def test_after_going_back_in_a_long_episode_its_newest_rewards_are_kept(fake: FakeWorkerSession) -> None:
+    fake.play(KEPT_REWARDS + 50)
+    assert fake.session.env_rows().rewards[1].tolist() == [*range(51, KEPT_REWARDS + 51)]
+    fake.back((0,), (0,), 119)
+    fake.step()
+    assert fake.session.env_rows().rewards[0].tolist() == [*range(21, 121)]
 
 
-def test_a_success_that_is_no_bool_counts_and_other_numbers_do_not(told: Told) -> None:
-    told.play(0)
+def test_a_numeric_success_counts_and_other_numbers_do_not(fake: FakeWorkerSession) -> None:
+    fake.play(0)
     numbers = {
         "success": np.array([[0.0], [1.0], [0.0]]),
         "distance": np.ones(N),
         "each": np.ones((N, 2), bool),
     }
-    told.step(success=(1,), evaluate=numbers)
-    rows = told.session.env_rows()
+    fake.step(success=(1,), evaluate=numbers)
+    rows = fake.session.env_rows()
     assert rows.first_true["success"].tolist() == [-1, 1, -1] and not {"distance", "each"} & {*rows.first}
     assert rows.outcome.tolist() == [Outcome.RUNNING, Outcome.SUCCESS, Outcome.RUNNING]
 
 
-# --- what is odd -------------------------------------------------------------------------------------------
+# --- outliers -------------------------------------------------------------------------------------------
 
 
-def odd_steps(told: Told) -> dict[int, list[int]]:
-    return {env: [o.step for o in seen] for env, seen in told.session.env_rows().outliers.items()}
+def outlier_steps(fake: FakeWorkerSession) -> dict[int, list[int]]:
+    return {env: [o.step for o in seen] for env, seen in fake.session.env_rows().outliers.items()}
 
 
-def test_what_was_odd_goes_with_the_moment_that_an_env_is_put_to_and_stays_of_an_episode_that_is_left(
-    told: Told,
+def test_an_env_takes_over_the_outliers_of_the_moment_it_goes_back_to_and_a_left_episode_keeps_its_own(
+    fake: FakeWorkerSession,
 ) -> None:
     def lost(*envs: int) -> list[float]:
         return [np.nan if env in envs else 1.0 for env in range(N)]
 
-    told.play(1)
+    fake.play(1)
     for _ in range(2):
-        told.step(reward=lost(1))  # moments 2 and 3
-    # Env 0 goes on from env 1's second step, env 1 from its own first, which was well.
-    told.back((0, 1), (1, 1), 2)
-    assert odd_steps(told) == {0: [2], 1: [2]}, "once"
-    told.back((1,), (1,), 1)
-    assert odd_steps(told) == {0: [2]}
-    told.step(reward=lost(0, 1))
-    assert odd_steps(told) == {0: [2], 1: [2]}, "once for env 0, and anew for env 1"
-    told.reset((0, 1))
-    rows = told.session.env_rows()
+        fake.step(reward=lost(1))  # moments 2 and 3
+    # Env 0 continues from env 1's second step, env 1 from its own first, which has no outlier.
+    fake.back((0, 1), (1, 1), 2)
+    assert outlier_steps(fake) == {0: [2], 1: [2]}, "once"
+    fake.back((1,), (1,), 1)
+    assert outlier_steps(fake) == {0: [2]}
+    fake.step(reward=lost(0, 1))
+    assert outlier_steps(fake) == {0: [2], 1: [2]}, "once for env 0, and again for env 1"
+    fake.reset((0, 1))
+    rows = fake.session.env_rows()
     assert rows.outliers == {} and {
         env: [o.step for o in seen] for env, seen in rows.last.outliers.items()
     } == {0: [2], 1: [2]}
     assert rows.last.outcome.tolist() == [Outcome.RUNNING] * N and rows.ended.tolist() == [0] * N
-    told.step(reward=lost())
-    told.reset((0,))
-    assert [*told.session.env_rows().last.outliers] == [0, 1], "one that was well and is left is none"
+    fake.step(reward=lost())
+    fake.reset((0,))
+    assert [*fake.session.env_rows().last.outliers] == [0, 1], "a left episode without outliers is not listed"
 
 
-def test_a_rule_that_is_off_flags_no_env_and_one_that_is_on_is_a_finding(told: Told) -> None:
-    rules = told_rules(told)
-    told.load("rebuilt", outlier_rules={"reward-finite": rules["reward-finite"]})
-    told.reset()
+def test_a_disabled_rule_flags_no_env_and_an_enabled_one_is_a_finding(fake: FakeWorkerSession) -> None:
+    rules = rules_of(fake)
+    fake.load("rebuilt", outlier_rules={"reward-finite": rules["reward-finite"]})
+    fake.reset()
     for _ in range(2):
-        told.step(reward=(0, np.nan, np.nan))
-    outliers = told.session.env_rows().outliers
+        fake.step(reward=(0, np.nan, np.nan))
+    outliers = fake.session.env_rows().outliers
     assert {env: [o.kind for o in seen] for env, seen in outliers.items()} == {
         1: [OutlierKind.REWARD_NOT_FINITE],
         2: [OutlierKind.REWARD_NOT_FINITE],
     }
-    (found,) = told.view.odd
+    (found,) = fake.view.odd
     assert (found.rule, found.count, found.first_step) == ("reward-finite", 4, 0)
     assert "env 1" in found.message and "step 1" in found.message
-    told.load("patched", source_hash="b", outlier_rules={})
-    assert told.view.odd == () and len(told.session.env_rows().outliers) == 2
+    fake.load("patched", source_hash="b", outlier_rules={})
+    assert fake.view.odd == () and len(fake.session.env_rows().outliers) == 2
 
 
-def told_rules(told: Told) -> dict[str, Any]:
-    told.load()
-    return dict(told.view.task.outlier_rules)
+def rules_of(fake: FakeWorkerSession) -> dict[str, Any]:
+    fake.load()
+    return dict(fake.view.task.outlier_rules)

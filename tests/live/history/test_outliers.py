@@ -1,4 +1,4 @@
-"""Every kind of outlier, provoked in a real task by a real worker; and the quiet of a task that is well."""
+"""Each kind of outlier, provoked in a real task by a real worker; a correct task has none."""
 
 # The fixture hands over a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false
@@ -98,7 +98,7 @@ def one_of_each(child_process: None, tmp_path_factory: pytest.TempPathFactory) -
         yield session
 
 
-def test_each_kind_is_found_in_the_env_that_does_it_and_nowhere_else(one_of_each: Session) -> None:
+def test_each_kind_is_found_only_in_the_env_that_causes_it(one_of_each: Session) -> None:
     found = {env: {o.kind for o in outliers} for env, outliers in one_of_each.env_rows().outliers.items()}
     assert found == {
         1: {OutlierKind.FAST},
@@ -111,7 +111,7 @@ def test_each_kind_is_found_in_the_env_that_does_it_and_nowhere_else(one_of_each
     }
 
 
-def test_each_is_a_finding_of_its_rule_at_the_hook(one_of_each: Session) -> None:
+def test_each_outlier_is_a_finding_of_its_rule_at_the_hook(one_of_each: Session) -> None:
     found = {finding.rule: finding for finding in one_of_each.view().odd}
     assert found.keys() == OUTLIER_RULES.keys()
     assert found["entries-finite"].code == "def evaluate(self):" and found["entries-finite"].degree == "warn"
@@ -119,7 +119,7 @@ def test_each_is_a_finding_of_its_rule_at_the_hook(one_of_each: Session) -> None
     assert found["reward-finite"].message == "the reward is NaN, in env 6 at step 1 of its episode"
 
 
-def test_outliers_of_an_episode_are_those_of_the_last_one_after_a_reset(one_of_each: Session) -> None:
+def test_after_a_reset_the_last_episode_has_the_outliers(one_of_each: Session) -> None:
     before = one_of_each.env_rows()
     one_of_each.happen(EnvsReset((2,)))
     wait_until(one_of_each, lambda v: v.step.elapsed_steps[2] == 0, "the reset")

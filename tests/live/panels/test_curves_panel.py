@@ -1,4 +1,4 @@
-"""The curves of the Reward tab: which are drawn, of which env, and what a click on one asks for."""
+"""The curves of the Reward tab: which ones, of which env, and what a click does."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def reward(length: int, num_envs: int, env: int) -> list[float]:
 
 
 def seen(length: int, num_envs: int, env: int = 0, past: int | None = None, **entries: Any) -> SessionView:
-    """A view after so many steps; `past` is the step that is shown, if not the last."""
+    """A view after `length` steps; `past` is the shown step, if not the last."""
     view = running(num_envs, curves=curves(length, num_envs, env, **entries), selected_env=env)
     shown = step(length if past is None else past, num_envs)
     timeline = TimelineView(0, length, past, tick=length if past is None else past)
@@ -65,7 +65,7 @@ def test_selected_env_against_the_mean(live: Live) -> None:
 
 
 @pytest.mark.thorough
-def test_all_steps_are_sent_in_few_points(live: Live) -> None:
+def test_a_long_run_is_sent_as_few_points(live: Live) -> None:
     live.show(seen(3000, 2))
     for chart in live.part("Reward").charts():
         assert {len(values) for values in chart.data} == {len(chart.data[0])} and len(chart.data[0]) < 1000
@@ -82,7 +82,7 @@ def test_other_env_shows_its_own_past(live: Live) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("length", [50, 3000])
-def test_a_moment_that_is_shown_is_a_dot_on_the_selected_envs_line(live: Live, length: int) -> None:
+def test_the_shown_moment_is_a_dot_on_the_selected_envs_line(live: Live, length: int) -> None:
     live.show(seen(length, 4, env=3, past=17))
     drawn = live.part("Reward").charts()
     assert [chart.title for chart in drawn] == ["reward", "success"]
@@ -111,7 +111,7 @@ def test_each_part_of_the_reward_has_a_line_of_the_selected_env(live: Live) -> N
     ).html().replace("<b>⚑", "")
 
 
-def test_any_entry_and_joint_can_be_chosen_and_the_choice_is_kept_for_the_task(live: Live) -> None:
+def test_any_entry_or_joint_can_be_chosen_and_the_choice_is_kept_per_task(live: Live) -> None:
     entries = {"height": np.array([0.1, 0.2]), "at": np.ones((2, 3)), "touches": np.array([True, False])}
     view = seen(3, 2, env=1, **entries)
     live.show(view)
@@ -141,7 +141,7 @@ def test_any_entry_and_joint_can_be_chosen_and_the_choice_is_kept_for_the_task(l
     ]
 
 
-def test_a_click_on_a_curve_asks_for_its_step_and_one_that_is_forgotten_is_named(live: Live) -> None:
+def test_a_click_on_a_curve_seeks_its_step_and_a_dropped_step_is_refused(live: Live) -> None:
     view = seen(50, 2)
     live.show(view)
     live.do(SeekOnCurve(step=7))
@@ -149,14 +149,14 @@ def test_a_click_on_a_curve_asks_for_its_step_and_one_that_is_forgotten_is_named
     kept = TimelineView(30, 50, 30, tick=31)
     live.show(replace(view, timeline=kept))
     assert (
-        "Step 7 is no longer in memory: the oldest that is, step 31, is shown" in live.part("Reward").html()
+        "Step 7 is no longer in memory: step 31 is shown, the oldest one there" in live.part("Reward").html()
     )
     live.do(SeekOnCurve(step=40))
     live.show(replace(view, timeline=replace(kept, shown=39, tick=40)))
     assert "no longer in memory" not in live.part("Reward").html()
 
 
-def test_without_a_past_nothing_is_drawn(live: Live) -> None:
+def test_no_curve_is_drawn_without_a_past(live: Live) -> None:
     live.show(running(4, curves=None))
     live.show(seen(1, 4))
     assert (

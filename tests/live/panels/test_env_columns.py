@@ -1,4 +1,4 @@
-"""Which columns of the table of envs are left out where its panel is narrow."""
+"""Which columns the table of envs omits in a narrow panel."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ COLUMNS = [
 ]
 
 
-def test_columns_are_left_out_by_rank_and_those_without_a_rank_stay() -> None:
+def test_columns_are_omitted_by_rank_and_those_without_a_rank_stay() -> None:
     found = levels(COLUMNS)
     assert [level.columns for level in found if level.columns] == [(4,), (3,)]
     assert found[-1].names == ("flags", "is_obj_placed")
 
 
-def test_the_narrower_the_panel_the_more_is_left_out_and_a_wide_one_shows_all() -> None:
+def test_a_narrower_panel_omits_more_columns_and_a_wide_one_shows_all() -> None:
     limits = [level.below for level in levels(COLUMNS)]
     assert limits == sorted(limits, reverse=True) and len(set(limits)) == len(limits)
     assert limits[0] <= wanted_width(COLUMNS)

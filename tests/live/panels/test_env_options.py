@@ -1,4 +1,4 @@
-"""The form of how the envs are made: what is shown, refused and applied, and the command line."""
+"""The form of the env options: what it shows, refuses and applies, and the command line."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MADE = HowMade("panda", (ROBOT, CONTROL), OWN)
 
 
 class Form:
-    """The form of a session that says what is told here."""
+    """The form on a session that reports the values set here."""
 
     def __init__(self, panels: Panels, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
         self.panels, self.applied = panels, list[TaskOptions]()
@@ -75,7 +75,7 @@ def form(panels: Panels, scripted_session: Callable[..., Session], monkeypatch: 
     return Form(panels, scripted_session(4), monkeypatch)
 
 
-def test_each_keyword_has_the_input_of_its_type_and_shows_what_is_in_effect(form: Form) -> None:
+def test_each_keyword_has_an_input_of_its_type_with_the_value_in_effect(form: Form) -> None:
     shown = {
         name: form.panels.field(name).value
         for name in ("Envs", "Robot", "Control", "size", "count", "flag", "name", "way", "where", "made")
@@ -97,7 +97,7 @@ def test_each_keyword_has_the_input_of_its_type_and_shows_what_is_in_effect(form
     assert form.panels.button("Apply").command is None and not form.panels.shows("Discard", "button")
 
 
-def test_only_what_was_changed_is_given_and_all_at_once(form: Form) -> None:
+def test_only_changed_options_are_applied_all_at_once(form: Form) -> None:
     form.set("Envs", 8)
     form.set("size", 0.001)
     form.set("flag", False)
@@ -111,17 +111,19 @@ def test_only_what_was_changed_is_given_and_all_at_once(form: Form) -> None:
 
 
 @pytest.mark.parametrize(("text", "why"), [("{", "where takes a value in JSON"), ("NaN", "where takes")])
-def test_a_value_that_is_none_is_refused_in_words(form: Form, text: str, why: str) -> None:
+def test_an_invalid_value_is_refused_with_a_reason(form: Form, text: str, why: str) -> None:
     form.set("where", text)
     form.press("Apply")
     assert form.applied == [] and why in form.panels.client.notices[-1]
-    assert form.panels.field("where").value == text, "to be mended"
+    assert form.panels.field("where").value == text, "the text stays, to be corrected"
 
 
 @pytest.mark.parametrize(
     ("name", "value"), [("made", "1"), ("nothing_like_it", 1), ("name", "a\0b"), ("where", "x" * 2001)]
 )
-def test_what_no_input_takes_is_refused_and_the_form_stays(form: Form, name: str, value: Any) -> None:
+def test_a_value_that_no_input_accepts_is_refused_and_the_form_stays(
+    form: Form, name: str, value: Any
+) -> None:
     before = form.panels.everything()
     fields = {"name": name, "value": value}
     with pytest.raises(Refused):
@@ -130,7 +132,7 @@ def test_what_no_input_takes_is_refused_and_the_form_stays(form: Form, name: str
     assert form.panels.everything() == before
 
 
-def test_whole_numbers_stay_whole_and_a_value_of_another_type_is_refused_in_words(form: Form) -> None:
+def test_integers_stay_integers_and_another_type_is_refused_with_a_reason(form: Form) -> None:
     form.set("count", 5)
     form.set("size", 2)
     form.press("Apply")
@@ -141,7 +143,7 @@ def test_whole_numbers_stay_whole_and_a_value_of_another_type_is_refused_in_word
     assert form.panels.client.notices == ["count takes a whole number; got '2.5'."]
 
 
-def test_what_is_typed_survives_a_save_and_goes_with_discard(form: Form) -> None:
+def test_typed_values_survive_a_save_and_are_dropped_by_discard(form: Form) -> None:
     form.set("size", 0.5)
     form.view = replace(form.view, task_serial=9)
     form.draw()
@@ -151,7 +153,7 @@ def test_what_is_typed_survives_a_save_and_goes_with_discard(form: Form) -> None
     assert not form.panels.shows("Discard", "button")
 
 
-def test_a_number_that_is_typed_while_the_task_loads_stays(form: Form) -> None:
+def test_a_number_typed_while_the_task_loads_stays(form: Form) -> None:
     loaded = form.view
     form.view = replace(loaded, task=None, options=TaskOptions(5))
     form.draw()
@@ -161,7 +163,7 @@ def test_a_number_that_is_typed_while_the_task_loads_stays(form: Form) -> None:
     assert form.panels.field("Envs").value == 7 and form.panels.field("size").value == 0.02
 
 
-def test_refused_options_stay_in_the_form_and_discard_takes_the_problem_away(form: Form) -> None:
+def test_refused_options_stay_in_the_form_and_discard_removes_the_problem(form: Form) -> None:
     form.set("Envs", 4000)
     form.press("Apply")
     form.view = replace(form.view, options_refused=form.applied[0], state="error")
@@ -172,7 +174,7 @@ def test_refused_options_stay_in_the_form_and_discard_takes_the_problem_away(for
     assert form.panels.field("Envs").value == 4 and form.applied[-1] == TaskOptions(4)
 
 
-def test_options_that_were_taken_are_what_is_in_effect(form: Form) -> None:
+def test_accepted_options_are_shown_as_in_effect(form: Form) -> None:
     form.set("size", 0.5)
     form.press("Apply")
     assert form.view.task is not None
@@ -191,7 +193,7 @@ VALUES = st.booleans() | st.integers(-5, 5) | st.floats(-5, 5) | st.text(max_siz
 
 
 @given(st.dictionaries(st.sampled_from(["size", "count", "x"]), VALUES), VALUES)
-def test_merged_gives_what_differs_and_leaves_the_rest(given_before: dict[str, Any], value: Any) -> None:
+def test_merged_sets_what_differs_and_keeps_the_rest(given_before: dict[str, Any], value: Any) -> None:
     now = given_before.get("size", 0.02)
     keyword = replace(SIZE, kind="json", value=json.dumps(now))
     result = merged(given_before, {keyword: value})

@@ -31,7 +31,7 @@ MANY = ROWS_PER_PAGE + 6
 
 
 def many(**changes: Any) -> EnvRows:
-    """So many envs that the table has two pages; those of odd numbers have failed, the last two are flagged."""
+    """Enough envs for two pages of the table; odd ones have failed, the last two are flagged."""
     none, odd = np.zeros(MANY, np.int32), np.arange(MANY) % 2
     last = LastEpisode(np.where(odd, 2, 0).astype(np.int8), none, np.zeros(MANY), {})
     values: dict[str, Any] = {
@@ -51,7 +51,7 @@ def many(**changes: Any) -> EnvRows:
 
 
 class Table:
-    """The table on a page, with a hand on it."""
+    """The table on a page, operated by a test."""
 
     def __init__(self, live: Live) -> None:
         self.live = live
@@ -84,21 +84,23 @@ def table(live_page: Live) -> Table:
     return table
 
 
-def test_pages_filters_and_rows_are_pressed(table: Table) -> None:
+def test_pages_filters_and_rows_can_be_pressed(table: Table) -> None:
     assert table.envs() == list(range(ROWS_PER_PAGE))
     assert table.ask(TurnEnvs(by=1)) == list(range(ROWS_PER_PAGE, MANY))
     table.ask(ShowEnvAtEvent(env=MANY - 3))
-    assert table.live.asked == [SettingsChanged({"selected_env": MANY - 3})], "there is no moment to go to"
+    assert table.live.asked == [SettingsChanged({"selected_env": MANY - 3})], "there is no moment to seek"
     table.ask(ShowEnvAtEvent(env=MANY - 1))
     assert table.live.asked[1:] == [EpisodeStepShown(MANY - 1, 12)]
-    table.live.do(TurnEnvs(by=1))  # it is pressed on a page that was drawn before the last one was shown
+    table.live.do(
+        TurnEnvs(by=1)
+    )  # pressed on a page that was drawn before the last page of the table was shown
     table.live.again()
     assert table.envs() == list(range(ROWS_PER_PAGE, MANY))
     assert table.ask(FilterEnvs(which="flagged")) == [MANY - 2, MANY - 1]
     assert "&lt;b&gt;odd" in table.html and "<b>odd" not in table.html
 
 
-def test_another_filter_and_another_order_begin_on_the_first_page(table: Table) -> None:
+def test_a_new_filter_or_order_starts_on_the_first_page(table: Table) -> None:
     table.ask(TurnEnvs(by=1))
     assert table.ask(FilterEnvs(which="running")) == list(range(ROWS_PER_PAGE))
     assert table.ask(FilterEnvs(which="failed")) == list(range(1, MANY, 2))
@@ -108,15 +110,15 @@ def test_another_filter_and_another_order_begin_on_the_first_page(table: Table) 
     table.ask(TurnEnvs(by=1))
     assert table.ask(SortEnvs(column="return")) == list(range(MANY - 1, MANY - 1 - ROWS_PER_PAGE, -1))
     assert table.ask(SortEnvs(column="env")) == list(range(ROWS_PER_PAGE)), (
-        "another column begins with its smallest"
+        "a new column starts with its smallest value"
     )
 
 
-def test_a_step_is_in_the_table_a_moment_later_and_a_press_at_once(table: Table) -> None:
+def test_a_step_reaches_the_table_with_a_delay_and_a_press_at_once(table: Table) -> None:
     before = table.html
     later = many(steps=np.full(MANY, 5, np.int32))
     table.show(2, 0.0, rows=later)
-    assert table.html == before, "it was drawn a moment ago"
+    assert table.html == before, "the table was drawn a moment ago"
     table.show(2, 0.0, env=3, rows=later)
     assert "wb-selected" in table.html and table.html != before
     before = table.html
@@ -126,18 +128,18 @@ def test_a_step_is_in_the_table_a_moment_later_and_a_press_at_once(table: Table)
 
 
 @pytest.mark.parametrize("by_hand", [True, False])
-def test_the_key_opens_and_closes_the_table_whatever_opened_it(live_page: Live, by_hand: bool) -> None:
+def test_the_key_toggles_the_table_however_it_was_opened(live_page: Live, by_hand: bool) -> None:
     assert live_page.is_folded("Envs")
     live_page.do(TellUnfolded(panel=TABLE) if by_hand else ToggleTable())
     if not by_hand:
         assert not live_page.is_folded("Envs")
-        live_page.do(TellUnfolded(panel=TABLE))  # as a page says it then
+        live_page.do(TellUnfolded(panel=TABLE))  # the message of a page
     for folded in (True, False, True):
         live_page.do(ToggleTable())
         assert live_page.is_folded("Envs") == folded
 
 
-def test_a_folded_table_is_not_drawn_while_steps_go_on(table: Table) -> None:
+def test_a_folded_table_is_not_redrawn_on_steps(table: Table) -> None:
     def stepped(number: int) -> str:
         table.show(number, rows=many(steps=np.full(MANY, number, np.int32)))
         return table.html
@@ -148,10 +150,10 @@ def test_a_folded_table_is_not_drawn_while_steps_go_on(table: Table) -> None:
     folded = stepped(6)
     assert stepped(7) == folded
     table.live.do(ToggleTable())
-    assert stepped(7) != folded, "unfolded it shows what is now"
+    assert stepped(7) != folded, "unfolded it shows the current state"
 
 
-def test_keys_go_round_the_envs_that_failed_and_that_are_flagged(table: Table) -> None:
+def test_keys_cycle_through_failed_and_through_flagged_envs(table: Table) -> None:
     def after(env: int, command: Command) -> int:
         table.live.asked.clear()
         table.show(env=env)
@@ -167,7 +169,7 @@ def test_keys_go_round_the_envs_that_failed_and_that_are_flagged(table: Table) -
     ]
 
 
-def test_a_press_on_an_env_that_a_smaller_version_lacks_is_refused(table: Table) -> None:
+def test_a_press_on_an_env_that_no_longer_exists_is_refused(table: Table) -> None:
     table.show()
     table.live.session.rows = rows_of()
     table.live.part("Envs").ask(ShowEnvAtEvent(env=40))

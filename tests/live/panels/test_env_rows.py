@@ -60,7 +60,7 @@ def test_any_returns_are_sorted_and_none_is_lost(totals: list[float], descending
     assert known.tolist() == sorted(known, reverse=descending)
 
 
-def test_cells_say_how_an_env_stands() -> None:
+def test_cells_show_the_state_of_an_env() -> None:
     rows = rows_of()
     assert entry_names(rows) == ("success", "near")
     running, solved, _, cut, after, odd = cells_of(rows, np.arange(6))
@@ -73,12 +73,12 @@ def test_cells_say_how_an_env_stands() -> None:
     assert odd.flags == ("bodies-stay: cube dropped 0.90 m (step 12)",) and odd.first_true == ("", "0")
 
 
-def test_the_moment_of_an_env_is_its_first_outlier_else_its_end() -> None:
+def test_the_moment_of_an_env_is_its_first_outlier_or_its_end() -> None:
     rows = rows_of()
     assert [moment_of(rows, env) for env in range(6)] == [None, 33, 20, 50, None, 12]
 
 
-def test_small_curves_share_one_scale_and_stay_in_their_box() -> None:
+def test_sparklines_share_one_scale_and_stay_in_their_box() -> None:
     lowest, *_, highest = (row.curve for row in cells_of(rows_of(), np.arange(6)))
     points = [[float(n) for n in point.split(",")] for line in (*lowest, *highest) for point in line.split()]
     assert len(points) == 6
@@ -86,12 +86,12 @@ def test_small_curves_share_one_scale_and_stay_in_their_box() -> None:
     assert all(0 <= x <= 60 and 1 <= y <= 13 for x, y in points)
 
 
-def test_a_reward_that_is_not_a_number_leaves_a_gap_and_no_reward_no_curve() -> None:
+def test_a_nan_reward_leaves_a_gap_and_no_reward_draws_no_curve() -> None:
     rewards = rows_of().rewards.copy()
     rewards[0, -2] = np.nan
     rewards[1, -1] = np.inf
     first, second, *_ = cells_of(rows_of(rewards=rewards), np.arange(6))
-    # Ends of one point each, drawn as a dot; and a line of the two that are left.
+    # Single points at the ends, drawn as dots; and a line of the two points between.
     assert len(first.curve) == 2 and all(len(set(line.split())) == 1 for line in first.curve)
     assert len(second.curve) == 1 and len(set(second.curve[0].split())) == 2
     nothing = rows_of(rewards=np.full((6, KEPT_REWARDS), np.nan, np.float32))

@@ -37,7 +37,7 @@ JOINTS = JointReadings(
 )
 
 
-def test_joints_stand_between_their_limits() -> None:
+def test_joints_are_shown_between_their_limits() -> None:
     turn, free, slide = (SimpleNamespace(**row) for row in joint_rows(JOINTS))
     assert (turn.place, turn.target_place, turn.at_limit) == (75.0, 50.0, False)
     assert turn.limits == "-1.000 to 1.000 rad"
@@ -57,7 +57,7 @@ PRESSED = Touching(
 )
 
 
-def test_a_contact_is_told_in_newtons_with_its_place() -> None:
+def test_a_contact_is_shown_in_newtons_with_its_position() -> None:
     html = inspect_html("contacts", running(1), Inspection(0, 5, contacts=(PRESSED,)), None)
     for words in (
         "<b>cube</b> ← &lt;i&gt;table&lt;/i&gt;",
@@ -71,7 +71,7 @@ def test_a_contact_is_told_in_newtons_with_its_place() -> None:
     assert "<br>at ; 0 points<" in html
 
 
-def test_arrows_start_at_the_points_and_are_bounded() -> None:
+def test_arrows_start_at_the_contact_points_and_are_limited() -> None:
     hard = Touching(
         ("a", "b"), PRESSED.force, PRESSED.impulse, np.ones((1, 3), np.float32), np.array([[1e6, 0, 0]]), 0.0
     )
@@ -84,7 +84,7 @@ def test_arrows_start_at_the_points_and_are_bounded() -> None:
     assert arrows_of(Inspection(0, 0)).shape == (0, 2, 3)
 
 
-def test_a_pose_is_copied_as_python_that_makes_it_again() -> None:
+def test_a_pose_is_copied_as_python_that_recreates_it() -> None:
     poses = np.array([[0.1, -2, 0, 1, 0, 0, 0], [np.nan] * 7], np.float32)
     [row] = pose_rows(("cube", "absent"), poses)
     assert row["code"] == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
@@ -118,7 +118,7 @@ def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str)
         assert choice == "poses" or expected[choice] not in other
 
 
-def test_what_changed_since_the_reading_before_is_marked_of_the_same_env_alone(live_page: Live) -> None:
+def test_changes_since_the_last_reading_of_the_same_env_are_marked(live_page: Live) -> None:
     inspect = live_page.part("Inspect")
     inspect.set("Show", "state")
 
@@ -134,7 +134,7 @@ def test_what_changed_since_the_reading_before_is_marked_of_the_same_env_alone(l
     ] == [0, 1, 0, 0, 1, 0]
 
 
-def test_only_what_is_chosen_is_read_and_contacts_for_the_arrows(live_page: Live) -> None:
+def test_only_chosen_quantities_are_read_and_contacts_for_the_arrows(live_page: Live) -> None:
     def chosen() -> tuple[str, ...]:
         return live_page.asked[-1].sections
 

@@ -36,7 +36,7 @@ LINES = (
 )
 
 
-def test_the_filter_takes_text_in_any_case_or_a_stream() -> None:
+def test_the_filter_matches_text_in_any_case_or_a_stream() -> None:
     def kept(wanted: str) -> list[str]:
         html = log_html(Printed(1, LINES, 0), wanted)
         return [line.text for line in LINES if f">{line.text}<" in html]
@@ -47,14 +47,14 @@ def test_the_filter_takes_text_in_any_case_or_a_stream() -> None:
     assert kept("nothing like it") == []
 
 
-def test_a_flood_is_shown_by_its_end_and_its_number() -> None:
+def test_a_flood_is_shown_as_its_last_lines_and_a_count() -> None:
     lines = tuple(PrintedLine("stdout", f"line {i}.") for i in range(1000))
     html = log_html(Printed(1, lines, 1234567), "")
     assert html.count('title="stdout"') == LINES_SHOWN and "line 999." in html and "line 0." not in html
     assert "1 234 567 more" in html and "lines. <" in html
 
 
-def test_held_still_it_waits_and_cleared_it_does_not(live_page: Live) -> None:
+def test_a_paused_log_does_not_update_and_a_cleared_one_does(live_page: Live) -> None:
     log = live_page.part("Log")
 
     def drawn(printed: Printed) -> str:
@@ -72,7 +72,7 @@ def test_held_still_it_waits_and_cleared_it_does_not(live_page: Live) -> None:
     log.set("Pause", True)
     assert "Warning" not in drawn(Printed(3, LINES[:2], 0))
     log.type("Filter", "Warn")
-    assert "Warning" in drawn(Printed(3, LINES[:2], 0)), "the filter is of what stands there"
+    assert "Warning" in drawn(Printed(3, LINES[:2], 0)), "the filter applies to the lines on the page"
     assert "data-field" in log.html()
     log.press("Clear")
     drawn(Printed(4, (), 0))
@@ -94,7 +94,7 @@ def shown(*raw: bytes) -> str:
     return log_html(log.view(), "")
 
 
-def test_colours_become_spans_and_all_else_is_shown() -> None:
+def test_colours_become_spans_and_all_other_text_is_shown() -> None:
     html = shown(b"\x1b[1;31mred\x1b[0m plain \x1b[38;2;10;20;30mown\x1b[0m \x1b]0;title\x07\n")
     assert '<span class="wb-ansi-bold wb-ansi-1">red</span> plain ' in html
     assert 'class="wb-ansi-rgb" style="--on-light:#0a141e;--on-dark:#' in html
@@ -130,7 +130,7 @@ def test_the_sixteen_colours_of_the_page_can_be_read(scheme: str, page: tuple[in
         bgcolor=st.one_of(st.builds(Color.from_ansi, BYTE), st.builds(Color.from_rgb, BYTE, BYTE, BYTE)),
     )
 )
-def test_text_can_be_seen_on_any_background(style: Style) -> None:
+def test_text_is_readable_on_any_background(style: Style) -> None:
     ((span,),) = spans_of_lines([("x", (StyledText("x", style),))])
     colours = re.fullmatch(r"color:#(\w{6});background:#(\w{6})", span.css)
     assert colours is not None

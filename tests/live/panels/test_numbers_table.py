@@ -29,8 +29,8 @@ def test_bools_are_counted_and_numbers_averaged() -> None:
     assert rows["elapsed steps"].selected == "7 / 50"
 
 
-def test_nan_is_said_and_not_hidden() -> None:
-    """One way everywhere: as it is in the selected env, counted over the batch, and left out of the mean."""
+def test_nan_is_shown() -> None:
+    """NaN is shown for the selected env, counted over the batch, and left out of the mean."""
     rows = rows_of(
         0,
         distance=np.array([np.nan, 1.0, 2.0, np.nan]),
@@ -60,7 +60,7 @@ OTHERS = {
 }
 
 
-def test_what_has_no_row_for_each_env_is_shown_as_it_is_and_marked() -> None:
+def test_a_value_without_a_row_per_env_is_shown_unchanged_and_marked() -> None:
     rows = {
         row.name: row for row in number_rows(replace(step_of(POSES, away=[0.0] * 4), others=OTHERS), 1, None)
     }
@@ -98,7 +98,7 @@ def test_the_mark_is_on_the_page(num_envs: int) -> None:
 
 
 @given(ENTRIES, st.integers(1, 4), st.integers(0, 5))
-def test_any_dict_of_evaluate_is_shown(entries: dict[Any, Any], num_envs: int, env: int) -> None:
+def test_any_evaluate_dict_is_shown(entries: dict[Any, Any], num_envs: int, env: int) -> None:
     columns, others = split_entries(entries, num_envs)
     rows = number_rows(replace(step_of(POSES[:num_envs]), evaluate=columns, others=others), env, None)
     html = render("numbers", rows=rows, env=env, num_envs=num_envs, has_success=False)

@@ -1,4 +1,4 @@
-"""What the page says of the file and the worker: banners, the status line, the version that runs."""
+"""What the page shows about the file and the worker: banners, the status line, the running version."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def banner(live: Live) -> str:
     return live.part("Problem").html() if live.part("Problem").seen else ""
 
 
-def test_a_problem_is_told_with_its_line_as_text_and_leaves_with_it(live: Live) -> None:
+def test_a_problem_is_shown_with_its_line_as_text_and_disappears_with_it(live: Live) -> None:
     live.show(failed())
     title, rest = banner(live).split("</div>", 1)
     assert all(word in title for word in ("PushEnv", "evaluate", "push.py:88"))
@@ -75,7 +75,7 @@ def test_a_problem_is_told_with_its_line_as_text_and_leaves_with_it(live: Live) 
     assert banner(live) == ""
 
 
-def test_a_traceback_that_someone_opened_is_not_written_again(live: Live) -> None:
+def test_an_open_traceback_is_not_redrawn(live: Live) -> None:
     live.show(failed())
     html = live.part("Problem").htmls()[0]
     html.content = "opened"
@@ -85,12 +85,12 @@ def test_a_traceback_that_someone_opened_is_not_written_again(live: Live) -> Non
     assert "ValueError: other" in banner(live)
     live.show(running(2))
     live.show(failed(serial=2, problem=problem("ValueError: other")))
-    assert "ValueError: other" in banner(live), "it comes back"
+    assert "ValueError: other" in banner(live), "the same problem comes back"
 
 
-def test_it_says_which_version_runs_now(live: Live) -> None:
+def test_the_banner_names_the_running_version(live: Live) -> None:
     at_run = failed(state="paused", playing=False, problem_at_run=True)
-    said = []
+    texts = []
     for view in (
         failed(state="running", stale=True),
         failed(state="starting", playing=False),
@@ -101,16 +101,16 @@ def test_it_says_which_version_runs_now(live: Live) -> None:
         failed("worker", state="paused", playing=False),
     ):
         live.show(view)
-        said.append(live.part("Problem").htmls()[1].content)
-    assert len({*said}) == len(said)
-    assert "env 0: step 7" in said[3] and "torch.get_default_dtype()" in said[4]
+        texts.append(live.part("Problem").htmls()[1].content)
+    assert len({*texts}) == len(texts)
+    assert "env 0: step 7" in texts[3] and "torch.get_default_dtype()" in texts[4]
 
 
 @pytest.mark.parametrize(
     ("stage", "offered"),
     [("evaluate", True), ("reset", True), ("syntax", False), ("policy", False), ("worker", False)],
 )
-def test_what_can_be_done_about_it_is_offered(live: Live, stage: str, offered: bool) -> None:
+def test_the_banner_offers_the_possible_actions(live: Live, stage: str, offered: bool) -> None:
     live.show(failed(stage))
     part = live.part("Problem")
     assert part.shows(REBUILD) is offered and part.shows(NEW_WORKER) is (stage == "worker")
@@ -123,7 +123,7 @@ def test_what_can_be_done_about_it_is_offered(live: Live, stage: str, offered: b
     assert live.asked == [*wanted, *([RestartWorker()] if stage == "worker" else [])]
 
 
-def test_an_empty_file_is_filled_by_a_press_and_only_while_it_is_empty(live: Live, tmp_path: Path) -> None:
+def test_a_press_fills_the_file_only_while_it_is_empty(live: Live, tmp_path: Path) -> None:
     file, other = tmp_path / "stack_two.py", tmp_path / "other.py"
     file.write_text("# mine\n\n")
     other.touch()
@@ -142,13 +142,13 @@ def test_an_empty_file_is_filled_by_a_press_and_only_while_it_is_empty(live: Liv
     live.show(replace(view, problem_serial=2))
     assert not live.shows(FILL), "it holds a task"
     live.show(replace(view, problem=replace(problem(), file=str(other)), problem_serial=3))
-    assert not live.shows(FILL), "it is not the task's"
+    assert not live.shows(FILL), "another file is not the task's"
     noticed = len(live.client.notices)
     live.do(FillEmptyFile())
     assert other.read_text() == "" and len(live.client.notices) == noticed + 1
 
 
-def test_what_takes_long_can_be_ended_and_stands_instead_of_a_problem(live: Live) -> None:
+def test_long_work_can_be_stopped_and_is_shown_instead_of_a_problem(live: Live) -> None:
     live.show(running(2, busy=replace(LOOP, seconds=SHOWN_AFTER_SECONDS - 1)))
     assert not live.part("Busy").seen
     live.show(failed(busy=LOOP))
@@ -167,14 +167,14 @@ def test_what_takes_long_can_be_ended_and_stands_instead_of_a_problem(live: Live
     assert not busy.seen and "KeyError" in banner(live)
 
 
-def test_a_worker_that_gets_ready_leaves_the_reason_in_sight(live: Live) -> None:
+def test_the_reason_stays_visible_while_a_worker_starts(live: Live) -> None:
     ready = busy_at(21.0, "warming up", "", (), ignores_interrupt=False)
     live.show(failed(busy=ready, state="starting", playing=False))
     assert not live.part("Busy").seen and banner(live)
     assert "busy" not in live.html("wb-status")
 
 
-def test_an_interrupt_is_not_called_a_failure(live: Live) -> None:
+def test_an_interrupt_is_not_shown_as_a_failure(live: Live) -> None:
     live.show(failed(problem=replace(problem("Interrupted: stopped by hand"), interrupted=True)))
     assert "interrupted in evaluate" in banner(live) and "failed" not in banner(live)
 
@@ -188,7 +188,7 @@ def status(live: Live, view: SessionView) -> str:
 
 
 def test_the_status_line_has_state_task_and_rate(live: Live) -> None:
-    said = status(live, running(16))
+    status_text = status(live, running(16))
     for word in (
         "running",
         "16 envs",
@@ -196,8 +196,8 @@ def test_the_status_line_has_state_task_and_rate(live: Live) -> None:
         "20 steps/s",
         "1.00 × real time",
     ):
-        assert word in said
-    assert 'data-title="Push-v1 · Workbench"' in said
+        assert word in status_text
+    assert 'data-title="Push-v1 · Workbench"' in status_text
     slow = status(live, running(1, steps_per_second=0.93, real_time_factor=0.0465))
     assert "0.93 steps/s" in slow and "0.046 × real time" in slow
     for quiet in (
@@ -212,7 +212,7 @@ def test_the_status_line_has_state_task_and_rate(live: Live) -> None:
     assert "compiling" in status(live, drawing) and "busy" not in status(live, drawing)
 
 
-def test_a_machine_that_cannot_keep_up_is_said_with_what_slows_it(live: Live) -> None:
+def test_a_slow_machine_is_reported_with_the_cause(live: Live) -> None:
     slow = running(4, speed=4.0, real_time_factor=1.2)
     assert "cannot reach it" in status(live, slow)
     assert "cannot reach it" not in status(live, running(4, speed=4.0, real_time_factor=3.9))
@@ -222,19 +222,25 @@ def test_a_machine_that_cannot_keep_up_is_said_with_what_slows_it(live: Live) ->
 
 
 @pytest.mark.parametrize("word", ["running", "paused", "loading"])
-def test_error_and_stale_are_marks_beside_the_state(live: Live, word: Any) -> None:
-    said = status(live, running(4, state=word, playing=word == "running", stale=True, problem=problem()))
-    assert f"<b>{word}</b>" in said and said.count(">error</span>") == 1
-    assert (">stale</span>" in said) is (word != "loading")
+def test_error_and_stale_are_marks_next_to_the_state(live: Live, word: Any) -> None:
+    status_text = status(
+        live, running(4, state=word, playing=word == "running", stale=True, problem=problem())
+    )
+    assert f"<b>{word}</b>" in status_text and status_text.count(">error</span>") == 1
+    assert (">stale</span>" in status_text) is (word != "loading")
 
 
-def test_while_actions_are_planned_it_says_how_long_a_plan_takes(live: Live) -> None:
+def test_the_status_line_shows_the_planning_time(live: Live) -> None:
     def planning(**solve: Any) -> str:
         view = running(4, steps_per_second=0.3, real_time_factor=0.01, solve=SolveView(**solve))
         return status(live, replace(view, settings=replace(view.settings, action_source="solve")))
 
-    said = planning(state="planning", plan=PLAN)
-    assert "<b>planning</b>" in said and "<b>0.25</b> s a plan" in said and "real time" not in said
+    status_text = planning(state="planning", plan=PLAN)
+    assert (
+        "<b>planning</b>" in status_text
+        and "<b>0.25</b> s a plan" in status_text
+        and "real time" not in status_text
+    )
     assert "building 1 env" in planning(state="starting", activity="building 1 env")
 
 
@@ -257,28 +263,32 @@ def version(live: Live, view: SessionView) -> str:
     return live.part("Code version").html()
 
 
-def test_a_load_is_told_with_level_time_reason_and_what_it_could_not_carry(live: Live) -> None:
-    said = version(
+def test_a_load_is_shown_with_level_time_reason_and_what_was_not_carried_over(live: Live) -> None:
+    status_text = version(
         live, running(2, reload=ReloadReport("patched", "only evaluate changed"), load_milliseconds=43.2)
     )
-    assert all(word in said for word in ("patched", "43 ms", "only evaluate changed"))
+    assert all(word in status_text for word in ("patched", "43 ms", "only evaluate changed"))
     missing = {f"actor cube_{i}": "<script>why</script>" for i in range(MAX_NAMED + 3)}
     report = ReloadReport("rebuilt", "_load_scene changed", ("actor goal",), missing)
-    said = version(live, running(2, reload=report, load_milliseconds=1500.0))
-    assert "1.5 s" in said and "actor cube_0" in said and f"actor cube_{MAX_NAMED}" not in said
-    assert "and 3 more" in said and "<script" not in said
+    status_text = version(live, running(2, reload=report, load_milliseconds=1500.0))
+    assert (
+        "1.5 s" in status_text
+        and "actor cube_0" in status_text
+        and f"actor cube_{MAX_NAMED}" not in status_text
+    )
+    assert "and 3 more" in status_text and "<script" not in status_text
 
 
 def test_while_the_file_is_broken_the_broken_save_comes_first(live: Live) -> None:
-    """It spoke of the good save before, as if that were what had just been saved."""
+    """Otherwise the last good save would look like the one that was just saved."""
     good = ReloadReport("patched", "only evaluate changed")
     told = version(live, running(4, reload=good, stale=True, state="error", refused=problem()))
     assert told.index("push.py:88") < told.index("only evaluate") and "KeyError" in told
     loading = version(live, running(4, reload=good, stale=True, state="loading", refused=problem()))
-    assert "KeyError" not in loading, "another one is being tried"
+    assert "KeyError" not in loading, "another version is loading"
 
 
-def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fails(live: Live) -> None:
+def test_the_tasks_of_a_file_can_be_chosen_while_the_requested_one_fails(live: Live) -> None:
     live.show(running(4))
     assert not live.part("Code version").shows("Task")
     live.show(running(4, task=None, state="error", refused=problem(), choices=("TwoEnv", "OneEnv")))
@@ -290,7 +300,7 @@ def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fail
     assert task.field("Task").value == "OneEnv"
 
 
-def test_the_file_is_loaded_again_by_the_level_that_is_pressed(live: Live) -> None:
+def test_the_file_is_reloaded_at_the_pressed_level(live: Live) -> None:
     live.show(running(4))
     part = live.part("Code version")
     for name in ("Reload", REBUILD, "Only reload code", "Only reload cameras"):
@@ -302,7 +312,7 @@ def test_the_file_is_loaded_again_by_the_level_that_is_pressed(live: Live) -> No
 
 def test_the_last_loads_are_listed_newest_first(live: Live) -> None:
     first = PastLoad(1e9, None, "the first version", 900.0)
-    assert "the first version" not in version(live, running(4, loads=(first,))), "one load is no list"
+    assert "the first version" not in version(live, running(4, loads=(first,))), "a single load is not listed"
     refused = PastLoad(1e9 + 60, None, "KeyError: '<goal>'", problem=problem())
     patched = PastLoad(1e9 + 120, "patched", "only evaluate changed", 43.0)
     told = version(live, running(4, loads=(patched, refused, first)))

@@ -1,4 +1,4 @@
-"""The timeline on a page, on a session with a hand-made scene, drawn without a browser."""
+"""The timeline on a page, without a browser, on a session with a synthetic scene."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SLIDER = "step of the past"
 
 @dataclass
 class EnvMoment:
-    """A session with a past, and its page."""
+    """A session with a history, and its page."""
 
     session: Session
     page: Page
@@ -79,18 +79,18 @@ def lived(panels: Panels, clock: Clock, scripted_session: Callable[..., Session]
     return EnvMoment(session, page, panels, clock)
 
 
-def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(lived: EnvMoment) -> None:
-    assert not lived.panels.part("Timeline").seen, "the page was not drawn yet"
+def test_the_timeline_appears_at_the_first_moment_and_offers_only_possible_actions(lived: EnvMoment) -> None:
+    assert not lived.panels.part("Timeline").seen, "the page is not drawn yet"
     lived.draw()
     assert lived.panels.part("Timeline").seen
     lived.step(4)
     assert lived.ends() == (-4, 0, 0)
-    assert not lived.panels.presses(ContinueFromHere()), "nobody is in the past"
-    assert not lived.panels.presses(UndoReset()), "nothing was before the first reset"
+    assert not lived.panels.presses(ContinueFromHere()), "the view is live"
+    assert not lived.panels.presses(UndoReset()), "there is nothing before the first reset"
     assert "live" in lived.strip()
 
 
-def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: EnvMoment) -> None:
+def test_the_view_the_numbers_and_the_status_line_show_the_past_moment(lived: EnvMoment) -> None:
     lived.step(2)
     there = lived.hand()
     lived.step(2)
@@ -107,7 +107,7 @@ def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: Env
     assert "live" in lived.strip() and not lived.panels.presses(ContinueFromHere())
 
 
-def test_going_on_puts_the_envs_that_were_named_back(lived: EnvMoment) -> None:
+def test_continuing_takes_the_named_envs_back(lived: EnvMoment) -> None:
     lived.step(4)
     lived.panels.ask(StepBack())
     lived.panels.ask(StepBack())
@@ -123,7 +123,7 @@ def test_going_on_puts_the_envs_that_were_named_back(lived: EnvMoment) -> None:
     assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
 
-def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: EnvMoment) -> None:
+def test_zoom_to_episode_starts_the_slider_at_the_episode(lived: EnvMoment) -> None:
     lived.step(4)
     last = lived.past.last
     lived.panels.do(ResetAll())
@@ -146,11 +146,11 @@ def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: EnvM
     lived.panels.do(GoToLast())
     lived.draw()
     lived.panels.ask(UndoReset())
-    view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the episode before")
+    view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the end of the jump back")
     assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
 
-def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived: EnvMoment) -> None:
+def test_the_slider_ends_follow_a_moment_beyond_them_at_once_and_others_rarely(lived: EnvMoment) -> None:
     lived.step(4)
     last = lived.past.last
     lived.panels.do(ResetAll())
@@ -163,15 +163,15 @@ def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived
     wait_until(lived.session, lambda view: view.timeline.last == 8, "a step")
     lived.session.happen(MomentShown(6))
     lived.page.redraw()
-    assert lived.ends() == (-2, 0, -1), "within them: whoever holds the slider is not disturbed"
+    assert lived.ends() == (-2, 0, -1), "a moment within them does not disturb a drag of the slider"
     lived.session.happen(MomentShown(2))
     lived.page.redraw()
-    assert lived.ends() == (-7, -3, -5), "the episode before"
+    assert lived.ends() == (-7, -3, -5), "the last episode"
     lived.draw()
     assert lived.ends() == (-7, -3, -5)
 
 
-def test_a_value_that_the_slider_had_a_moment_ago_shows_the_nearest_that_there_is(lived: EnvMoment) -> None:
+def test_an_outdated_slider_value_shows_the_nearest_moment(lived: EnvMoment) -> None:
     lived.step(3)
     lived.panels.do(SeekBack(steps=-9))
     assert lived.past.shown == lived.past.first and lived.past.last == 3
@@ -179,7 +179,7 @@ def test_a_value_that_the_slider_had_a_moment_ago_shows_the_nearest_that_there_i
         COMMANDS.decode("seek_back", {"steps": 1})
 
 
-def test_one_moment_alone_has_nothing_to_slide_along(lived: EnvMoment) -> None:
+def test_a_single_moment_has_a_valid_slider_range(lived: EnvMoment) -> None:
     lived.draw()
     assert lived.panels.shows(SLIDER), "the panel does not grow at the first step"
     assert lived.panels.field(SLIDER).off

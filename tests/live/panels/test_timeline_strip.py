@@ -33,7 +33,7 @@ def past(shown: int | None = None) -> TimelineView:
 
 
 def marks(html: str) -> list[tuple[float, str, str]]:
-    """Per cent from the left, style and words of each."""
+    """Per cent from the left, style and text of each mark."""
     found = re.findall(
         r'class="wb-mark wb-mark-(\w+)" style="left:([\d.]+)%" data-do="[^"]*" title="([^"]*)"', html
     )
@@ -44,7 +44,7 @@ def cursor(html: str) -> float:
     return float(re.findall(r'<line x1="([\d.]+)" x2="\1" [^>]*wb-cursor', html)[0])
 
 
-def test_marks_stand_where_they_happened_and_say_what_matters_most() -> None:
+def test_marks_are_at_their_steps_and_name_the_most_important_event() -> None:
     html = strip_html(strip(), running(4, timeline=past()))
     assert marks(html) == [
         (0.0, "reset", "reset, 100 steps ago"),
@@ -58,7 +58,7 @@ def test_marks_stand_where_they_happened_and_say_what_matters_most() -> None:
     assert legend == [("success", "success"), ("back", "went back"), ("reset", "reset")]
 
 
-def test_bands_are_what_was_lived_through_without_a_jump() -> None:
+def test_a_band_is_a_stretch_without_a_jump() -> None:
     html = strip_html(strip(), running(4, timeline=past()))
     bands = re.findall(r'<rect x="([\d.]+)" y="-14" width="([\d.]+)" height="46" class="([^"]*)"', html)
     assert bands == [
@@ -68,7 +68,7 @@ def test_bands_are_what_was_lived_through_without_a_jump() -> None:
     ]
 
 
-def test_what_came_from_a_recording_or_from_before_the_strip_is_said_so() -> None:
+def test_a_branch_from_a_recording_or_from_before_the_strip_is_shown() -> None:
     html = strip_html(strip(branches=()), running(4, timeline=past()))
     assert marks(html)[-1] == (80.0, "back", "from a recording, 20 steps ago") and "<path" not in html
     html = strip_html(strip(low=150, branches=((180, 120),)), running(4, timeline=past()))
@@ -76,7 +76,7 @@ def test_what_came_from_a_recording_or_from_before_the_strip_is_said_so() -> Non
 
 
 @pytest.mark.parametrize("count", [2, REWARD_POINTS, REWARD_POINTS + 1, 15_000])
-def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
+def test_a_one_step_spike_stays_in_the_line(count: int) -> None:
     reward = np.zeros(count, np.float32)
     reward[count // 3] = 5.0
     (line,) = reward_lines(reward)
@@ -86,7 +86,7 @@ def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
     assert all(0 <= x <= 100 for x, _ in points)
 
 
-def test_where_there_is_no_reward_is_a_gap_and_without_a_change_a_straight_line() -> None:
+def test_a_missing_reward_is_a_gap_and_a_constant_one_a_straight_line() -> None:
     assert reward_lines(np.full(10, np.nan, np.float32)) == []
     (line,) = reward_lines(np.ones(10, np.float32))
     assert {point.split(",")[1] for point in line.split()} == {f"{HEIGHT / 2:.1f}"}
@@ -105,7 +105,7 @@ def test_where_there_is_no_reward_is_a_gap_and_without_a_change_a_straight_line(
     assert "<polyline" not in strip_html(strip(reward=np.zeros(101, np.float32)), without)
 
 
-def test_of_very_many_events_each_part_of_the_strip_shows_the_worst() -> None:
+def test_of_many_events_each_part_of_the_strip_shows_the_worst() -> None:
     ends = ((tick, (FAIL if tick % 1000 == 0 else TRUNCATED) | RESET) for tick in range(0, 100_000, 50))
     html = strip_html(
         strip(low=0, high=100_000, events=tuple(ends), branches=()), running(4, timeline=past())

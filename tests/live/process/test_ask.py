@@ -1,4 +1,4 @@
-"""Who asks a worker: each question has its own answer, and what a process sends is believed as little as a task is."""
+"""Questions to a worker: each gets its own answer, and a process's messages are trusted as little as a task."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 import psutil
 import pytest
 
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from tests.live.hazards import calm, provoke, provoked, write_task
 from workbench.cameras.questions import MeasureCamera
 from workbench.live.messages import Answer, Load, Progress, Request, Reset
@@ -40,7 +40,7 @@ def question(env: int) -> MeasureCamera:
 
 
 class Line:
-    """What a worker was sent."""
+    """A connection that queues the requests to a worker."""
 
     def __init__(self) -> None:
         self.calls: Queue[Call] = Queue()
@@ -51,17 +51,17 @@ class Line:
         self.calls.put(request)
 
     def next(self) -> int:
-        return self.calls.get(timeout=PATIENCE).number
+        return self.calls.get(timeout=TIMEOUT_SECONDS).number
 
     def take(self, event: Answer | Progress) -> None:
         do(lambda: self.asker.take(event))
 
     def ask(self, question: Question[Any], on_progress: OnProgress = lambda *at: None) -> Future[Any]:
-        return begun(self.asker.ask(question, on_progress))
+        return start(self.asker.ask(question, on_progress))
 
 
-def begun(work: Coroutine[Any, Any, Any]) -> Future[Any]:
-    """Work that goes on; the future is cancelled as a job is stopped."""
+def start(work: Coroutine[Any, Any, Any]) -> Future[Any]:
+    """Start this coroutine on the loop; cancelling the future cancels it, as stopping a job does."""
     made: Future[Any] = Future()
 
     def begin() -> None:
@@ -78,36 +78,36 @@ def begun(work: Coroutine[Any, Any, Any]) -> Future[Any]:
     return made
 
 
-def test_two_that_ask_at_once_each_hear_their_own_whatever_comes_first() -> None:
+def test_concurrent_questions_each_get_their_own_answer_in_any_order() -> None:
     line = Line()
     asked = [line.ask(Reset((env,), env)) for env in range(2)]
-    calls: list[Any] = [line.calls.get(timeout=PATIENCE) for _ in range(2)]
+    calls: list[Any] = [line.calls.get(timeout=TIMEOUT_SECONDS) for _ in range(2)]
     line.take(Answer(99, why="nobody's"))
     for call in reversed(calls):
         line.take(Answer(call.number, why=f"env {call.request.env_idx[0]}"))
     for env, future in enumerate(asked):
         with pytest.raises(JobFailed, match=f"env {env}"):
-            future.result(timeout=PATIENCE)
+            future.result(timeout=TIMEOUT_SECONDS)
 
 
-def test_progress_comes_in_order_before_the_answer_and_an_answer_brings_its_problem() -> None:
-    line, heard = Line(), list[tuple[int, int, Any]]()
+def test_progress_arrives_in_order_before_the_answer_and_a_failed_answer_has_its_problem() -> None:
+    line, progress = Line(), list[tuple[int, int, Any]]()
     scene = MakeScene("PushCube-v1", (), {}, 0, {}, {})
-    asked = line.ask(scene, lambda *at: heard.append(at))
+    asked = line.ask(scene, lambda *at: progress.append(at))
     number = line.next()
     for done in range(3):
         line.take(Progress(number, done, 3, pack(f"state {done}")))
     line.take(Answer(number, why="no such camera", problem=PROBLEM))
     with pytest.raises(JobFailed, match="no such camera") as failed:
-        asked.result(timeout=PATIENCE)
-    assert failed.value.problem is PROBLEM and heard == [(done, 3, f"state {done}") for done in range(3)]
+        asked.result(timeout=TIMEOUT_SECONDS)
+    assert failed.value.problem is PROBLEM and progress == [(done, 3, f"state {done}") for done in range(3)]
     asked = line.ask(question(0))
     line.take(Answer(line.next(), pack(("no", "report"))))
     with pytest.raises(JobFailed, match="unreadable"):
-        asked.result(timeout=PATIENCE)
+        asked.result(timeout=TIMEOUT_SECONDS)
 
 
-def test_who_is_stopped_waits_no_longer_and_a_late_answer_is_nobody_s() -> None:
+def test_a_cancelled_question_ends_and_its_late_answer_is_ignored() -> None:
     line = Line()
     asked = line.ask(question(0))
     number = line.next()
@@ -118,10 +118,10 @@ def test_who_is_stopped_waits_no_longer_and_a_late_answer_is_nobody_s() -> None:
     assert second != number
     line.take(Answer(second, why="mine"))
     with pytest.raises(JobFailed, match="mine"):
-        again.result(timeout=PATIENCE)
+        again.result(timeout=TIMEOUT_SECONDS)
 
 
-# --- a process in the background ---------------------------------------------------------------------------
+# --- the background process ---------------------------------------------------------------------------
 
 
 def load_of(folder: Path, num_envs: int = 1) -> Load:
@@ -136,12 +136,12 @@ def background(child_process: None) -> Iterator[Background]:
 
 
 def in_turns(background: Background, job: Job, work: Work, priority: Priority = "person") -> Future[Any]:
-    """Begin to do this in turns."""
-    return begun(background.in_turns(job, work, priority))
+    """Start work that takes turns with other jobs."""
+    return start(background.in_turns(job, work, priority))
 
 
 @pytest.mark.parametrize("what", ["garbage", pytest.param("half", marks=pytest.mark.slow)])
-def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another(
+def test_garbage_from_a_process_ends_its_job_and_the_next_job_gets_a_new_process(
     background: Background, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     monkeypatch.setattr(askers, "_LOAD_CANCEL_TIMEOUT_SECONDS", 1.0)
@@ -149,37 +149,37 @@ def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another
     file = Path(str(load.task))
     provoke(file, "import", what)
     asked = in_turns(background, job, lambda: background.ensure(job, load))
-    until(lambda: provoked(file), "that it is provoked")
+    until(lambda: provoked(file), "the hazard")
     pid = background.pid
     if what == "half":
-        # It hangs in the middle of a message: a job that is stopped gets out all the same, and the process is ended.
+        # The process hangs in the middle of a message: stopping the job still works and ends the process.
         assert asked.cancel()
     else:
         with pytest.raises(JobFailed):
-            asked.result(timeout=PATIENCE)
+            asked.result(timeout=TIMEOUT_SECONDS)
     until(lambda: not (pid and psutil.pid_exists(pid)), "its end")
     calm(file)
-    in_turns(background, job, lambda: background.ensure(job, load)).result(timeout=PATIENCE)
+    in_turns(background, job, lambda: background.ensure(job, load)).result(timeout=TIMEOUT_SECONDS)
     assert background.pid is not None
 
 
-def test_what_is_loaded_is_loaded_once_and_what_dies_or_fails_is_loaded_anew(
+def test_a_version_is_loaded_once_and_again_after_a_death_or_failure(
     background: Background, tmp_path: Path
 ) -> None:
     (tmp_path / "other").mkdir()
     job, load = Job("rescoring"), load_of(tmp_path, 2)
-    told = list[str]()
-    job.report = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
+    steps = list[str]()
+    job.report = lambda done, total, what="": steps.append(what)  # type: ignore[method-assign]
 
     async def work() -> int | None:
-        assert await background.ensure(job, load) == 2 and len(told) == 2
-        assert await background.ensure(job, load) == 2 and len(told) == 2, "it is there already"
+        assert await background.ensure(job, load) == 2 and len(steps) == 2
+        assert await background.ensure(job, load) == 2 and len(steps) == 2, "it is already loaded"
         assert (await background.ask(Reset((1,), 7))).poses.shape[0] == 2
         with pytest.raises(JobFailed, match="nothing"):
             await background.ask(MeasureCamera(("human", "nothing"), None, 0))
         first = background.pid
         assert first is not None
-        assert psutil.Process(first).nice() > psutil.Process().nice(), "what plays comes first"
+        assert psutil.Process(first).nice() > psutil.Process().nice(), "the playing worker has priority"
         os.kill(first, signal.SIGKILL)
         with pytest.raises(ProcessDied, match="SIGKILL"):
             await background.ask(Reset((1,), 7))
@@ -187,7 +187,7 @@ def test_what_is_loaded_is_loaded_once_and_what_dies_or_fails_is_loaded_anew(
 
     async def again(first: int | None) -> None:
         assert await background.ensure(job, load) == 2 and background.pid not in (None, first)
-        # What fails to load leaves the version before open, and is tried otherwise if there is another way.
+        # A failed load leaves the last version open, and `or_else` is tried if given.
         provoke(Path(str(load.task)), "build", "ctrl_c")
         with pytest.raises(JobFailed) as failed:
             await background.ensure(job, replace(load, level="rebuilt"))
@@ -195,15 +195,15 @@ def test_what_is_loaded_is_loaded_once_and_what_dies_or_fails_is_loaded_anew(
         other = load_of(tmp_path / "other")
         assert await background.ensure(job, replace(load, level="rebuilt"), or_else=other) == 1
 
-    first = in_turns(background, job, work).result(timeout=PATIENCE)
-    in_turns(background, job, lambda: again(first)).result(timeout=PATIENCE)
+    first = in_turns(background, job, work).result(timeout=TIMEOUT_SECONDS)
+    in_turns(background, job, lambda: again(first)).result(timeout=TIMEOUT_SECONDS)
 
 
 @pytest.mark.parametrize("aside", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_the_job_that_was_begun_last_comes_first_and_what_gave_way_is_done_again(
+def test_the_newest_job_goes_first_and_an_interrupted_one_is_repeated(
     background: Background, tmp_path: Path, aside: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(askers, "_CANCEL_TIMEOUT_SECONDS", PATIENCE)  # also of a machine that is busy
+    monkeypatch.setattr(askers, "_CANCEL_TIMEOUT_SECONDS", TIMEOUT_SECONDS)  # also on a busy machine
     load = load_of(tmp_path)
     done, under_way, seen = list[str](), threading.Event(), threading.Event()
     pids = set[int | None]()
@@ -217,50 +217,50 @@ def test_the_job_that_was_begun_last_comes_first_and_what_gave_way_is_done_again
             under_way.set()
         done.append("ends")
 
-    async def somebody_waits(job: Job) -> None:
+    async def foreground_work(job: Job) -> None:
         await background.ensure(job, load)
         await background.ask(Reset((0,), 2))
         pids.add(background.pid)
         done.append("answered")
         seen.set()
 
-    # What nobody waits for gives way to what was begun before it, too.
+    # A low-priority job also gives way to jobs that were started before it.
     one, other = Job("one"), Job("other")
     job, waiting = (other, one) if aside else (one, other)
-    told = list[str]()
-    job.report = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
-    # It would go on for ever if it did not give way.
+    steps = list[str]()
+    job.report = lambda done, total, what="": steps.append(what)  # type: ignore[method-assign]
+    # It would run forever if it did not give way.
     side = in_turns(background, job, lambda: side_work(job), "low" if aside else "person")
-    assert under_way.wait(PATIENCE)
-    in_turns(background, waiting, lambda: somebody_waits(waiting)).result(PATIENCE)
-    side.result(PATIENCE)
-    assert done == ["begins", "answered", "begins", "ends"] and told[-1] == askers.WAITING
-    assert len(pids) == 1, "what was left gave its answer in time, and its process goes on"
+    assert under_way.wait(TIMEOUT_SECONDS)
+    in_turns(background, waiting, lambda: foreground_work(waiting)).result(TIMEOUT_SECONDS)
+    side.result(TIMEOUT_SECONDS)
+    assert done == ["begins", "answered", "begins", "ends"] and steps[-1] == askers.WAITING
+    assert len(pids) == 1, "the interrupted question was answered in time, and its process goes on"
 
 
-def test_two_that_are_stopped_at_once_leave_the_process_to_the_next(background: Background) -> None:
-    async def for_ever() -> None:
+def test_two_jobs_stopped_at_once_free_the_process_for_the_next(background: Background) -> None:
+    async def forever() -> None:
         await asyncio.Event().wait()
 
     async def at_once() -> str:
         return "done"
 
-    tasks = do(lambda: [loop.begin(background.in_turns(Job(name), for_ever)) for name in ("one", "other")])
+    tasks = do(lambda: [loop.begin(background.in_turns(Job(name), forever)) for name in ("one", "other")])
     do(lambda: None)  # one has the process, the other waits for it
 
     def stop() -> None:
-        # As a save stops two jobs: neither has left before the other is stopped.
+        # A save stops two jobs like this: neither has ended when the other is stopped.
         for task in tasks:
             task.cancel()
 
     do(stop)
     until(lambda: all(task.done() for task in tasks), "their end")
     assert all(task.cancelled() for task in tasks)
-    assert in_turns(background, Job("next"), at_once).result(PATIENCE) == "done"
+    assert in_turns(background, Job("next"), at_once).result(TIMEOUT_SECONDS) == "done"
 
 
 @pytest.mark.slow
-def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes_on_with_another(
+def test_a_dead_process_fails_only_its_own_job_and_the_queue_goes_on_with_a_new_one(
     background: Background, tmp_path: Path
 ) -> None:
     load = load_of(tmp_path)
@@ -281,7 +281,7 @@ def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes
 
     stopped, before, aside, last = (Job("one of four") for _ in range(4))
     fails = in_turns(background, last, lambda: work(last, waits=True))
-    assert has_it.wait(PATIENCE)
+    assert has_it.wait(TIMEOUT_SECONDS)
     low = in_turns(background, aside, nothing, "low")
     queue = in_turns(background, before, lambda: work(before))
     given_up = in_turns(background, stopped, lambda: work(stopped))
@@ -289,18 +289,18 @@ def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes
     os.kill(pids[0] or 0, signal.SIGKILL)
     do(killed.set)
     with pytest.raises(ProcessDied, match="SIGKILL"):
-        fails.result(timeout=PATIENCE)
-    queue.result(timeout=PATIENCE)
-    low.result(timeout=PATIENCE)
+        fails.result(timeout=TIMEOUT_SECONDS)
+    queue.result(timeout=TIMEOUT_SECONDS)
+    low.result(timeout=TIMEOUT_SECONDS)
     assert done == ["person", "low"] and pids[1] == background.pid not in (None, pids[0])
 
 
 @pytest.mark.slow
-def test_a_process_that_nobody_wants_is_ended_and_one_that_is_wanted_is_not(
+def test_an_idle_process_is_ended_and_one_in_use_is_not(
     background: Background, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     load, job = load_of(tmp_path), Job("rescoring")
-    in_turns(background, job, lambda: background.ensure(job, load)).result(PATIENCE)
+    in_turns(background, job, lambda: background.ensure(job, load)).result(TIMEOUT_SECONDS)
     monkeypatch.setattr(askers, "IDLE_SECONDS", 0.0)
     first = background.pid
     assert first is not None, "it is kept for the next job"
@@ -308,12 +308,12 @@ def test_a_process_that_nobody_wants_is_ended_and_one_that_is_wanted_is_not(
     async def look() -> None:
         assert background.has_loaded(load) and background.pid == first
 
-    in_turns(background, job, look).result(PATIENCE)
+    in_turns(background, job, look).result(TIMEOUT_SECONDS)
     until(lambda: background.pid is None, "its end")
     assert not psutil.pid_exists(first)
 
 
-def test_a_long_question_outside_a_turn_is_no_idleness(
+def test_a_long_question_outside_a_turn_is_not_idle_time(
     background: Background, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(askers, "IDLE_SECONDS", 0.01)
@@ -323,4 +323,4 @@ def test_a_long_question_outside_a_turn_is_no_idleness(
         await background.ensure(job, load)
         return await background.ensure(job, replace(load, level="rebuilt"))
 
-    assert begun(work()).result(PATIENCE) == 1
+    assert start(work()).result(TIMEOUT_SECONDS) == 1

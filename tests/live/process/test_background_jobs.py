@@ -1,4 +1,4 @@
-"""Jobs beside a session: one at a time, stopped at any time, and one that fails fails alone. And the loop that they run on."""
+"""Background jobs of a session: one at a time, stoppable at any time, each failing alone; and the loop that runs them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from workbench.machine.processes.watched_thread import listen, stop_listening
 
 
 class Seen:
-    """Jobs, and what a page sees of them."""
+    """Background jobs, and what a page sees of them."""
 
     def __init__(self) -> None:
         self.failed: list[str] = []
@@ -32,7 +32,7 @@ class Seen:
         return loop.do(lambda: self.jobs.progress)
 
     def runs(self) -> bool:
-        """Whether a job that is started now is done."""
+        """Whether a job that is started now finishes."""
         done = threading.Event()
 
         async def work(job: Job) -> None:
@@ -51,7 +51,7 @@ def seen() -> Iterator[Seen]:
     stop_listening(seen.said.append)
 
 
-def test_a_job_that_fails_is_told_and_the_next_is_done(seen: Seen) -> None:
+def test_a_failed_job_is_reported_and_the_next_one_runs(seen: Seen) -> None:
     async def broken(job: Job) -> None:
         raise AttributeError("no such thing")
 
@@ -63,10 +63,10 @@ def test_a_job_that_fails_is_told_and_the_next_is_done(seen: Seen) -> None:
         until(lambda words=words: seen.failed and words in seen.failed[-1], "the failure")
         assert seen.progress() is None
         assert seen.runs()
-    assert len(seen.said) == 1 and "AttributeError" in seen.said[0], "only a fault of the workbench"
+    assert len(seen.said) == 1 and "AttributeError" in seen.said[0], "only a fault of the workbench is logged"
 
 
-def test_a_job_that_is_stopped_changes_nothing_more_and_one_that_has_not_begun_never_does(seen: Seen) -> None:
+def test_a_stopped_job_changes_nothing_more_and_a_pending_one_never_starts(seen: Seen) -> None:
     done: list[str] = []
 
     async def works_on(job: Job) -> None:
@@ -94,7 +94,7 @@ def test_a_job_that_is_stopped_changes_nothing_more_and_one_that_has_not_begun_n
     assert done == ["begins", "tidies up"] and seen.failed == []
 
 
-def test_after_the_end_nothing_begins(seen: Seen) -> None:
+def test_no_job_starts_after_close(seen: Seen) -> None:
     ended = threading.Event()
 
     async def works_on(job: Job) -> None:
@@ -115,13 +115,13 @@ def test_after_the_end_nothing_begins(seen: Seen) -> None:
 # --- the loop ------------------------------------------------------------------------------------------
 
 
-def test_changes_are_made_one_after_the_other_whoever_asks() -> None:
+def test_changes_from_any_thread_run_one_at_a_time() -> None:
     count = 0
 
     def change() -> None:
         nonlocal count
         before = count
-        time.sleep(0.0001)  # another thread may go on here
+        time.sleep(0.0001)  # lets another thread run here
         count = before + 1
 
     threads = [threading.Thread(target=lambda: [loop.do(change) for _ in range(100)]) for _ in range(8)]
@@ -132,7 +132,7 @@ def test_changes_are_made_one_after_the_other_whoever_asks() -> None:
     assert count == 800
 
 
-def test_what_a_change_raises_is_raised_where_it_was_asked_for_and_the_loop_goes_on() -> None:
+def test_an_exception_in_a_change_reaches_its_caller_and_the_loop_goes_on() -> None:
     def fails() -> None:
         raise LookupError("nothing there")
 
@@ -159,7 +159,7 @@ def test_what_a_change_raises_is_raised_where_it_was_asked_for_and_the_loop_goes
         ("raise LookupError('nothing there')", "nothing there"),
     ],
 )
-def test_a_command_may_block_while_the_loop_and_its_signals_are_in_the_main_thread(
+def test_a_command_may_block_while_the_main_thread_runs_the_loop_and_its_signals(
     child_process: None, does: str, comes_to: str
 ) -> None:
     script = f"""
@@ -186,7 +186,7 @@ except KeyboardInterrupt:
     assert (ended.stdout.strip(), ended.stderr) == (comes_to, "")
 
 
-def test_who_waits_for_work_of_the_loop_can_give_it_up() -> None:
+def test_a_wait_for_work_of_the_loop_can_be_given_up() -> None:
     ended = threading.Event()
 
     async def work() -> None:
@@ -203,7 +203,7 @@ def test_who_waits_for_work_of_the_loop_can_give_it_up() -> None:
     assert ended.wait(60)
 
 
-def test_what_blocks_keeps_its_order_and_does_not_keep_the_loop() -> None:
+def test_blocking_work_keeps_its_order_and_does_not_block_the_loop() -> None:
     aside, goes_on, done = loop.BlockingPool("test"), threading.Event(), list[int]()
 
     async def work(number: int) -> None:

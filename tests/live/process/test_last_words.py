@@ -1,4 +1,4 @@
-"""Stacks of real processes, read by another."""
+"""Stacks of real processes, read by another process."""
 
 from __future__ import annotations
 
@@ -26,9 +26,7 @@ def dump_of(file: Path, what: str) -> str:
 
 
 @pytest.mark.parametrize("name", ["task.py", "Äufgabe 工 'x'.py"])
-def test_the_authors_line_is_found_whatever_the_file_is_called(
-    child_process: None, tmp_path: Path, name: str
-) -> None:
+def test_the_authors_line_is_found_for_any_file_name(child_process: None, tmp_path: Path, name: str) -> None:
     file = tmp_path / name
     frames = parse_stack(dump_of(file, "faulthandler.dump_traceback(all_threads=False)"))
     assert [frame.name for frame in frames] == ["deep", "evaluate", "<module>"]
@@ -37,7 +35,7 @@ def test_the_authors_line_is_found_whatever_the_file_is_called(
     assert author_place(frames, ["/elsewhere.py"]) == (None, None, None)
 
 
-def test_a_crash_says_what_it_was(child_process: None, tmp_path: Path) -> None:
+def test_a_crash_is_reported_with_its_kind(child_process: None, tmp_path: Path) -> None:
     file = tmp_path / "task.py"
     dump = dump_of(file, "ctypes.string_at(0)")
     assert fatal_error(dump) == "Segmentation fault"

@@ -1,4 +1,4 @@
-"""One worker after the other, and a reason for each end: real processes, which hold no task and begin at once."""
+"""The supervisor replaces workers and reports why each ended: real processes without a task, which start at once."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ SMALL_WORKER = Path(__file__).parents[1] / "small_worker.py"
 OPTIONS = TaskOptions(num_envs=1)
 
 
-class Minded:
-    """A `Supervisor`, and all that it told."""
+class Supervised:
+    """A `Supervisor`, and everything that it reported."""
 
     def __init__(self, options: WorkerOptions) -> None:
         self.events: list[Event] = []
@@ -37,7 +37,7 @@ class Minded:
         self.busy: list[Busy | None] = []
         self.greeted = 0
         self.fails = 0
-        """So many events cannot be taken."""
+        """Number of next events whose handling fails."""
         self.first_requests: Callable[[], list[Request]] = self.greeting
         self.worker = Supervisor(
             options,
@@ -61,28 +61,30 @@ class Minded:
         self.events.append(event)
 
     @property
-    def said(self) -> list[str]:
+    def activities(self) -> list[str]:
         return [event.activity for event in self.events if isinstance(event, Loading)]
 
     def until(self, condition: Callable[[], object], what: str) -> None:
-        until(lambda: bool(condition()), what, seen=lambda: (self.said[-9:], self.deaths, self.busy[-1:]))
+        until(
+            lambda: bool(condition()), what, seen=lambda: (self.activities[-9:], self.deaths, self.busy[-1:])
+        )
 
     def until_greeted(self, times: int) -> None:
-        self.until(lambda: f"hello {times}" in self.said, f"greeting {times}")
+        self.until(lambda: f"hello {times}" in self.activities, f"greeting {times}")
 
     def until_dead(self, times: int = 1) -> Death:
         self.until(lambda: len(self.deaths) >= times, f"death {times}")
         return self.deaths[times - 1]
 
     def until_busy(self) -> Busy:
-        self.until(lambda: self.busy and self.busy[-1] is not None, "that it is busy")
+        self.until(lambda: self.busy and self.busy[-1] is not None, "a busy report")
         found = self.busy[-1]
         assert found is not None
         return found
 
 
 def do(what: str) -> Call:
-    """A question that `small_worker` reads another way; none of it takes the place of another."""
+    """A request that `small_worker` reads as a command; unlike others, these are never merged in the queue."""
     return Call(0, RunCameras(what, {}))
 
 
@@ -91,8 +93,8 @@ def load(name: str, number: int = 0) -> Load:
 
 
 @contextmanager
-def minded(options: WorkerOptions | None = None) -> Iterator[Minded]:
-    one = Minded(options or WorkerOptions())
+def supervised(options: WorkerOptions | None = None) -> Iterator[Supervised]:
+    one = Supervised(options or WorkerOptions())
     one.worker.start()
     try:
         one.until_greeted(1)
@@ -109,7 +111,7 @@ def small_workers(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(worker_start, "python_command", command)
     monkeypatch.setattr(worker_process, "worker_forks", SimpleNamespace(start=worker_start.start_anew))
-    # What takes seconds for the sake of slow machines takes tenths here.
+    # Timeouts of seconds, for slow machines, are tenths here.
     for name, seconds in (
         ("_BUSY_SECONDS", 0.8),
         ("_STACK_PERIOD_SECONDS", 0.3),
@@ -125,27 +127,27 @@ def small_workers(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(supervisor, name, seconds)
 
 
-def test_each_worker_is_greeted_and_what_it_says_arrives_in_order() -> None:
-    with minded() as one:
+def test_each_worker_gets_the_first_requests_and_its_events_arrive_in_order() -> None:
+    with supervised() as one:
         assert one.worker.pid is not None and one.worker.pid != os.getpid()
         for number in range(20):
             one.worker.send(do(f"say {number}"))
-        one.until(lambda: "19" in one.said, "the last")
-        assert one.said == ["hello 1", *map(str, range(20))]
+        one.until(lambda: "19" in one.activities, "the last")
+        assert one.activities == ["hello 1", *map(str, range(20))]
         first = one.worker.pid
         one.worker.replace()
         death = one.until_dead()
         assert (death.end, death.gives_up) == (End.ASKED, False)
         one.until_greeted(2)
         assert one.worker.pid not in (first, None)
-    assert len(one.deaths) == 1, "its end for good is no death"
+    assert len(one.deaths) == 1, "a stop is not reported as a death"
 
 
-def test_the_end_says_what_it_was_at_and_where_and_what_was_sent_before_is_taken_first() -> None:
-    with minded() as one:
+def test_a_death_names_the_work_and_line_after_all_earlier_events() -> None:
+    with supervised() as one:
         one.worker.send(do("last_steps 300"))
         death = one.until_dead()
-        assert one.said[1:301] == [f"step {number}" for number in range(300)]
+        assert one.activities[1:301] == [f"step {number}" for number in range(300)]
         assert (death.why, death.end, death.doing, death.stack) == (
             *("was killed by SIGKILL", End.DIED, None, ""),
         )
@@ -156,16 +158,16 @@ def test_the_end_says_what_it_was_at_and_where_and_what_was_sent_before_is_taken
 
 
 @pytest.mark.slow
-def test_whenever_a_worker_dies_its_true_cause_is_told() -> None:
-    """From its first moment on, and in the middle of messages."""
-    with minded() as one:
+def test_the_true_cause_of_a_death_is_reported_at_any_time() -> None:
+    """Also right after the start, and in the middle of messages."""
+    with supervised() as one:
         one.first_requests = lambda: [*one.greeting(), do("chatter")]
         one.worker.replace()
         one.until_dead(1)
         for moment in range(20):
             one.until(lambda: one.worker.pid is not None, "the next worker")
-            heard, number = len(one.events), (signal.SIGKILL, signal.SIGSEGV, signal.SIGABRT)[moment % 3]
-            one.until(lambda count=heard + 2 * moment: len(one.events) >= count, "the moment")
+            received, number = len(one.events), (signal.SIGKILL, signal.SIGSEGV, signal.SIGABRT)[moment % 3]
+            one.until(lambda count=received + 2 * moment: len(one.events) >= count, "the moment")
             os.kill(one.worker.pid or 0, number)
             death = one.until_dead(moment + 2)
             assert (death.why, death.end) == (f"was killed by {number.name}", End.DIED), moment
@@ -173,10 +175,8 @@ def test_whenever_a_worker_dies_its_true_cause_is_told() -> None:
 
 
 @pytest.mark.slow
-def test_the_third_death_in_a_row_is_the_last_until_somebody_asks_and_a_load_forgives_the_earlier_ones() -> (
-    None
-):
-    with minded() as one:
+def test_after_three_deaths_in_a_row_no_worker_starts_until_asked_and_a_load_resets_the_count() -> None:
+    with supervised() as one:
         for times in range(1, 6):
             one.until_greeted(times)
             if times == 3:
@@ -189,74 +189,78 @@ def test_the_third_death_in_a_row_is_the_last_until_somebody_asks_and_a_load_for
         for times in (6, 7, 8):
             one.until_greeted(times)
             one.worker.send(do("leave 1"))
-            assert one.until_dead(times).gives_up is (times == 8), "it was asked for, and begins anew"
-    assert one.worker.pid is None, "it ends while it waits to be asked"
+            assert one.until_dead(times).gives_up is (times == 8), "a requested restart counts from zero"
+    assert one.worker.pid is None, "no worker runs until it is asked for"
 
 
 @pytest.mark.slow
-def test_long_work_is_told_again_and_again_and_that_it_is_over() -> None:
-    with minded() as one:
+def test_long_work_is_reported_repeatedly_and_when_it_is_over() -> None:
+    with supervised() as one:
         one.worker.send(do("work 2.0"))
         one.until(lambda: None in one.busy, "its end")
-        told = [busy for busy in one.busy if busy is not None]
+        reports = [busy for busy in one.busy if busy is not None]
         assert (
-            len(told) >= 2
-            and told[0].seconds >= supervisor._BUSY_SECONDS
-            and told[-1].seconds > told[0].seconds
+            len(reports) >= 2
+            and reports[0].seconds >= supervisor._BUSY_SECONDS
+            and reports[-1].seconds > reports[0].seconds
         )
-        assert told[-1].file == str(SMALL_WORKER) and not told[-1].ignores_interrupt and not told[-1].held
+        assert (
+            reports[-1].file == str(SMALL_WORKER)
+            and not reports[-1].ignores_interrupt
+            and not reports[-1].held
+        )
         assert one.deaths == [] and one.busy.count(None) == 1
 
 
-def test_a_worker_whose_handlers_are_down_is_not_ended_by_the_question_where_it_is() -> None:
-    with minded() as one:
+def test_asking_for_the_stack_does_not_kill_a_worker_without_signal_handlers() -> None:
+    with supervised() as one:
         one.worker.send(do("without_handlers 1.5"))
         one.until(lambda: None in one.busy, "its end")
         assert one.deaths == []
 
 
 @pytest.mark.slow
-def test_an_interrupt_leaves_work_and_nothing_that_is_idle_or_held() -> None:
-    with minded() as one:
+def test_an_interrupt_stops_work_but_no_idle_or_debugged_worker() -> None:
+    with supervised() as one:
         one.worker.interrupt()
         one.worker.send(do("held_by_a_debugger 1.5"))
-        one.until(lambda: any(busy is not None and busy.held for busy in one.busy), "that it is held")
+        one.until(lambda: any(busy is not None and busy.held for busy in one.busy), "the debugger")
         one.worker.interrupt()
         one.worker.send(load("mended"))
-        one.until(lambda: "mended" in one.said, "the load, for which it is not ended")
-        one.until(lambda: one.busy[-1] is None, "that it goes on")
-        assert "interrupted" not in one.said and one.deaths == []
+        one.until(lambda: "mended" in one.activities, "the load by the same worker")
+        one.until(lambda: one.busy[-1] is None, "the end of the debugger")
+        assert "interrupted" not in one.activities and one.deaths == []
         one.worker.send(do("work 600"))
         one.until_busy()
         one.worker.interrupt()
-        one.until(lambda: "interrupted" in one.said, "the interrupt")
+        one.until(lambda: "interrupted" in one.activities, "the interrupt")
         assert one.deaths == []
 
 
 @pytest.mark.slow
-def test_who_does_not_listen_to_an_interrupt_is_told_deaf() -> None:
-    with minded() as one:
+def test_a_worker_that_ignores_an_interrupt_is_reported() -> None:
+    with supervised() as one:
         one.worker.send(do("work_on 600"))
         assert not one.until_busy().ignores_interrupt
         one.worker.interrupt()
-        one.until(lambda: one.until_busy().ignores_interrupt, "that it is deaf")
+        one.until(lambda: one.until_busy().ignores_interrupt, "the ignored interrupt")
 
 
-def test_a_load_waits_for_short_work_only() -> None:
-    with minded() as one:
+def test_a_load_waits_only_for_short_work() -> None:
+    with supervised() as one:
         one.worker.send(do("work 600"))
         one.until_busy()
         assert not one.worker.load_pending
         one.worker.send(load("mended"))
         assert one.worker.load_pending
-        one.until(lambda: "mended" in one.said, "the load")
-        assert "interrupted" in one.said and one.deaths == []
-        one.until(lambda: not one.worker.load_pending, "that it was taken up")
+        one.until(lambda: "mended" in one.activities, "the load")
+        assert "interrupted" in one.activities and one.deaths == []
+        one.until(lambda: not one.worker.load_pending, "the start of the load")
 
 
 @pytest.mark.slow
-def test_a_save_while_the_first_requests_of_the_next_worker_are_made_is_loaded_after_them() -> None:
-    with minded() as one:
+def test_a_save_during_the_first_requests_of_a_new_worker_is_loaded_after_them() -> None:
+    with supervised() as one:
 
         def saved_meanwhile() -> list[Request]:
             one.worker.send(load("saved", 7))
@@ -269,13 +273,16 @@ def test_a_save_while_the_first_requests_of_the_next_worker_are_made_is_loaded_a
         for first, last in ((saved_meanwhile, "saved"), (has_it, "the end")):
             one.first_requests = first
             os.kill(one.worker.pid or 0, signal.SIGKILL)
-            one.until(lambda last=last: last in one.said, f"that it says {last}")
-        assert "brought back" not in one.said[one.said.index("saved") :] and one.said.count("again") == 1
+            one.until(lambda last=last: last in one.activities, f"the activity {last}")
+        assert (
+            "brought back" not in one.activities[one.activities.index("saved") :]
+            and one.activities.count("again") == 1
+        )
 
 
 @pytest.mark.slow
-def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
-    with minded() as one:
+def test_a_load_behind_uninterruptible_work_ends_the_worker() -> None:
+    with supervised() as one:
         for times in (1, 2, 3):
             one.until_greeted(times)
             one.worker.send(do("work_on 600"))
@@ -283,7 +290,7 @@ def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
             one.worker.send(load("mended"))
             death = one.until_dead(times)
             assert death.end is End.FILE_WAITS and not death.gives_up, "it was not the worker's fault"
-            # Not before the interrupt was given its time: 0.3 s until it was sent and 1.2 s after it.
+            # Only after the interrupt had its time: sent after 0.3 s, and 1.2 s to work.
             waited = re.search(r"(\d+) s", death.why)
             assert waited is not None and int(waited[1]) >= 2, death.why
             assert death.doing == "stepping" and "in _pass_time" in death.stack
@@ -299,46 +306,46 @@ def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
         pytest.param("close_its_line 600", 0, "closed its line", marks=pytest.mark.slow),
     ],
 )
-def test_what_cannot_go_on_is_ended_with_a_reason_and_another_comes(does: str, fails: int, says: str) -> None:
-    with minded() as one:
+def test_a_broken_worker_is_ended_with_a_reason_and_replaced(does: str, fails: int, says: str) -> None:
+    with supervised() as one:
         one.fails = fails
         one.worker.send(do(does))
         assert says in one.until_dead().why
         one.until_greeted(2)
 
 
-def test_one_that_is_about_to_end_without_its_main_thread_is_left_to_it(
+def test_a_worker_without_main_thread_may_end_on_its_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(supervisor, "_HEADLESS_SECONDS", 600.0)
-    with minded() as one:
+    with supervised() as one:
         one.worker.send(do("ends_soon_without_a_main_thread 0.5"))
         assert "exit code 7" in one.until_dead().why
 
 
 @pytest.mark.slow
-def test_a_greeting_that_fails_loses_the_worker_and_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
-    with minded() as one:
+def test_failing_first_requests_end_the_worker_and_are_tried_again(caplog: pytest.LogCaptureFixture) -> None:
+    with supervised() as one:
         failures = iter(range(5))
 
         def fails() -> list[Request]:
             if next(failures, None) is not None:
-                raise RuntimeError("nothing to say")
+                raise RuntimeError("no first requests")
             return one.greeting()
 
         one.first_requests = fails
         one.worker.replace()
         one.until_dead(4)
-        assert all("nothing to say" in death.why for death in one.deaths[1:])
+        assert all("no first requests" in death.why for death in one.deaths[1:])
         assert [death.gives_up for death in one.deaths] == [False, False, False, True]
         assert one.worker.pid is None
         one.worker.replace()
         one.until_greeted(2)
         assert [death.gives_up for death in one.deaths[4:]] == [False, False]
-    assert "nothing to say" in caplog.text
+    assert "no first requests" in caplog.text
 
 
-def test_where_no_worker_can_be_started_it_gives_up_until_somebody_asks(
+def test_without_a_startable_worker_it_gives_up_until_asked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     command, failures = worker_start.python_command, iter(range(4))
@@ -349,7 +356,7 @@ def test_where_no_worker_can_be_started_it_gives_up_until_somebody_asks(
         return command(*arguments)
 
     monkeypatch.setattr(worker_start, "python_command", fails)
-    one = Minded(WorkerOptions())
+    one = Supervised(WorkerOptions())
     one.worker.start()
     try:
         one.until_dead(3)
@@ -361,10 +368,10 @@ def test_where_no_worker_can_be_started_it_gives_up_until_somebody_asks(
         one.worker.stop()
 
 
-def test_memory_beyond_the_limit_ends_the_worker_and_what_it_holds_is_told() -> None:
+def test_memory_use_is_reported_and_ends_the_worker_above_the_limit() -> None:
     limit = 600 << 20
-    with minded(WorkerOptions(memory_limit=limit)) as one:
-        one.until(lambda: one.worker.vitals.memory > 0, "a look")
+    with supervised(WorkerOptions(memory_limit=limit)) as one:
+        one.until(lambda: one.worker.vitals.memory > 0, "a memory reading")
         vitals = one.worker.vitals
         assert (vitals.memory_limit, vitals.spare_memory, vitals.spare_ready) == (limit, None, False)
         one.worker.send(do("fill_memory 700"))
@@ -373,7 +380,7 @@ def test_memory_beyond_the_limit_ends_the_worker_and_what_it_holds_is_told() -> 
 
 
 def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
-    with minded() as one:
+    with supervised() as one:
         one.worker.send(do("work_on 600"))
         one.until_busy()
         pid = one.worker.pid
@@ -382,24 +389,24 @@ def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
 
 
 @pytest.mark.slow
-def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_spare_replaces_a_dead_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor, "_SPARE_DELAY_SECONDS", 0.0)
-    with minded(WorkerOptions(spare=True)) as one:
+    with supervised(WorkerOptions(spare=True)) as one:
         assert one.worker.vitals.spare_memory is None
         one.worker.send(do("loaded"))
         one.until(lambda: one.worker.vitals.spare_ready, "the spare")
         assert (one.worker.vitals.spare_memory or 0) > 0
-        # The next one would be ready before the assertion.
+        # A new spare would be ready before the assertion.
         monkeypatch.setattr(supervisor, "_SPARE_DELAY_SECONDS", 600.0)
         first = one.worker.pid
         os.kill(first or 0, signal.SIGKILL)
         one.until_greeted(2)
         assert one.worker.pid not in (None, first)
-        one.until(lambda: not one.worker.vitals.spare_ready, "that it is no spare any more")
+        one.until(lambda: not one.worker.vitals.spare_ready, "the use of the spare")
 
 
 @pytest.mark.slow
-def test_a_spare_that_dies_of_its_warming_up_is_tried_once_more_and_no_more(
+def test_a_spare_that_dies_while_warming_up_is_tried_only_once_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(supervisor, "_SPARE_DELAY_SECONDS", 0.0)

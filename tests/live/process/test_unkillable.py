@@ -1,4 +1,4 @@
-"""Whatever the author's code does to its process, the session goes on and says what happened."""
+"""The session survives and reports whatever the author's code does to its process."""
 
 # The fixture hands over a session whose task is loaded: what may be None before is not here.
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false
@@ -40,8 +40,8 @@ LIMIT = 2 * 2**30
 
 
 @pytest.fixture(scope="module", autouse=True)
-def soon() -> Iterator[None]:
-    """What takes seconds for the sake of slow machines takes about one here."""
+def short_timeouts() -> Iterator[None]:
+    """Timeouts of several seconds, for slow machines, are about one second here."""
     with pytest.MonkeyPatch.context() as patch:
         for name, seconds in (
             ("_BUSY_SECONDS", 1.0),
@@ -60,7 +60,9 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def risky_session(soon: None, file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+def risky_session(
+    short_timeouts: None, file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Session]:
     limited = WorkerOptions(memory_limit=LIMIT)
     with live_session(file, tmp_path_factory.mktemp("recordings"), worker=limited) as session:
         yield session
@@ -68,7 +70,7 @@ def risky_session(soon: None, file: Path, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.fixture
 def session(risky_session: Session, file: Path) -> Iterator[Session]:
-    """The session at rest at step 3 of an episode, with the file as it is on disk."""
+    """The session, paused at step 3 of an episode, with the file on disk loaded."""
     session = risky_session
     session.do(PauseRun())
     steps = session.view().step_serial
@@ -81,7 +83,7 @@ def session(risky_session: Session, file: Path) -> Iterator[Session]:
 
 
 def back(session: Session, before: SessionView, steps: tuple[int, int] = (3, 3)) -> SessionView:
-    """The first view of the version that has come back, at the moment that was last shown."""
+    """The first view after the version was restored at the last shown moment."""
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the version again")
     assert view.task.source_hash == before.task.source_hash and not view.playing
     np.testing.assert_allclose(view.step.poses, before.step.poses, atol=1e-5)
@@ -93,7 +95,7 @@ def back(session: Session, before: SessionView, steps: tuple[int, int] = (3, 3))
 
 
 @pytest.mark.parametrize("place", ["evaluate", "reward"])
-def test_a_loop_in_a_step_is_told_and_can_be_left_with_its_traceback(
+def test_an_infinite_loop_in_a_step_is_reported_and_can_be_interrupted_with_its_traceback(
     session: Session, file: Path, place: str
 ) -> None:
     before, worker = session.view(), session.worker_pid
@@ -110,15 +112,13 @@ def test_a_loop_in_a_step_is_told_and_can_be_left_with_its_traceback(
     assert view.problem.stage == place and view.problem.interrupted
     assert view.problem.file == str(file) and f'hazard("{place}")' in view.problem.traceback
     calm(file)
-    # Nothing of the step that was left remains: the next one is the one that it would have been.
+    # The interrupted step leaves no trace: the next step is the same as without it.
     session.do(Step())
     view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the fourth step")
     assert view.problem is None and session.worker_pid == worker and view.task_serial == before.task_serial
 
 
-def test_a_loop_in_the_middle_of_a_replay_is_left_and_the_batch_is_where_it_was(
-    session: Session, file: Path
-) -> None:
+def test_interrupting_a_loop_in_a_replay_leaves_the_batch_where_it_was(session: Session, file: Path) -> None:
     before, worker = step(session, 3), session.worker_pid
     session.happen(MomentShown(before.timeline.last - 2))
     provoke(file, "evaluate", "loop")
@@ -127,14 +127,14 @@ def test_a_loop_in_the_middle_of_a_replay_is_left_and_the_batch_is_where_it_was(
     session.do(Interrupt())
     view = wait_until(session, lambda v: v.problem is not None and v.busy is None, "the interrupt")
     assert view.problem.interrupted and view.problem.file == str(file) and view.problem_at_run
-    assert view.timeline.last == before.timeline.last, "it went nowhere"
+    assert view.timeline.last == before.timeline.last, "no moment was added"
     calm(file)
     session.do(Step())
     view = wait_until(session, lambda v: v.timeline.last > before.timeline.last, "the next step")
     assert (
         view.step.elapsed_steps.tolist() == [7, 7] and view.problem is None and session.worker_pid == worker
     )
-    # What was asked for then can be asked for again, and comes to the moment.
+    # The same request can be repeated and reaches the moment.
     session.happen(MomentShown(before.timeline.last - 2))
     shown, last = session.view().step.poses, view.timeline.last
     session.do(ContinueFromHere(scope="all"))
@@ -146,7 +146,7 @@ def test_a_loop_in_the_middle_of_a_replay_is_left_and_the_batch_is_where_it_was(
 @pytest.mark.parametrize(
     "place", ["import", *(pytest.param(place, marks=pytest.mark.slow) for place in ("reset", "build"))]
 )
-def test_a_loop_in_a_load_can_be_left_and_the_last_good_version_stays(
+def test_a_loop_in_a_load_can_be_interrupted_and_the_last_good_version_stays(
     session: Session, file: Path, place: str
 ) -> None:
     before = session.view()
@@ -165,9 +165,7 @@ def test_a_loop_in_a_load_can_be_left_and_the_last_good_version_stays(
 
 
 @pytest.mark.slow
-def test_a_hang_that_a_save_waits_for_is_left_and_the_new_version_loaded_where_it_never_ran(
-    session: Session, file: Path
-) -> None:
+def test_a_save_behind_a_hang_is_loaded_in_a_new_worker(session: Session, file: Path) -> None:
     before, worker = session.view(), session.worker_pid
     provoke(file, "evaluate", "loop")
     session.do(Step())
@@ -182,28 +180,30 @@ def test_a_hang_that_a_save_waits_for_is_left_and_the_new_version_loaded_where_i
 @pytest.mark.parametrize(
     "what", ["native", *(pytest.param(one, marks=pytest.mark.slow) for one in ("catch", "half"))]
 )
-def test_what_cannot_be_interrupted_is_said_and_a_restart_brings_the_moment_back(
+def test_uninterruptible_work_is_reported_and_a_restart_restores_the_moment(
     session: Session, file: Path, what: str
 ) -> None:
     before = session.view()
     provoke(file, "evaluate", what)
     session.do(Step())
     wait_until(session, lambda v: v.busy is not None, "busy")
-    if what != "half":  # a message that stops in the middle
+    if what != "half":  # "half" hangs in the middle of a message
         session.do(Interrupt())
-        busy = wait_until(session, lambda v: v.busy and v.busy.ignores_interrupt, "that it is deaf").busy
+        busy = wait_until(
+            session, lambda v: v.busy and v.busy.ignores_interrupt, "the ignored interrupt"
+        ).busy
         assert busy.file == str(file) and 'hazard("evaluate")' in busy.traceback
     calm(file)
     session.do(RestartWorker())
-    assert back(session, before).problem is None, "the file as it is now is not the one that hung"
+    assert back(session, before).problem is None, "the file no longer hangs"
 
 
 @pytest.mark.slow
-def test_what_is_only_slow_is_told_and_left_alone(session: Session, file: Path) -> None:
+def test_slow_work_is_reported_and_not_stopped(session: Session, file: Path) -> None:
     before, worker = session.view(), session.worker_pid
     provoke(file, "build", "slow")
     edit(file)
-    # For longer than a load waits for what cannot be interrupted.
+    # Longer than a load waits for uninterruptible work.
     long = supervisor._LOAD_WAIT_SECONDS + supervisor._SILENCE_TIMEOUT_SECONDS + 0.5
     busy = wait_until(session, lambda v: v.busy is not None and v.busy.seconds > long, "busy").busy
     assert "build" in busy.doing and busy.code == "_time.sleep(0.1)"
@@ -215,14 +215,14 @@ def test_what_is_only_slow_is_told_and_left_alone(session: Session, file: Path) 
 
 
 def another_version(session: Session, file: Path) -> SessionView:
-    """One that has not ended a process yet: one that does so twice soon gives way to the version before it."""
+    """A new version, which has not crashed yet: two crashes in quick succession restore the version before it."""
     edit(file)
     return runs(session, file.read_text())
 
 
 # --- ends ------------------------------------------------------------------------------------------------
 
-WAYS = [
+DEATHS = [
     ("segfault", "SIGSEGV", "_ctypes.string_at(0)"),
     ("exit", "os._exit(3)", "_os._exit(3)"),
     ("abort", "SIGABRT", "_os.abort()"),
@@ -236,14 +236,14 @@ WAYS = [
     ("thread", "exit code 1", ...),
 ]
 QUICK = ("segfault",)
-"""The others end the process in the same ways, and each costs a new one."""
+"""Deaths in the quick run; the others are similar, and each needs a new process."""
 
 
 @pytest.mark.parametrize(
     ("what", "says", "code"),
-    [pytest.param(*way, id=way[0], marks=() if way[0] in QUICK else pytest.mark.slow) for way in WAYS],
+    [pytest.param(*way, id=way[0], marks=() if way[0] in QUICK else pytest.mark.slow) for way in DEATHS],
 )
-def test_a_death_is_told_with_its_line_and_the_moment_comes_back(
+def test_a_death_is_reported_with_its_line_and_the_moment_is_restored(
     session: Session, file: Path, what: str, says: str, code: object
 ) -> None:
     before, worker = another_version(session, file), session.worker_pid
@@ -251,7 +251,7 @@ def test_a_death_is_told_with_its_line_and_the_moment_comes_back(
     session.do(Step())
     wait_until(session, lambda v: v.problem is not None and v.problem.stage == "worker", "the death")
     calm(file)
-    if what == "thread":  # it ends a while after the step
+    if what == "thread":  # it ends some time after the step
         view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the version again")
         assert view.step.elapsed_steps[0] in (3, 4)
     else:
@@ -262,11 +262,11 @@ def test_a_death_is_told_with_its_line_and_the_moment_comes_back(
         assert code is None or view.problem.line == line_of(file, code)
     assert session.worker_pid != worker and not psutil.pid_exists(worker)
     innocent = [p for p in psutil.process_iter(["cmdline"]) if p.info["cmdline"] == ["innocent", "3600"]]
-    assert not innocent, "what the task detached was left behind"
+    assert not innocent, "a process that the task detached is left alive"
 
 
 @pytest.mark.slow
-def test_a_new_version_that_kills_whoever_imports_it_costs_one_worker(session: Session, file: Path) -> None:
+def test_a_version_that_kills_its_process_on_import_costs_one_worker(session: Session, file: Path) -> None:
     before, good = session.view(), file.read_text()
     file.write_text(good + "\n\n_ctypes.string_at(0)\n")
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the last good version")
@@ -278,7 +278,7 @@ def test_a_new_version_that_kills_whoever_imports_it_costs_one_worker(session: S
     save(session, file, good)
 
 
-def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, file: Path) -> None:
+def test_a_recording_loses_only_the_step_in_progress(session: Session, file: Path) -> None:
     written = another_version(session, file).of(RecordingStatus).episodes_written
     session.happen(RecordingWanted((1,)))
     for count in (1, 2, 3, 4, 5):
@@ -292,14 +292,14 @@ def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, file
     assert not view.of(RecordingStatus).active and view.of(RecordingStatus).problem is None
     assert verify_rrd(view.of(RecordingStatus).last_file) is None
     assert "5" in str(read_properties(Path(view.of(RecordingStatus).last_file)))
-    # A recording begins an episode of its own.
+    # A recording starts a new episode.
     view = back(session, before, steps=(8, 5))
     assert "SIGKILL" in view.problem.message and view.problem.code is None
     assert not view.stale and session.worker_pid != worker and not psutil.pid_exists(worker)
 
 
 @pytest.mark.slow
-def test_a_file_that_never_loaded_costs_one_worker_and_is_waited_for(tmp_path: Path) -> None:
+def test_a_file_that_never_loaded_costs_one_worker_until_the_next_save(tmp_path: Path) -> None:
     file = write_task(tmp_path)
     provoke(file, "import", "abort")
     options = TaskOptions(num_envs=1, env_kwargs={"render_backend": "none"})
@@ -315,7 +315,7 @@ def test_a_file_that_never_loaded_costs_one_worker_and_is_waited_for(tmp_path: P
     assert not psutil.pid_exists(waiting)
 
 
-# --- what is an error like others --------------------------------------------------------------------------
+# --- ordinary errors --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -328,7 +328,7 @@ def test_a_file_that_never_loaded_costs_one_worker_and_is_waited_for(tmp_path: P
         ("reset", "own_base", "GeneratorExit", 'raise GeneratorExit("of this")'),
     ],
 )
-def test_what_would_wait_or_leave_or_is_no_ordinary_exception_is_named_with_its_line(
+def test_input_exit_and_odd_exceptions_are_reported_with_their_line(
     session: Session, file: Path, place: str, what: str, says: str, code: str
 ) -> None:
     worker = session.worker_pid
@@ -347,14 +347,14 @@ def test_what_would_wait_or_leave_or_is_no_ordinary_exception_is_named_with_its_
         pytest.param("import", 'GeneratorExit("two")', marks=pytest.mark.slow),
     ],
 )
-def test_what_a_saved_version_raises_is_shown_with_the_text_of_that_version(
+def test_an_error_of_a_saved_version_is_shown_with_that_versions_code(
     session: Session, file: Path, place: str, error: str
 ) -> None:
     good, worker = file.read_text(), session.worker_pid
     hook = f'hazard("{place}")'
     (line,) = [line for line in good.splitlines() if line.strip() == hook]
     raised = line.replace(hook, f"raise {error}")
-    # In the place of a line that says something else in the version that is kept.
+    # At a line that is different in the version that keeps running.
     file.write_text(good.replace(f"{line}\n", f"{raised}\n{line}\n"))
     view = wait_until(session, lambda v: v.problem is not None, "the problem")
     number, code = line_of(file, raised.strip()), raised.strip()
@@ -365,11 +365,11 @@ def test_what_a_saved_version_raises_is_shown_with_the_text_of_that_version(
         f"line {number}, in" in above and below == code
         for above, below in zip(shown, shown[1:], strict=False)
     )
-    assert session.worker_pid != worker, "a version that was refused costs its process"
+    assert session.worker_pid != worker, "a refused version costs its process"
 
 
 @pytest.mark.parametrize("what", ["device", pytest.param("large", marks=pytest.mark.slow)])
-def test_a_task_file_that_is_no_file_any_more_is_told_and_the_mended_one_loaded(
+def test_a_task_path_that_is_no_longer_a_file_is_reported_and_loaded_once_fixed(
     session: Session, file: Path, what: str
 ) -> None:
     good, before = file.read_text(), session.view()
@@ -394,19 +394,19 @@ def test_a_task_file_that_is_no_file_any_more_is_told_and_the_mended_one_loaded(
         runs(session, good)
 
 
-def test_a_flood_of_prints_is_counted_and_its_end_kept(session: Session, file: Path) -> None:
+def test_a_flood_of_prints_is_counted_and_its_last_lines_kept(session: Session, file: Path) -> None:
     session.clear_printed()
     provoke(file, "evaluate", "flood")
     session.do(Step())
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the step behind the flood")
-    # The slower it is drained the more lines are kept for a while; those are pushed out by newer ones, and not counted.
+    # A slow reader keeps more lines for a while; newer ones push them out, so they are not counted.
     view = wait_until(session, lambda v: v.printed.dropped > 150_000, "most of the flood")
     assert len(view.printed.lines) <= 1000 and view.problem is None
     assert view.printed.lines[-1].stream == "stdout" and "no play" in view.printed.texts[-1]
 
 
 @pytest.mark.slow
-def test_a_task_that_goes_to_another_folder_is_reloaded_and_recorded_as_before(
+def test_a_task_that_changes_the_working_directory_is_still_reloaded_and_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = write_task(tmp_path)
@@ -433,11 +433,11 @@ def test_a_task_that_goes_to_another_folder_is_reloaded_and_recorded_as_before(
         assert Path(view.of(RecordingStatus).last_file).resolve().parent == tmp_path / "recordings"
 
 
-def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None:
-    """The kernel may give a signal for the process to a thread of torch's, and then nothing leaves the loop."""
+def test_an_interrupt_goes_to_the_thread_that_handles_signals_in_python() -> None:
+    """The kernel may deliver a process signal to one of torch's threads, which would not interrupt the loop."""
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     child.send_signal(signal.SIGSTOP)
-    os.waitpid(child.pid, os.WUNTRACED)  # it stops some time later, and until then a signal is delivered
+    os.waitpid(child.pid, os.WUNTRACED)  # it stops some time later; until then signals are delivered
     try:
         signal_main_thread(child.pid, INTERRUPT_SIGNAL)
         status = Path(f"/proc/{child.pid}/status").read_text()
@@ -449,4 +449,4 @@ def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None
     finally:
         child.kill()
         child.wait()
-    signal_main_thread(child.pid, INTERRUPT_SIGNAL)  # gone: nothing to interrupt
+    signal_main_thread(child.pid, INTERRUPT_SIGNAL)  # the process is gone: no error

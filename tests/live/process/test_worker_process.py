@@ -14,7 +14,7 @@ from workbench.task.description import TaskOptions
 TASK = Path(__file__).parents[3] / "tasks" / "minimal.py"
 
 
-def test_a_key_that_is_held_down_while_the_worker_reads_nothing_costs_no_later_request(
+def test_a_held_key_while_the_worker_reads_nothing_loses_no_later_request(
     child_process: None,
 ) -> None:
     worker = WorkerProcess(lambda name, text: False)

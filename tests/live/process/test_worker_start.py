@@ -1,4 +1,4 @@
-"""Workers as forks of one process that has done the imports, and without it where they would be of something else."""
+"""Workers are forks of a process with the imports done; started without it where a fork would differ."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from tests.drive.processes import workers_of
 from tests.drive.session import live_session, wait_until
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from tests.live.hazards import write_task
 from workbench.live.process import worker_process, worker_start
 from workbench.live.process.worker_process import WorkerProcess
@@ -38,7 +38,7 @@ def forks(fork_server: WorkerForks, monkeypatch: pytest.MonkeyPatch) -> WorkerFo
 
 @pytest.fixture
 def own_forks(monkeypatch: pytest.MonkeyPatch) -> Iterator[WorkerForks]:
-    """A fork server of the test's own."""
+    """A fork server for one test."""
     forks = WorkerForks()
     monkeypatch.setattr(worker_process, "worker_forks", forks)
     yield forks
@@ -58,8 +58,8 @@ def is_fork(worker: WorkerProcess) -> bool:
 
 
 def ends_as_asked(worker: WorkerProcess) -> bool:
-    """With as much time as a busy machine may need."""
-    worker.stop(grace=PATIENCE)
+    """Whether the worker stops on request, within the time that a busy machine may need."""
+    worker.stop(grace=TIMEOUT_SECONDS)
     return worker.exit_code() == 0
 
 
@@ -77,7 +77,7 @@ def has_ended(process: psutil.Process) -> bool:
 
 
 @pytest.mark.slow
-def test_workers_are_forks_that_end_apart_from_each_other_and_say_how(forks: WorkerForks) -> None:
+def test_forked_workers_end_independently_and_report_how(forks: WorkerForks) -> None:
     one, other = started(), started()
     assert listens(one) and listens(other)
     assert len({os.getpid(), one.pid, other.pid}) == 3 and is_fork(one) and is_fork(other)
@@ -89,7 +89,7 @@ def test_workers_are_forks_that_end_apart_from_each_other_and_say_how(forks: Wor
 
 
 @pytest.mark.slow
-def test_those_that_are_ended_at_once_leave_the_others_alone(forks: WorkerForks) -> None:
+def test_workers_killed_right_after_the_start_leave_the_others_alone(forks: WorkerForks) -> None:
     worker = started()
     assert listens(worker)
     for pause in (0.0, 0.0, 0.005, 0.01, 0.02, 0.04, 0.08):
@@ -115,7 +115,7 @@ def test_two_forks_do_not_draw_the_same_random_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_worker_that_would_be_of_something_else_is_no_fork(
+def test_a_worker_with_other_code_or_settings_is_not_forked(
     forks: WorkerForks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     workers = [started()]
@@ -137,7 +137,7 @@ def test_a_worker_that_would_be_of_something_else_is_no_fork(
 
 
 @pytest.mark.slow
-def test_after_a_save_of_what_was_imported_a_worker_imports_it_itself(
+def test_after_a_save_of_an_imported_module_a_worker_imports_it_itself(
     own_forks: WorkerForks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     library = tmp_path / "usercustomize.py"
@@ -153,20 +153,20 @@ def test_after_a_save_of_what_was_imported_a_worker_imports_it_itself(
 
 
 @pytest.mark.slow
-def test_what_cannot_be_imported_is_said_by_each_worker(
+def test_each_worker_reports_a_failed_import(
     own_forks: WorkerForks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "gymnasium.py").write_text("raise ImportError('broken by the test')\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    said: list[bytes] = []
-    worker = WorkerProcess(lambda name, piece: bool(said.append(piece)))
+    printed: list[bytes] = []
+    worker = WorkerProcess(lambda name, piece: bool(printed.append(piece)))
     assert until_gone(worker) == 1
     worker.stop(0)
-    assert b"ImportError: broken by the test" in b"".join(said)
+    assert b"ImportError: broken by the test" in b"".join(printed)
 
 
 @pytest.mark.slow
-def test_one_that_is_ended_before_it_has_been_forked_never_runs(own_forks: WorkerForks) -> None:
+def test_a_worker_ended_before_its_fork_never_runs(own_forks: WorkerForks) -> None:
     worker = started()
     began = time.monotonic()
     worker.stop(0)
@@ -178,7 +178,7 @@ def test_one_that_is_ended_before_it_has_been_forked_never_runs(own_forks: Worke
 
 
 @pytest.mark.slow
-def test_when_the_fork_server_is_killed_its_workers_end_and_the_next_has_another(
+def test_a_killed_fork_server_ends_its_workers_and_is_replaced(
     own_forks: WorkerForks,
 ) -> None:
     worker = started()

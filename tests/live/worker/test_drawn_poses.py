@@ -65,7 +65,7 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
             view = wait_until(session, lambda v, env=env: drawn(v, env), "a picture")
             assert shows_cube(view) == seen
             assert (view.step.poses[:, column, 2] > 25).tolist() == [False, True]
-        # A moment of the past, and on from there.
+        # A past moment, and continuing from it.
         session.change(selected_env=1)
         past = session.view().timeline.first
         session.happen(MomentShown(past))

@@ -1,4 +1,4 @@
-"""Going back to a moment: lived up to again to the last byte, and put there where that does not come out."""
+"""Going back to a moment: replayed to the last byte, or restored where the replay differs."""
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
@@ -28,13 +28,13 @@ LATER = [0, 100, 200]
 
 
 class EnvMoment:
-    """A humanoid's fall: what was, moment by moment."""
+    """A humanoid's fall, moment by moment."""
 
     def __init__(self, opened: OpenedTask) -> None:
         self.opened, self.told = opened, []
         task, rng = opened.env, np.random.default_rng(0)
         task.reset(2)
-        # As if each had begun at another time.
+        # As if each episode had started at a different time.
         opened.env.env._elapsed_steps += torch.tensor(LATER)
         self.snapshots: list[Snapshot] = [task.snapshot()]
         self.actions: list[np.ndarray] = []
@@ -55,7 +55,7 @@ class EnvMoment:
     def back(
         self, moment: int, begins: dict[int, int], source: dict[int, int] | None = None
     ) -> go_back.Restored:
-        """To `moment`, from where each env begins."""
+        """Go back to `moment`; `begins` has the start of each env's replay."""
         source = source or {i: i for i in begins}
         ways = {
             i: ReplayPath(at, source[i], np.stack([a[source[i]] for a in self.actions[at:moment]]))
@@ -86,7 +86,7 @@ def lived() -> Iterator[EnvMoment]:
 
 
 @pytest.mark.thorough
-def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: EnvMoment) -> None:
+def test_a_humanoid_repeats_its_run_to_the_last_byte(lived: EnvMoment) -> None:
     did = lived.back(T, dict.fromkeys(range(N), 0))
     assert did.replayed == tuple(range(N)) and not did.not_carried
     assert lived.told == [(done, T) for done in range(1, T + 1)]
@@ -97,7 +97,7 @@ def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: EnvMoment) -> None
     assert lived.packed() == lived.packs[2 * T]
 
 
-def test_one_env_alone_and_as_another_while_the_others_notice_nothing(lived: EnvMoment) -> None:
+def test_one_env_goes_back_alone_or_as_another_env_without_affecting_the_others(lived: EnvMoment) -> None:
     before = lived.packed()
     did = lived.back(T, {1: 0}, {1: 2})
     assert did.replayed == (1,)
@@ -106,8 +106,8 @@ def test_one_env_alone_and_as_another_while_the_others_notice_nothing(lived: Env
     assert [now[0], now[2]] == [before[0], before[2]]
 
 
-def test_ways_of_several_lengths_end_together(lived: EnvMoment) -> None:
-    """Moment T put there is an exact point: what follows it is another run, and repeats itself."""
+def test_replays_of_different_lengths_end_together(lived: EnvMoment) -> None:
+    """Moment T, once restored, is an exact state: the run from there differs, and is repeatable."""
     go_back.go_back(
         lived.opened, Restore(pickle.dumps(lived.snapshots[T]), (0,), (0,), T), lambda *done: None
     )
@@ -128,7 +128,7 @@ def test_ways_of_several_lengths_end_together(lived: EnvMoment) -> None:
     assert did.replayed == every and lived.packed() == wanted
 
 
-def test_where_it_does_not_come_out_the_moment_is_put_there(lived: EnvMoment) -> None:
+def test_the_moment_is_restored_where_the_replay_differs(lived: EnvMoment) -> None:
     kept = lived.actions[3]
     lived.actions[3] = kept * np.array([[1.0], [0.5], [1.0]], np.float32)  # as an edited hook would
     try:
@@ -143,7 +143,7 @@ def test_where_it_does_not_come_out_the_moment_is_put_there(lived: EnvMoment) ->
     )
 
 
-def test_an_interrupt_in_the_middle_of_a_replay_ends_it_and_another_failure_on_the_way_does_not(
+def test_an_interrupt_ends_a_replay_and_another_failure_does_not(
     lived: EnvMoment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails_in_the_fifth_step(error: BaseException) -> None:
@@ -158,16 +158,18 @@ def test_an_interrupt_in_the_middle_of_a_replay_ends_it_and_another_failure_on_t
     fails_in_the_fifth_step(KeyError("edited"))
     did = lived.back(T, dict.fromkeys(range(N), 0))
     assert did.replayed == () and len(lived.told) == 4
-    assert lived.opened.env.env.elapsed_steps.tolist() == [T + later for later in LATER], "it was put there"
+    assert lived.opened.env.env.elapsed_steps.tolist() == [T + later for later in LATER], (
+        "the moment was restored"
+    )
     fails_in_the_fifth_step(Interrupted("stopped by hand"))
     with pytest.raises(TaskError) as ended:
         lived.back(T, dict.fromkeys(range(N), 0))
     assert isinstance(ended.value.__cause__, Interrupted) and len(lived.told) == 4
     monkeypatch.undo()
-    assert lived.back(T, dict.fromkeys(range(N), 0)).replayed == tuple(range(N)), "and the next comes out"
+    assert lived.back(T, dict.fromkeys(range(N), 0)).replayed == tuple(range(N)), "the next replay is exact"
 
 
-def test_a_way_that_takes_too_long_is_given_up(lived: EnvMoment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replay_that_takes_too_long_is_given_up(lived: EnvMoment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(go_back, "MAX_REPLAY_SECONDS", 0.0)
     did = lived.back(T, dict.fromkeys(range(N), 0))
     assert did.replayed == () and did.how == "" and len(lived.told) == 1

@@ -1,4 +1,4 @@
-"""The budget of simulated time that decides when a control step is due."""
+"""The simulated-time budget that decides when a control step is due."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def steps_taken(pacer: Pacer, moments: list[float]) -> int:
     speed=st.floats(0.1, 8.0),
     gaps=st.lists(st.floats(0.0, 0.09), min_size=20, max_size=200),
 )
-def test_simulated_time_follows_wall_time_however_uneven_the_loop(
+def test_simulated_time_follows_wall_time_with_an_uneven_loop(
     control_dt: float, speed: float, gaps: list[float]
 ) -> None:
     pacer = Pacer(control_dt, speed)
@@ -37,14 +37,14 @@ def test_simulated_time_follows_wall_time_however_uneven_the_loop(
     assert simulated >= now * speed - control_dt * 1.001
 
 
-def test_a_long_pause_is_not_caught_up_with() -> None:
+def test_a_long_pause_is_not_caught_up() -> None:
     pacer = Pacer(control_dt=0.05, speed=1.0)
     pacer.start(0.0)
     steps_taken(pacer, [0.0])
     assert steps_taken(pacer, [60.0]) <= 3
 
 
-def test_waiting_as_long_as_it_says_makes_a_step_due() -> None:
+def test_a_step_is_due_after_the_returned_wait() -> None:
     pacer = Pacer(control_dt=0.05, speed=0.5)
     pacer.start(0.0)
     assert pacer.due(0.0)
@@ -58,4 +58,4 @@ def test_the_rate_is_that_of_the_last_second() -> None:
     for i in range(100):
         rate.tick(i * 0.02)
     assert rate.per_second(1.98) == pytest.approx(50)
-    assert rate.per_second(11.98) == pytest.approx(0.1), "the next one takes ten seconds already"
+    assert rate.per_second(11.98) == pytest.approx(0.1), "the next step has taken ten seconds already"

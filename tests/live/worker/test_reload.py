@@ -1,4 +1,4 @@
-"""Reloads on real envs: what each level keeps, and that none leaves a mixture of two versions."""
+"""Reloads on real envs: what each level keeps, and that no mixture of two versions remains."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NUM_ENVS = 3
 
 @dataclass
 class Desk:
-    """An author's file and the version of it that runs, as the worker keeps it."""
+    """An author's file and its running version, as in the worker."""
 
     file: Path
     good: str
@@ -49,7 +49,7 @@ class Desk:
         return self.running.opened.env
 
     def save(self, text: str, level: LoadLevel = "auto") -> ReloadReport:
-        """Save and reload; raises TaskError as the reload does."""
+        """Save and reload; raises the reload's TaskError."""
         self.file.write_text(text)
         request = Load(str(self.file), self.options, level=level)
         opened, report = load_version(request, self.running)
@@ -77,7 +77,7 @@ def open_desk(file: Path, **env_kwargs: Any) -> Desk:
     options = TaskOptions(num_envs=NUM_ENVS, env_kwargs=env_kwargs)
     request = Load(str(file), options)
     opened, report = load_version(request, None)
-    assert report is None, "the first version takes nobody's place"
+    assert report is None, "the first version replaces none"
     return Desk(file, file.read_text(), options, Running(request, opened, opened.first))
 
 
@@ -103,7 +103,7 @@ def state_of(task: TaskEnv) -> list[bytes]:
 # --- patched ---------------------------------------------------------------------------------------
 
 
-def test_an_edited_reset_is_tried_without_touching_the_moment_and_seen_at_the_next_reset(desk: Desk) -> None:
+def test_an_edited_reset_is_tried_without_changing_the_moment_and_used_at_the_next_reset(desk: Desk) -> None:
     before = desk.step(4)
     state, rng = state_of(desk.task), torch.get_rng_state()
     report = desk.edit("SPAWN_HALF_WIDTH = 0.1", "SPAWN_HALF_WIDTH = 0.0")
@@ -118,10 +118,10 @@ def test_an_edited_reset_is_tried_without_touching_the_moment_and_seen_at_the_ne
     assert torch.allclose(cube[:, :2], torch.zeros(2), atol=1e-6)
 
 
-# --- what fails --------------------------------------------------------------------------------------
+# --- failures --------------------------------------------------------------------------------------
 
 
-# --- cameras, rebuilt, as asked ------------------------------------------------------------------------
+# --- levels: cameras, rebuilt, requested ------------------------------------------------------------------------
 
 
 def pictures(task: TaskEnv) -> list[np.ndarray]:
@@ -130,7 +130,7 @@ def pictures(task: TaskEnv) -> list[np.ndarray]:
     return [array for picture in made for array in (picture.rgb, picture.segmentation) if array is not None]
 
 
-def test_edited_cameras_are_those_of_a_fresh_env_and_the_scene_stays(desk: Desk) -> None:
+def test_edited_cameras_equal_those_of_a_fresh_env_and_the_scene_stays(desk: Desk) -> None:
     before = desk.step(3)
     env, state, was = desk.task.env, state_of(desk.task), pictures(desk.task)
     text = desk.good.replace("eye=[0.45, 0, 0.6]", "eye=[0.5, 0.1, 0.7]").replace(
@@ -153,15 +153,15 @@ def test_edited_cameras_are_those_of_a_fresh_env_and_the_scene_stays(desk: Desk)
         fresh.env.close()
 
 
-def test_cameras_can_be_exchanged_again_and_again_and_snapshots_stay_exact(desk: Desk) -> None:
+def test_cameras_can_be_replaced_repeatedly_and_snapshots_stay_exact(desk: Desk) -> None:
     for height in (0.5, 0.6, 0.7):
         assert desk.edit("eye=[0.45, 0, 0.6]", f"eye=[0.4, 0, {height}]").level == "cameras"
     snapshot = desk.task.snapshot()
     _, report = desk.task.restore(snapshot)
-    assert not report.not_carried, "an env whose entities were renumbered gets no fresh physics"
+    assert not report.not_carried, "renumbered entities still get the same physics"
 
 
-def test_a_moment_in_which_the_new_scene_fails_is_left_and_a_fresh_episode_begins(desk: Desk) -> None:
+def test_if_the_new_scene_fails_at_the_moment_a_fresh_episode_starts(desk: Desk) -> None:
     desk.step(5)
     text = desk.good.replace("base_color=[0.05,", "base_color=[0.5,")
     late = "assert (self._elapsed_steps < 3).all(), 'too late'\n        distance = torch"
@@ -170,7 +170,7 @@ def test_a_moment_in_which_the_new_scene_fails_is_left_and_a_fresh_episode_begin
     assert (desk.running.last.elapsed_steps == 0).all()
 
 
-def test_a_module_that_a_hook_imports_when_it_runs_is_compared_with_what_is_on_disk(tmp_path: Path) -> None:
+def test_a_module_that_a_hook_imports_at_run_time_is_compared_with_the_disk(tmp_path: Path) -> None:
     helper = tmp_path / "late.py"
     helper.write_text("def weight():\n    return 1.0\n")
     file = tmp_path / "push_cube.py"
@@ -191,10 +191,10 @@ def test_a_module_that_a_hook_imports_when_it_runs_is_compared_with_what_is_on_d
 
 
 @pytest.mark.slow
-def test_a_reload_as_random_as_can_be_equals_a_fresh_env_step_for_step(
+def test_a_random_reload_equals_a_fresh_env_step_for_step(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    """Anywhere in real tasks: in hooks, constants, defaults, scenes and cameras."""
+    """Edits anywhere in real tasks: in hooks, constants, defaults, scenes and cameras."""
     folder = tmp_path_factory.mktemp("author")
     desks = [open_desk(Path(shutil.copy(path, folder / path.name)), obs_mode="state") for path in EDITED]
     tried: list[str] = []
@@ -219,7 +219,7 @@ def test_a_reload_as_random_as_can_be_equals_a_fresh_env_step_for_step(
             goes_on_as(desk.running.opened, fresh)
         finally:
             fresh.env.close()
-            # The newest load of the file must be the one that runs, or it could not be taken back.
+            # The running version must be the newest load of the file, or it could not be undone.
             desk.save(text)
 
     edit()
@@ -237,7 +237,7 @@ EDITED = (
 
 
 def randomly_edited(text: str, rng: random.Random, edits: int) -> str:
-    """`text` with some of its numbers changed, or moved to functions, or statements gone or doubled."""
+    """`text` with some numbers changed or moved to functions, or statements removed or duplicated."""
     for _ in range(edits):
         kind = rng.choice(("number", "number", "number", "moved", "gone", "doubled"))
         text = (
@@ -259,7 +259,7 @@ def _with_a_number(text: str, rng: random.Random, kind: str) -> str:
     new = f"number_of_line_{node.lineno}()" if kind == "moved" else value
     lines[node.lineno - 1] = f"{line[: node.col_offset]}{new}{line[node.end_col_offset :]}"
     if kind == "moved":
-        # In front of everything but docstring and __future__: constants of the file may need it.
+        # After the docstring and __future__ imports only: constants of the file may need it.
         first = next(i for i, line in enumerate(lines) if line.startswith(("import ", "from typing")))
         lines.insert(first, f"def number_of_line_{node.lineno}():\n    return {value}\n\n\n")
     return "".join(lines)
@@ -279,10 +279,10 @@ def _with_a_statement(text: str, rng: random.Random, kind: str) -> str:
 
 
 def goes_on_as(reloaded: OpenedTask, fresh: OpenedTask) -> None:
-    """From a reset, then from the same moment with the same actions: the same bits."""
+    """Check for equal bits from a reset, then from the same moment with the same actions."""
     mine, theirs = reloaded.env, fresh.env
     moment = mine.snapshot()
-    # First, since a snapshot would put what the reloaded env remembers into the fresh one.
+    # First, because a snapshot would copy state of the reloaded env into the fresh one.
     same(mine.reset(seed=11), theirs.reset(seed=11))
     assert torch.equal(mine.obs, theirs.obs)
     start = mine.snapshot()

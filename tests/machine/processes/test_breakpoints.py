@@ -1,4 +1,4 @@
-"""``breakpoint()`` where there is no terminal: it raises at its own line, unless Python is told of something else."""
+"""``breakpoint()`` without a terminal raises at its own line, unless PYTHONBREAKPOINT says otherwise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BEGIN = "from workbench.machine.processes.debugger import refuse_breakpoints\nre
         ("0", "from pdb import set_trace\nset_trace(header='here')", True),
     ],
 )
-def test_it_raises_at_its_line_or_does_what_python_was_told(
+def test_breakpoint_raises_at_its_line_or_follows_pythonbreakpoint(
     named: str, call: str, raises: bool, tmp_path: Path
 ) -> None:
     file = tmp_path / "task.py"

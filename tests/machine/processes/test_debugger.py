@@ -1,4 +1,4 @@
-"""``--debug``: a real debugger attaches to the worker, holds it for longer than a worker may hang, and lets it go on."""
+"""``--debug``: a real debugger attaches to the worker, pauses it for longer than the hang timeouts, and resumes it."""
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
@@ -27,10 +27,10 @@ from workbench.machine.processes.child_python import child_environment, python_c
 from workbench.machine.processes.debugger import port_for_debugger
 from workbench.task.description import TaskOptions
 
-HANGS = 0.3
-"""Seconds; as short as the worker's ordinary work allows."""
+HANG_SECONDS = 0.3
+"""Patched hang timeouts; as short as the worker's ordinary work allows."""
 
-JUDGES, REWARDS = "distance = torch.linalg.norm(", "behind_cube = self.cube.pose.p.clone()"
+EVALUATE_LINE, REWARD_LINE = "distance = torch.linalg.norm(", "behind_cube = self.cube.pose.p.clone()"
 """The first lines of two hooks of the task."""
 
 
@@ -38,7 +38,7 @@ def line_of(file: Path, text: str) -> int:
     return next(i for i, line in enumerate(file.read_text().splitlines(), 1) if text in line)
 
 
-def said(view: SessionView, words: str) -> int:
+def count_printed(view: SessionView, words: str) -> int:
     return sum(words in text for text in view.printed.texts)
 
 
@@ -51,10 +51,10 @@ def port() -> int:
 def session(
     child_process: None, task_file: Path, tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Session]:
-    """Its worker waits for a debugger before it loads the task."""
-    monkeypatch.setattr(supervisor, "_BUSY_SECONDS", HANGS)
-    monkeypatch.setattr(supervisor, "_LOAD_WAIT_SECONDS", HANGS)
-    monkeypatch.setattr(supervisor, "_SILENCE_TIMEOUT_SECONDS", HANGS)
+    """A session whose worker waits for a debugger before it loads the task."""
+    monkeypatch.setattr(supervisor, "_BUSY_SECONDS", HANG_SECONDS)
+    monkeypatch.setattr(supervisor, "_LOAD_WAIT_SECONDS", HANG_SECONDS)
+    monkeypatch.setattr(supervisor, "_SILENCE_TIMEOUT_SECONDS", HANG_SECONDS)
     session = Session(
         str(task_file),
         TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"}),
@@ -64,16 +64,14 @@ def session(
     text = task_file.read_text()
     yield session
     session.close()
-    task_file.write_text(text)  # a breakpoint() left in it would stop the next test's recording for ever
+    task_file.write_text(text)  # a remaining breakpoint() would block the next test's recording forever
 
 
 @pytest.mark.slow
-def test_a_debugger_holds_the_worker_as_long_as_it_likes(
-    session: Session, task_file: Path, port: int
-) -> None:
+def test_a_debugger_can_pause_the_worker_for_any_time(session: Session, task_file: Path, port: int) -> None:
     view = wait_until(session, lambda v: bool(v.busy and v.busy.awaited), "the waiting")
     assert view.task is None and status_values(view)["word"] == "waiting"
-    assert said(view, f"waits for a debugger at 127.0.0.1:{port}") == 1
+    assert count_printed(view, f"waits for a debugger at 127.0.0.1:{port}") == 1
     listens = [
         found.laddr.ip  # type: ignore[union-attr]
         for found in psutil.net_connections("tcp")
@@ -86,8 +84,8 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
     before = wait_until(session, lambda v: v.task is not None and v.step is not None, "the first load")
     worker = session.worker_pid
 
-    # A breakpoint, held for longer than a worker may hang, with a save that waits behind it.
-    line = line_of(task_file, JUDGES)
+    # Pause at a breakpoint for longer than the hang timeouts, while a save waits.
+    line = line_of(task_file, EVALUATE_LINE)
     assert client.stop_at(task_file, line) == [True]
     session.do(Step())
     thread, *place = client.stopped_at()
@@ -99,32 +97,34 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
     good = task_file.read_text()
     task_file.write_text(good.replace("def evaluate", "# a line more\n    def evaluate"))
     held_since = time.monotonic()
-    view = wait_until(session, lambda v: bool(v.busy and v.busy.seconds > 6 * HANGS), "a long time")
+    view = wait_until(session, lambda v: bool(v.busy and v.busy.seconds > 6 * HANG_SECONDS), "a long time")
     session.do(Interrupt())
     assert view.stale and not is_busy_for_long(view) and view.problem is None
-    assert session.worker_pid == worker and time.monotonic() - held_since > 4 * HANGS
+    assert session.worker_pid == worker and time.monotonic() - held_since > 4 * HANG_SECONDS
     client.stop_at(task_file)
     client.ask("continue", threadId=thread)
     view = wait_until(session, lambda v: v.task_serial > before.task_serial and not v.stale, "the save")
     assert session.worker_pid == worker and view.problem is None and view.reload.level == "same"
-    assert view.step.elapsed_steps.tolist() == [1, 1], "the step that was held was made"
+    assert view.step.elapsed_steps.tolist() == [1, 1], "the paused step must be completed"
     wait_until(session, lambda v: v.busy is None, "rest")
 
-    # After the reload the same debugger goes on, and breakpoint() stops for it.
-    task_file.write_text(good.replace(REWARDS, f"breakpoint()\n        {REWARDS}"))
+    # After the reload the same debugger stays attached, and breakpoint() stops.
+    task_file.write_text(good.replace(REWARD_LINE, f"breakpoint()\n        {REWARD_LINE}"))
     _, *place = client.stopped_at()
     stops = line_of(task_file, "breakpoint()")
     assert place in ([str(task_file), stops], [str(task_file), stops + 1])
 
-    # A debugger that is gone lets go, and what it would have stopped at is passed and told.
+    # After the debugger disconnects, breakpoints are skipped with a message.
     client.close()
-    view = wait_until(session, lambda v: said(v, "a breakpoint was skipped") == 1, "the note")
+    view = wait_until(session, lambda v: count_printed(v, "a breakpoint was skipped") == 1, "the note")
     wait_until(session, lambda v: v.task_serial > before.task_serial + 1 and v.busy is None, "the version")
     assert session.worker_pid == worker
 
-    # Another worker listens at the same place, waits for nobody, and says so.
+    # A new worker listens at the same port, does not wait, and prints a message.
     session.do(RestartWorker())
-    view = wait_until(session, lambda v: said(v, "worker listens for a debugger") == 1, "the port again")
+    view = wait_until(
+        session, lambda v: count_printed(v, "worker listens for a debugger") == 1, "the port again"
+    )
     view = wait_until(session, lambda v: v.task is not None and v.busy is None, "the task again")
     wait_until(session, lambda v: session.worker_pid not in (None, worker), "another worker")
     client = DebugClient(port)
@@ -140,18 +140,18 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
 
 @pytest.mark.slow
 def test_a_recording_waits_for_a_debugger_and_stops_for_it(task_file: Path, tmp_path: Path) -> None:
-    asked = ("--debug", "--episodes", "1", "--num-envs", "1", "--max-steps", "2", "--no-pictures")
+    arguments = ("--debug", "--episodes", "1", "--num-envs", "1", "--max-steps", "2", "--no-pictures")
     command = python_command(
-        "-m", "workbench.cli.main", "record", str(task_file), "--out", str(tmp_path), *asked
+        "-m", "workbench.cli.main", "record", str(task_file), "--out", str(tmp_path), *arguments
     )
     environment = child_environment(PYTHONUNBUFFERED="1")
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:
         assert process.stdout is not None
-        said = process.stdout.readline()
-        assert said.startswith("waiting for a debugger at 127.0.0.1:")
-        client = DebugClient(int(said.rsplit(":", 1)[1]))
-        line = line_of(task_file, JUDGES)
+        line_printed = process.stdout.readline()
+        assert line_printed.startswith("waiting for a debugger at 127.0.0.1:")
+        client = DebugClient(int(line_printed.rsplit(":", 1)[1]))
+        line = line_of(task_file, EVALUATE_LINE)
         client.stop_at(task_file, line)
         client.begin()
         thread, *place = client.stopped_at()
@@ -167,7 +167,7 @@ def test_a_recording_waits_for_a_debugger_and_stops_for_it(task_file: Path, tmp_
         process.wait()
 
 
-def test_a_port_that_is_taken_is_refused_or_another_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_in_use_is_refused_if_given_and_replaced_if_not(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -182,7 +182,7 @@ def test_a_port_that_is_taken_is_refused_or_another_found(monkeypatch: pytest.Mo
     "options",
     [("--debug", "--socket", "here"), ("--debug-wait", "--socket", "here"), ("--debug-port", "70000")],
 )
-def test_what_everybody_on_the_machine_could_debug_is_refused(
+def test_debug_options_that_open_a_port_to_other_users_are_refused(
     options: tuple[str, ...], task_file: Path
 ) -> None:
     with pytest.raises(SystemExit) as ended:

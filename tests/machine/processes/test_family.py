@@ -1,4 +1,4 @@
-"""Nothing that a worker started outlives it, however it tries, and nothing else is touched."""
+"""Processes that a worker started end with it, even daemons, and other processes are not touched."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ import ctypes, mmap, os, signal, sys, threading, time
 
 
 def detach():
-    """As a daemon does it, and under another name and an empty environment."""
+    """Detach as a daemon does, under another name and with an empty environment."""
     if os.fork() == 0:
         os.setsid()
         if os.fork() == 0:
@@ -93,7 +93,9 @@ def begin(child_process: None, tmp_path: Path) -> Iterator[Callable[..., subproc
         end_family(process)
 
 
-def test_code_that_asks_the_terminal_is_refused_and_not_stopped(child_process: None, tmp_path: Path) -> None:
+def test_a_read_from_the_terminal_fails_and_does_not_stop_the_process(
+    child_process: None, tmp_path: Path
+) -> None:
     (tmp_path / "family_member.py").write_text(_MEMBER)
     ours, theirs = os.openpty()
     process = subprocess.Popen(
@@ -119,53 +121,53 @@ def members(keeper: int) -> list[psutil.Process]:
     return [psutil.Process(pid) for pid in family(keeper)[1:]]
 
 
-def gone(processes: list[psutil.Process]) -> bool:
+def have_ended(processes: list[psutil.Process]) -> bool:
     return not psutil.wait_procs(processes, timeout=10)[1]
 
 
 @pytest.mark.parametrize(("how", "code"), [("exit", 3), ("crash", -signal.SIGSEGV), ("group", 5)])
-def test_what_detached_itself_goes_with_the_worker_and_the_exit_code_is_the_workers(
+def test_detached_processes_end_with_the_worker_whose_exit_code_is_returned(
     begin: Callable[..., subprocess.Popen[bytes]], how: str, code: int
 ) -> None:
     keeper = begin(how)
     until(lambda: len(family(keeper.pid)) == 4, "the whole family")
-    all_of_it = members(keeper.pid)
-    assert {process.name() for process in all_of_it} >= {"sleep"}
+    processes = members(keeper.pid)
+    assert {process.name() for process in processes} >= {"sleep"}
     assert keeper.stdin is not None
     keeper.stdin.write(b"\n")
     keeper.stdin.close()
     assert keeper.wait(timeout=20) == code
-    assert gone(all_of_it)
+    assert have_ended(processes)
 
 
-def test_a_family_is_ended_when_asked_and_nobody_else(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
+def test_end_family_ends_one_family_only(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
     one, other = begin("wait"), begin("wait")
     ours = subprocess.Popen(["sleep", "600"], start_new_session=True)
     all_of_one, all_of_other = members(one.pid), members(other.pid)
     end_family(one)
-    assert one.returncode == -signal.SIGKILL and gone(all_of_one)
+    assert one.returncode == -signal.SIGKILL and have_ended(all_of_one)
     assert all(process.is_running() for process in all_of_other) and ours.poll() is None
     end_family(other)
     ours.kill()
-    assert ours.wait() == -signal.SIGKILL and gone(all_of_other)
+    assert ours.wait() == -signal.SIGKILL and have_ended(all_of_other)
 
 
 @pytest.mark.slow
-def test_a_keeper_that_was_stopped_is_not_waited_for(
+def test_end_family_does_not_wait_for_a_stopped_keeper(
     begin: Callable[..., subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workbench.machine.processes.family._END_TIMEOUT_SECONDS", 0.1)
     keeper = begin("wait")
-    all_of_it = members(keeper.pid)
+    processes = members(keeper.pid)
     os.kill(keeper.pid, signal.SIGSTOP)
     end_family(keeper)
-    worker = all_of_it.pop(0)
-    assert gone([worker])
-    for process in all_of_it:
+    worker = processes.pop(0)
+    assert have_ended([worker])
+    for process in processes:
         process.kill()
 
 
-def test_a_server_that_is_killed_leaves_no_family(child_process: None, tmp_path: Path) -> None:
+def test_a_killed_server_leaves_no_family(child_process: None, tmp_path: Path) -> None:
     (tmp_path / "family_member.py").write_text(_MEMBER)
     (tmp_path / "server.py").write_text(
         "import os, subprocess, sys, time\n"
@@ -179,16 +181,16 @@ def test_a_server_that_is_killed_leaves_no_family(child_process: None, tmp_path:
         stdout=subprocess.PIPE,
     )
     assert server.stdout is not None
-    # The member's stdin is at its end: it goes on to sleep.
+    # The member's stdin is at EOF, so it goes on to sleep.
     assert server.stdout.readline() == b"ready\n"
     until(lambda: len(family(server.pid)) == 5, "the whole family")
-    all_of_it = members(server.pid)
+    processes = members(server.pid)
     server.kill()
     server.wait()
-    assert gone(all_of_it)
+    assert have_ended(processes)
 
 
-def test_the_memory_of_a_family_counts_what_is_shared_once(
+def test_a_familys_memory_counts_shared_pages_once(
     begin: Callable[..., subprocess.Popen[bytes]],
 ) -> None:
     keeper = begin("share")

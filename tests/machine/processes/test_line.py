@@ -1,4 +1,4 @@
-"""Whatever comes in on a worker's line is a message, the end of the worker, or not all there yet."""
+"""Data on a worker's socket is a message, EOF, an incomplete message, or unreadable."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def framed(raw: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("by_connection", [True, False])
-def test_messages_come_as_they_were_sent_whatever_their_size(ends: Ends, by_connection: bool) -> None:
+def test_messages_of_any_size_arrive_as_sent(ends: Ends, by_connection: bool) -> None:
     sent = [Loading("x" * size) for size in (0, 10, 16_384, 70_000, 300_000, 20_000_000, 0, 1)]
 
     def send() -> None:
-        """As a pool's process does, too: what is sent to it are not messages."""
+        """Send through a multiprocessing connection, as a pool's process does, or through a `MessageSocket`."""
         with ends.theirs:
             if by_connection:
                 connection = Connection(ends.theirs.detach())
@@ -74,9 +74,7 @@ def test_messages_come_as_they_were_sent_whatever_their_size(ends: Ends, by_conn
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.text(max_size=30), min_size=1, max_size=6), st.data())
-def test_messages_that_come_in_pieces_are_told_whole_and_in_order(
-    texts: list[str], data: st.DataObject
-) -> None:
+def test_messages_in_pieces_are_received_whole_and_in_order(texts: list[str], data: st.DataObject) -> None:
     ends, sent = Ends(), [Loading(text.encode(errors="backslashreplace").decode()) for text in texts]
     raw, got, ready = b"".join(framed(pack_message(event)) for event in sent), [], 0
     whole = [len(framed(pack_message(event))) for event in sent]
@@ -95,7 +93,7 @@ def test_messages_that_come_in_pieces_are_told_whole_and_in_order(
     ends.close()
 
 
-def test_what_was_read_is_not_kept_also_where_the_next_message_has_always_begun(ends: Ends) -> None:
+def test_read_bytes_are_freed_even_if_the_next_message_has_begun(ends: Ends) -> None:
     whole = framed(pack_message(Loading("x" * 100_000)))
     ends.theirs.sendall(whole[:1])
     before = psutil.Process().memory_info().rss
@@ -105,13 +103,15 @@ def test_what_was_read_is_not_kept_also_where_the_next_message_has_always_begun(
     assert psutil.Process().memory_info().rss - before < 50 * 2**20
     ends.theirs.sendall(whole[1:] + struct.pack("!i", MAX_MESSAGE_BYTES) + b"x")
     assert ends.line.receive(60) is not None and ends.line.receive(0) is None
-    assert psutil.Process().memory_info().rss - before < 100 * 2**20, "a length alone takes no memory"
+    assert psutil.Process().memory_info().rss - before < 100 * 2**20, (
+        "a length header alone must not allocate memory"
+    )
 
 
-def test_several_threads_may_ask_at_once_and_it_is_waited_for_no_shorter_than_asked_for(ends: Ends) -> None:
+def test_several_threads_can_poll_and_receive_waits_for_its_full_timeout(ends: Ends) -> None:
     stop = threading.Event()
 
-    def ask() -> int:
+    def poll() -> int:
         count = 0
         while not stop.is_set():
             assert not ends.line.waits()
@@ -119,17 +119,17 @@ def test_several_threads_may_ask_at_once_and_it_is_waited_for_no_shorter_than_as
         return count
 
     with ThreadPoolExecutor(3) as threads:
-        asked = [threads.submit(ask) for _ in range(3)]
+        polls = [threads.submit(poll) for _ in range(3)]
         began = time.monotonic()
         try:
             assert ends.line.receive(0.3) is None and time.monotonic() - began >= 0.3
         finally:
             stop.set()
-        assert all(one.result() > 0 for one in asked)
+        assert all(one.result() > 0 for one in polls)
         received = threads.submit(ends.line.receive, 60.0)
         whole = framed(pack_message(Loading("importing")))
         ends.theirs.sendall(whole[:-1])
-        until(lambda: not ends.line.waits(), "all but one byte taken")
+        until(lambda: not ends.line.waits(), "all bytes but one to be read")
         ends.theirs.sendall(whole[-1:])
         assert received.result(timeout=60) == Loading("importing")
 
@@ -148,18 +148,18 @@ def test_several_threads_may_ask_at_once_and_it_is_waited_for_no_shorter_than_as
         b"print(1)\n",
     ],
 )
-def test_what_is_no_message_is_said_to_be_unreadable(ends: Ends, sent: bytes) -> None:
+def test_invalid_messages_raise_unreadable(ends: Ends, sent: bytes) -> None:
     ends.theirs.sendall(sent)
     with pytest.raises(Unreadable):
         ends.line.receive(60.0)
 
 
 @pytest.mark.parametrize("begun", [b"", b"\0\0", framed(b"hello")[:6]])
-def test_a_process_that_goes_in_the_middle_or_without_reading_is_an_end(ends: Ends, begun: bytes) -> None:
+def test_a_process_that_ends_mid_message_or_without_reading_is_eof(ends: Ends, begun: bytes) -> None:
     ends.theirs.sendall(begun)
     assert ends.line.receive(0) is None
     ends.ours.sendall(b"a request")
-    ends.theirs.close()  # the kernel says that the connection was reset, and not that it is over
+    ends.theirs.close()  # the kernel reports ECONNRESET here, not EOF
     with pytest.raises(EOFError) as caught:
         ends.line.receive(60.0)
     assert not isinstance(caught.value, Unreadable)

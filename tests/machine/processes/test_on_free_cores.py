@@ -1,4 +1,4 @@
-"""Threads that leave the cores to others."""
+"""`on_free_cores` runs threads with idle priority."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ def policies() -> set[int]:
     return {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")}
 
 
-def test_all_threads_are_low_within_and_as_before_afterwards_or_as_soon_as_somebody_waits() -> None:
+def test_threads_have_idle_priority_until_the_block_ends_or_another_thread_waits() -> None:
     began: list[int] = []
     waits = threading.Event()
     with on_free_cores(waits.is_set):
         thread = threading.Thread(target=lambda: began.append(os.sched_getscheduler(0)))
         thread.start()
         thread.join()
-        assert began == [os.sched_getscheduler(0)] == [os.SCHED_IDLE], "one that is started within is low too"
+        assert began == [os.sched_getscheduler(0)] == [os.SCHED_IDLE], (
+            "threads started within the block have idle priority, too"
+        )
         waits.set()
-        until(lambda: policies() == {os.SCHED_OTHER}, "the end of it")
+        until(lambda: policies() == {os.SCHED_OTHER}, "normal priority")
     with on_free_cores(lambda: False):
         assert os.sched_getscheduler(0) == os.SCHED_IDLE
     assert policies() == {os.SCHED_OTHER}

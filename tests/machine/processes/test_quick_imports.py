@@ -1,4 +1,4 @@
-"""While a process imports, garbage is not looked for; afterwards it is, and not among what was imported."""
+"""Garbage collection is off during imports, and afterwards skips the imported objects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from workbench.machine.processes.child_python import quick_imports
 
 
-def test_garbage_is_left_alone_meanwhile_and_looked_for_afterwards_also_after_a_failure() -> None:
+def test_garbage_collection_is_off_during_imports_and_on_again_even_after_an_error() -> None:
     frozen = gc.get_freeze_count()
     gc.unfreeze()
     try:
@@ -21,7 +21,7 @@ def test_garbage_is_left_alone_meanwhile_and_looked_for_afterwards_also_after_a_
         assert gc.isenabled()
         sys.modules.pop("this", None)
         with quick_imports(), redirect_stdout(StringIO()):
-            import this  # noqa: F401  one that nobody has imported yet
+            import this  # noqa: F401  a module that is not imported yet
 
             assert not gc.isenabled()
         assert gc.isenabled() and gc.get_freeze_count() > 10_000

@@ -1,4 +1,4 @@
-"""A thread of the workbench that fails is told of, and goes on."""
+"""A failure in a workbench thread is reported, and the thread continues."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from workbench.task.watch import SourceWatcher
 
 
 @pytest.fixture
-def said() -> Iterator[list[str]]:
-    said: list[str] = []
-    listen(said.append)
-    yield said
-    stop_listening(said.append)
+def reports() -> Iterator[list[str]]:
+    reports: list[str] = []
+    listen(reports.append)
+    yield reports
+    stop_listening(reports.append)
 
 
-def test_a_thread_that_fails_is_said_with_its_place_and_goes_on_until_it_is_done(said: list[str]) -> None:
+def test_a_failing_thread_is_reported_with_its_place_and_restarts_until_done(reports: list[str]) -> None:
     runs: list[int] = []
 
     def work() -> None:
@@ -32,11 +32,15 @@ def test_a_thread_that_fails_is_said_with_its_place_and_goes_on_until_it_is_done
     thread = watched_thread("letters", work)
     thread.start()
     thread.join(timeout=60)
-    assert len(runs) == 3 and len(set(runs)) == 1 and len(said) == 2
-    assert all("'letters'" in text and "KeyError: 'a thing'" in text and "in work" in text for text in said)
+    assert len(runs) == 3 and len(set(runs)) == 1 and len(reports) == 2
+    assert all(
+        "'letters'" in text and "KeyError: 'a thing'" in text and "in work" in text for text in reports
+    )
 
 
-def test_a_listener_that_fails_stops_nobody(said: list[str], caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_listener_does_not_stop_the_others(
+    reports: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
     def closed_terminal(text: str) -> None:
         raise BrokenPipeError
 
@@ -45,10 +49,10 @@ def test_a_listener_that_fails_stops_nobody(said: list[str], caplog: pytest.LogC
         report_failure("Something failed", ValueError("so"))
     finally:
         stop_listening(closed_terminal)
-    assert "ValueError: so" in said[0] and "Something failed" in caplog.text
+    assert "ValueError: so" in reports[0] and "Something failed" in caplog.text
 
 
-def test_the_watcher_goes_on_after_whatever_fails_in_it(tmp_path: Path, said: list[str]) -> None:
+def test_the_watcher_continues_after_an_error_in_its_callback(tmp_path: Path, reports: list[str]) -> None:
     file = tmp_path / "task.py"
     file.write_text("x = 1\n")
     seen: list[set[Path]] = []
@@ -64,6 +68,6 @@ def test_the_watcher_goes_on_after_whatever_fails_in_it(tmp_path: Path, said: li
         for times in (1, 2):
             file.write_text(f"x = {times + 1}\n")
             until(lambda times=times: len(seen) == times, "the change", seen=lambda: seen)
-        assert seen == [{file}] * 2 and len(said) == 1
+        assert seen == [{file}] * 2 and len(reports) == 1
     finally:
         watcher.stop()

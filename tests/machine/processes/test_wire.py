@@ -1,4 +1,4 @@
-"""Messages arrive as they were sent; other bytes are data of the expected types, or unreadable."""
+"""Messages arrive as sent; other bytes decode to the expected types or raise `Unreadable`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ EVENTS: tuple[type, ...] = get_args(Event)
 @pytest.mark.parametrize("kind", [*EVENTS, *QUESTIONS], ids=lambda kind: kind.__name__)
 @settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(st.data())
-def test_whatever_is_made_of_the_schema_is_that_message_and_what_is_not_is_unreadable(
+def test_data_of_a_schema_is_its_message_and_other_data_is_unreadable(
     kind: type, data: st.DataObject
 ) -> None:
     schema = inspect.type_info(kind)
@@ -46,12 +46,12 @@ def test_whatever_is_made_of_the_schema_is_that_message_and_what_is_not_is_unrea
     except Unreadable as error:
         assert str(error)
     else:
-        # What it says passes: then it says the same when it is packed again.
+        # If the data passes, packing it again must give the same type.
         again = unpacker.message(pack_message(wrong))
         assert type(again) is type(wrong)
 
 
-def test_every_answer_has_a_type_that_can_be_read() -> None:
+def test_every_answer_type_can_be_unpacked() -> None:
     kinds: tuple[Any, ...] = QUESTIONS
     for question in kinds:
         for kind in (value_type(question), question.part):
@@ -89,7 +89,7 @@ def messages() -> list[Any]:
 
 
 @pytest.mark.parametrize("message", messages(), ids=lambda message: type(message).__name__)
-def test_a_message_comes_as_it_was_sent(message: Any) -> None:
+def test_a_message_arrives_as_sent(message: Any) -> None:
     got = Unpacker(EVENTS, QUESTIONS).message(pack_message(message))
     if isinstance(message, Status):
         assert np.isnan(got.real_time_factor) and got.steps_per_second == float("inf")
@@ -97,7 +97,7 @@ def test_a_message_comes_as_it_was_sent(message: Any) -> None:
         assert same(got, message)
 
 
-def test_arrays_can_be_written_to_and_one_that_is_named_twice_is_sent_once() -> None:
+def test_received_arrays_are_writable_and_shared_ones_are_sent_once() -> None:
     array = np.arange(1000.0)
     packed = pack(
         {"a": array, "b": [array, array[::2]], "scalar": np.float32(2), "none": np.zeros((0, 3), "<i2")}
@@ -111,7 +111,7 @@ def test_arrays_can_be_written_to_and_one_that_is_named_twice_is_sent_once() -> 
 
 
 class Named(msgspec.Struct):
-    """A message with a text, and what msgpack does not know by itself beside it."""
+    """A message with texts and with types that msgpack lacks."""
 
     text: str
     path: Path
@@ -123,7 +123,7 @@ class Named(msgspec.Struct):
 @given(
     st.text(st.characters(exclude_categories=())), st.binary(min_size=1, max_size=20), ARRAYS, st.floats(0, 1)
 )
-def test_whatever_its_texts_are_a_message_arrives_and_its_paths_are_the_same(
+def test_a_message_with_any_text_arrives_and_keeps_its_paths(
     text: str, name: bytes, numbers: np.ndarray, one: float
 ) -> None:
     path = Path(os.fsdecode(name))
@@ -135,7 +135,7 @@ def test_whatever_its_texts_are_a_message_arrives_and_its_paths_are_the_same(
 
 
 @pytest.mark.parametrize("value", [object(), np.array([object()]), np.zeros(2, [("a", "<i4")]), lambda: None])
-def test_what_is_no_data_is_not_sent(value: object) -> None:
+def test_objects_that_are_not_data_are_not_sent(value: object) -> None:
     with pytest.raises(TypeError, match="cannot be sent"):
         pack({"a": value})
 
@@ -165,12 +165,12 @@ def array(name: str, shape: tuple[int, ...], code: int = 1) -> msgspec.msgpack.E
         framed(("LoadFailed", None, {"problem": {"stage": "step"}, "kept": False})),
     ],
 )
-def test_what_is_no_message_is_said_to_be_unreadable(sent: bytes) -> None:
+def test_invalid_messages_raise_unreadable(sent: bytes) -> None:
     with pytest.raises(Unreadable, match="."):
         Unpacker(EVENTS).message(sent)
 
 
-NO_ARRAYS = [
+INVALID_ARRAYS = [
     *(array("<f4", (3,)), array("<f4", (1 << 40, 1 << 40)), array("<f4", (-1,)), array("|O", (1,))),
     *(
         array("nonsense", (1,)),
@@ -182,14 +182,14 @@ NO_ARRAYS = [
 ]
 
 
-@pytest.mark.parametrize("value", NO_ARRAYS)
-def test_what_is_no_array_is_unreadable(value: object) -> None:
+@pytest.mark.parametrize("value", INVALID_ARRAYS)
+def test_invalid_arrays_raise_unreadable(value: object) -> None:
     with pytest.raises(Unreadable):
         Unpacker().unpack(framed({"a": value}, b"\0" * 8), dict[str, np.ndarray])
 
 
 @pytest.mark.parametrize("seed", [1, *[pytest.param(n, marks=pytest.mark.slow) for n in range(2, 30)]])
-def test_bytes_that_changed_on_the_way_raise_nothing_else(seed: int) -> None:
+def test_corrupted_bytes_raise_only_unreadable(seed: int) -> None:
     chosen = random.Random(seed)
     unpacker = Unpacker(EVENTS)
     sent = [pack_message(message) for message in messages() if isinstance(message, Event)]

@@ -1,4 +1,4 @@
-"""The judgement on one request, as a function: `test_attacks` asks the same over real sockets."""
+"""The decision on one request, as a function; `test_attacks` tests it over real sockets."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def why(decision: Decision) -> Why | None:
         ("", None),
     ],
 )
-def test_a_host_and_its_port_are_read_or_refused(text: str, split: tuple[str, int | None] | None) -> None:
+def test_a_host_and_its_port_are_parsed_or_refused(text: str, split: tuple[str, int | None] | None) -> None:
     assert split_authority(text) == split
 
 
 @pytest.mark.parametrize("host", [[], [""], ["evil.example"], ["localhost:8080", "localhost:8080"]])
-def test_a_request_for_another_host_or_for_two_is_refused_by_its_name(host: list[str]) -> None:
+def test_a_request_for_another_host_or_for_two_is_refused_with_the_reason(host: list[str]) -> None:
     for websocket in (False, True):
         assert why(decide(GATE, replace(KNOWN, host=host, websocket=websocket))) is Why.NAME
 
@@ -77,7 +77,7 @@ def test_a_request_for_another_host_or_for_two_is_refused_by_its_name(host: list
         ("localhost:8080", "null", False),
         ("localhost:8080", "http://", False),
         ("localhost:8080", "http:localhost:8080", False),
-        # A scheme's own port may be left out on either side.
+        # A scheme's default port may be omitted on either side.
         ("localhost", "http://localhost", True),
         ("localhost", "http://localhost:80", True),
         ("localhost:80", "http://localhost", True),
@@ -87,7 +87,7 @@ def test_a_request_for_another_host_or_for_two_is_refused_by_its_name(host: list
         ("localhost:80", "https://localhost", False),
     ],
 )
-def test_an_origin_is_ours_where_scheme_host_and_port_lead_here(host: str, origin: str, ours: bool) -> None:
+def test_an_origin_is_ours_if_scheme_host_and_port_match(host: str, origin: str, ours: bool) -> None:
     assert decide(AccessRules(None), RequestParts("/", [host], origin=[origin])) == (
         Admitted(host) if ours else RefusedRequest(Why.SITE, "It came from a page of another site.")
     )
@@ -97,7 +97,7 @@ NAVIGATES, DOCUMENT = {"fetch_mode": ["navigate"]}, {"fetch_dest": ["document"]}
 
 
 @pytest.mark.parametrize("site", [["cross-site"], ["same-site"], [""], ["none", "cross-site"]])
-def test_what_a_foreign_page_loads_is_refused_and_a_link_that_a_person_followed_is_not(
+def test_a_load_by_a_foreign_page_is_refused_and_a_followed_link_is_not(
     site: list[str],
 ) -> None:
     foreign = replace(KNOWN, fetch_site=site)
@@ -106,11 +106,11 @@ def test_what_a_foreign_page_loads_is_refused_and_a_link_that_a_person_followed_
     framed = replace(foreign, **NAVIGATES, fetch_dest=["iframe"])
     assert why(decide(GATE, framed)) is Why.SITE
     assert why(decide(GATE, replace(foreign, **NAVIGATES, **DOCUMENT))) is None
-    # Browsers differ in what they say of a handshake, which carries an Origin anyway.
+    # Browsers send different headers with a handshake, which has an Origin anyway.
     assert why(decide(GATE, replace(foreign, websocket=True))) is None
 
 
-def test_the_cookie_is_the_one_of_the_port_that_the_browser_sees() -> None:
+def test_the_cookie_belongs_to_the_port_that_the_browser_sees() -> None:
     assert cookie_name(8080) == "workbench-token-8080"
     for host, port in (("localhost", 80), ("localhost:80", 80), ("localhost:9000", 9000)):
         name = cookie_name(port)
@@ -125,7 +125,7 @@ def test_the_cookie_is_the_one_of_the_port_that_the_browser_sees() -> None:
         assert entered.set_cookie == f"{name}={TOKEN}; Path=/; HttpOnly; SameSite=Strict"
 
 
-def test_a_wrong_cookie_hides_no_right_one() -> None:
+def test_a_wrong_cookie_does_not_hide_the_right_one() -> None:
     name = cookie_name(8080)
     for cookies in (
         [f"{name}=wrong; {name}={TOKEN}"],
@@ -133,7 +133,7 @@ def test_a_wrong_cookie_hides_no_right_one() -> None:
         [f"{name}=wrong", f"{name}={TOKEN}"],
     ):
         assert why(decide(GATE, replace(KNOWN, cookie=cookies))) is None
-    # A token may hold the sign that ends a cookie's name.
+    # A token may contain the character that ends a cookie's name.
     assert why(decide(AccessRules("a=b"), replace(KNOWN, cookie=[f"{name}=a=b"]))) is None
 
 
@@ -151,14 +151,16 @@ def test_a_wrong_cookie_hides_no_right_one() -> None:
         ("/x?token=right&a?b=c", "/x?a%3Fb=c"),
     ],
 )
-def test_the_right_token_in_the_address_goes_on_to_the_same_page_without_it(path: str, location: str) -> None:
+def test_the_right_token_in_the_address_redirects_to_the_same_page_without_it(
+    path: str, location: str
+) -> None:
     for cookie in ([], KNOWN.cookie):
         entered = decide(GATE, replace(KNOWN, path=path, cookie=cookie))
         assert isinstance(entered, Entered)
         assert (entered.location, entered.by_page) == (location, False)
 
 
-def test_a_link_on_another_site_with_the_token_goes_on_by_a_page() -> None:
+def test_a_link_with_the_token_on_another_site_redirects_through_a_page() -> None:
     followed = replace(KNOWN, path="/?token=right", **NAVIGATES, **DOCUMENT)
     for site, by_page in (("cross-site", True), ("same-site", True), ("none", False)):
         entered = decide(GATE, replace(followed, fetch_site=[site]))
@@ -168,16 +170,16 @@ def test_a_link_on_another_site_with_the_token_goes_on_by_a_page() -> None:
 @pytest.mark.parametrize(
     "query", ["token=wrong", "token=righ", "token=rightt", "token=right&token=right", f"token={quote('é')}"]
 )
-def test_a_wrong_or_doubled_token_in_the_address_is_refused_even_with_the_cookie(query: str) -> None:
+def test_a_wrong_or_duplicated_token_in_the_address_is_refused_even_with_the_cookie(query: str) -> None:
     assert why(decide(GATE, replace(KNOWN, path=f"/?{query}"))) is Why.OTHER_TOKEN
 
 
-def test_the_token_in_a_handshakes_address_counts_for_nothing() -> None:
+def test_the_token_in_a_handshakes_address_is_ignored() -> None:
     handshake = replace(KNOWN, path="/?token=right", websocket=True)
     assert decide(GATE, handshake) == Admitted("localhost:8080")
     assert why(decide(GATE, replace(handshake, cookie=[]))) is Why.NO_TOKEN
 
 
-def test_an_empty_token_in_the_address_is_none() -> None:
+def test_an_empty_token_in_the_address_is_no_token() -> None:
     assert why(decide(GATE, replace(KNOWN, path="/?token="))) is None
     assert why(decide(GATE, replace(KNOWN, path="/?token=", cookie=[]))) is Why.NO_TOKEN

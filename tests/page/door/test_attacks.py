@@ -50,7 +50,7 @@ from workbench.page.door.page_guard import PageGuard
 
 pytestmark = pytest.mark.thorough
 
-# A busy machine is no failure, and one door is for all that is tried on it.
+# A slow example on a busy machine is not a failure, and all examples share one server.
 with_fixtures = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 LOADED_BY = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"}
@@ -58,7 +58,7 @@ LOADED_BY = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"}
 
 @pytest.fixture(scope="module")
 def gated_server() -> Iterator[GatedServer]:
-    """One for all that is tried on it."""
+    """One server for all tests of this file."""
     gated_server = open_server(ServerOptions(port=0))
     yield gated_server
     gated_server.close()
@@ -66,7 +66,7 @@ def gated_server() -> Iterator[GatedServer]:
 
 @pytest.fixture
 def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
-    """An honest client that was there before; call it to see that it still works."""
+    """A legitimate client that connected earlier; call it to check that it still works."""
     bell = Bell(gated_server)
     with client(gated_server) as connection:
         bell.rings(connection)
@@ -77,7 +77,7 @@ def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
 # The gate ----------------------------------------------------------------------------------------
 
 
-def test_an_honest_page_is_let_in(gated_server):
+def test_a_legitimate_page_is_let_in(gated_server):
     assert both(gated_server) == (200, 101)
     assert both(gated_server, Sec_Fetch_Site="same-origin") == (200, 101)
     assert ask(gated_server, Sec_Fetch_Site="none")[0] == 200
@@ -90,7 +90,7 @@ ORIGINS = [
     "",
     "http://127.0.0.1",
     "http://127.0.0.1:3000",
-    "http://localhost:{port}",  # another origin than the Host to a browser
+    "http://localhost:{port}",  # for a browser a different origin than the Host
     "http://127.0.0.1:{port}.evil.example",
     "http://127.0.0.1:{port}@evil.example",
     "http://evil.example#127.0.0.1:{port}",
@@ -122,7 +122,7 @@ HOSTS = [
 def test_a_rebound_host_is_refused_even_with_the_token(gated_server):
     for host in HOSTS:
         host = host and host.format(port=gated_server.port)
-        origin = f"http://{host}"  # a rebound page is same-origin with its own name
+        origin = f"http://{host}"  # to the browser a rebound page is same-origin with its own name
         assert both(gated_server, Host=host, Origin=origin) == (403, 403)
         assert ask(gated_server, f"/?token={token_of(gated_server)}", Host=host)[0] == 403
 
@@ -151,7 +151,7 @@ def test_without_the_token_nothing_is_served(gated_server):
 @pytest.mark.parametrize(
     "change", [str.lower, lambda t: t[:-1], lambda t: t + "A", lambda t: "", lambda t: "é" + t]
 )
-def test_a_wrong_token_is_refused_wherever_it_is_shown(gated_server, change):
+def test_a_wrong_token_is_refused_wherever_it_is_sent(gated_server, change):
     wrong = change(token_of(gated_server))
     status, headers, _ = ask(gated_server, f"/?token={quote(wrong)}", Cookie=None)
     assert status == 403
@@ -162,7 +162,7 @@ def test_a_wrong_token_is_refused_wherever_it_is_shown(gated_server, change):
     )
 
 
-def test_the_right_token_becomes_a_cookie_and_leaves_the_address(gated_server):
+def test_the_right_token_becomes_a_cookie_and_is_removed_from_the_address(gated_server):
     status, headers, body = ask(gated_server, f"/some/page?token={token_of(gated_server)}&x=1", Cookie=None)
     assert (status, headers["Location"], body) == (303, "/some/page?x=1", b"")
     assert headers["Cache-Control"] == "no-store"
@@ -177,7 +177,7 @@ def test_the_cookie_of_another_ports_workbench_is_refused(gated_server):
         assert both(gated_server, Cookie=cookie_of(other)) == (403, 403)
         assert both(gated_server, Cookie=f"{cookie_name(gated_server.port)}={token_of(other)}") == (403, 403)
         assert both(gated_server, Cookie=f"{cookie_name(other.port)}={token_of(gated_server)}") == (403, 403)
-        # And the browser that is in both shows both, in any order.
+        # A browser that is logged in to both sends both cookies, in any order.
         assert both(gated_server, Cookie=f"{cookie_of(other)}; {cookie_of(gated_server)}") == (200, 101)
         assert both(other, Cookie=f"{cookie_of(other)}; {cookie_of(gated_server)}") == (200, 101)
     finally:
@@ -222,7 +222,7 @@ def test_no_path_leads_out_of_the_served_folders(gated_server):
         b"\x16\x03\x01\x02\x00\x01\x00",  # TLS
     ],
 )
-def test_garbage_instead_of_http_harms_nobody(gated_server, bystander, raw, capfd):
+def test_garbage_instead_of_http_does_no_harm(gated_server, bystander, raw, capfd):
     with socket.create_connection(("127.0.0.1", gated_server.port), timeout=20) as connection:
         connection.sendall(raw)
         connection.shutdown(socket.SHUT_WR)
@@ -237,7 +237,7 @@ hosts = st.from_regex(r"[A-Za-z0-9.:@\[\]/\\_-]{0,30}", fullmatch=True)
 
 @with_fixtures
 @given(host=st.one_of(hosts, st.text(max_size=30)), path=st.text(max_size=40), cookie=st.text(max_size=40))
-def test_the_gate_lets_nobody_in_without_the_token_and_never_fails(host, path, cookie):
+def test_no_request_gets_in_without_the_token_and_none_raises(host, path, cookie):
     rules = AccessRules(token="x" * 43, any_address=True)
     for websocket in (False, True):
         asked = RequestParts(
@@ -257,7 +257,7 @@ def test_without_a_token_only_loopback_hosts_are_let_in(host):
 
 @with_fixtures
 @given(st.text(max_size=60))
-def test_what_follows_the_right_token_is_always_a_path_of_ours(path):
+def test_the_right_token_always_redirects_to_a_path_of_ours(path):
     rules = AccessRules(token="right")
     decision = decide(rules, RequestParts(path=f"{path}?token=right", host=["localhost:8080"]))
     if isinstance(decision, Entered):
@@ -284,7 +284,7 @@ def test_a_page_without_a_token_still_refuses_foreign_pages_and_rebound_names():
         gated_server.close()
 
 
-def test_a_wide_door_takes_its_addresses_and_no_foreign_name():
+def test_a_server_on_all_addresses_accepts_its_addresses_and_no_foreign_name():
     gated_server = open_server(ServerOptions(host="0.0.0.0", port=0))
     try:
         for host in ("192.168.1.5", socket.gethostname().lower(), "localhost"):
@@ -307,7 +307,7 @@ def test_a_wide_door_takes_its_addresses_and_no_foreign_name():
         gated_server.close()
 
 
-# Past the gate: what an authenticated client may say ----------------------------------------------
+# Past the gate: what an authenticated client may send ----------------------------------------------
 
 
 def test_no_client_can_open_the_share_tunnel(gated_server, bystander, caplog):
@@ -320,7 +320,7 @@ def test_no_client_can_open_the_share_tunnel(gated_server, bystander, caplog):
     with client(gated_server) as connection:
         say(connection, {"type": "ShareUrlRequest"})
         say(connection, {"type": "ShareUrlDisconnect"})
-        Bell(gated_server).rings(connection)  # the same connection lives on, and has been read this far
+        Bell(gated_server).rings(connection)  # the same connection stays open, and has been read up to here
     bystander()
     assert gated_server.server._share_tunnel is None
     assert set(process.children()) <= children
@@ -369,14 +369,16 @@ def test_no_client_can_upload(gated_server, bystander):
     bystander()
 
 
-def test_what_is_not_for_a_page_of_ours_to_send_changes_nothing(gated_server, bystander):
-    """No page of ours has an input of viser's. viser would set any attribute of one, and store any value."""
+def test_messages_that_our_pages_never_send_change_nothing(gated_server, bystander):
+    """Our pages have no inputs of viser's: viser would set any attribute of one and store any value."""
     slider = gated_server.server.gui.add_slider("x", 0.0, 10.0, 0.1, 5.0)
     with client(gated_server) as connection:
         for prop in ("value", "removed", "is_button", "update_cb", "uuid", "props", "__class__", "no_such"):
             say(connection, {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid, "updates": {prop: 7.0}})
         say(connection, {"type": "GuiFormSubmitMessage", "uuid": slider._impl.uuid})
-        say(connection, {"type": "RunJavascriptMessage", "source": "alert(1)"})  # only the server says that
+        say(
+            connection, {"type": "RunJavascriptMessage", "source": "alert(1)"}
+        )  # only the server may send that
         Bell(gated_server).rings(connection)
     assert slider.value == 5.0 and not slider._impl.removed and callable(slider.on_update)
     slider.remove()
@@ -399,8 +401,8 @@ MALFORMED = [
     packed(**{name: value for name, value in CAMERA.items() if name != "position"}),
     *(packed(**{**CAMERA, "position": value}) for value in ((1.0, 2.0), "abc", 5)),
     *(packed(**CAMERA, surplus=1), packed(**{**CAMERA, "fov": "wide"})),
-    b"\x82\xa4type\xb3ViewerCameraMessage\xa3fov\xcb\x7f\xf8" + b"\0" * 6,  # and no more
-    b"\x91" * 100_000,  # nested deeper than any stack
+    b"\x82\xa4type\xb3ViewerCameraMessage\xa3fov\xcb\x7f\xf8" + b"\0" * 6,  # truncated
+    b"\x91" * 100_000,  # nested deeper than the stack
 ]
 
 
@@ -410,9 +412,9 @@ def test_a_malformed_frame_closes_its_own_connection_only(gated_server, bystande
             connection.send(frame)
             assert close_code(connection) == (1009 if len(frame) > MAX_BYTES else 1008), frame[:40]
     bystander()
-    with client(gated_server):  # and the door still opens
+    with client(gated_server):  # and a new client still gets in
         pass
-    # The author's terminal is no place for a stranger's tracebacks.
+    # No traceback of an attacker's message may reach the author's terminal.
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -431,34 +433,34 @@ def test_a_malformed_frame_closes_its_own_connection_only(gated_server, bystande
     st.sampled_from(sorted(KINDS)),
     st.data(),
 )
-def test_any_message_is_admitted_dropped_or_called_malformed(value, kind, data):
+def test_any_message_is_admitted_dropped_or_malformed(value, kind, data):
     fields = list(KINDS[kind].__struct_fields__)
     message = {
         "type": kind,
         **dict.fromkeys(data.draw(st.lists(st.sampled_from(fields), max_size=9)), value),
     }
-    judged(msgspec.msgpack.encode(message))
+    check(msgspec.msgpack.encode(message))
 
 
 @with_fixtures
 @given(st.binary(max_size=200))
-def test_any_bytes_are_admitted_dropped_or_called_malformed(raw):
-    judged(raw)
+def test_any_bytes_are_admitted_dropped_or_malformed(raw):
+    check(raw)
 
 
-def judged(raw: bytes) -> None:
-    """Let the guard of a page that is on no connection check a frame; any other error fails the test."""
+def check(raw: bytes) -> None:
+    """Check a frame with a page guard without a connection; any unexpected error fails the test."""
     guard = PageGuard(lambda kind: False, RateLimitedLog(lambda line: None))
     with contextlib.suppress(MalformedMessage):
         assert guard.admits(raw) in (True, False)
 
 
 INPUTS = {"GuiUpdateMessage", "GuiFormDirtyMessage", "GuiFormSubmitMessage"}
-"""What viser hears of inputs, which no page of ours has."""
+"""viser's messages about inputs, which our pages do not have."""
 
 
-def test_viser_listens_to_nothing_that_the_seam_does_not_know(gated_server, bystander):
-    """An upgrade that adds a kind of message must be looked at before clients may send it."""
+def test_viser_handles_only_known_message_types(gated_server, bystander):
+    """A message type that a viser upgrade adds must be reviewed before clients may send it."""
     handled = {kind.__name__ for kind in gated_server.server._websock_server._incoming_handlers}
     for one in gated_server.server.get_clients().values():
         handled |= {kind.__name__ for kind in one._websock_connection._incoming_handlers}
@@ -471,8 +473,7 @@ def test_viser_listens_to_nothing_that_the_seam_does_not_know(gated_server, byst
 
 @contextlib.contextmanager
 def hostile_site(html: str, handshakes: list[str] | None = None) -> Iterator[int]:
-    """A web server on another port of this machine, which serves ``html`` and notes who comes with a
-    websocket handshake."""
+    """A web server on another local port, which serves ``html`` and records websocket handshakes."""
 
     class Site(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -500,11 +501,11 @@ def hostile_site(html: str, handshakes: list[str] | None = None) -> Iterator[int
 @pytest.mark.slow
 @pytest.mark.browser
 def test_a_link_cannot_send_our_page_to_another_server(gated_server, browser, monkeypatch):
-    """``?websocket=`` is viser's; what such a server sends would run as our page, with our cookie."""
+    """viser reads ``?websocket=``: code from such a server would run as our page, with our cookie."""
     came: list[str] = []
     later: list[str] = []
     with (
-        # Another for each try: what was begun in the first may arrive late.
+        # A new page for each try: requests of the first may arrive late.
         hostile_site("", came) as first,
         hostile_site("", later) as second,
         page_at(browser, "about:blank", 640, 480) as (page, _),
@@ -514,19 +515,21 @@ def test_a_link_cannot_send_our_page_to_another_server(gated_server, browser, mo
         with monkeypatch.context() as without_policy:
             without_policy.setattr(responses, "page_policy", lambda authority: "frame-ancestors 'self'")
             page.goto(f"{link}{first}", wait_until="domcontentloaded")
-            until(lambda: came, "the attack, which is real")
+            until(lambda: came, "the attack, which works without the policy")
         page.goto("about:blank")
         page.goto(f"{link}{second}", wait_until="domcontentloaded")
         page.wait_for_selector("canvas", timeout=60_000)
-        page.wait_for_timeout(4000)  # it tries once a second, and nobody is told what the policy refuses
+        page.wait_for_timeout(
+            4000
+        )  # it tries once a second, and a request that the policy blocks raises no event
         assert later == []
 
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(gated_server, browser):
-    """The browser holds the cookie. ``127.0.0.1`` on another port is the same *site* to it, so there the
-    cookie is sent along; ``localhost`` is another site."""
+def test_pages_of_other_sites_cannot_use_a_logged_in_browser(gated_server, browser):
+    """The browser has the cookie. For it ``127.0.0.1`` on another port is the same *site*, so it sends the
+    cookie there; ``localhost`` is another site."""
     target = f"127.0.0.1:{gated_server.port}"
     attack = """
         <body><script>
@@ -550,7 +553,7 @@ def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(gated_ser
     with hostile_site(attack) as port, page_at(browser, "about:blank", 640, 480) as (page, _):
         page.goto(gated_server.url, wait_until="domcontentloaded")
         until(gated_server.server.get_clients, "the page")
-        # The attack itself works: from our own page it gets through.
+        # The attack itself works: from our own page it succeeds.
         own = page.evaluate(
             "() => {" + attack.partition("<script>")[2].partition("</script>")[0] + "; return attack(); }"
         )
@@ -559,7 +562,7 @@ def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(gated_ser
             page.goto(f"http://{site}:{port}/", wait_until="domcontentloaded")
             assert page.evaluate("attack()") == refused, site
 
-        # A person who follows a link to the printed address in another site's page gets in.
+        # A user who follows a link to the printed address on another site gets in.
         page.context.clear_cookies()
         page.goto(f"http://localhost:{port}/", wait_until="domcontentloaded")
         page.evaluate(

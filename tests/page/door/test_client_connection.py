@@ -1,4 +1,4 @@
-"""The line to a page: real sockets, with a relay of limited rate and delay between."""
+"""The connection to a page: real sockets, through a relay with limited rate and delay."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from workbench.page.door.gated_server import GatedServer
 
 pytestmark = pytest.mark.thorough
 
-BITS, DELAY = 2e6, 0.04
-"""A slow line: 250 kB a second, 80 ms there and back."""
+BITS_PER_SECOND, DELAY_SECONDS = 2e6, 0.04
+"""A slow line: 250 kB/s, 80 ms round trip."""
 
 
 @dataclass
@@ -34,10 +34,10 @@ class Seen:
     messages: int = 0
 
 
-def talk(
-    speak: Callable[[ServerConnection], Awaitable[None]], bits: float = float("inf"), delay: float = 0.0
+def transfer(
+    server_side: Callable[[ServerConnection], Awaitable[None]], bits: float = float("inf"), delay: float = 0.0
 ) -> tuple[FarLine, Seen]:
-    """What `speak` sends, received by a client over this line."""
+    """Run `server_side` and receive what it sends with a client behind this relay."""
     seen = Seen()
 
     async def both() -> FarLine:
@@ -45,7 +45,7 @@ def talk(
 
         async def handler(connection: ServerConnection) -> None:
             try:
-                await speak(connection)
+                await server_side(connection)
                 spoken.set_result(None)
             except Exception as error:
                 spoken.set_exception(error)
@@ -79,7 +79,7 @@ async def send_all(send: Send, size: int, count: int) -> None:
         await send(os.urandom(size))
 
 
-def test_a_page_far_away_gets_what_repeats_compressed() -> None:
+def test_repeated_messages_to_a_distant_page_are_compressed() -> None:
     same = os.urandom(8000)
 
     async def repeat(connection: ServerConnection) -> None:
@@ -87,11 +87,11 @@ def test_a_page_far_away_gets_what_repeats_compressed() -> None:
         for _ in range(10):
             await line.send(same)
 
-    far, seen = talk(repeat, delay=0.02)
+    far, seen = transfer(repeat, delay=0.02)
     assert seen.received == 80_000 and far.down < 20_000
 
 
-def test_compression_may_begin_and_end_with_any_message() -> None:
+def test_compression_may_start_and_stop_at_any_message() -> None:
     same = os.urandom(8000)
 
     async def repeat(connection: ServerConnection) -> None:
@@ -100,11 +100,11 @@ def test_compression_may_begin_and_end_with_any_message() -> None:
             deflate.on = number % 4 > 1
             await connection.send(same)
 
-    far, seen = talk(repeat)
+    far, seen = transfer(repeat)
     assert seen.received == 12 * 8000 and 7 * 8000 < far.down < 9 * 8000
 
 
-def test_a_message_for_a_page_that_leaves_meanwhile_is_not_waited_for() -> None:
+def test_a_message_to_a_page_that_disconnects_is_not_awaited() -> None:
     async def talk_to_one_that_leaves() -> None:
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
@@ -119,7 +119,7 @@ def test_a_message_for_a_page_that_leaves_meanwhile_is_not_waited_for() -> None:
 
         async with serve(handler, "127.0.0.1", 0, compression=None) as server:
             port = server.sockets[0].getsockname()[1]
-            with line_to(f"ws://127.0.0.1:{port}", BITS, DELAY) as line:
+            with line_to(f"ws://127.0.0.1:{port}", BITS_PER_SECOND, DELAY_SECONDS) as line:
                 client = await connect(line.address(f"ws://127.0.0.1:{port}"))
                 await client.recv()
                 client.transport.abort()
@@ -129,8 +129,8 @@ def test_a_message_for_a_page_that_leaves_meanwhile_is_not_waited_for() -> None:
 
 
 @pytest.mark.slow
-def test_a_page_on_a_slow_line_is_given_the_newest_and_no_queue(gated_server: GatedServer) -> None:
-    """The real server: 60 changes a second are four times what the line carries."""
+def test_a_page_on_a_slow_line_gets_the_newest_state_without_a_queue(gated_server: GatedServer) -> None:
+    """The real server: 60 changes a second are four times the capacity of the line."""
     server = gated_server.server
     rng = np.random.default_rng(0)
     colours = np.zeros((1500, 3), np.uint8)
@@ -151,7 +151,7 @@ def test_a_page_on_a_slow_line_is_given_the_newest_and_no_queue(gated_server: Ga
                 if newest == "120":
                     return
 
-    with line_to(gated_server.url, BITS, DELAY) as line:
+    with line_to(gated_server.url, BITS_PER_SECOND, DELAY_SECONDS) as line:
         reading = threading.Thread(target=lambda: asyncio.run(asyncio.wait_for(read(line), 60)))
         reading.start()
         until(lambda: line.down > 0 and len(server.get_clients()) == 1, "the page")
@@ -162,10 +162,10 @@ def test_a_page_on_a_slow_line_is_given_the_newest_and_no_queue(gated_server: Ga
             most = max(most, line.waiting)
         reading.join()
     assert newest == "120"
-    assert most < 250_000, "a second of the line"
+    assert most < 250_000, "one second of the line's capacity"
 
 
-def test_a_message_that_unpacks_to_megabytes_ends_the_connection(gated_server: GatedServer) -> None:
+def test_a_message_that_decompresses_to_megabytes_ends_the_connection(gated_server: GatedServer) -> None:
     async def send() -> int | None:
         address, options = handshake(gated_server.url)
         async with connect(address, **{**options, "compression": "deflate"}) as client:

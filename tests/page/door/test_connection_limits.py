@@ -1,4 +1,4 @@
-"""Connections that have not shown the token: how long, how many, how much, and what is said of them."""
+"""Limits for connections without the token: time, number, bytes and log lines."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def connected(gated_server: GatedServer) -> socket.socket:
 
 
 def is_closed(sock: socket.socket) -> bool:
-    """Whether the other end has hung up; waits no longer than the socket does."""
+    """Whether the other end has closed; waits up to the socket's timeout."""
     try:
         return sock.recv(1 << 16) == b""
     except ConnectionResetError:
@@ -39,7 +39,7 @@ def is_closed(sock: socket.socket) -> bool:
 @pytest.mark.parametrize(
     "said", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nX: ", b"\x16\x03"]
 )
-def test_a_connection_that_asks_nothing_is_closed_after_a_while(gated_server, monkeypatch, said):
+def test_a_connection_without_a_request_is_closed_after_a_timeout(gated_server, monkeypatch, said):
     monkeypatch.setattr(strangers, "TOKEN_TIMEOUT_SECONDS", 0.3)
     with connected(gated_server) as quiet:
         quiet.sendall(said)
@@ -48,15 +48,15 @@ def test_a_connection_that_asks_nothing_is_closed_after_a_while(gated_server, mo
 
 
 @pytest.mark.thorough
-def test_a_head_that_comes_a_byte_at_a_time_gains_no_time(gated_server, monkeypatch):
+def test_sending_the_head_byte_by_byte_does_not_extend_the_timeout(gated_server, monkeypatch):
     monkeypatch.setattr(strangers, "TOKEN_TIMEOUT_SECONDS", 0.5)
     with connected(gated_server) as slow, pytest.raises(OSError):
         for byte in b"GET / HTTP/1.1\r\nX: " + b"y" * 10_000:
             slow.sendall(bytes([byte]))
-            time.sleep(0.02)  # what is tested: all the time a little comes
+            time.sleep(0.02)  # under test: a few bytes arrive all the time
 
 
-def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(gated_server, monkeypatch):
+def test_a_refused_client_that_does_not_close_is_closed(gated_server, monkeypatch):
     monkeypatch.setattr(strangers, "TOKEN_TIMEOUT_SECONDS", 0.5)
     with connected(gated_server) as refused:
         refused.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
@@ -67,10 +67,10 @@ def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(gated_server
 
 
 @pytest.mark.thorough
-def test_a_page_that_has_shown_the_token_is_not_hurried(gated_server, monkeypatch):
+def test_a_page_with_the_token_has_no_timeout(gated_server, monkeypatch):
     monkeypatch.setattr(strangers, "TOKEN_TIMEOUT_SECONDS", 0.3)
     slow = (200, "application/octet-stream", b"x" * 1000)
-    # Both take longer than a stranger is given.
+    # Both take longer than the timeout without a token.
     gated_server.add_route("/slow/", lambda path: time.sleep(0.8) or slow)
     assert ask(gated_server, "/slow/x")[2] == b"x" * 1000
     with client(gated_server) as page:
@@ -78,14 +78,14 @@ def test_a_page_that_has_shown_the_token_is_not_hurried(gated_server, monkeypatc
         page.ping().wait(30)
 
 
-def test_too_many_that_say_nothing_lock_nobody_out(gated_server, monkeypatch, caplog):
+def test_many_silent_connections_do_not_lock_out_others(gated_server, monkeypatch, caplog):
     monkeypatch.setattr(strangers, "MAX_WITHOUT_TOKEN", 10)
     with contextlib.ExitStack() as stack, caplog.at_level(logging.WARNING):
         idle = [stack.enter_context(connected(gated_server)) for _ in range(30)]
         for _ in range(5):
             assert both(gated_server) == (200, 101)
             assert ask(gated_server, "/", Cookie=None)[0] == 403
-        # The first of them have gone, the last are still there.
+        # The oldest are closed, the newest are still open.
         assert is_closed(idle[0])
         idle[-1].settimeout(0.2)
         with pytest.raises(TimeoutError):
@@ -100,7 +100,7 @@ def test_too_many_that_say_nothing_lock_nobody_out(gated_server, monkeypatch, ca
         b"GET /" + b"y" * 5000 + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" + b"more" * 50_000,
     ],
 )
-def test_a_head_is_not_taken_beyond_its_bound(gated_server, head):
+def test_a_head_above_the_size_limit_is_refused(gated_server, head):
     with connected(gated_server) as large:
         with contextlib.suppress(OSError):
             for _ in range(200):
@@ -111,7 +111,7 @@ def test_a_head_is_not_taken_beyond_its_bound(gated_server, head):
     assert both(gated_server) == (200, 101)
 
 
-def test_the_cookies_of_many_other_programs_come_with_it(gated_server):
+def test_cookies_of_many_other_programs_fit_into_the_head(gated_server):
     others = "; ".join(f"other-{number}={'x' * 3000}" for number in range(2))
     assert both(gated_server, Cookie=f"{others}; {cookie_of(gated_server)}") == (200, 101)
     lines = "".join(f"X-{number}: {'y' * 4000}\r\n" for number in range(20))
@@ -146,7 +146,7 @@ def fuzz(gated_server: GatedServer, raw: bytes) -> None:
 
 @pytest.fixture
 def fuzzed(gated_server: GatedServer, capfd: pytest.CaptureFixture[str]) -> Iterator[GatedServer]:
-    """After all that was sent to it, it still opens, and nothing was printed of it."""
+    """A server that still lets a page in after the fuzzing, and has printed nothing."""
     yield gated_server
     assert both(gated_server) == (200, 101)
     assert "Traceback" not in capfd.readouterr().err
@@ -157,24 +157,24 @@ with_fixtures = settings(suppress_health_check=[HealthCheck.function_scoped_fixt
 
 @settings(with_fixtures, max_examples=60)
 @given(REQUESTS)
-def test_whatever_a_stranger_sends_is_refused(fuzzed, raw):
+def test_any_data_without_the_token_is_refused(fuzzed, raw):
     fuzz(fuzzed, raw)
 
 
-# What is said ------------------------------------------------------------------------------------
+# Log lines ------------------------------------------------------------------------------------
 
-MOST_LINES = 20
-"""Of a terminal, whatever a few hundred connections do in some seconds."""
+MAX_LINES = 20
+"""Maximum terminal lines from a few hundred connections in some seconds."""
 
 
 def reset(sock: socket.socket) -> None:
-    """Hang up so that what the other end still writes fails."""
+    """Close with a reset, so that later writes of the other end fail."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     sock.close()
 
 
 def page_of(gated_server: GatedServer, protocol: str) -> socket.socket:
-    """A connection with the token after its handshake, to send any bytes on."""
+    """A raw connection with the token, after its handshake."""
     sock, host = connected(gated_server), f"127.0.0.1:{gated_server.port}"
     head = f"GET / HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\nCookie: {cookie_of(gated_server)}\r\n"
     head += "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
@@ -229,7 +229,7 @@ def presses(gated_server: GatedServer) -> None:
     ("attack", "times"),
     [(zeros, 60), (long_protocol, 30), (pings, 5), (broken_frames, 30), (fails, 60), (presses, 60)],
 )
-def test_whatever_is_sent_prints_a_few_short_lines(
+def test_any_attack_prints_only_a_few_short_lines(
     gated_server: GatedServer,
     attack: Callable[[GatedServer], None],
     times: int,
@@ -244,25 +244,25 @@ def test_whatever_is_sent_prints_a_few_short_lines(
     for _ in range(times):
         attack(gated_server)
     assert both(gated_server) == (200, 101)
-    time.sleep(0.5)  # what fails in threads
+    time.sleep(0.5)  # for failures in threads
     gated_server.close()
     last_resort = logging.lastResort
     assert last_resort is not None
     said = [last_resort.format(record) for record in caplog.records if record.levelno >= logging.WARNING]
     printed = capfd.readouterr()
     lines = "\n".join((*said, printed.out, printed.err)).strip().splitlines()
-    assert len(lines) <= MOST_LINES * (4 if attack in (fails, presses) else 1), lines[:100]
+    assert len(lines) <= MAX_LINES * (4 if attack in (fails, presses) else 1), lines[:100]
     if attack not in (
         fails,
         presses,
-    ):  # a terminal cuts the lines of a traceback (tests/machine/test_terminal_text.py)
+    ):  # a terminal truncates the lines of a traceback (tests/machine/test_terminal_text.py)
         assert all(len(line) <= 600 for line in lines)
 
 
-def test_what_is_turned_away_is_counted_and_told_once_of_each_kind(gated_server, caplog):
+def test_refused_requests_are_counted_and_logged_once_per_kind(gated_server, caplog):
     hostile = "\x1b[31m\n<b>"
     with caplog.at_level(logging.WARNING):
-        assert gated_server.turned_away == 0  # the door's own try is not one
+        assert gated_server.turned_away == 0  # the server's self-test does not count
         for _ in range(3):
             ask(gated_server, "/", Cookie=None)
             ask(gated_server, f"/?token=wrong{'x' * 30}", Cookie=None)
@@ -279,21 +279,21 @@ def test_what_is_turned_away_is_counted_and_told_once_of_each_kind(gated_server,
     )
 
 
-def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
+def test_a_repeated_message_is_logged_less_and_less_often(monkeypatch):
     now = [1000.0]
     monkeypatch.setattr(strangers.time, "monotonic", lambda: now[0])
     said: list[str] = []
-    told = RateLimitedLog(said.append, pause=60.0)
+    log = RateLimitedLog(said.append, pause=60.0)
     for _ in range(4 * 3600):
-        told.happened("a", "It happened.")
+        log.happened("a", "It happened.")
         now[0] += 1.0
     assert said[:2] == ["It happened.", "It happened. (59 more times since the last message.)"]
     assert len(said) < 12
     lines = len(said)
     for _ in range(2):
-        told.say_the_rest()
-    assert len(said) == lines + 1, "what was not told is told once"
-    untold = sum(int(number) for line in said for number in re.findall(r"\((\d+) more times", line))
-    assert lines + untold == 4 * 3600
-    told.happened("b", "Another\x1b[2J\nthing\u202e.")
+        log.say_the_rest()
+    assert len(said) == lines + 1, "suppressed messages are reported once"
+    suppressed = sum(int(number) for line in said for number in re.findall(r"\((\d+) more times", line))
+    assert lines + suppressed == 4 * 3600
+    log.happened("b", "Another\x1b[2J\nthing\u202e.")
     assert said[-1] == r"Another\x1b[2J\nthing\u202e."

@@ -1,4 +1,4 @@
-"""A slow line is not a deaf client: real sockets, with little room in the kernel."""
+"""A slow client is not a deaf one: real sockets with small kernel buffers."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ pytestmark = pytest.mark.thorough
 MESSAGE = b"x" * 2**20
 
 
-def talk(client: Callable[[ClientConnection], Awaitable[None]]) -> int | None:
-    """Serve one message to this client, and the bytes of it that were unsent when the server was done with it."""
+def unsent_bytes(client: Callable[[ClientConnection], Awaitable[None]]) -> int | None:
+    """Serve one message to this client; return its unsent bytes when the server is done."""
 
     async def both() -> int | None:
         ended: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
@@ -50,31 +50,31 @@ def talk(client: Callable[[ClientConnection], Awaitable[None]]) -> int | None:
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strangers, "READ_TIMEOUT_SECONDS", 1.0)
 
 
 @pytest.mark.slow
-def test_one_that_reads_slowly_gets_all_of_it_however_long_it_takes() -> None:
+def test_a_slow_reader_gets_the_whole_message() -> None:
     async def read_a_little_now_and_then(connection: ClientConnection) -> None:
         took = asyncio.create_task(connection.recv())
-        for _ in range(15):  # three times as long as one that reads nothing is waited for
+        for _ in range(15):  # three times the timeout of a client that reads nothing
             connection.transport.pause_reading()
             await asyncio.sleep(0.2)
-            assert not took.done(), "this is not slow"
+            assert not took.done(), "the client is not slow enough"
             connection.transport.resume_reading()
             await asyncio.sleep(0)
             await asyncio.sleep(0)
         assert await took == MESSAGE
         await connection.send("thanks")
 
-    assert talk(read_a_little_now_and_then) == 0
+    assert unsent_bytes(read_a_little_now_and_then) == 0
 
 
-def test_one_that_has_nothing_to_read_is_not_deaf() -> None:
+def test_a_client_with_nothing_to_read_is_not_deaf() -> None:
     async def wait(connection: ClientConnection) -> None:
         assert await connection.recv() == MESSAGE
         await asyncio.sleep(2.0)
         await connection.send("thanks")
 
-    assert talk(wait) == 0
+    assert unsent_bytes(wait) == 0

@@ -1,4 +1,4 @@
-"""Files that a route answers with, over a real socket: as long as was announced, whatever becomes of them."""
+"""Files served by a route over a real socket: never longer than announced, even if the file changes."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from tests.drive.waiting import until
 from workbench.page.door.file_response import BLOCK_BYTES, FileReply
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
-LARGE = 48 * 2**20
-"""More bytes than the kernel takes of a connection whose other end does not read."""
+LARGE_BYTES = 48 * 2**20
+"""More than the kernel buffers for a connection whose other end does not read."""
 
 
 @pytest.fixture(scope="module")
 def gated_server() -> Iterator[GatedServer]:
-    """One for all that is tried on it."""
+    """One server for all tests of this file."""
     gated_server = open_server(ServerOptions(port=0))
     yield gated_server
     gated_server.close()
@@ -30,7 +30,7 @@ def gated_server() -> Iterator[GatedServer]:
 
 @pytest.fixture
 def file(gated_server: GatedServer, tmp_path: Path, request: pytest.FixtureRequest) -> tuple[str, Path]:
-    """An address, and the file that it answers with."""
+    """An address, and the file that is served there."""
     path = tmp_path / "recording.rerun.write"
     prefix = f"/{request.node.name.partition('[')[0]}-{tmp_path.name}/"
     gated_server.add_route(
@@ -39,8 +39,8 @@ def file(gated_server: GatedServer, tmp_path: Path, request: pytest.FixtureReque
     return f"{prefix}x", path
 
 
-def begun(gated_server: GatedServer, address: str) -> tuple[socket.socket, bytes]:
-    """A connection on which the answer has begun and is not read on: its head and a few bytes."""
+def started(gated_server: GatedServer, address: str) -> tuple[socket.socket, bytes]:
+    """A connection whose response was read only up to its head and a few bytes."""
     raw = socket.socket()
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
     raw.settimeout(30)
@@ -54,7 +54,7 @@ def begun(gated_server: GatedServer, address: str) -> tuple[socket.socket, bytes
 
 
 def rest(raw: socket.socket, got: bytes) -> tuple[int, int]:
-    """What was announced, and how many bytes came until the server hung up."""
+    """The announced length, and the number of bytes until the server closed the connection."""
     head, _, body = got.partition(b"\r\n\r\n")
     (announced,) = [int(line[15:]) for line in head.split(b"\r\n") if line.startswith(b"Content-Length:")]
     count = len(body)
@@ -80,7 +80,7 @@ def position(path: Path) -> int:
 
 
 @pytest.mark.parametrize("size", [0, 1, BLOCK_BYTES - 1, BLOCK_BYTES, 2 * BLOCK_BYTES + 1])
-def test_a_file_comes_whole_and_under_its_name(
+def test_a_file_is_sent_whole_and_under_its_name(
     gated_server: GatedServer, file: tuple[str, Path], size: int
 ) -> None:
     address, path = file
@@ -95,37 +95,37 @@ def test_a_file_comes_whole_and_under_its_name(
     until(lambda: open_files(path) == 0, "the end of the reading")
 
 
-def test_of_a_file_that_grows_no_more_comes_than_was_announced(
+def test_a_file_that_grows_is_sent_only_up_to_the_announced_length(
     gated_server: GatedServer, file: tuple[str, Path]
 ) -> None:
     address, path = file
     path.touch()
-    os.truncate(path, LARGE + 100)
-    raw, got = begun(gated_server, address)
-    os.truncate(path, LARGE + 10 * BLOCK_BYTES)
-    assert rest(raw, got) == (LARGE + 100, LARGE + 100)
+    os.truncate(path, LARGE_BYTES + 100)
+    raw, got = started(gated_server, address)
+    os.truncate(path, LARGE_BYTES + 10 * BLOCK_BYTES)
+    assert rest(raw, got) == (LARGE_BYTES + 100, LARGE_BYTES + 100)
 
 
-def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(
+def test_a_file_that_shrinks_is_cut_off_and_not_padded(
     gated_server: GatedServer, file: tuple[str, Path]
 ) -> None:
     address, path = file
     path.touch()
-    os.truncate(path, LARGE)
-    raw, got = begun(gated_server, address)
-    os.truncate(path, LARGE // 2)
+    os.truncate(path, LARGE_BYTES)
+    raw, got = started(gated_server, address)
+    os.truncate(path, LARGE_BYTES // 2)
     announced, count = rest(raw, got)
-    assert announced == LARGE and count <= LARGE // 2
+    assert announced == LARGE_BYTES and count <= LARGE_BYTES // 2
     until(lambda: open_files(path) == 0, "the end of the reading")
 
 
-def test_who_goes_away_in_the_middle_holds_nothing_and_is_no_news(
+def test_a_client_that_leaves_midway_keeps_no_file_open_and_logs_nothing(
     gated_server: GatedServer, file: tuple[str, Path], caplog: pytest.LogCaptureFixture
 ) -> None:
     address, path = file
     path.touch()
-    os.truncate(path, LARGE)
-    raw, _ = begun(gated_server, address)
+    os.truncate(path, LARGE_BYTES)
+    raw, _ = started(gated_server, address)
     assert open_files(path) == 1
     raw.close()
     until(lambda: open_files(path) == 0, "the end of the reading")
@@ -133,24 +133,24 @@ def test_who_goes_away_in_the_middle_holds_nothing_and_is_no_news(
     assert caplog.records == []
 
 
-def test_for_who_does_not_read_no_more_is_read(gated_server: GatedServer, file: tuple[str, Path]) -> None:
+def test_the_file_is_not_read_ahead_for_a_client_that_does_not_read(
+    gated_server: GatedServer, file: tuple[str, Path]
+) -> None:
     address, path = file
     path.touch()
-    os.truncate(path, LARGE)
-    raw, _ = begun(gated_server, address)
+    os.truncate(path, LARGE_BYTES)
+    raw, _ = started(gated_server, address)
     with raw:
         still, at = 0, -1
         while still < 30:
             assert ask(gated_server, "/workbench/logo.svg")[0] == 200
             before, at = at, position(path)
             still = still + 1 if at == before else 0
-        assert 0 < at < LARGE, "all of it is in memory"
+        assert 0 < at < LARGE_BYTES, "the whole file is in memory"
 
 
 @pytest.mark.parametrize("kind", ["missing", "folder"])
-def test_a_file_that_is_gone_is_not_found(
-    gated_server: GatedServer, file: tuple[str, Path], kind: str
-) -> None:
+def test_a_deleted_file_is_not_found(gated_server: GatedServer, file: tuple[str, Path], kind: str) -> None:
     address, path = file
     if kind == "folder":
         path.mkdir()
@@ -159,7 +159,7 @@ def test_a_file_that_is_gone_is_not_found(
     assert headers["X-Content-Type-Options"] == "nosniff" and "Content-Security-Policy" in headers
 
 
-def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(
+def test_a_compressed_file_is_decompressed_for_clients_that_cannot(
     gated_server: GatedServer, tmp_path: Path
 ) -> None:
     plain = b"wasm " * BLOCK_BYTES
@@ -176,7 +176,7 @@ def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(
 
 
 @pytest.mark.parametrize("damage", ["not packed at all", "torn off", "turned"])
-def test_a_packed_file_that_is_damaged_is_cut_off_and_the_terminal_stays_quiet(
+def test_a_damaged_compressed_file_is_cut_off_without_terminal_output(
     gated_server: GatedServer, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
     packed = bytearray(gzip.compress(os.urandom(6 * BLOCK_BYTES)))
@@ -190,7 +190,7 @@ def test_a_packed_file_that_is_damaged_is_cut_off_and_the_terminal_stays_quiet(
     path.write_bytes(packed)
     prefix = f"/damaged-{damage.replace(' ', '-')}/"
     gated_server.add_route(prefix, lambda _: FileReply(path, "application/wasm", gzipped=True))
-    raw, got = begun(gated_server, f"{prefix}x")
+    raw, got = started(gated_server, f"{prefix}x")
     announced, count = rest(raw, got)
     assert announced == 6 * BLOCK_BYTES and count < announced
     until(lambda: open_files(path) == 0, "the end of the reading")

@@ -1,4 +1,4 @@
-"""The door as its own people use it: what it listens on, what it says, what it serves."""
+"""The door for legitimate users: where it listens, what it prints and what it serves."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def token_of(gated_server: GatedServer) -> str:
 
 
 def get(gated_server: GatedServer, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
-    """GET ``path`` with the door's cookie, sent as it stands."""
+    """GET ``path``, unmodified, with the door's cookie."""
     connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
     cookie = {"Cookie": f"{cookie_name(gated_server.port)}={token_of(gated_server)}"}
     try:
@@ -67,15 +67,15 @@ def test_it_listens_on_loopback_only_unless_told_otherwise(gated_server):
     assert gated_server.warning is None and gated_server.addresses() == (gated_server.url,)
 
 
-def test_the_whole_machine_is_listened_on_only_with_a_token_and_a_warning(capsys):
+def test_all_interfaces_are_opened_only_with_a_token_and_a_warning(capsys):
     gated_server = open_server(ServerOptions(host="0.0.0.0", port=0))
     try:
         assert listening_addresses(gated_server.port) == {"0.0.0.0"}
         assert gated_server.warning is not None and "0.0.0.0" in gated_server.warning
         assert "0.0.0.0" not in gated_server.url  # no browser can open that
-        assert any(url.startswith("http://127.0.0.1:") for url in gated_server.addresses())  # of a container
+        assert any(url.startswith("http://127.0.0.1:") for url in gated_server.addresses())  # for a container
         assert len(token_of(gated_server)) >= 43  # 256 bits
-        # Where the machine has no way out, the page's own address is of no use to others.
+        # Without a network the page's own address is useless to other machines.
         own = [address for host in psutil.net_if_addrs().values() for address in host]
         reach = [a.address for a in own if a.family == socket.AF_INET and not a.address.startswith("127.")]
         hosts = {url.removeprefix("http://").partition(":")[0] for url in gated_server.addresses()} - {
@@ -123,21 +123,21 @@ def test_without_a_token_only_loopback_is_allowed(host):
         {"socket": Path("x"), "host": "0.0.0.0"},
     ],
 )
-def test_options_that_cannot_be_are_refused(options):
+def test_invalid_options_are_refused(options):
     with pytest.raises(ValueError):
         ServerOptions(**options)
     assert ServerOptions(port=65535).port == 65535
 
 
-def test_a_taken_port_that_was_asked_for_is_an_error_that_says_what_to_do():
+def test_a_requested_port_that_is_taken_is_an_error_with_advice():
     taken, port = a_taken_port()
     with taken, pytest.raises(ServerError, match=f"Port {port} is taken.*--port"):
         open_server(ServerOptions(port=port))
 
 
-def test_the_default_port_makes_way_and_says_so(monkeypatch):
+def test_a_taken_default_port_is_replaced_with_a_notice(monkeypatch):
     taken, port = a_taken_port()
-    # 8080 itself may be in use on the machine that runs this.
+    # 8080 itself may be in use on the test machine.
     monkeypatch.setattr(listening, "DEFAULT_PORT", port)
     with taken:
         gated_server = open_server(ServerOptions(port=port))
@@ -158,7 +158,7 @@ def test_closing_frees_the_port_and_ends_the_thread(gated_server):
     thread = gated_server.server._websock_server._server_thread
     idle = socket.create_connection(
         ("127.0.0.1", gated_server.port)
-    )  # as Chromium holds them: nothing asked yet
+    )  # as Chromium keeps them: no request yet
     assert get(gated_server, "/")[0] == 200
     gated_server.close()
     gated_server.close()
@@ -180,9 +180,9 @@ rich.print({name: value for name, value in os.environ.items() if before.get(name
 """
 
 
-def test_nothing_is_printed_but_by_us_and_a_picture_leaves_the_environment(child_process: None) -> None:
-    """What is printed at the exit counts too. Children have the environment: OpenCV has libraries looked for in the current folder,
-    which may be one of downloaded recordings."""
+def test_only_the_workbench_prints_and_a_picture_does_not_change_the_environment(child_process: None) -> None:
+    """Includes output at exit. Child processes inherit the environment: OpenCV adds the current folder to the library path,
+    and that may be a folder of downloaded recordings."""
     environment = {name: value for name, value in os.environ.items() if name != "LD_LIBRARY_PATH"}
     done = subprocess.run(
         [sys.executable, "-c", SERVED], capture_output=True, text=True, timeout=120, env=environment
@@ -190,7 +190,7 @@ def test_nothing_is_printed_but_by_us_and_a_picture_leaves_the_environment(child
     assert (done.returncode, done.stdout, done.stderr) == (0, "{}\n", "")
 
 
-def test_viser_has_every_private_name_that_the_seam_relies_on(gated_server):
+def test_viser_has_every_private_name_that_we_use(gated_server):
     assert viser_private.missing_names() == []
     for name in viser_private.PRIVATE_ATTRIBUTES:
         here = gated_server.server
@@ -198,7 +198,7 @@ def test_viser_has_every_private_name_that_the_seam_relies_on(gated_server):
             here = getattr(here, part)
 
 
-def test_a_viser_that_moved_opens_no_door(monkeypatch):
+def test_a_viser_without_a_private_name_starts_no_server(monkeypatch):
     before = threading.active_count()
     monkeypatch.delattr(viser._messages, "ShareUrlRequest")
     with pytest.raises(ServerError, match=r"ShareUrlRequest.*viser==\d"):
@@ -214,13 +214,13 @@ def test_the_scripts_of_the_installed_page_are_the_known_ones() -> None:
     assert first.removeprefix("sha256-") in hashes
 
 
-def test_a_viser_that_starts_its_server_another_way_opens_no_door(monkeypatch):
+def test_a_viser_that_starts_its_server_differently_starts_no_server(monkeypatch):
     worker = viser.infra._infra.WebsockServer._background_worker
 
     def as_a_later_viser_might(self, ready):
         import websockets
 
-        # Not by monkeypatch, which would put the seam's look-alike back at the end, for good.
+        # Not with monkeypatch, which would restore our replacement module at the end, permanently.
         viser.infra._infra.websockets = websockets  # pyright: ignore[reportPrivateImportUsage]
         worker(self, ready)
 
@@ -229,7 +229,7 @@ def test_a_viser_that_starts_its_server_another_way_opens_no_door(monkeypatch):
         open_server(ServerOptions(port=0))
 
 
-def test_a_gate_that_hangs_loose_opens_no_door(monkeypatch):
+def test_no_server_starts_if_its_gate_is_not_in_effect(monkeypatch):
     monkeypatch.setattr(
         door_module.access, "decide", lambda rules, asked: door_module.access.Admitted(asked.host[0])
     )
@@ -239,8 +239,8 @@ def test_a_gate_that_hangs_loose_opens_no_door(monkeypatch):
 
 @pytest.mark.browser
 @pytest.mark.slow
-def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(gated_server, browser):
-    """With one of each thing that the page's policy could break: blobs, data, workers, wasm, eval."""
+def test_a_real_browser_opens_the_page_without_errors(gated_server, browser):
+    """The page has one of each thing that its policy could break: blobs, data, workers, wasm, eval."""
     import numpy as np
     import trimesh
     import trimesh.visual
@@ -284,13 +284,15 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(gated_server,
         page.wait_for_selector("#from-html", timeout=60_000)
         page.wait_for_function("() => document.getElementById('logo').naturalWidth > 0", timeout=60_000)
         assert connected.wait(60)
-        assert page.url == f"http://127.0.0.1:{gated_server.port}/"  # the token has left the address bar
+        assert (
+            page.url == f"http://127.0.0.1:{gated_server.port}/"
+        )  # the token is no longer in the address bar
         assert page.evaluate("document.cookie") == ""  # and no script can read it
         (cookie,) = page.context.cookies()
         assert (cookie.get("httpOnly"), cookie.get("sameSite")) == (True, "Strict")
-        # Nothing tells that nothing more is refused: what could be has this long to load.
+        # No event marks the last refusal, so give everything this long to load.
         page.wait_for_timeout(3000)
-        page.reload(wait_until="domcontentloaded")  # by the cookie alone
+        page.reload(wait_until="domcontentloaded")  # with the cookie only
         page.wait_for_selector("#from-html", timeout=60_000)
     assert complaints == []
 

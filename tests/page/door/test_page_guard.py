@@ -1,4 +1,4 @@
-"""What a page tells viser: impossible numbers and floods reach neither viser nor any other page."""
+"""Messages of a page to viser: invalid numbers and floods reach neither viser nor other pages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.thorough
 
 @pytest.fixture(scope="module")
 def gated_server() -> Iterator[GatedServer]:
-    """One for all that is tried on it."""
+    """One server for all tests of this file."""
     gated_server = open_server(ServerOptions(port=0))
     yield gated_server
     gated_server.close()
@@ -29,16 +29,16 @@ def gated_server() -> Iterator[GatedServer]:
 
 @pytest.fixture
 def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
-    """A page that was there before; call it to see that it still works, and still hears what others are told."""
+    """A page that connected earlier; call it to check that it still works and still receives broadcasts."""
     bell, shown = Bell(gated_server), gated_server.server.gui.add_html("0")
-    heard: list[str] = []
+    received: list[str] = []
 
     def listen(connection: Connection) -> None:
         for frame in connection:
             assert isinstance(frame, bytes)
             for message in messages_in(frame):
                 if message["type"] == "GuiUpdateMessage" and "content" in message["updates"]:
-                    heard.append(message["updates"]["content"])
+                    received.append(message["updates"]["content"])
 
     with client(gated_server) as reader, client(gated_server) as other:
         thread = threading.Thread(target=listen, args=(reader,))
@@ -47,7 +47,7 @@ def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
         def works() -> None:
             bell.rings(other)
             shown.content = str(bell.rung)
-            until(lambda: str(bell.rung) in heard, "what all pages are told")
+            until(lambda: str(bell.rung) in received, "the broadcast")
 
         works()
         yield works
@@ -75,7 +75,7 @@ NAN, INF = float("nan"), float("inf")
     ],
     ids=str,
 )
-def test_a_camera_that_cannot_be_is_dropped_and_the_page_stays(gated_server, bystander, change):
+def test_an_invalid_camera_is_dropped_and_the_page_stays(gated_server, bystander, change):
     with client(gated_server) as connection:
         known = {
             number: one.camera.position.copy() for number, one in gated_server.server.get_clients().items()
@@ -87,7 +87,7 @@ def test_a_camera_that_cannot_be_is_dropped_and_the_page_stays(gated_server, bys
     bystander()
 
 
-def test_a_gizmo_goes_nowhere_that_is_no_place(gated_server, bystander):
+def test_a_gizmo_does_not_move_to_an_invalid_pose(gated_server, bystander):
     gizmo = gated_server.server.scene.add_transform_controls("/gizmo")
     update = {"type": "TransformControlsUpdateMessage", "name": "/gizmo", "owner": gizmo._impl.api._owner_id}
     with client(gated_server) as connection:
@@ -106,14 +106,16 @@ def test_a_gizmo_goes_nowhere_that_is_no_place(gated_server, bystander):
 
 
 @pytest.mark.parametrize("item", [b"\xc0", b"\x90", b"\x80", b"\xa0", b"\x01"], ids=repr)
-def test_a_large_message_of_tiny_objects_is_not_taken_apart(gated_server, bystander, item):
+def test_a_large_message_of_tiny_objects_is_not_decoded(gated_server, bystander, item):
     with client(gated_server) as connection:
         connection.send(b"\xdd" + (20_000_000).to_bytes(4, "big") + item * 20_000_000)
         assert close_code(connection) == 1009
     bystander()
 
 
-def test_a_page_that_floods_is_slowed_then_let_go_and_the_others_go_on(gated_server, bystander, monkeypatch):
+def test_a_flooding_page_is_throttled_then_disconnected_and_the_others_go_on(
+    gated_server, bystander, monkeypatch
+):
     monkeypatch.setattr(page_guard, "MAX_SLOWED_SECONDS", 0.5)
     flooded = Bell(gated_server)
     gone = threading.Event()

@@ -1,4 +1,4 @@
-"""The headers: what they forbid, and that each exception of the page's policy is needed."""
+"""The response headers: what they forbid, and that each exception in the page's policy is needed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from workbench.page.widgets.visitors import PATH, Visitors
 
 @pytest.fixture
 def filled(gated_server: GatedServer) -> GatedServer:
-    """With one of each thing that a policy could break: blobs, data, workers, wasm, frames."""
+    """A page with one of each thing that a policy could break: blobs, data, workers, wasm, frames."""
     server = gated_server.server
     server.gui.add_html(
         "<div id='from-html' style='color: red'>html</div><img src='/workbench/logo.svg'>"
@@ -44,7 +44,7 @@ def filled(gated_server: GatedServer) -> GatedServer:
     return gated_server
 
 
-def complaints_of(page: Page) -> list[str]:
+def policy_errors_of(page: Page) -> list[str]:
     complaints: list[str] = []
     page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -54,19 +54,19 @@ def complaints_of(page: Page) -> list[str]:
 # Without a browser --------------------------------------------------------------------------------
 
 
-def test_no_template_has_code_in_a_tag():
+def test_no_template_has_inline_code():
     for template in (web_assets_folder() / "panels").glob("*.html"):
         assert not re.findall(r'(?:^|\s)on[a-z]+="', template.read_text(encoding="utf-8")), template
 
 
-def test_code_comes_from_files_and_known_hashes_alone():
+def test_code_comes_only_from_files_and_known_hashes():
     sources = DIRECTIVES["script-src"].split()
     assert "'unsafe-inline'" not in sources and "'unsafe-eval'" not in sources
     assert not [source for source in sources if source.startswith(("http", "blob:", "data:", "*"))]
     assert DIRECTIVES["default-src"] == "'none'"
 
 
-def test_every_reply_isolates_the_page_and_gives_it_no_devices(gated_server):
+def test_every_reply_isolates_the_page_and_denies_devices(gated_server):
     for path in ("/", "/none", "/workbench/logo.svg", "/workbench/none", "/?token=wrong"):
         headers = ask(gated_server, path)[1]
         assert (
@@ -85,7 +85,7 @@ def test_every_reply_isolates_the_page_and_gives_it_no_devices(gated_server):
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_code_that_came_into_the_page_as_html_does_not_run(gated_server, browser):
+def test_code_injected_as_html_does_not_run(gated_server, browser):
     attacks = (
         '<img src="/none" onerror="document.title=\'ran\'">',
         "<svg onload=\"document.title='ran'\"></svg>",
@@ -107,10 +107,10 @@ def test_code_that_came_into_the_page_as_html_does_not_run(gated_server, browser
         )
 
         def were() -> dict[str, int]:
-            page.wait_for_timeout(50)  # in which Playwright hears of them
+            page.wait_for_timeout(50)  # for Playwright to receive them
             return {what: sum(what in complaint for complaint in complaints) for what in refused}
 
-        until(lambda: were() == refused, "the browser's word that each was refused", seen=were)
+        until(lambda: were() == refused, "the browser's report of each refusal", seen=were)
         assert page.title() != "ran"
     handle.remove()
 
@@ -134,10 +134,10 @@ def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
 @pytest.mark.browser
 @pytest.mark.slow
 def test_each_exception_is_needed(filled, browser, monkeypatch):
-    # 'self' means ws: too in Chromium, but not in every browser; connect-src 'self' is what input.js asks when the
-    # connection is refused, see the test above.
+    # In Chromium 'self' includes ws:, but not in every browser; input.js needs connect-src 'self' when the connection
+    # is refused, see the test above.
     elsewhere = {("connect-src", source) for source in ("'self'", "ws://{authority}", "wss://{authority}")}
-    # viser's scripts by their hashes; without one there is no page.
+    # viser's scripts, by hash; without one of them there is no page.
     exceptions = [
         (name, source)
         for name, sources in DIRECTIVES.items()
@@ -147,9 +147,9 @@ def test_each_exception_is_needed(filled, browser, monkeypatch):
 
     def load() -> list[str]:
         page = browser.new_page(viewport={"width": 640, "height": 480})
-        complaints = complaints_of(page)
+        complaints = policy_errors_of(page)
         page.goto(filled.url, wait_until="domcontentloaded")
-        # The first complaint is enough; to have none takes as long as everything needs to load.
+        # The first error is enough; to see none, wait until everything has loaded.
         for _ in range(80):
             page.wait_for_timeout(100)
             if complaints:

@@ -1,4 +1,4 @@
-"""What is answered to a request that was let in, as a function: `test_door` asks the same over real sockets."""
+"""The reply to an admitted request, as a function; `test_gated_server` tests it over real sockets."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NO_SUCH_FILE = b"There is no such file."
 
 
 def of_viser(kind: str = "text/html; charset=utf-8", body: bytes = PAGE, **headers: str) -> Any:
-    """viser's own answer to whatever it is asked."""
+    """viser's own reply to any request."""
     fields = {"Content-Type": kind, "Content-Length": str(len(body)), **headers}
     return lambda connection, request: Response(200, "OK", Headers(fields), body)
 
@@ -48,7 +48,7 @@ def answer(
     accepts: str = "",
 ) -> Response:
     request = Request(path, Headers({"Accept-Encoding": accepts} if accepts else {}))
-    connection = cast(ServerConnection, None)  # only a file that is sent while it is read needs one
+    connection = cast(ServerConnection, None)  # only a streamed file needs a connection
     hook = viser_hook or of_viser()
     return asyncio.run(admitted_reply(routes or {}, hook, connection, request, AUTHORITY, RateLimitedLog()))
 
@@ -61,13 +61,13 @@ def says(body: bytes, kind: str = "text/plain") -> Callable[[str], tuple[int, st
     ("upgrade", "websocket"),
     [([], False), (["websocket"], True), (["WebSocket"], False), (["websocket", "websocket"], False)],
 )
-def test_a_handshake_is_what_viser_takes_for_one(upgrade: list[str], websocket: bool) -> None:
+def test_a_handshake_is_recognized_as_viser_does(upgrade: list[str], websocket: bool) -> None:
     assert (
         request_parts(Request("/", Headers([("Upgrade", value) for value in upgrade]))).websocket is websocket
     )
 
 
-def test_a_refusal_says_why_and_where_to_go_in_html_that_holds_no_markup_of_theirs() -> None:
+def test_a_refusal_gives_reason_and_link_in_html_without_foreign_markup() -> None:
     refused = refusals("http://localhost:8080/?a=<b>")("<script>")
     text = bytes(refused.body).decode()
     assert refused.status_code == 403
@@ -77,7 +77,7 @@ def test_a_refusal_says_why_and_where_to_go_in_html_that_holds_no_markup_of_thei
 
 
 @pytest.mark.parametrize("zipped", [False, True])
-def test_visers_page_gets_our_head_and_the_length_that_it_then_has(zipped: bool) -> None:
+def test_visers_page_gets_our_head_and_the_new_length(zipped: bool) -> None:
     body, headers = (gzip.compress(PAGE), {"Content-Encoding": "gzip"}) if zipped else (PAGE, {})
     made = answer("/", viser_hook=of_viser(body=body, **headers))
     assert made.headers.get_all("Content-Length") == [str(len(made.body))]
@@ -90,7 +90,7 @@ def test_visers_page_gets_our_head_and_the_length_that_it_then_has(zipped: bool)
     assert EVERY_REPLY.items() <= dict(made.headers.raw_items()).items()
 
 
-def test_what_viser_serves_besides_its_page_stays_as_it_is() -> None:
+def test_other_replies_of_viser_are_unchanged() -> None:
     made = answer("/x.js", viser_hook=of_viser("text/javascript", b"</head>"))
     assert (made.body, made.headers["Content-Length"]) == (b"</head>", "7")
     assert made.headers["Content-Security-Policy"] == page_policy(AUTHORITY)
@@ -98,12 +98,12 @@ def test_what_viser_serves_besides_its_page_stays_as_it_is() -> None:
     assert answer("/x", viser_hook=nameless).body == b"</head>"
 
 
-def test_what_only_viser_takes_for_a_handshake_is_a_bad_request() -> None:
+def test_a_handshake_that_only_viser_recognizes_is_a_bad_request() -> None:
     made = answer("/", viser_hook=lambda connection, request: None)
     assert (made.status_code, bytes(made.body)) == (400, b"Bad request.")
 
 
-def test_the_longest_prefix_gets_the_rest_of_the_path_decoded_once() -> None:
+def test_the_longest_prefix_gets_the_remaining_path_decoded_once() -> None:
     def route(name: str) -> Handler:
         return lambda path: (200, "text/plain", f"{name}: {path}".encode())
 
@@ -115,7 +115,7 @@ def test_the_longest_prefix_gets_the_rest_of_the_path_decoded_once() -> None:
     assert answer("/c/x", routes, of_viser("text/plain", b"viser's")).body == b"viser's"
 
 
-def test_a_route_that_fails_says_so_and_its_error_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_route_is_reported_and_its_error_logged(caplog: pytest.LogCaptureFixture) -> None:
     def fails(path: str) -> tuple[int, str, bytes]:
         raise ZeroDivisionError
 
@@ -138,7 +138,7 @@ def test_a_route_that_fails_says_so_and_its_error_is_in_the_log(caplog: pytest.L
         ("image/png", 1025, "gzip", False),
     ],
 )
-def test_what_is_large_and_compresses_is_packed_for_who_takes_it(
+def test_large_compressible_replies_are_compressed_for_clients_that_accept_it(
     kind: str, size: int, accepts: str, packed: bool
 ) -> None:
     made = answer("/a/x", {"/a/": (says(b"x" * size, kind), {})}, accepts=accepts)
@@ -163,13 +163,13 @@ def test_what_is_large_and_compresses_is_packed_for_who_takes_it(
         ("/a/x%00y", False),
     ],
 )
-def test_a_path_that_no_file_can_have_is_answered_without_a_look(path: str, served: bool) -> None:
+def test_an_impossible_path_is_answered_without_disk_access(path: str, served: bool) -> None:
     assert (MAX_NAME_BYTES, MAX_PATH_BYTES) == (255, 3000)
     made = answer(path, {"/a/": (says(b"served"), {})})
     assert (made.status_code, bytes(made.body)) == ((200, b"served") if served else (404, NO_SUCH_FILE))
 
 
-def test_a_folder_serves_its_files_and_nothing_else(tmp_path: Path) -> None:
+def test_a_folder_serves_only_its_own_files(tmp_path: Path) -> None:
     folder = tmp_path / "served"
     (folder / "below").mkdir(parents=True)
     (folder / "below" / "a.JS").write_bytes(b"1")
@@ -183,16 +183,16 @@ def test_a_folder_serves_its_files_and_nothing_else(tmp_path: Path) -> None:
         assert handle(path) == (404, "text/plain; charset=utf-8", NO_SUCH_FILE)
 
 
-def test_what_a_browser_asked_for_writes_nothing_into_the_terminal(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_requested_path_writes_no_control_codes_to_the_terminal(caplog: pytest.LogCaptureFixture) -> None:
     def fails(path: str) -> tuple[int, str, bytes]:
         raise ZeroDivisionError
 
     answer("/a/%1b[31m", {"/a/": (fails, {})})
-    told = caplog.records[0].getMessage()  # `caplog.text` has such codes taken out
-    assert "/a/" in told and "\x1b" not in told
+    logged = caplog.records[0].getMessage()  # `caplog.text` strips such codes
+    assert "/a/" in logged and "\x1b" not in logged
 
 
-def test_a_folder_beside_the_served_one_and_a_link_to_itself_are_not_served(tmp_path: Path) -> None:
+def test_a_sibling_folder_and_a_link_to_itself_are_not_served(tmp_path: Path) -> None:
     folder, beside = tmp_path / "served", tmp_path / "served-not"
     for made in (folder, beside):
         made.mkdir()

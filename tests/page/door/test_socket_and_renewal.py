@@ -42,7 +42,7 @@ from workbench.page.door.listening_socket import ServerError
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    # A socket's path is short, and pytest's are long.
+    # A socket path must be short, and pytest's are long.
     folder = Path(tempfile.mkdtemp(prefix="wb-"))
     yield folder
     shutil.rmtree(folder)
@@ -75,11 +75,11 @@ def listening_ports() -> set[int]:
 
 @pytest.fixture
 def before() -> set[int]:
-    """Ports that other tests in this process left open."""
+    """Listening ports that other tests of this process left open."""
     return listening_ports()
 
 
-def test_only_its_owner_can_connect_and_no_port_is_open(before, gated_server, folder):
+def test_only_the_owner_can_connect_and_no_port_is_open(before, gated_server, folder):
     found = (folder / "page.sock").lstat()
     assert stat.S_ISSOCK(found.st_mode) and stat.S_IMODE(found.st_mode) == 0o600
     assert listening_ports() <= before
@@ -92,7 +92,7 @@ def test_the_gate_is_the_same_as_on_a_port(gated_server):
     assert get(gated_server, Cookie=cookie) == 200
     assert get(gated_server, Cookie=cookie, Origin="https://evil.example") == 403
     assert get(gated_server, host="evil.example", Cookie=cookie) == 403
-    # Another port at the other end of ssh -L.
+    # A different port at the other end of ssh -L.
     assert (
         get(gated_server, host="localhost:9000", Cookie=f"{cookie_name(9000)}={token_of(gated_server)}")
         == 200
@@ -110,11 +110,11 @@ def test_a_websocket_works_over_it(gated_server):
         max_size=None,
         close_timeout=0.2,
     ) as connection:
-        say(connection, CAMERA)  # without one viser counts no page as come
+        say(connection, CAMERA)  # without a camera message viser counts no page as connected
         bell.rings(connection)
 
 
-def test_the_file_is_gone_at_the_end_and_one_that_was_left_is_taken_over(folder):
+def test_the_socket_file_is_removed_at_the_end_and_a_stale_one_replaced(folder):
     place = folder / "page.sock"
     left = socket.socket(socket.AF_UNIX)
     left.bind(str(place))
@@ -126,7 +126,7 @@ def test_the_file_is_gone_at_the_end_and_one_that_was_left_is_taken_over(folder)
     assert not place.exists()
 
 
-def test_what_is_not_ours_is_left_alone(folder):
+def test_a_file_that_is_not_ours_is_left_alone(folder):
     place = folder / "page.sock"
     (folder / "target").write_text("kept")
     for make in (
@@ -143,7 +143,7 @@ def test_what_is_not_ours_is_left_alone(folder):
     assert (folder / "target").read_text() == "kept"
 
 
-def test_a_socket_that_another_program_listens_at_is_left_to_it(gated_server, folder):
+def test_a_socket_that_another_program_listens_on_is_left_alone(gated_server, folder):
     with pytest.raises(ServerError, match="Another program is listening"):
         open_server(ServerOptions(socket=folder / "page.sock"))
     assert get(gated_server) == 403
@@ -158,15 +158,15 @@ def test_a_socket_that_was_replaced_is_not_removed(folder):
     assert place.read_text() == "somebody else's"
 
 
-def test_a_folder_that_others_write_into_is_refused(folder):
+def test_a_folder_writable_by_others_is_refused(folder):
     folder.chmod(0o777)
     with pytest.raises(ServerError, match="Others can write into"):
         open_server(ServerOptions(socket=folder / "page.sock"))
-    folder.chmod(0o1777)  # as /tmp: what is there stays its owner's
+    folder.chmod(0o1777)  # as /tmp: files there stay their owner's
     open_server(ServerOptions(socket=folder / "page.sock")).close()
 
 
-def test_many_that_start_at_once_are_one(folder):
+def test_only_one_of_many_concurrent_starts_succeeds(folder):
     made: list[listening.Listening] = []
 
     def start() -> None:
@@ -195,7 +195,7 @@ def on_port() -> Iterator[GatedServer]:
     gated_server.close()
 
 
-def test_a_renewed_token_shuts_out_who_had_the_old_one(on_port):
+def test_a_renewed_token_locks_out_holders_of_the_old_one(on_port):
     old_url, old_cookie, old_token = on_port.url, cookie_of(on_port), token_of(on_port)
     with client(on_port) as one, client(on_port) as two:
         assert on_port.renew_token() == on_port.url != old_url
@@ -207,7 +207,7 @@ def test_a_renewed_token_shuts_out_who_had_the_old_one(on_port):
     assert on_port.addresses("/x/") == (f"http://127.0.0.1:{on_port.port}/x/?token={token_of(on_port)}",)
 
 
-def test_an_answer_on_its_way_ends_with_the_token(on_port):
+def test_renewing_the_token_cuts_off_a_response_in_progress(on_port):
     begun, go_on = threading.Event(), threading.Event()
 
     def slow(path: str) -> tuple[int, str, bytes]:
@@ -233,7 +233,7 @@ def test_an_answer_on_its_way_ends_with_the_token(on_port):
     assert got and got != [b"secret"]
 
 
-def test_a_page_that_does_not_listen_is_closed_as_well(on_port):
+def test_a_page_that_does_not_read_is_closed_too(on_port):
     tab = open_deaf_tab(on_port.url)
     until(on_port.server.get_clients, "the page")
     on_port.renew_token()
@@ -248,11 +248,11 @@ def until_line(process: subprocess.Popen[str], wanted: Callable[[str], bool]) ->
     for line in process.stdout:
         if wanted(line):
             return line
-    pytest.fail("it ended without the line")
+    pytest.fail("the command ended without the expected line")
 
 
 @pytest.mark.slow
-def test_the_command_renews_at_a_signal_and_ends_at_another(child_process: None, tmp_path, folder):
+def test_one_signal_renews_the_token_and_another_ends_the_command(child_process: None, tmp_path, folder):
     place = folder / "review.sock"
     process = subprocess.Popen(
         [*python_command("-m", "workbench.cli.main"), "review", str(tmp_path), "--socket", str(place)],

@@ -18,7 +18,7 @@ def handle_named(view: SceneView, part: str) -> viser.BatchedGlbHandle:
     return next(handle for handle in view.handles if part in handle.name)
 
 
-def test_bodies_stand_at_their_pose_plus_their_env_s_place(server: viser.ViserServer) -> None:
+def test_bodies_are_at_their_pose_plus_the_env_offset(server: viser.ViserServer) -> None:
     geometry, poses = table_scene(4)
     layout = lay_out(geometry, poses)
     view = SceneView(server)
@@ -38,7 +38,7 @@ def test_floor_is_drawn_once(server: viser.ViserServer) -> None:
     assert handle_named(view, "ground").batched_positions.shape == (1, 3)
 
 
-def test_one_env_alone_sends_one_env_at_the_origin(server: viser.ViserServer) -> None:
+def test_a_single_env_view_sends_one_env_at_the_origin(server: viser.ViserServer) -> None:
     geometry, poses = table_scene(9)
     layout = lay_out(geometry, poses)
     view = SceneView(server)
@@ -48,7 +48,7 @@ def test_one_env_alone_sends_one_env_at_the_origin(server: viser.ViserServer) ->
     assert handle_named(view, "cube").batched_positions.shape == (9, 3)
 
 
-def test_absent_body_is_left_out_and_hidden_when_no_env_has_it(server: viser.ViserServer) -> None:
+def test_an_absent_body_is_omitted_and_hidden_if_no_env_has_it(server: viser.ViserServer) -> None:
     geometry, poses = table_scene(3)
     layout = lay_out(geometry, poses)
     view = SceneView(server)
@@ -66,7 +66,7 @@ def test_absent_body_is_left_out_and_hidden_when_no_env_has_it(server: viser.Vis
     assert cube.visible
 
 
-def test_what_another_env_alone_has_is_not_seen_in_this_one(server: viser.ViserServer) -> None:
+def test_a_body_of_one_env_is_not_shown_in_another(server: viser.ViserServer) -> None:
     geometry, poses = table_scene(3)
     cube = replace(geometry.visuals[4], envs=np.array([0, 2], np.int32), bodies=np.full(2, 3, np.int32))
     geometry = replace(geometry, visuals=(*geometry.visuals[:4], cube))
@@ -79,7 +79,7 @@ def test_what_another_env_alone_has_is_not_seen_in_this_one(server: viser.ViserS
     assert handle_named(view, "cube").visible and len(handle_named(view, "cube").batched_positions) == 2
 
 
-def test_reload_keeps_the_nodes_that_look_as_before(server: viser.ViserServer) -> None:
+def test_a_reload_keeps_nodes_with_an_unchanged_look(server: viser.ViserServer) -> None:
     geometry, poses = table_scene(4)
     layout = lay_out(geometry, poses)
     view = SceneView(server)
@@ -114,7 +114,7 @@ def test_a_dark_floor_is_lighter_in_the_light_theme_and_nothing_else_is_sent(
     assert {handle.glb_data for handle in view.handles} == set(before.values())
 
 
-def test_simpler_shapes_take_the_place_of_the_finer_ones_a_moment_later(server: viser.ViserServer) -> None:
+def test_simplified_meshes_replace_the_finer_ones_with_a_delay(server: viser.ViserServer) -> None:
     now = 0.0
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32))
@@ -133,7 +133,7 @@ def test_simpler_shapes_take_the_place_of_the_finer_ones_a_moment_later(server: 
     assert [handle.name for handle in view.handles if handle is not simple] == rest
     poses[:, 3, 0] += 0.1
     view.move(poses, layout, None)
-    # Both follow, so that nothing is seen of the change.
+    # Both are moved, so that the replacement is not visible.
     np.testing.assert_array_equal(fine.batched_positions, simple.batched_positions)
     assert server.scene.get_handle_by_name(fine.name) is fine
     now = REMOVAL_DELAY_SECONDS

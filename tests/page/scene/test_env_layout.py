@@ -10,7 +10,7 @@ from workbench.envs.scene.shapes import SceneGeometry
 from workbench.page.scene.env_grid import env_under_ray, grid_offsets, lay_out, place_of_plane, plane_normal
 
 
-def test_box_of_an_env_holds_what_stands_in_it_and_not_its_floor() -> None:
+def test_the_box_of_an_env_contains_its_bodies_but_not_its_floor() -> None:
     geometry, poses = table_scene(4)
     layout = lay_out(geometry, poses)
     np.testing.assert_allclose(layout.low, [-0.6, -1.2, -0.92], atol=1e-6)
@@ -25,7 +25,7 @@ def test_box_of_an_env_holds_what_stands_in_it_and_not_its_floor() -> None:
     width=st.floats(0.3, 12.0),
 )
 @settings(max_examples=60)
-def test_no_two_envs_of_a_grid_touch(num_envs: int, depth: float, width: float) -> None:
+def test_envs_of_a_grid_do_not_touch(num_envs: int, depth: float, width: float) -> None:
     offsets = grid_offsets(num_envs, np.array([depth, width]))
     assert offsets.shape == (num_envs, 3)
     apart = np.abs(offsets[:, None] - offsets[None])
@@ -33,7 +33,7 @@ def test_no_two_envs_of_a_grid_touch(num_envs: int, depth: float, width: float) 
     assert clear[~np.eye(num_envs, dtype=bool)].all()
 
 
-def test_wide_table_is_no_floor_and_a_moving_plate_is_none_either() -> None:
+def test_neither_a_wide_table_nor_a_moving_plate_is_a_floor() -> None:
     geometry, poses = table_scene(1)
     normal = plane_normal(geometry.visuals[0], geometry, poses)
     assert normal is not None
@@ -44,7 +44,7 @@ def test_wide_table_is_no_floor_and_a_moving_plate_is_none_either() -> None:
     assert plane_normal(plate, moving, poses[:, :1]) is None
 
 
-def test_wall_counts_for_no_box_and_stands_behind_the_whole_grid() -> None:
+def test_a_wall_belongs_to_no_box_and_stands_behind_the_whole_grid() -> None:
     geometry, poses = table_scene(9)
     wall = visual("wall/0", box_mesh((40, 0.01, 20)), 9, len(geometry.body_names))
     geometry = SceneGeometry(
@@ -64,7 +64,7 @@ def test_wall_counts_for_no_box_and_stands_behind_the_whole_grid() -> None:
     np.testing.assert_allclose(place[[0, 2]], 0, atol=1e-6)
 
 
-def test_click_finds_the_env_it_points_at() -> None:
+def test_a_click_selects_the_env_under_it() -> None:
     geometry, poses = table_scene(9)
     layout = lay_out(geometry, poses)
     for env in range(9):
@@ -72,19 +72,19 @@ def test_click_finds_the_env_it_points_at() -> None:
         assert env_under_ray(layout, above, np.array([0.0, 0.0, -1.0])) == env
 
 
-def test_click_takes_the_nearer_of_two_envs_in_a_row() -> None:
+def test_a_click_selects_the_nearer_of_two_envs_in_a_row() -> None:
     geometry, poses = table_scene(9)
     layout = lay_out(geometry, poses)
     front = layout.offsets[0] + [10.0, 0.0, 0.0]
     assert env_under_ray(layout, front, np.array([-1.0, 0.0, 0.0])) == 0
 
 
-def test_a_click_between_envs_behind_them_or_with_broken_numbers_finds_none() -> None:
+def test_a_click_between_or_behind_envs_or_with_invalid_numbers_selects_none() -> None:
     geometry, poses = table_scene(4)
     layout = lay_out(geometry, poses)
     above, down = layout.offsets[0] + [0.1, 0.1, 5.0], np.array([0.0, 0.0, -1.0])
     assert env_under_ray(layout, above, down) == 0
-    assert env_under_ray(layout, above, -down) is None, "it lies behind"
+    assert env_under_ray(layout, above, -down) is None, "the env is behind the eye"
     between = (layout.offsets[0] + layout.offsets[1]) / 2 + [0.1, 0.0, 5.0]
     assert env_under_ray(layout, between, down) is None
     edge = layout.offsets[0] + [layout.high[0], 0.0, 5.0]
@@ -95,7 +95,7 @@ def test_a_click_between_envs_behind_them_or_with_broken_numbers_finds_none() ->
         assert env_under_ray(layout, np.array([0.0, broken, 5.0]), down) is None
 
 
-def test_the_box_of_a_body_is_turned_with_it_by_the_right_hand_rule() -> None:
+def test_the_box_of_a_body_rotates_with_it_by_the_right_hand_rule() -> None:
     arm = visual("arm", box_mesh((1.0, 0.2, 0.4), (0.5, 0, 0)), 2, 0)
     geometry = SceneGeometry(2, ("arm",), ("dynamic",), (False,), (arm,))
     quarter_about_z = [0.1, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]

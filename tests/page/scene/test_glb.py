@@ -31,8 +31,8 @@ def test_glb_keeps_triangles_normals_and_colours() -> None:
     assert second.visual.material.alphaMode == "BLEND"
 
 
-def test_part_without_texture_beside_a_textured_one_gets_uvs_too() -> None:
-    """The browser refuses to merge parts whose attributes differ, and then shows none of them."""
+def test_an_untextured_part_next_to_a_textured_one_gets_uvs_too() -> None:
+    """The browser does not merge parts with different attributes, and then shows none of them."""
     plain = box_mesh((1, 1, 1))
     uvs = np.random.default_rng(0).random((len(plain.vertices), 2)).astype(np.float32)
     texture = np.full((4, 4, 4), 200, np.uint8)
@@ -45,11 +45,11 @@ def test_part_without_texture_beside_a_textured_one_gets_uvs_too() -> None:
         )
     )
     assert all(part.visual.uv is not None for part in parts)
-    # In the file v counts from the top as in `Mesh`; trimesh turns it round when it reads.
+    # In the file v counts from the top as in `Mesh`; trimesh flips it on loading.
     np.testing.assert_allclose(parts[0].visual.uv, np.column_stack([uvs[:, 0], 1 - uvs[:, 1]]), atol=1e-6)
 
 
-def test_painted_layers_are_pulled_apart_and_solids_are_not() -> None:
+def test_flat_painted_layers_are_separated_and_solids_are_not() -> None:
     discs = [box_mesh((0.1 / (n + 1), 0.1 / (n + 1), 2e-5 + 2e-5 * n)) for n in range(3)]
     solid = box_mesh((0.1, 0.1, 0.1))
     *lifted, same = lift_painted_layers([*discs, solid])

@@ -24,7 +24,7 @@ Callback = Callable[[Any], Coroutine[Any, Any, None]]
 
 
 class Server:
-    """A server's pages, that come and go."""
+    """A stub server whose pages connect and disconnect."""
 
     def __init__(self) -> None:
         self.pages: dict[int, Any] = {}
@@ -50,7 +50,7 @@ class Server:
     def _tell(self, callbacks: list[Callback], page: int) -> None:
         for callback in callbacks:
             asyncio.run(callback(self.pages[page]))
-        do(lambda: None)  # what was posted before has happened then
+        do(lambda: None)  # everything posted earlier has run now
 
 
 def heavy_scene() -> tuple[SceneGeometry, EnvLayout]:
@@ -61,7 +61,7 @@ def heavy_scene() -> tuple[SceneGeometry, EnvLayout]:
     return geometry, lay_out(geometry, poses)
 
 
-def test_a_page_that_does_not_tell_in_time_draws_otherwise_until_it_leaves(
+def test_a_page_that_does_not_report_in_time_counts_as_using_a_gpu(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     server: Any = Server()
@@ -72,20 +72,20 @@ def test_a_page_that_does_not_tell_in_time_draws_otherwise_until_it_leaves(
     in_software.told_by(server.visitor(1))
     until(lambda: in_software.all_pages, "the page says so")
     server.come(2)
-    assert in_software.all_pages, "nothing changes before the page had time to say so"
+    assert in_software.all_pages, "nothing changes before the page's report is overdue"
     until(lambda: not in_software.all_pages, "the time is over")
     in_software.told_by(server.visitor(2))
-    until(lambda: in_software.all_pages, "it says so late")
+    until(lambda: in_software.all_pages, "the late report")
     server.come(3)
     until(lambda: not in_software.all_pages, "the time is over")
     server.leave(3)
     assert in_software.all_pages
     server.leave(1)
     server.leave(2)
-    assert in_software.all_pages, "a page that is reloaded gets the same shapes"
+    assert in_software.all_pages, "a reloaded page gets the same meshes"
 
 
-def test_shapes_are_simplified_in_the_background_for_pages_that_draw_in_software() -> None:
+def test_meshes_are_simplified_in_the_background_for_software_rendering() -> None:
     server: Any = Server()
     in_software = InSoftware(server)
     geometry, layout = heavy_scene()
@@ -98,12 +98,12 @@ def test_shapes_are_simplified_in_the_background_for_pages_that_draw_in_software
     server.pages[1].camera.position = np.array([50.0, 0.0, 30.0])
     until(
         lambda: in_software.looks(DrawStyle(), geometry, layout, alone=False).error > 4 * near,
-        "still simpler ones for an eye that is far away",
+        "even simpler meshes for a distant eye",
     )
     server.leave(1)
 
 
-def test_a_pixel_is_that_of_the_nearest_env_and_eye() -> None:
+def test_the_pixel_size_is_that_of_the_nearest_env_and_eye() -> None:
     geometry, poses = table_scene(4)
     layout = lay_out(geometry, poses)
     above = np.array([0.0, 0.0, layout.high[2] + 2.0])
@@ -111,5 +111,5 @@ def test_a_pixel_is_that_of_the_nearest_env_and_eye() -> None:
     near = Eye(above + layout.offsets[3], 0.001)
     assert np.isclose(pixel_of((far,), layout, alone=False), 0.005)
     assert np.isclose(pixel_of((far, near), layout, alone=False), 0.002)
-    # One env alone stands at the origin, whichever it is.
+    # A single env is shown at the origin, whichever it is.
     assert np.isclose(pixel_of((Eye(above, 0.001),), layout, alone=True), 0.002)

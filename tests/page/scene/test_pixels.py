@@ -19,7 +19,7 @@ def poses_at(x: float, turn: float = 0.0) -> NDArray[np.float32]:
     return poses
 
 
-def test_less_than_a_pixel_is_not_sent_and_what_adds_up_is() -> None:
+def test_motion_below_a_pixel_is_sent_once_it_adds_up() -> None:
     sent = SentPoses(REACH)
     first, changed = sent.update(poses_at(0.0), (EYE,), 0.0)
     assert changed.all() and np.array_equal(first, poses_at(0.0))
@@ -32,7 +32,7 @@ def test_less_than_a_pixel_is_not_sent_and_what_adds_up_is() -> None:
     assert (displacements(shown, poses_at(0.006), REACH) < 0.005).all()
 
 
-def test_turning_counts_at_the_far_end_of_a_body() -> None:
+def test_rotation_is_measured_at_the_far_end_of_a_body() -> None:
     sent = SentPoses(REACH)
     sent.update(poses_at(0.0), (EYE,), 0.0)
     _, changed = sent.update(poses_at(0.0, turn=0.01), (EYE,), 0.03)
@@ -41,7 +41,7 @@ def test_turning_counts_at_the_far_end_of_a_body() -> None:
     assert changed.all(), "8 mm"
 
 
-def test_no_body_is_ever_seen_more_than_a_pixel_and_a_half_away() -> None:
+def test_no_body_is_shown_more_than_one_and_a_half_pixels_off() -> None:
     rng = np.random.default_rng(0)
     sent = SentPoses(REACH)
     x = turn = 0.0
@@ -52,7 +52,7 @@ def test_no_body_is_ever_seen_more_than_a_pixel_and_a_half_away() -> None:
         x, turn = x + rng.normal(0, 0.002), turn + rng.normal(0, 0.01)
 
 
-def test_what_comes_to_rest_gets_its_exact_pose() -> None:
+def test_a_body_at_rest_gets_its_exact_pose() -> None:
     sent = SentPoses(REACH)
     sent.update(poses_at(0.0), (EYE,), 0.0)
     end = poses_at(0.0123456, turn=0.1234)
@@ -66,7 +66,7 @@ def test_what_comes_to_rest_gets_its_exact_pose() -> None:
     assert not changed.any(), "once"
 
 
-def test_coming_nearer_shows_what_was_too_small() -> None:
+def test_a_closer_eye_shows_motion_that_was_too_small() -> None:
     sent = SentPoses(REACH)
     sent.update(poses_at(0.0), (EYE,), 0.0)
     _, changed = sent.update(poses_at(0.003), (EYE,), 0.03)
@@ -76,7 +76,7 @@ def test_coming_nearer_shows_what_was_too_small() -> None:
     assert changed.any(), "for one of the two pages"
 
 
-def test_a_body_that_comes_or_goes_is_told() -> None:
+def test_an_appearing_or_disappearing_body_is_sent() -> None:
     sent = SentPoses(REACH)
     sent.update(poses_at(0.0), (EYE,), 0.0)
     gone = poses_at(0.0)

@@ -6,7 +6,7 @@ from workbench.page.scene.env_grid import lay_out
 from workbench.page.scene.viewpoint import View3D
 
 
-def test_bodies_and_light_outlive_a_page_and_nothing_else_does(panels: Panels) -> None:
+def test_only_bodies_and_light_outlive_a_page(panels: Panels) -> None:
     server = panels.server
     stage = View3D(server)
     geometry, poses = table_scene(2)
@@ -21,6 +21,6 @@ def test_bodies_and_light_outlive_a_page_and_nothing_else_does(panels: Panels) -
     names = [node.name for node in nodes]
     assert {name.split("/")[1] for name in names if name} <= {"envs", "floor", "lights", "WorldAxes"}
     assert any(name.startswith("/lights/") for name in names)
-    # The next page draws the same: nothing of it is sent again.
+    # The next page shows the same bodies: none is sent again.
     stage.scene.build(geometry, layout, poses)
     assert stage.scene.handles == bodies

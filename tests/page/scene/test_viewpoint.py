@@ -61,9 +61,9 @@ def test_the_human_camera_s_picture_fits_the_view() -> None:
         assert abs((z - viewpoint.position[2]) / (away * np.tan(FOV_RADIANS / 2)) - place) < 1e-5
 
 
-def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:
+def test_a_single_env_is_seen_from_the_tasks_human_camera() -> None:
     geometry, poses = table_scene(1)
-    # At x = 1.5, turned half round z: it looks along -x.
+    # At x = 1.5, rotated by pi about z: it looks along -x.
     pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
     viewpoint = frame_one(lay_out(geometry, poses), Picture("render_camera", "human", 0, pose))
     np.testing.assert_allclose(viewpoint.position, pose[:3], atol=1e-6)
@@ -71,7 +71,7 @@ def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:
     np.testing.assert_allclose(towards / np.linalg.norm(towards), [-1, 0, 0], atol=1e-6)
 
 
-def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
+def test_a_page_is_reframed_on_resize_until_the_user_moves_the_view(
     server: viser.ViserServer,
 ) -> None:
     framing = Framing(server)
@@ -84,7 +84,7 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
     with websockets.sync.client.connect(address, **arguments) as page:
 
         def shows(width: int, position: np.ndarray) -> np.ndarray:
-            """Where it looks from after it said that it is so wide."""
+            """The camera position after the page reported this width."""
             page.send(camera_message(position.tolist(), width))
             until(
                 lambda: any(one.camera.image_width == width for one in server.get_clients().values()),
@@ -103,7 +103,7 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
         begins = np.array(server.initial_camera.position)
         assert np.allclose(shows(399, begins), frame(399 / 720).position), "where it begins came after"
         moved = at + 0.1
-        assert np.allclose(shows(300, moved), moved), "the view is the person's"
+        assert np.allclose(shows(300, moved), moved), "the user's view is kept"
         (client,) = server.get_clients().values()
         for what in ("live", "review"):
             assert framing.is_new(what)
@@ -112,10 +112,10 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
         assert not np.allclose(client.camera.position, moved)
         assert framing.is_new("live")
         framing.frame_new(frame)
-        assert np.allclose(client.camera.position, moved), "back from the review"
+        assert np.allclose(client.camera.position, moved), "the view is kept after the review"
 
 
-def test_what_is_chosen_in_the_view_panel_holds_for_the_pages_to_come(panels: Panels) -> None:
+def test_choices_in_the_view_panel_apply_to_later_pages(panels: Panels) -> None:
     choice = ViewChoice()
     panel = ViewPanel(panels.server, dark=True, chosen=choice)
     panels.visitors.do = panel.do

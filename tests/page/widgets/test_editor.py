@@ -1,4 +1,4 @@
-"""Links that open the author's editor: which addresses are taken, and which files are linked."""
+"""Links that open the author's editor: which URL templates are accepted, and which files are linked."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workbench.page.widgets.templates import render
 REMOTE = "vscode://vscode-remote/ssh-remote+lab{file}:{line}"
 
 
-def test_an_address_is_taken_as_it_is_and_names_file_and_line() -> None:
+def test_a_url_template_is_used_unchanged_with_file_and_line() -> None:
     link = editor_link(parse_editor(REMOTE), "/home/me/push it.py", 88, lambda path: True)
     assert link.address == "vscode://vscode-remote/ssh-remote+lab/home/me/push%20it.py:88"
     assert link.copied == "/home/me/push it.py:88" and not link.new_tab
@@ -40,7 +40,7 @@ def test_an_address_is_taken_as_it_is_and_names_file_and_line() -> None:
         "",
     ],
 )
-def test_what_would_run_a_script_or_is_no_address_is_refused(text: str) -> None:
+def test_a_script_or_an_invalid_url_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="--editor takes vscode, cursor, pycharm, none or an address"):
         parse_editor(text)
 
@@ -61,7 +61,7 @@ def test_only_files_that_the_server_knows_are_linked() -> None:
         lambda name: name not in (".", "..")  # names of folders
     )
 )
-def test_any_name_of_a_file_stays_one_path_and_cannot_leave_its_attribute(name: str) -> None:
+def test_any_file_name_stays_one_path_and_cannot_escape_its_attribute(name: str) -> None:
     link = editor_link(EDITORS["vscode"], f"/home/me/{name}", 7, lambda path: True)
     parts = urlsplit(link.address)
     assert (parts.scheme, parts.netloc, parts.query, parts.fragment) == ("vscode", "file", "", "")

@@ -21,7 +21,7 @@ from workbench.page.widgets.images import (
 )
 
 
-def test_ends_of_the_depth_range_take_the_ends_of_the_scale() -> None:
+def test_the_ends_of_the_depth_range_use_the_ends_of_the_scale() -> None:
     depth = np.array([[1.0, 2.0, 3.0, 0.0, 99.0]], np.float32)
     coloured = colour_depth(depth, DepthRange(1.0, 3.0))
     np.testing.assert_array_equal(coloured[0, 0], VIRIDIS[0].astype(np.uint8))
@@ -40,7 +40,7 @@ def test_any_depth_gives_a_picture(depth: np.ndarray) -> None:
         assert 0 < span.near < span.far
 
 
-def test_floor_to_the_horizon_does_not_flatten_the_table() -> None:
+def test_a_floor_to_the_horizon_does_not_reduce_contrast_on_the_table() -> None:
     depth = np.full((100, 100), 1.0, np.float32)
     depth[:20] = 80.0
     depth[60:, :] = 0.5
@@ -50,7 +50,7 @@ def test_floor_to_the_horizon_does_not_flatten_the_table() -> None:
     assert span.far == pytest.approx(3.0)
 
 
-def test_segment_has_one_colour_everywhere_and_neighbours_differ() -> None:
+def test_a_segment_id_has_one_colour_everywhere_and_neighbours_differ() -> None:
     coloured = colour_segmentation(np.array([[0, 1], [2, 1]], np.int32))
     np.testing.assert_array_equal(coloured[0, 1], coloured[1, 1])
     np.testing.assert_array_equal(coloured[0, 0], NOTHING)
@@ -80,7 +80,7 @@ def test_normals_are_drawn_as_normal_maps_and_background_is_dark() -> None:
 
 
 @given(hnp.arrays(np.float32, (5, 7, 3), elements=st.floats(-100, 100, width=32)))
-def test_positions_take_the_whole_scale_and_background_is_dark(position: np.ndarray) -> None:
+def test_positions_use_the_whole_scale_and_the_background_is_dark(position: np.ndarray) -> None:
     met = position[..., 2] < 0
     coloured = colour_position(position)
     assert (coloured[~met] == NOTHING).all()

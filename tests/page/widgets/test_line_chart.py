@@ -1,4 +1,4 @@
-"""A chart that is there is only ever sent data; what a browser draws of them is in ``tests/browser/test_charts.py``."""
+"""An existing chart is only sent data; what a browser draws is tested in ``tests/browser/test_charts.py``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Y = np.array([0.5, np.nan, 1.0])
 LINES = (ChartLine("one", Y),)
 
 
-def test_new_data_go_to_the_same_chart_and_other_lines_to_another(server: viser.ViserServer) -> None:
+def test_new_data_reuse_the_chart_and_other_lines_need_a_new_one(server: viser.ViserServer) -> None:
     chart = LineChart(server, server.gui.add_folder(None), 150)
     chart.draw("reward", X, LINES)
     first = chart.handle
@@ -32,7 +32,7 @@ def test_new_data_go_to_the_same_chart_and_other_lines_to_another(server: viser.
         assert chart.handle is not before
 
 
-def test_what_has_no_number_or_one_place_alone_is_hidden(panels: Panels) -> None:
+def test_a_chart_without_numbers_or_with_a_single_x_is_hidden(panels: Panels) -> None:
     chart = LineChart(panels.server, panels.server.gui.add_folder(None), 150)
     nothing = ChartLine("two", np.array([np.nan, np.inf, np.nan]))
     chart.draw("reward", X, (nothing, *LINES))
@@ -43,7 +43,7 @@ def test_what_has_no_number_or_one_place_alone_is_hidden(panels: Panels) -> None
         chart.draw("reward", X, LINES)
 
 
-def test_charts_take_turns_in_one_place_and_one_is_shown(panels: Panels) -> None:
+def test_charts_share_one_place_and_one_of_them_is_shown(panels: Panels) -> None:
     folder = panels.server.gui.add_folder(None)
     upper, lower = LineChart(panels.server, folder, 150), LineChart(panels.server, folder, 150)
     upper.draw("reward", X, LINES)
@@ -60,6 +60,6 @@ def test_charts_take_turns_in_one_place_and_one_is_shown(panels: Panels) -> None
     assert panels.charts() == [lower.handle]
 
 
-def test_yes_or_no_has_one_range_and_numbers_that_of_the_data() -> None:
+def test_booleans_have_a_fixed_range_and_numbers_the_range_of_the_data() -> None:
     assert span_of((np.array([0.0, np.nan, 1.0]), np.zeros(2))) == YES_OR_NO
     assert span_of((np.array([0.0, 0.5]),)) is None

@@ -19,7 +19,7 @@ def due(clock: Clock) -> DrawThrottle:
     return DrawThrottle(0.5, clock)
 
 
-def test_something_new_waits_until_the_last_could_be_read(due: DrawThrottle, clock: Clock) -> None:
+def test_a_new_value_waits_until_the_last_could_be_read(due: DrawThrottle, clock: Clock) -> None:
     assert due.is_due(1)
     clock.passes(0.25)
     assert not due.is_due(2)
@@ -27,9 +27,7 @@ def test_something_new_waits_until_the_last_could_be_read(due: DrawThrottle, clo
     assert due.is_due(2) and not due.is_due(3)
 
 
-def test_what_somebody_waits_for_is_drawn_at_once_and_counts_as_drawn(
-    due: DrawThrottle, clock: Clock
-) -> None:
+def test_an_urgent_value_is_drawn_at_once_and_counts_as_drawn(due: DrawThrottle, clock: Clock) -> None:
     assert due.is_due(1) and due.is_due(1, urgent="pressed") and not due.is_due(1, urgent="pressed")
     clock.passes(0.25)
     assert not due.is_due(3, urgent="pressed")
@@ -38,7 +36,7 @@ def test_what_somebody_waits_for_is_drawn_at_once_and_counts_as_drawn(
 
 
 class Halves(PagePart[int]):
-    """Shows half of a number, and is in a hurry about large ones."""
+    """Shows half of a number; large ones are urgent."""
 
     every = 0.5
 
@@ -55,7 +53,7 @@ class Halves(PagePart[int]):
         self.drawn.append(view)
 
 
-def test_each_part_of_a_page_is_drawn_when_it_has_something_new_to_show(clock: Clock) -> None:
+def test_each_part_of_a_page_is_drawn_when_its_content_changes(clock: Clock) -> None:
     halves, plain = Halves(), Plain()
     parts = Parts((halves, plain), clock)
     for view, seconds in ((2, 0.0), (3, 9.0), (4, 0.0), (6, 0.25), (100, 0.0), (102, 0.25), (102, 0.25)):

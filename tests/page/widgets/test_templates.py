@@ -10,18 +10,18 @@ from workbench.page.widgets.templates import render
 from workbench.task.problem import Problem
 
 
-def test_a_name_that_cannot_be_sent_is_shown() -> None:
+def test_a_name_that_is_not_valid_utf8_is_shown() -> None:
     problem = Problem(
         "import", "name\udcff and \x1b[31m", "/tmp/a\u202egpj.py", 1, "x = 1\t# tab", "one\ntwo\udcff"
     )
     html = banner_html(problem, running(2))
     assert "name\\udcff and \\x1b[31m" in html and "a\\u202egpj.py" in html
-    assert "one\ntwo\\udcff" in html and "x = 1\t# tab" in html, "lines and tabs are as they were"
+    assert "one\ntwo\\udcff" in html and "x = 1\t# tab" in html, "newlines and tabs are kept"
     msgspec.msgpack.encode(html)
 
 
 @given(st.text(st.characters()))
-def test_whatever_is_rendered_can_be_sent_to_a_page(text: str) -> None:
+def test_any_rendered_text_can_be_sent_to_a_page(text: str) -> None:
     html = render("warning", text=text)
     msgspec.msgpack.encode(html)
     assert not {"\x1b", "\u202e", "\x9b", "\x00"} & set(html)

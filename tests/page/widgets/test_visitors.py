@@ -1,4 +1,4 @@
-"""The channel of commands: numbered, in order, one reply each; what is no command ends it."""
+"""The command channel: numbered commands, in order, one reply each; an invalid message closes it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 from tests.drive.tabs import handshake, tabs_of
-from tests.drive.waiting import PATIENCE, until
+from tests.drive.waiting import TIMEOUT_SECONDS, until
 from workbench.commands import COMMANDS
 from workbench.live.commands import SetSeed, Step, TogglePlay
 from workbench.live.env_commands import NextEnv, SelectEnv
@@ -26,7 +26,7 @@ from workbench.page.widgets.visitors import PATH, Done, Visitor, Visitors
 
 @dataclass
 class House:
-    """Two open pages, and what they asked for."""
+    """Two open pages, and the commands that they sent."""
 
     gated_server: GatedServer
     visitors: Visitors
@@ -45,7 +45,7 @@ class House:
         return None
 
     async def _wait(self, command: Command, visitor: Visitor) -> None:
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(TIMEOUT_SECONDS):
             while not self.go_on.is_set():
                 await asyncio.sleep(0.01)
         self.came.append((visitor.name, command))
@@ -78,10 +78,10 @@ def say(channel: Connection, number: int, name: str, **fields: Any) -> None:
 
 
 def reply(channel: Connection) -> dict[str, Any]:
-    return json.loads(channel.recv(PATIENCE))
+    return json.loads(channel.recv(TIMEOUT_SECONDS))
 
 
-def test_commands_are_done_in_order_and_each_is_answered(house: House) -> None:
+def test_commands_run_in_order_and_each_is_answered(house: House) -> None:
     one, other = house.names()
     with house.open(one) as channel, house.open(other) as beside:
         for number in range(1, 21):
@@ -95,7 +95,7 @@ def test_commands_are_done_in_order_and_each_is_answered(house: House) -> None:
     assert (other, Step()) in house.came
 
 
-def test_a_page_that_waits_does_not_hold_up_another(house: House) -> None:
+def test_a_page_that_waits_does_not_block_another(house: House) -> None:
     one, other = house.names()
     with house.open(one) as channel, house.open(other) as beside:
         say(channel, 1, "next_env")
@@ -120,7 +120,7 @@ def test_a_page_that_waits_does_not_hold_up_another(house: House) -> None:
         ("set_seed", {"seed": True}),
     ],
 )
-def test_what_a_command_does_not_take_is_refused_in_words_and_the_next_is_done(
+def test_invalid_fields_are_refused_with_a_reason_and_the_next_command_runs(
     house: House, name: str, fields: dict[str, Any]
 ) -> None:
     with house.open(house.names()[0]) as channel:
@@ -131,7 +131,7 @@ def test_what_a_command_does_not_take_is_refused_in_words_and_the_next_is_done(
     assert [command for _, command in house.came] == [SetSeed(seed=12)]
 
 
-def test_a_command_that_fails_costs_itself_alone(house: House, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_command_affects_nothing_else(house: House, caplog: pytest.LogCaptureFixture) -> None:
     with house.open(house.names()[0]) as channel:
         say(channel, 1, "toggle_play")
         say(channel, 2, "step")
@@ -154,30 +154,30 @@ def test_a_command_that_fails_costs_itself_alone(house: House, caplog: pytest.Lo
         b"\xff\xfe",
     ],
 )
-def test_what_is_no_command_ends_that_connection_and_no_other(house: House, raw: str | bytes) -> None:
+def test_an_invalid_message_closes_only_its_own_connection(house: House, raw: str | bytes) -> None:
     one, other = house.names()
     with house.open(one) as channel, house.open(other) as beside:
         channel.send(raw)
         with pytest.raises(ConnectionClosed) as closed:
-            channel.recv(PATIENCE)
+            channel.recv(TIMEOUT_SECONDS)
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
         say(beside, 1, "step")
         assert reply(beside) == {"n": 1}
     assert [command for _, command in house.came] == [Step()]
 
 
-def test_who_is_no_open_page_is_sent_away(house: House) -> None:
+def test_a_client_that_is_not_an_open_page_is_refused(house: House) -> None:
     for name in ("", "made-up", house.names()[0][:-1]):
         with house.open(name) as channel, pytest.raises(ConnectionClosed):
-            channel.recv(PATIENCE)
+            channel.recv(TIMEOUT_SECONDS)
     address, how = handshake(house.gated_server.url.replace("token=", "token=x"))
     del how["subprotocols"]
     with pytest.raises(InvalidHandshake):
         connect(f"{address.rstrip('/')}{PATH}?page={house.names()[0]}", proxy=None, **how)
 
 
-def test_each_command_says_what_it_does_and_has_a_key_of_its_own() -> None:
+def test_each_command_has_a_description_and_a_unique_key() -> None:
     helps = [kind.help() for kind in COMMANDS]
     assert all(helps) and len(set(helps)) == len(helps)
     for kind, key in COMMANDS.keys().items():
-        assert isinstance(kind(), Command) and key.command in COMMANDS, "a key asks with default values"
+        assert isinstance(kind(), Command) and key.command in COMMANDS, "a key sends default values"

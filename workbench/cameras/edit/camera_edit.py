@@ -64,7 +64,9 @@ class CameraEdit(Changes):
         """
         files = {file.path: file for file, _ in self.replacements}
         if not files:
-            raise RefusedEdit("the change is smaller than what is written (0.1 mm, 0.01 degree)")
+            raise RefusedEdit(
+                "the change is smaller than the precision of the written numbers (0.1 mm, 0.01 degree)"
+            )
         made: list[FileChange] = []
         for file in sorted(files.values(), key=lambda file: (file is not first, file.path)):
             check_own(file.path)
@@ -83,7 +85,7 @@ class CameraEdit(Changes):
             ):
                 raise RefusedEdit(f"the change would also change the camera {other[1]}")
         if after.keys() != before.keys() - {key} | ({expected} if expected is not None else set()):
-            raise RefusedEdit("the file could not be changed without changing what else it does")
+            raise RefusedEdit("the change would add or remove other cameras than requested")
         found = None if expected is None else after[expected]
         if found is not None and key is not None and key in before and found.mount != before[key].mount:
             raise RefusedEdit("the change would put the camera on another mount")

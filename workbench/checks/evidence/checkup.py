@@ -227,7 +227,7 @@ class Checkup:
             raise NotApplicable("it is a robot in a scene of ManiSkill's")
 
     def at_most(self, wanted: int) -> int:
-        """The number of envs to make for a wish of `wanted`: 1 if the checkup has one env."""
+        """Number of envs to make if `wanted` are wanted: 1 if the checkup has one env."""
         return wanted if self.num_envs > 1 else 1
 
     @contextmanager
@@ -597,7 +597,7 @@ def leaf_rows(value: Any, num_envs: int) -> dict[str, NDArray[np.float64]]:
 
 
 def overlaps_of(task: TaskEnv, env: int) -> tuple[Overlap, ...]:
-    """Bodies that overlapped at the begin of the last substep, deepest first. Links of one articulation that touch are left out,
+    """Bodies that overlapped at the start of the last substep, deepest first. Links of one articulation that touch are left out,
     since joints hold them."""
     deepest: dict[tuple[str, str], float] = {}
     for contact in list_contacts(task.env, env):

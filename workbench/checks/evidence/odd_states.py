@@ -34,7 +34,7 @@ KINDS = ("right after the reset", "with joints and bodies at random places", "wi
 MAX_GOALS = 4
 """Maximum number of goal marks at which bodies are placed: a drawing has hundreds of marks."""
 AT_GOAL = "with bodies at the place of {}"
-SHORT = "on the way back from a success to the reset"
+SHORT = "between the reset and a success"
 HALVINGS = 6
 """Halvings of the way back: the last states are within 1/64 of the way from where success ends."""
 DENSE_HOOKS = {"dense": "compute_dense_reward", "normalized_dense": "compute_normalized_dense_reward"}

@@ -234,7 +234,7 @@ def _is_host(tensor: torch.Tensor) -> bool:
 
 
 def _place_of(hosts: list[torch.Tensor], frame: FrameType | None) -> Any:
-    """The line that made a host tensor: that of the first one given, else the line that runs."""
+    """The line that made the first of `hosts`; without `hosts`, the line of `frame`."""
     return getattr(hosts[0], _STATE) if hosts else _OWN if frame is None else _place(frame)
 
 

@@ -116,7 +116,7 @@ def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             )
         elif not row.names:
             yield Found(
-                "evaluate() returns neither success nor fail, from which the sparse reward is made: it is always 0. Return "
+                "evaluate() returns neither success nor fail, so the sparse reward made from them is always 0. Return "
                 "{'success': ...} as a bool tensor with a row for each env.",
                 row.place,
             )
@@ -306,7 +306,7 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         raise NotKnown(f"no {which} episode succeeds")
     if not times:
         raise NotKnown(
-            "where success is true, it is so from the reset on"
+            "success becomes true in no episode after its reset"
             if at_reset
             else "success comes at the last step only"
         )
@@ -348,7 +348,7 @@ def entries_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         count = of(len(row.seeds), tried(rows, kind), f"{kind} episode")
         yield Found(
             f"{name!r} is not finite in {count}, {row.texts[0]}. Look for a division "
-            "or a square root of what can be 0, and clamp it; for what is not known, return 0 and a bool beside it.",
+            "or a square root of what can be 0, and clamp it; for an unknown value, return 0 and a bool that says so.",
             row.place,
             row.count,
         )

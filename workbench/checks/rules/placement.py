@@ -540,7 +540,7 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
     if not robots:
         raise NotApplicable("it has no robot")
     if len(robots) > 1:
-        raise NotKnown("it has several robots: which one is to touch what is not known")
+        raise NotKnown("it has several robots, and which of them must touch which body is not known")
     if not _is_fixed(robots[0].robot):
         raise NotApplicable("its robot moves around")
     tool = getattr(robots[0], "tcp", None)  # what a property of the author's raises is told

@@ -290,8 +290,8 @@ def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
     ]
     if wrong:
         yield Found(
-            f"one env alone is built with other shapes or colours for seed {listed(wrong)} than the env of that seed among "
-            f"{checkup.num_envs}. Draw from self._batched_episode_rng[i] for env i, not from torch or numpy.",
+            f"a single env is built with other shapes or colours for seed {listed(wrong)} than the env of that seed in a "
+            f"batch of {checkup.num_envs}. Draw from self._batched_episode_rng[i] for env i, not from torch or numpy.",
             checkup.places.hook("_load_scene"),
             len(wrong),
         )

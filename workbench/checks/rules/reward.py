@@ -178,9 +178,9 @@ def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             row.count,
         )
     elif any(row.names == ("no success",) for row in rows):
-        raise NotKnown("evaluate() has no success: which states pay most is not known")
+        raise NotKnown("evaluate() has no success, so it is not known in which states the reward is largest")
     elif not any(row.tried for row in rows):
-        raise NotKnown("no tried episode succeeds, where the reward is largest")
+        raise NotKnown("no tried episode succeeds, and the reward is largest at success")
 
 
 def paid_at_success(seen: OddStates, mode: str) -> float | None:
@@ -252,8 +252,8 @@ def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] |
 
 
 def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each episode, in rollouts and odd states, that has success and a higher reward elsewhere; and one for the reward
-    at success, if that is one number."""
+    """A row for each episode, of rollouts or odd states, whose reward is higher elsewhere than at success. One more row for the
+    reward at success, if it is the same number in all states."""
     _require_dense(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     every = _scored(checkup)

@@ -578,7 +578,7 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
             yield Found(
                 f"{_several([part.name for part in parts], 'is', 'are')} hidden, and {merged.name}, which "
                 f"{'it is' if len(parts) == 1 else 'they are'} merged into, is not: on a GPU hiding moves a body 99999 m away, "
-                f"so the pose of {merged.name} is wrong, and sensors see it again once that is set. Hide the merged actor "
+                f"so the pose of {merged.name} is wrong, and sensors see it again once its pose is set. Hide the merged actor "
                 f"instead: {name}.has_collision_shapes = False, then self._hidden_objects.append({name}).",
                 _hiding_line(checkup, parts[0]),
                 len(parts),
@@ -637,8 +637,8 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
     alone = checkup.alone
     if len(set(alone.shapes.values())) > 1 and not alone.rebuilds:
         yield Found(
-            "One env is built with other shapes or colours for another seed, and never rebuilt after the first. In "
-            "__init__, take `reconfiguration_freq=None` and, if it is None, hand on 1 for num_envs == 1 and 0 otherwise.",
+            "Another seed gives other shapes or colours, but a single env is never rebuilt after its first seed. In "
+            "__init__, take `reconfiguration_freq=None` and, if it is None, pass on 1 for num_envs == 1 and 0 otherwise.",
             checkup.places.hook("__init__", "_load_scene"),
         )
     elif not alone.rebuilds:

@@ -40,7 +40,7 @@ def bodies_stay(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         raise NotApplicable("nothing in it moves")
     for row in sorted(together(rows, worst=True), key=lambda row: -row.size):
         yield Found(
-            f"{row.texts[0]}; in this way or another it leaves the scene in "
+            f"{row.texts[0]}; in this or another way it leaves the scene in "
             f"{of(len(row.seeds), tried(rows), 'random episode')} (seed {listed(row.seeds)}). Let nothing overlap and "
             "nothing be thrown, or end an episode without it: return `fail` from evaluate().",
             row.place,

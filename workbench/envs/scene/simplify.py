@@ -67,7 +67,7 @@ def collapse_mesh(mesh: Mesh, max_faces: int) -> Mesh:
 
 
 def coarsen_mesh(mesh: Mesh, max_faces: int, by_pieces: bool = False) -> Mesh:
-    """`mesh` with at least `max_faces` triangles, and more where fewer would be another shape; slower than `reduce_mesh`,
+    """`mesh` with about `max_faces` triangles, or more if that many cannot keep the shape; slower than `reduce_mesh`,
     nearer to the surface, and with normals of its own faces.
 
     Args:

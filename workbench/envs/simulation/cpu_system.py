@@ -351,7 +351,7 @@ class BatchedCpuSystem:
         place = place_of(frames_of_the_task())
         if len(self.systems) > 1:
             raise NeedsOneEnv(
-                f"scene.px.{name} is of one CPU simulation, and there are {len(self.systems)} here",
+                f"scene.px.{name} belongs to a single CPU simulation, and there are {len(self.systems)} here",
                 _INSTEAD.get(name, ""),
                 place,
             )

@@ -356,7 +356,7 @@ class StrictCpuSystem(BatchedCpuSystem):
                 self.rules.report_breach(
                     "applied-by-reset",
                     f"The {mirror.what} of '{name}' in {envs_named(mirror.envs[mine])} was set outside _initialize_episode and "
-                    "not applied: on the GPU the reset of other envs applies it, and not before. Call "
+                    "not applied: on the GPU it is applied only when other envs are reset. Call "
                     "self.scene._gpu_apply_all() and self.scene._gpu_fetch_all() after the write (under "
                     "`if self.gpu_sim_enabled:`).",
                     self._writes.frames(mirror.group, mine),

@@ -252,10 +252,10 @@ def write_cpu_state(
 
 
 def make_cpu_exact_point(env: Any, env_idx: list[int]) -> None:
-    """Give these envs a PhysX scene without a past, with their present state.
+    """Give these envs a new PhysX scene with their present state.
 
-    A snapshot taken now and the same actions then repeat what follows to the last bit. If PhysX does not return an
-    articulation's root pose as it was set, the root is moved by some last bits until it does.
+    Restoring a snapshot taken now and repeating the actions then gives the same run to the last bit. If PhysX returns an
+    articulation's root pose with other last bits than were set, those bits are changed until it returns the same.
     """
     left, state, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
     positions = list(range(len(env_idx)))
@@ -405,11 +405,11 @@ def _touching(
     return found
 
 
-# --- physics without a past --------------------------------------------------------------------------
+# --- a new PhysX scene --------------------------------------------------------------------------------
 
 
 def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
-    """Give these envs of a batched CPU scene a new PhysX scene, which has no past.
+    """Give these envs of a batched CPU scene a new PhysX scene.
 
     PhysX solves contacts in the order of numbers that it assigns to pairs of shapes, and reuses freed numbers, last freed
     first. So the last bits of a result depend on every contact that the scene ever had, and no call resets that (tried:

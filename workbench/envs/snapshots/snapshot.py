@@ -49,7 +49,7 @@ class Snapshot(NamedTuple):
     (`task_state`), elapsed steps and random generators (`rng`), with a row per env. So one env's state can be restored in
     place, into another env, or by name into an env that was built again.
 
-    *Two restores of a snapshot continue identically*, to the last bit: a restored env gets a PhysX scene without a past.
+    *Two restores of a snapshot continue identically*, to the last bit: a restored env gets a new PhysX scene.
 
     *A restore continues like the uninterrupted run* except for state that PhysX does not expose: contact caches, the order
     in which it solves contacts, and the last bit of an articulation's root. Nothing else is missing (tested: an
@@ -128,7 +128,7 @@ def restore_snapshot(
         env_idx: the envs to restore; None for those of the snapshot.
         source: the snapshot's envs whose state they get: one for all, or one each. None: each its own; or if the snapshot
             has a single env, that one.
-        fresh_physics: give the envs a PhysX scene without a past, so that they continue identically, to the last bit.
+        fresh_physics: give the envs a new PhysX scene, so that they continue identically, to the last bit.
             Without it, a restore is several times as fast, and later contacts may be solved in another order
             (`renew_physics`).
 
@@ -158,7 +158,7 @@ def restore_snapshot(
 
 
 def begin_anew(env: Any, env_idx: list[int]) -> None:
-    """Make the present an exact point of these envs: a PhysX scene without a past, in a state that it returns as written.
+    """Make the present an exact point of these envs: a new PhysX scene, in a state that it returns as written.
 
     From an exact point, a snapshot and the same actions give the same bits as the uninterrupted run.
 

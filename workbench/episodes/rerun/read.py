@@ -67,7 +67,7 @@ class RerunTable:
             self._read_what_is_left()
 
     def _read_what_is_left(self) -> None:
-        """Read the intact chunks of a damaged file: most of it are pictures, and a damaged one must not lose the rest."""
+        """Read the intact chunks of a damaged file: most chunks are pictures, and a damaged one must not lose the others."""
         for held in (self._timed, self._static, self._pictures, self._static_chunks):
             held.clear()
         pictures = self._file.entities_with(PICTURE_COMPONENTS.values())
@@ -244,7 +244,7 @@ class RerunTable:
         return np.concatenate([rgb, np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=-1)
 
     def _full_texture(self, entity: str, shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The full texture (H, W, 3) of the small one that rerun shows; `shown` itself if there is no other."""
+        """The full-size texture (H, W, 3) of which rerun shows a small version; `shown` itself if there is none."""
         encoded = self._static.get((entity, "texture"))
         if encoded is None:
             return shown

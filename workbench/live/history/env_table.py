@@ -145,7 +145,7 @@ class EnvTable:
 
         Args:
             then: the rows at the moment that some envs went back to. None without a jump back, or if that moment is
-                unknown: then the rows of these envs start without a past.
+                unknown: then the rows of these envs start with an empty history.
             rewards_then: returns the rewards of an env's episode up to that moment, oldest first.
 
         Returns:

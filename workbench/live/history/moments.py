@@ -383,7 +383,7 @@ class History:
         return tuple(episode_backwards[k] for k in chosen)
 
     def episode_backwards(self, env: int, serial: int) -> Iterator[EnvMoment]:
-        """The episode of this env up to a moment, newest first, through its jumps back.
+        """The episode of this env up to a moment, newest first; a jump back continues at the moment that it led to.
 
         Yields each control step and finally the first reset, as far as they are kept.
         """

@@ -30,8 +30,8 @@ FILL = "Write the minimal task into it"
 RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Restart the worker"
 REBUILD = "Rebuild the scene"
 REBUILD_HINT = (
-    "Where the new code needs what building the scene makes, such as a body or an attribute of _load_scene: a patch keeps "
-    "the old scene. The moment is restored."
+    "A patch keeps the old scene. Rebuild if the new code needs something that _load_scene makes, such as a body or an "
+    "attribute. The moment is restored."
 )
 _MAY_BE_OLD = ("reset", "step", "evaluate", "reward", "observation", "returns")
 """Stages that use objects made while the scene was built: a patch keeps those objects, and some that the new code

@@ -35,7 +35,7 @@ from workbench.task.description import ActionDimension
 ENVS = {"the selected env": "selected", "all envs": "all"}
 """Choices of a field *Envs*, with their values in commands."""
 HOLD = "Hold still"
-MOVED_HINT = "Whose robot a slider moves. The sliders show what the robot of the selected env is told."
+MOVED_HINT = "Whose robot a slider moves. The sliders show the action of the selected env."
 DEFAULT_BOUND = 1.0
 """Bound of the slider of a dimension without bounds: from -1 to 1."""
 
@@ -121,7 +121,10 @@ SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
 RESET_ALL, RESET_THIS = "Reset all", "Reset this env"
 PREVIOUS, NEXT = "‹ previous", "next ›"
 CHOOSE = "choose one"
-KNOWN_HINT = "Functions of one parameter in the files where the command was started and beside the task, and policies used before."
+KNOWN_HINT = (
+    "Functions with one parameter, from the files in the task's folder and in the folder where the command was started; "
+    "and policies used before."
+)
 
 
 class RunPanel(PagePart[SessionView]):

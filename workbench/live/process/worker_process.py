@@ -298,8 +298,8 @@ def signal_main_thread(pid: int, number: signal.Signals) -> None:
     """Send a signal to the main thread of a process, where Python's handlers run.
 
     The kernel delivers a signal for the whole process to any thread, on a busy machine also to a thread of torch or the
-    renderer. CPython 3.11 then records the signal without waking the main thread, whose endless loop continues until
-    another Python thread wants to run: never.
+    renderer. CPython 3.11 then records the signal without waking the main thread. An endless loop there continues until
+    another Python thread wants to run, which may be never.
     """
     if _libc.tgkill(pid, pid, int(number)) != 0:
         error = ctypes.get_errno()

@@ -180,9 +180,9 @@ class Framing:
                 self._point(client, frame)
 
     def _is_untouched(self, client: viser.ClientHandle) -> bool:
-        """Whether the page is at the viewpoint that it was last given, or at that of every new page.
+        """Whether the page is at the viewpoint that was last sent to it, or at the initial one of every new page.
 
-        The latter, since the initial viewpoint may reach a new page after the one that it was given.
+        The initial viewpoint counts too, since it may reach a new page after the one that was sent.
         """
         position, _ = self._pointed.get(client.client_id, (None, None))
         begins = self._server.initial_camera.position
