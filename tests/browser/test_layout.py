@@ -25,7 +25,7 @@ DEFECTS = {
     "buttons touch": ".wb-pills { gap: 0 !important }",
     "cut": "label { display: block; width: 12px; overflow: hidden; white-space: nowrap }",
     "a scroll bar lies over": ".wb-row { margin-right: -25px }",
-    "panels on each other": "[data-floating-window] { left: 600px !important }",
+    "panels on each other": "[data-floating-window]:has(.wb-transport) { margin-right: -60px !important }",
     "text over a button's edge": ".wb-button { max-width: 30px; min-width: 0 !important }",
     "on each other": ".wb-row { height: 4px; min-height: 0 !important }",
 }
