@@ -54,7 +54,7 @@ def test_a_question_mark_lists_the_keys_and_disables_them_meanwhile(desk: Desk) 
 
 
 def test_the_tooltip_of_a_button_names_its_key(desk: Desk) -> None:
-    for name, key in (("Reset this env", "Shift+S"), ("‹ step", "Left arrow")):
+    for name, key in (("Reset this env", "Shift+S"), ("Step back", "Left arrow")):
         expect(desk.button(name)).to_have_attribute("title", re.compile(re.escape(f"({key})")))
     desk.button("Play").hover()
     expect(desk.button("Play")).to_have_attribute("title", re.compile(re.escape("(Space)")))
@@ -65,7 +65,7 @@ def test_keys_work_again_after_leaving_a_field_or_clicking_the_view(desk: Desk) 
         found = re.search(r"env \d", desk.page.locator(".wb-timeline").inner_text())
         return "" if found is None else found[0]
 
-    view = desk.box("canvas[data-engine]")
+    view = desk.box("div:has(> canvas[data-engine])")
     seed = desk.page.get_by_label("Seed")
     seed.click()
     desk.press("Enter", "s")

@@ -92,7 +92,7 @@ class Firefox:
         return None if value is None else json.loads(value)
 
     def text(self) -> str:
-        return self.evaluate("document.body.innerText")
+        return self.evaluate("document.body?.innerText ?? ''")
 
     def click(self, role: str, name: str) -> None:
         """Click with the mouse the element that has this role and exactly this text."""
