@@ -134,9 +134,9 @@ def folder_of_policies() -> Iterator[Path]:
 
 def above_the_timeline(page: Page) -> Image.Image:
     whole = picture_of(page)
-    timeline = page.get_by_role("tab", name="Timeline").bounding_box()
+    timeline = page.locator("[data-floating-window]:has(.wb-transport)").bounding_box()
     assert timeline is not None
-    return whole.crop((0, 0, whole.width, int(timeline["y"]) - 20))
+    return whole.crop((0, 36, whole.width, int(timeline["y"])))
 
 
 def main(names: list[str]) -> None:

@@ -183,7 +183,7 @@ def shoot_reload(browser: Browser) -> None:
                 desk.wear(theme)
                 time.sleep(FRAME_SECONDS)
                 whole = picture_of(desk.page)
-                left = (desk.page.locator(".wb-status").bounding_box() or {"x": 0.0})["x"] - 10
+                left = (desk.page.locator("[data-dock-region=right]").bounding_box() or {"x": 0.0})["x"]
                 taken[theme].append(whole.crop((int(left), 0, whole.width, whole.height)))
             desk.wear("dark")
         # Next to the current view, so that all pictures have the same size.

@@ -181,7 +181,7 @@ def test_without_room_for_both_unfolding_rerun_or_the_library_folds_the_other(
     expect(rerun).to_be_visible()
     expect(library).to_have_count(0)
     until(lambda: page.locator("canvas[data-engine]").evaluate("c => c.clientWidth") < 400, "the narrow view")
-    tops = [page.get_by_role("button", name=name, exact=True) for name in ("first", "play", "last")]
+    tops = [page.get_by_role("button", name=name, exact=True) for name in ("First step", "Play", "Last step")]
     until(lambda: len({top.evaluate("b => b.offsetTop") for top in tops}) == 1, "the buttons in one row")
     unfold.click()  # viser's own button, which does not notify the server
     expect(library).to_be_visible()

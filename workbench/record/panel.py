@@ -27,6 +27,7 @@ RECORD_HINT = "Reset and record every episode until it is stopped"
 SAVE_HINT = "Record after the fact: the episode at the shown moment"
 RECORD, NEXT, SAVE = "Record", "Record the next episode", "Save what I just saw"
 SAVE_BEFORE = "Save the previous episode"
+REC = "REC"
 STOP, STOP_WAITING, STOP_SAVING = "Stop recording", "Stop waiting", "Stop saving"
 
 
@@ -35,7 +36,7 @@ def record_tool(view: SessionView) -> Tool:
     recording = view.of(RecordingStatus)
     off = not recording.active and (view.task is None or view.state == "stopped")
     hint = with_key(ToggleRecording, STOP if recording.active else RECORD_HINT)
-    return Tool(STOP if recording.active else RECORD, ToggleRecording(), hint, on=recording.active, off=off)
+    return Tool(REC, ToggleRecording(), hint, on=recording.active, off=off)
 
 
 class RecordPanel(MomentPart):
