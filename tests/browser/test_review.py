@@ -220,7 +220,7 @@ def test_switching_to_the_recordings_and_back_keeps_the_env(folder: Path, browse
         def steps() -> bool:
             # The last part of the page brings the keys.
             page.keyboard.press("s")
-            return page.locator(".wb-status").get_by_text(re.compile(r"step [1-9]")).count() > 0
+            return page.locator(".wb-where").get_by_text(re.compile(r"step [1-9]")).count() > 0
 
         until(steps, "a step")
         assert [e for e in errors if LATE_UPDATE_ERROR not in e] == []

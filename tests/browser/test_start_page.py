@@ -200,7 +200,7 @@ def test_a_new_task_is_created_with_the_mouse_and_opens(
         name.click()
         page.keyboard.type("push")
         create.click()
-        expect(page.get_by_text("There is a file push.py already")).to_be_visible()
+        expect(page.get_by_text("push.py exists already")).to_be_visible()
         name.click()
         page.keyboard.press("Control+a")
         page.keyboard.type("walk_far")
