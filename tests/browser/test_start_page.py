@@ -77,7 +77,7 @@ def runs(page: Page, title: str, envs: str = "2 envs") -> None:
 
 def view_of(page: Page) -> NDArray[np.uint8]:
     """Pixels in the middle of the 3-D view."""
-    return picture_of_view(page, {"x": 150, "y": 250, "width": 500, "height": 250})
+    return picture_of_view(page, {"x": 150, "y": 320, "width": 500, "height": 200})
 
 
 def open_list(page: Page) -> None:
