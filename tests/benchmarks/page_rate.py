@@ -214,7 +214,7 @@ def used(server: int) -> tuple[dict[int, tuple[str, float]], dict[int, float]]:
 def name_of(is_server: bool, command: str, niceness: int) -> str:
     if is_server:
         return "server"
-    if "session.worker." in command:
+    if "workbench.app.worker." in command:
         # Background processes have a lower priority than the playing worker.
         return "planner" if niceness else "worker"
     drawing = "browser's drawing" if "--type=gpu-process" in command else "browser's rest"

@@ -54,7 +54,7 @@ def listens(worker: WorkerProcess) -> bool:
 
 
 def is_fork(worker: WorkerProcess) -> bool:
-    return "fork_server" in " ".join(psutil.Process(worker.pid).cmdline())
+    return "fork_workers" in " ".join(psutil.Process(worker.pid).cmdline())
 
 
 def ends_as_asked(worker: WorkerProcess) -> bool:
