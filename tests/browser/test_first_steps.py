@@ -71,7 +71,7 @@ def test_keys_work_again_after_leaving_a_field_or_clicking_the_view(desk: Desk) 
     desk.press("Enter", "s")
     desk.timeline_says("step 1 /")
     # Find a place where a click selects another env.
-    places = [(view["x"] + view["width"] * x / 8, view["y"] + view["height"] * 0.35) for x in range(1, 8)]
+    places = [(view["x"] + view["width"] * x / 8, view["y"] + view["height"] * 0.28) for x in range(1, 8)]
     desk.page.keyboard.press("f")
     for place in places:
         desk.page.mouse.click(*place)

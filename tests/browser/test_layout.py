@@ -27,7 +27,7 @@ DEFECTS = {
     "a scroll bar lies over": ".wb-row { margin-right: -25px }",
     "panels on each other": "[data-floating-window]:has(.wb-transport) { margin-right: -60px !important }",
     "text over a button's edge": ".wb-button { max-width: 30px; min-width: 0 !important }",
-    "on each other": ".wb-field { height: 4px !important; padding: 0 !important }",
+    "on each other": ".wb-status > .wb-news { margin-left: -30px }",
 }
 VIEW = "canvas[data-engine]"
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from tests.drive.page import page_at
+from tests.drive.page import close_notice, page_at
 from tests.drive.waiting import until
 from workbench.commands import COMMANDS
 from workbench.live.commands import Step
@@ -37,6 +37,7 @@ def test_command_keys_do_not_move_the_view(browser: Browser) -> None:
             until(lambda: len(gated_server.server.get_clients()) == 1, "the page")
             (client,) = gated_server.server.get_clients().values()
             until(lambda: client.camera.image_width > 300, "the view")
+            close_notice(page)  # it stands where the view is dragged
             before = client.camera.position.copy()
             for key in ("s", "ArrowLeft", "w", "e", "ArrowUp"):
                 page.keyboard.down(key)
