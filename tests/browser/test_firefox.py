@@ -79,8 +79,8 @@ def test_each_tab_opens_and_nothing_is_cut_off_or_covered(page: Firefox, tab: st
     with Image.open(file) as picture:
         assert picture.size == (1280, 720)
         view, panel = (
-            np.asarray(picture.convert("L"))[20:480, 60:920],
-            np.asarray(picture.convert("L"))[130:, 945:1260],
+            np.asarray(picture.convert("L"))[50:480, 60:880],
+            np.asarray(picture.convert("L"))[70:, 945:1260],
         )
     assert view.std() > 10 and panel.std() > 4, "the view and the tab are drawn"
 

@@ -182,7 +182,10 @@ def test_without_room_for_both_unfolding_rerun_or_the_library_folds_the_other(
     expect(library).to_have_count(0)
     until(lambda: page.locator("canvas[data-engine]").evaluate("c => c.clientWidth") < 400, "the narrow view")
     tops = [page.get_by_role("button", name=name, exact=True) for name in ("First step", "Play", "Last step")]
-    until(lambda: len({top.evaluate("b => b.offsetTop") for top in tops}) == 1, "the buttons in one row")
+    until(
+        lambda: len({top.evaluate("b => Math.round(b.offsetTop + b.offsetHeight / 2)") for top in tops}) == 1,
+        "the buttons in one row",
+    )
     unfold.click()  # viser's own button, which does not notify the server
     expect(library).to_be_visible()
     expect(rerun).to_have_count(0)

@@ -142,7 +142,7 @@ def test_a_saved_placement_is_compared_with_the_files_previous_one(panels: Panel
     draw(SETTINGS)
     panels.set("Now, with", NAMES["before"])
     panels.press("Show side by side")
-    assert session.asked == [] and "in one way" in panels.client.notices[-1]
+    assert session.asked == [] and "has not changed" in panels.client.notices[-1]
     draw(replace(SETTINGS, far=50.0))
     draw(replace(SETTINGS, far=50.0))
     panels.press("Show side by side")

@@ -95,10 +95,10 @@ class Firefox:
         return self.evaluate("document.body?.innerText ?? ''")
 
     def click(self, role: str, name: str) -> None:
-        """Click with the mouse the element that has this role and exactly this text."""
+        """Click with the mouse the element that has this role and exactly this text or label."""
         script = (
             f"(() => {{ const e = [...document.querySelectorAll({json.dumps(role)})]"
-            f".find(e => e.innerText.trim() === {json.dumps(name)} && e.checkVisibility());"
+            f".find(e => [e.innerText.trim(), e.ariaLabel].includes({json.dumps(name)}) && e.checkVisibility());"
             " if (!e) return null; e.scrollIntoView({block: 'nearest'});"
             " const r = e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2].map(Math.round) })()"
         )

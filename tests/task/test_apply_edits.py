@@ -18,7 +18,7 @@ from workbench.source.parsed import RefusedEdit, plain_line_ends
 from workbench.task.apply_edits import FileChange, SourceEdit, apply, revert
 from workbench.task.modules import exact_text
 
-SOURCE = WRITTEN["an argument a line, with remarks"]
+SOURCE = WRITTEN["one argument per line, with comments"]
 
 
 def planned(path: Path) -> SourceEdit:

@@ -383,7 +383,7 @@ REFUSED: dict[str, tuple[str, str]] = {
             """,
             before='EYES = {"panda": [0.3, 0, 0.6]}\n\n\n',
         ).replace('    robot_uids = "panda"', '    robot_uids = str("panda")'),
-        "only the running task knows",
+        "only the running task has",
     ),
     "a custom look_at": (
         _hook(

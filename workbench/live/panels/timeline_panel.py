@@ -176,6 +176,15 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             self._draw_slider(view)
             self._draw_buttons(view)
             self._draw_strip(view)
+        else:
+            self._draw_empty()
+
+    def _draw_empty(self) -> None:
+        """Draw that nothing is kept: no task, or its envs were just built."""
+        self._range, self._newest, self._range_at, self._strip_of = (0, 0), 0, -math.inf, None
+        self._show_slider(0, 0, 0)
+        self._strip.content = self._hint.content = self._walk.content = ""
+        self._travel.visible, self._hint.visible = False, True
 
     def _draw_transport(self, view: SessionView) -> None:
         live = view.timeline.shown is None
