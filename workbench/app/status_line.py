@@ -1,4 +1,4 @@
-"""The status line above the tabs."""
+"""The status line in the bar."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 import viser
 
 from workbench.live.panels.moment import MomentPart
-from workbench.live.panels.timeline_panel import ago_in_words, step_in_words
+from workbench.live.panels.timeline_panel import ago_in_words
 from workbench.live.panels.version_panel import took
 from workbench.live.process.heartbeat import Busy
 from workbench.live.timeline_commands import ContinueFromHere
@@ -40,7 +40,7 @@ STATE_WORDS = {
 
 
 class StatusLine(MomentPart):
-    """State, task, activity and speed of the session, and the selected env's step."""
+    """State, speed, activity and task of the session."""
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         self._handle = server.gui.add_html("")
@@ -97,7 +97,6 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         if busy is None
         else _doing(busy),
         "news": _news(view) if fresh else "",
-        "at": step_in_words(view),
         "ago": ago_in_words(view.timeline),
         "can_continue": ContinueFromHere() if view.timeline.can_continue else None,
         "continue_hint": with_key(ContinueFromHere),
