@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import viser
 
+from workbench.page.widgets.templates import render
+
 
 def add_bar(server: viser.ViserServer) -> viser.GuiTabHandle:
     """The bar of 36 px across the top of the page, as a container.
@@ -13,6 +15,6 @@ def add_bar(server: viser.ViserServer) -> viser.GuiTabHandle:
     panel = server.gui.add_panel(order=-20.0)
     bar = panel.add_tab("Bar")
     with bar:
-        server.gui.add_html('<i class="wb-hidden wb-bar" hidden></i>')
+        server.gui.add_html(render("bar"))
     panel.float(x=0, y=0)
     return bar
