@@ -570,5 +570,5 @@
     showValues();
   }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-page", "data-shows", "data-title"] });
 
-  window.wb = { ask, arrivals };
+  window.wb = { ask, arrivals, isTyping: () => Boolean(document.activeElement?.closest(TYPED)) };
 }

@@ -3,7 +3,7 @@
 //
 //   data-which="3f2a"      id of the page's content: when the user returns to it, its last open tab is restored (data-anew: the first)
 //     data-says              report the open tab to the server
-//   data-open-tab="Studio" open this tab, and in it data-open-fold
+//   data-open-tab="Reward" open this tab, and in it data-open-fold; the keys 1 to 9 open the tabs of that panel
 //   data-toggle="timeline-open"  add or remove this attribute of <html>, for the style sheet
 "use strict";
 {
@@ -43,9 +43,18 @@
   wb.arrivals.openTab = ({ dataset }) => {
     const tab = [...document.querySelectorAll("[role=tab]")].find((one) => nameOf(one) === dataset.openTab);
     if (tab) keep(tab);
+    if (tab?.closest("[data-floating-window]")?.querySelector(".wb-drawer")) document.documentElement.setAttribute("data-timeline-open", "");
     if (tab) press(tab);
     if (dataset.openFold) openFold(dataset.openFold, performance.now() + FOLD_COMES);
   };
+
+  addEventListener("keydown", (event) => {
+    const tab = !heldIn(event) && !wb.isTyping() && tabsOf(marker())[Number(event.key) - 1];
+    if (!tab || document.querySelector("[aria-modal=true]")) return;
+    keep(tab);
+    press(tab);
+  });
+  const heldIn = ({ ctrlKey, metaKey, altKey }) => ctrlKey || metaKey || altKey;
 
   wb.arrivals.toggle = ({ dataset }) => document.documentElement.toggleAttribute(`data-${dataset.toggle}`);
 

@@ -3,7 +3,7 @@ keeps an old place."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import viser
 from tests.drive.env_rows import rows_of
 from tests.drive.live import Live
 from tests.drive.panels import difference
-from tests.drive.scenes import PLAN, camera, changed, problem, running, step_of
+from tests.drive.scenes import PLAN, camera, changed, problem, running
 from workbench.cameras.view import StudioCamera, StudioView
 from workbench.checks.profile import ProfileView
 from workbench.checks.results import HookTime, RuleResult, StepProfile
@@ -24,8 +24,8 @@ from workbench.envs.camera_data import CameraSettings, Picture
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection, Leaf
 from workbench.envs.keywords import HowMade, Keyword
-from workbench.live.history.curves import StepCurves
-from workbench.live.history.moments import RESET, SUCCESS
+from workbench.live.history.curves import Column
+from workbench.live.history.moments import RESET, SUCCESS, EpisodeNumbers
 from workbench.live.messages import ReloadReport, RulesBroken
 from workbench.live.past import Strip, TimelineView
 from workbench.live.process.background_jobs import JobProgress
@@ -56,13 +56,9 @@ KEY = CAMERA.key
 PAST = TimelineView(0, 40, None, 0, 40, 40, 2**20, 2**28, 41)
 
 
-def curves(env: int = 0, steps: int = 40, scale: float = 1.0) -> Any:
-    made = StepCurves(ENVS, ("hinge",))
-    for number in range(1, steps + 1):
-        step = step_of(np.zeros((ENVS, 1, 7), np.float32), success=np.zeros(ENVS, bool))
-        reward = scale * (np.arange(ENVS, dtype=np.float32) + number)
-        made.add(replace(step, reward=reward, qpos=np.full((ENVS, 1), number, np.float32)))
-    return made.curves(env)
+def episodes(env: int, last: int, columns: Sequence[Column], before: int) -> tuple[EpisodeNumbers, ...]:
+    steps = np.arange(1, last + 1)
+    return (EpisodeNumbers(steps, {column: env + steps.astype(np.float32) for column in columns}, None),)
 
 
 def episode(env: int, largest: float = 0.25) -> Verdict[PastRun]:
@@ -93,7 +89,6 @@ def base() -> SessionView:
         view,
         task=task,
         options=TaskOptions(ENVS),
-        curves=curves(),
         timeline=PAST,
         details=np.zeros((ENVS, 2), np.float32),
         loads=(load, load),
@@ -135,7 +130,7 @@ def just(**changes: Any) -> Any:
 
 CHANGES: dict[str, Any] = {
     "another env": lambda view: settings(view, selected_env=1)
-    | {"curves": curves(1), "pictures": picture(50, 1), "pictures_serial": 2},
+    | {"pictures": picture(50, 1), "pictures_serial": 2},
     "the speed": lambda view: settings(view, speed=2.0),
     "the source of actions": lambda view: settings(view, action_source="sliders"),
     "planned actions": lambda view: settings(view, action_source="solve") | {"solve": SolveView("planning", 3, plan=PLAN)},
@@ -160,8 +155,6 @@ CHANGES: dict[str, Any] = {
     "what was refused": just(refused=problem("ValueError: refused")),
     "a problem": just(problem=problem(), problem_serial=1),
     "a long call": just(busy=Busy(6.4, "in evaluate", "/home/me/push.py", 88, "while True:", "Traceback ...")),
-    "longer curves": just(curves=curves(steps=45)),
-    "no curves": just(curves=None),
     "the past": at(shown=30, tick=30, can_continue=True),
     "what can be undone": at(undo="reset of all"),
     "what was not restored": at(not_carried=("actor peg: gone",)),
@@ -193,14 +186,17 @@ CHANGES: dict[str, Any] = {
 
 def strip(low: int, high: int, env: int) -> Strip:
     reward = np.linspace(0, 1, high - low + 1, dtype=np.float32) ** (1 + env)
-    return Strip(low, high, ((low, RESET), ((low + high) // 2, SUCCESS)), reward, (), ((low, high, False),))
+    return Strip(
+        low, high, ((low, RESET), ((low + high) // 2, SUCCESS)), reward, (), ((low, high, False, ""),)
+    )
 
 
 def made() -> Live:
     live = Live(viser.ViserServer(host="127.0.0.1", port=0, verbose=False))
     tick, old = np.arange(20), np.ones(20, np.float32)
     live.session.answers |= {
-        "strip": lambda low, high: strip(low, high, live.session.shown.selected_env),
+        "strip": lambda low, high, column: strip(low, high, live.session.shown.selected_env),
+        "episodes": episodes,
         "rescored_curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
     }
     live.do(ToggleTable())

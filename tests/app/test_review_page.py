@@ -124,7 +124,7 @@ def test_an_opened_recording_fills_every_part(shown: Reviewed) -> None:
     shown.draw()  # the Cameras tab has requested its pictures by now
     assert np.allclose(cube.batched_positions[:, 0], 0.07)
     assert shown.field(SLIDER).bounds == (0, 10) and shown.field(SLIDER).value == 7
-    assert "step 7 / 10" in shown.html("wb-timeline") and "success" in shown.html("wb-timeline")
+    assert "step 7 / 10" in timeline_of(shown) and "success" in timeline_of(shown)
     assert "success" in shown.part("Curves").html("wb-numbers")
     assert shown.chart("reward")
     image = shown.part("Cameras").images()[0]
@@ -141,7 +141,7 @@ def test_two_recordings_are_compared_and_aligned(shown: Reviewed, monkeypatch: p
     assert sorted(float(h.batched_positions[0, 0]) for h in ghost if h.visible) == pytest.approx([0.05, 0.15])
     assert "They diverge at step 1" in shown.part("Compare").html()
     assert "reward = 2" in shown.part("Compare").html()
-    assert len(shown.chart("reward").series) == 4, "step, two lines and the dot"
+    assert shown.chart("reward").names == ["A", "B"]
     shown.do(ToggleOverlaid())
     shown.draw()
     (cubes,) = shown.bodies("cube")
@@ -208,9 +208,14 @@ def test_a_press_retries_an_unreadable_recording(shown: Reviewed, folder: Path) 
     shown.library.refresh()
 
 
+def timeline_of(shown: Reviewed) -> str:
+    """HTML of the strip and of its legend."""
+    return shown.html("wb-timeline") + shown.html("wb-legend-row")
+
+
 def strip_of(shown: Reviewed) -> dict[str, list[tuple[str, ...]]]:
     """What the strip draws: extents of recordings, marks and vertical lines, with positions in per cent."""
-    html = shown.html("wb-timeline")
+    html = timeline_of(shown)
     extent = r'wb-length" style="left:([-\d.]+)%;width:([-\d.]+)%;background:(#\w+)"'
     mark = r'wb-mark wb-mark-(\w+)" style="left:([-\d.]+)%" data-do="[^"]*" title="([^"]*)"'
     return {
@@ -229,13 +234,13 @@ def test_the_strip_shows_each_recording_at_its_alignment(shown: Reviewed) -> Non
     assert strip["marks"] == [("success", "70.0", " success, step 7")] and strip["extents"] == []
     assert strip["legend"] == [("success", "success")] and strip["bands"] == [("0.0", "100.0")]
     assert strip["lines"] == [("70.0", "wb-cursor wb-past")]
-    html = shown.html("wb-timeline")
+    html = timeline_of(shown)
     assert ">step 7 / 10<" in html and ">0.35 s<" in html and '<span class="wb-num">success</span>' in html
     assert "stroke:" not in html and "aligned at" not in html
     shown.open(1, 2)
     shown.seek(8)
     assert strip_of(shown)["extents"] == [("0.0", "100.0", "#228be6"), ("0.0", "60.0", "#f08c00")]
-    assert ">A: step 8 / 10<" in shown.html("wb-timeline")
+    assert ">A: step 8 / 10<" in timeline_of(shown)
     shown.select(1)
     shown.review.do(AlignRecordings(at="first success"))
     shown.draw()
@@ -247,7 +252,7 @@ def test_the_strip_shows_each_recording_at_its_alignment(shown: Reviewed) -> Non
     assert strip["lines"][0] == ("53.846", "wb-zero") and len(strip["lines"]) == 2
     assert float(strip["lines"][1][0]) == pytest.approx(100 * (place + 7) / 13, abs=1e-3)
     shown.seek(-3)
-    html = shown.html("wb-timeline")
+    html = timeline_of(shown)
     assert ">B: step 0 / 6<" in html and "(no state there)" in html
     assert "aligned at first success" in html and "stroke:#f08c00" in html
     rows = re.findall(r"<tr data-do.*?</tr>", shown.part("Review").html("wb-opened-list"), re.DOTALL)
@@ -312,7 +317,7 @@ def test_a_value_that_is_not_per_env_is_shown_marked_and_drawn(shown: Reviewed, 
     assert {line, "reward (evaluate)"} <= set(shown.field("Also").options)
     shown.set("Also", line)
     shown.seek(4)
-    np.testing.assert_array_equal(shown.chart(line).data[1], np.linspace(0, 1, 5))
+    np.testing.assert_allclose(shown.chart(line).lines[0][1][:, 1], np.linspace(0, 1, 5), atol=0.01)
     shown.open(11, 12)
     words = "Not compared, because they are not per env: progress: all, goal, phase."
     assert words in shown.part("Compare").html()

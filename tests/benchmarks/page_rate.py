@@ -124,11 +124,12 @@ def prepare(page: Page, options: Options, url: str) -> None:
         page.add_init_script(PRETEND_GPU)
     page.add_init_script(COUNT_DRAWN)
     page.goto(url)
-    expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+    expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
     page.get_by_role("tab", name="Cameras").click()
+    page.get_by_text("All pictures", exact=True).click()
     expect(page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
     if not options.cameras:
-        for tick in page.locator("input[type=checkbox]:visible").all()[1:]:
+        for tick in page.locator("input[type=checkbox]:visible").all():
             if tick.is_checked():
                 tick.uncheck(force=True)
     page.get_by_role("tab", name="Run").click()

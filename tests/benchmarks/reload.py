@@ -124,6 +124,7 @@ def workbench_side(options: Options, folder: Path, chromium: str) -> dict[str, l
     ):
         # Tabs keep their content once opened, so both the picture and the table are in the document.
         page.get_by_role("tab", name="Cameras").click()
+        page.get_by_text("All pictures", exact=True).click()
         expect(page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
         page.get_by_role("tab", name="Reward").click()
         seen: dict[str, list[tuple[float, float]]] = {}

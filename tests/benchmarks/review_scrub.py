@@ -111,7 +111,7 @@ def review(browser: Browser, folder: Path, options: Options) -> list[tuple[float
         page.get_by_text("Side by side", exact=True).click()
         expect(page.locator(".wb-timeline")).to_be_visible()
         first = time.monotonic() - began
-        expect(page.get_by_text("paused", exact=True)).to_be_visible()
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
         opened = time.monotonic() - began
         print(f"  {options.envs} recordings: the first seen after {first:.1f} s, all after {opened:.1f} s")
         return measured(page, options)
@@ -120,14 +120,14 @@ def review(browser: Browser, folder: Path, options: Options) -> list[tuple[float
 def live(browser: Browser, options: Options) -> list[tuple[float, float]]:
     with command("open", str(TASK), "--num-envs", str(options.envs), "--no-spare") as url:
         page = opened_page(browser, url, options)
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=180_000)
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(timeout=180_000)
         untick(page)
         page.keyboard.press("Space")
         slider = page.locator(".wb-timeline")
         until(lambda: (m := re.search(r"(\d+) steps$", slider.inner_text().strip())) is not None
               and int(m[1]) > STEPS, "the past", 180)  # fmt: skip
         page.keyboard.press("Space")
-        expect(page.get_by_text("paused", exact=True)).to_be_visible()
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
         return measured(page, options)
 
 

@@ -196,7 +196,9 @@ def main(options: Options) -> None:
             page, _ = new_page(launch(playwright, chromium))
             page.add_init_script(NO_DRAWING + SOCKET_TIMES)
             page.goto(opened.url)
-            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+            expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(
+                timeout=120_000
+            )
             page.get_by_role("tab", name="Log").click()
             page.get_by_role("tab", name="Run").click()
             desk = Desk(page, file, psutil.Process(opened.process.pid), options)

@@ -30,7 +30,7 @@ def _opened(tmp_path_factory: pytest.TempPathFactory, *arguments: str) -> Iterat
 @contextmanager
 def _desk(opened: Opened, file: Path, browser: Browser, width: int, height: int) -> Iterator[Desk]:
     with page_at(browser, opened.url, width, height) as (page, errors):
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
         desk = Desk(page, errors, file, opened)
         desk.select_the_first_env()
         yield desk

@@ -85,7 +85,7 @@ def take(browser: Browser, name: str, view: View) -> None:
     ):
         page, _ = new_page(browser, *SIZE)
         page.goto(opened.url)
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=180_000)
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(timeout=180_000)
         close_notice(page)
         hints = page.get_by_text("close for good", exact=True)
         if hints.is_visible():

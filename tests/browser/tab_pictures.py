@@ -34,7 +34,7 @@ from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 PLACE = Path("/tmp/golden")
-LIVE_TABS = ("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Checks", "Log")
+LIVE_TABS = ("Run", "Cameras", "Reward", "Inspect", "Try", "Checks")
 REVIEW_TABS = ("Review", "Cameras", "Curves", "Compare", "Rescore", "Share")
 STEPS = 6
 WIDTH, HEIGHT = 1280, 1000
@@ -75,7 +75,7 @@ def take(folder: Path) -> None:
 
 
 def take_live(page: Page, folder: Path) -> None:
-    expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+    expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
     close_notice(page)
     for step in range(1, STEPS + 1):
         page.get_by_role("button", name="Step", exact=True).click()

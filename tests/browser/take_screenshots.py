@@ -123,7 +123,9 @@ def live_page(
         with open_workbench(str(file), *arguments, cwd=file.parent, checks=checks) as opened:
             page, _ = new_page(browser)
             page.goto(opened.url)
-            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+            expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(
+                timeout=120_000
+            )
             close_notice(page)
             hints = page.get_by_text("close for good", exact=True)
             if hints.is_visible():

@@ -27,7 +27,7 @@ def choose(page: Page, words: str) -> None:
 def test_every_fold_is_reached_by_tab_and_toggled_by_enter_and_space(example: At, browser: Browser) -> None:
     with example(browser) as desk:
         page = desk.page
-        for tab in ("Run", "Checks"):
+        for tab in ("Run", "Try"):
             desk.tab(tab)
             folded = page.locator("div[role=button][aria-expanded=false]:has(> svg)").filter(
                 has_text=re.compile("."), visible=True
@@ -45,7 +45,7 @@ def test_every_fold_is_reached_by_tab_and_toggled_by_enter_and_space(example: At
                 page.keyboard.press("Space")
                 expect(heading).to_have_attribute("aria-expanded", "false")
                 expect(heading).to_be_focused()
-        expect(page.get_by_text("paused", exact=True)).to_be_visible()
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
         # The page is redrawn with the fold open: the focus stays.
         choose(page, "how the envs are made")
         heading = page.get_by_role("button", name="How the envs are made")
@@ -70,7 +70,7 @@ def test_the_palette_finds_places_envs_cameras_and_control_modes(example: At, br
         choose(page, "env 1")
         desk.timeline_says("env 1")
         choose(page, "base_camera")
-        expect(page.get_by_role("tab", name="Studio")).to_have_attribute("aria-selected", "true")
+        expect(page.get_by_role("tab", name="Cameras")).to_have_attribute("aria-selected", "true")
         expect(page.get_by_role("combobox", name="Camera")).to_have_value(re.compile("base_camera"))
         choose(page, "pd_ee_delta_pose")
         status = page.locator(".wb-status")

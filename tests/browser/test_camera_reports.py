@@ -45,7 +45,7 @@ def opened(example: At, browser: Browser) -> Iterator[Page]:
     """The Studio tab on base_camera, with every report folder open."""
     with example(browser, height=900) as desk:
         page = desk.page
-        desk.tab("Studio")
+        desk.tab("Cameras")
         page.get_by_label("Camera", exact=True).select_option(label=f"{CAMERA} · sensor")
         # The first picture moves the folders down, and a click in progress would miss its folder.
         expect(page.locator(PICTURE).first).to_be_visible(timeout=180_000)

@@ -23,7 +23,7 @@ def test_play_and_pause_answer_and_nothing_queues_for_seconds(tmp_path: Path, br
         page_at(browser, line.address(opened.url)) as (page, errors),
     ):
         # The slow line first has to transfer the page and all meshes.
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=240_000)
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(timeout=240_000)
         most, before = 0, line.down
         for _ in range(3):
             page.get_by_role("button", name="Play", exact=True).click()

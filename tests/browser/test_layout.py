@@ -72,7 +72,7 @@ def faults_of_all_tabs(page: Page, tabs: tuple[str, ...], table: str) -> dict[st
     found = {}
     for tab in tabs:
         page.get_by_role("tab", name=tab, exact=True).click()
-        if tab == "Studio":
+        if tab == "Cameras" and table == "Envs":
             expect(page.get_by_role("button", name=re.compile("Look through"))).to_be_visible()
         found[tab] = faults(page)
     page.keyboard.press("b")
@@ -82,7 +82,7 @@ def faults_of_all_tabs(page: Page, tabs: tuple[str, ...], table: str) -> dict[st
 
 
 def choose_camera(desk: Desk) -> None:
-    desk.tab("Studio")
+    desk.tab("Cameras")
     desk.page.get_by_label("Camera", exact=True).select_option(label="base_camera · sensor")
 
 
@@ -101,7 +101,7 @@ def test_every_tab_of_the_live_page_in_both_themes(desk: Desk, size: tuple[int, 
 
 
 def test_each_layout_defect_is_found(desk: Desk) -> None:
-    desk.tab("Run")
+    desk.tab("Reward")
     for kind, css in DEFECTS.items():
         sheet = desk.page.evaluate_handle(
             "css => document.head.appendChild(Object.assign(document.createElement('style'), {textContent: css}))",
@@ -124,7 +124,7 @@ def test_all_tabs_are_in_one_row_and_inputs_use_the_font_of_their_labels(desk: D
         "() => [...document.querySelectorAll('.wb-field > :is(span, input[type=text], select)')].filter(e => e.offsetParent && e.closest('[data-dock-region=right]')).map(e => getComputedStyle(e))"
         ".map(s => [s.fontSize, s.fontFamily, s.letterSpacing].join())"
     )
-    assert len(fonts) > 8 and len(set(fonts)) == 1, set(fonts)
+    assert len(fonts) > 6 and len(set(fonts)) == 1, set(fonts)
 
 
 def test_nothing_covers_the_view_through_a_camera(desk: Desk) -> None:
@@ -142,7 +142,7 @@ def test_nothing_covers_the_view_through_a_camera(desk: Desk) -> None:
 
     until(lambda: len(orange_rows()) > 1, "the border of the picture", seen=orange_rows)
     covered = desk.page.evaluate(
-        """s => [...document.querySelectorAll("[data-floating-window]")].map(e => e.getBoundingClientRect())
+        """s => [...document.querySelectorAll("[data-floating-window]:not(:has(.wb-view-icons))")].map(e => e.getBoundingClientRect())
         .some(a => { const b = document.querySelector(s).parentElement.getBoundingClientRect(); return a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1 })""",
         VIEW,
     )

@@ -15,7 +15,7 @@ from tests.drive.studio import HEIGHT, WIDTH, end_of_the_left_arrow, numbers
 from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
-TABS = ("Cameras", "Studio", "Reward", "Inspect", "Episodes", "Checks", "Log", "Run")
+TABS = ("Cameras", "Reward", "Inspect", "Try", "Checks", "Episodes", "Log", "Run")
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +28,10 @@ def desk(example: At, browser: Browser) -> Iterator[Desk]:
 
 def expect_on_every_tab(desk: Desk, mark: Locator) -> None:
     """Expect the mark on every tab, also with the panel scrolled to its end."""
-    desk.tab("Run")  # before the Studio tab was opened for the first time
+    desk.tab("Run")  # before the Cameras tab was opened for the first time
     desk.page.mouse.move(WIDTH - 150, HEIGHT - 100)
     desk.page.mouse.wheel(0, 3000)
-    expect(desk.page.get_by_text("Theme", exact=True)).to_be_in_viewport()
+    expect(desk.page.get_by_text("View", exact=True)).to_be_in_viewport()
     expect(mark).to_be_in_viewport(ratio=1)
     desk.page.mouse.wheel(0, -3000)
     for tab in TABS:
@@ -72,7 +72,7 @@ def test_recording_is_shown_on_every_tab_and_in_the_title(desk: Desk) -> None:
 @pytest.mark.slow
 def test_a_moved_camera_is_shown_until_it_is_reset(desk: Desk) -> None:
     mark = desk.page.locator(".wb-sight-moved")
-    desk.tab("Studio")
+    desk.tab("Cameras")
     until(lambda: end_of_the_left_arrow(desk.page) is not None, "the handles")
     x, y = end_of_the_left_arrow(desk.page) or (0.0, 0.0)
     expect(mark).to_have_count(0)
@@ -84,7 +84,7 @@ def test_a_moved_camera_is_shown_until_it_is_reset(desk: Desk) -> None:
     desk.page.mouse.move(x + 40, y, steps=4)
     desk.page.mouse.up()
     desk.press("Alt+ArrowUp")
-    desk.tab("Studio")
+    desk.tab("Cameras")
     until(lambda: numbers(desk.page, "Position") == [0.45, 0, 0.6], "where the file has it")
     desk.leave_inputs()
     desk.press("Alt+ArrowUp")
@@ -109,7 +109,7 @@ def test_a_moved_camera_is_shown_until_it_is_reset(desk: Desk) -> None:
 @pytest.mark.slow
 def test_the_review_shows_that_a_camera_was_moved(desk: Desk) -> None:
     page = desk.page
-    desk.tab("Studio")
+    desk.tab("Cameras")
     until(lambda: numbers(page, "Position") == [0.45, 0, 0.6], "the camera")
     desk.leave_inputs()
     desk.press("Alt+ArrowUp")

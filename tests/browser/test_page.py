@@ -36,7 +36,9 @@ def at_start(desk: Desk) -> Desk:
     if desk.file.read_text() != good:
         desk.file.write_text(good)
     expect(
-        desk.page.get_by_text("paused", exact=True).or_(desk.page.get_by_text("running", exact=True))
+        desk.page.locator(".wb-status")
+        .get_by_text("paused", exact=True)
+        .or_(desk.page.locator(".wb-status").get_by_text("running", exact=True))
     ).to_be_visible()
     desk.tab("Run")
     if desk.button("Pause").count():
@@ -57,12 +59,12 @@ def test_the_page_opens_with_the_task_and_without_an_error(desk: Desk) -> None:
 
 def test_play_runs_and_pause_stops(at_start: Desk) -> None:
     at_start.button("Play").click()
-    expect(at_start.page.get_by_text("running", exact=True)).to_be_visible()
+    expect(at_start.page.locator(".wb-status").get_by_text("running", exact=True)).to_be_visible()
     at_start.tab("Reward")
     until(lambda: at_start.elapsed() >= 3, "three steps")
     at_start.tab("Run")
     at_start.button("Pause").click()
-    expect(at_start.page.get_by_text("paused", exact=True)).to_be_visible()
+    expect(at_start.page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
     at_start.tab("Reward")
     stopped = at_start.elapsed()
     time.sleep(1.0)  # time in which it would have continued
@@ -71,7 +73,8 @@ def test_play_runs_and_pause_stops(at_start: Desk) -> None:
 
 def test_the_sensor_and_human_pictures_arrive(at_start: Desk) -> None:
     at_start.tab("Cameras")
-    expect(at_start.page.get_by_text("base_camera")).to_be_visible()
+    at_start.page.get_by_text("All pictures", exact=True).click()
+    expect(at_start.page.get_by_text("base_camera · sensor").last).to_be_visible()
     expect(at_start.page.get_by_text(re.compile(r"rendered in \d+ ms")).first).to_be_visible()
     until(lambda: at_start.page.locator("img").count() >= 2, "two pictures")
 
@@ -177,7 +180,7 @@ def test_the_mark_of_a_warning_rule_stays_until_the_file_is_fixed(at_start: Desk
     expect(row).to_contain_text("self.drawn = torch.rand((self.num_envs, 2))")
     at_start.file.write_text(text)
     expect(mark).to_be_hidden()
-    expect(at_start.page.get_by_text("paused", exact=True)).to_be_visible()
+    expect(at_start.page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
     assert sum(bool(re.search(finding, printed)) for printed in at_start.opened.lines) == 1
 
 

@@ -28,7 +28,7 @@ def desk(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
         page.get_by_role("button", name="Play", exact=True).click()
         until(lambda: desk.moments_kept() > STEPS, "some steps")
         page.get_by_role("button", name="Pause", exact=True).click()
-        expect(page.get_by_text("paused", exact=True)).to_be_visible()
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
         page.get_by_role("button", name="Reset all", exact=True).click()
         page.get_by_role("tab", name="Reward").click()
         # Before there is a result.

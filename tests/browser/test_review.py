@@ -212,7 +212,7 @@ def test_switching_to_the_recordings_and_back_keeps_the_env(folder: Path, browse
         open_workbench(str(task), *quick, "--recordings", str(folder)) as opened,
         page_at(browser, opened.url) as (page, errors),
     ):
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
         page.get_by_role("tab", name="Episodes").click()
         page.get_by_role("button", name="Review recordings").click()
         expect(page.locator(".wb-status")).to_contain_text("seed0002")

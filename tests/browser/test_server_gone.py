@@ -65,7 +65,9 @@ def test_a_reconnected_page_keeps_its_tab_and_env_and_its_commands_work(
 
         with line_to(opened.url) as line:
             page.goto(line.address(opened.url))
-            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+            expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(
+                timeout=120_000
+            )
             page.keyboard.press("n")
             open_tab(page, "Inspect")
             expect_unchanged()
@@ -74,8 +76,8 @@ def test_a_reconnected_page_keeps_its_tab_and_env_and_its_commands_work(
             expect(page.get_by_role("alert").filter(has_text=str(line.port))).to_have_count(0)
             expect_unchanged()
             page.keyboard.press("Space")
-            expect(page.get_by_text("running", exact=True).first).to_be_visible()
+            expect(page.locator(".wb-status").get_by_text("running", exact=True).first).to_be_visible()
             page.keyboard.press("Space")
-            expect(page.get_by_text("paused", exact=True)).to_be_visible()
+            expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
             expect_unchanged()
             page.close()

@@ -42,7 +42,7 @@ def test_a_task_is_solved_saved_and_exported_with_the_mouse_only(desk: Desk) -> 
     save = desk.button("Save the solved episode")
     expect(save).to_be_visible(timeout=120_000)
     expect(page.get_by_text(re.compile(r"^Solved at step \d+$"))).to_be_visible()
-    expect(page.get_by_text("paused", exact=True)).to_be_visible()
+    expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
     expect(page.get_by_text(re.compile("The best rollout: return"))).to_be_visible()
     save.click()
     expect(page.get_by_text(re.compile("^saved "))).to_be_visible()

@@ -41,11 +41,12 @@ def opened(task_file: Path, browser: Browser) -> Iterator[Page]:
         errors,
         _,
     ):
-        page.get_by_role("tab", name="Studio").click()
+        page.get_by_role("tab", name="Cameras").click()
         # The tab opens with the first sensor camera chosen.
         expect(page.get_by_label("Camera", exact=True).locator("option:checked")).to_have_text(
             "base_camera · sensor"
         )
+        page.get_by_text("Handles and preview", exact=True).click()
         yield page
         assert not errors
 

@@ -121,7 +121,7 @@ def test_keys_work_after_a_click_on_a_tab_a_checkbox_or_a_dropdown_but_not_in_a_
     desk.comes_to(1)
     expect(reward).to_have_attribute("aria-selected", "true")
     page.get_by_role("tab", name="Inspect").click()
-    shown = page.get_by_label("Show", exact=True).locator("visible=true").first
+    shown = page.get_by_label("Show", exact=True).locator("visible=true").last
     shown.select_option(label="contacts")
     shown.click()
     page.keyboard.press("Escape")  # a list that is closed again takes no letters

@@ -60,7 +60,7 @@ def test_restart_ends_uninterruptible_work(desk: Desk) -> None:
     expect(desk.button("Interrupt")).to_be_hidden()
     calm(desk.file)
     desk.button("Restart").click()
-    expect(desk.page.get_by_text("paused", exact=True)).to_be_visible()
+    expect(desk.page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
     desk.timeline_says(where)
     assert desk.opened.wait_for_line("worker failed.*stopped by hand in evaluate")
     # The new worker and the next spare are forks: neither did the imports itself.
@@ -78,6 +78,6 @@ def test_the_log_shows_printed_lines_and_can_be_cleared(desk: Desk) -> None:
     expect(desk.page.get_by_text(re.compile("all work and no play")).first).to_be_visible()
     expect(desk.page.get_by_text(re.compile(r"Memory: .* GB allowed"))).to_be_visible()
     until(lambda: not (desk.file.parent / "hazard").exists(), "the end of the flood")
-    expect(desk.page.get_by_text("paused", exact=True)).to_be_visible()
+    expect(desk.page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible()
     desk.button("Clear").click()
     expect(desk.page.get_by_text("Nothing printed so far.")).to_be_visible()

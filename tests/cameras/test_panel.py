@@ -60,17 +60,14 @@ def test_ticked_pictures_are_requested_and_stay_ticked_while_their_camera_is_gon
     panel = CamerasPanel(panels.server)
     panels.visitors.do = panel.do
     panel.draw(None)
-    assert not panels.shows("Show in 3D view")
     panel.draw(seen(1, (camera("base"),)))
     assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("rgb",)),)
     base = panels.part(BASE)
     base.set("rgb", False)
     base.set("segmentation", True)
-    panels.set("Show in 3D view", False)
     panel.draw(seen(1, (camera("base"),)))
     assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("segmentation",)),)
-    assert not base.field("rgb").value and not panels.field("Show in 3D view").value
-    assert not panel.show_frustums
+    assert not base.field("rgb").value
     panel.draw(seen(2, (camera("top"),)))
     panel.draw(seen(3, (camera("base"),)))
     assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("segmentation",)),)

@@ -42,7 +42,9 @@ class Desk:
 
     def row(self, name: str) -> list[str]:
         """The cells of a row of the numbers table on the Reward tab."""
-        row = self.page.locator("tr", has=self.page.get_by_text(name, exact=True))
+        row = self.page.locator(
+            ".wb-numbers:not(.wb-env-table) tr", has=self.page.get_by_text(name, exact=True)
+        )
         return [cell.strip() for cell in row.first.locator("td, th").all_inner_texts()]
 
     def elapsed(self) -> int:
@@ -64,7 +66,7 @@ class Desk:
 
     def moments_kept(self) -> int:
         """Control steps in the history, as the timeline shows them."""
-        found = re.search(r"history: (\d+) steps?,", self.page.locator(".wb-timeline").inner_text())
+        found = re.search(r"history: (\d+) steps?,", self.page.locator(".wb-legend-row").inner_text())
         return 0 if found is None else int(found[1])
 
     def box(self, what: str) -> FloatRect:

@@ -36,5 +36,6 @@ def rows_of(**changes: object) -> EnvRows:
         ),
         "ended": np.array([5, 1, 1, 1, 2, 0]),
         "succeeded": np.array([3, 1, 0, 0, 0, 0]),
+        "failed": np.array([1, 0, 1, 0, 2, 0]),
     }
     return EnvRows(**{**values, **changes})  # type: ignore[arg-type]

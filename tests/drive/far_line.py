@@ -108,10 +108,12 @@ class FarLine:
                 break
         else:
             raise OSError(f"port {near} is taken")
-        self.port = server.sockets[0].getsockname()[1]
-        self.loop = asyncio.get_running_loop()
-        ready.set()
-        await self.ended.wait()
+        # Without this the port stays taken until the server is garbage-collected: the end of the loop does not close it.
+        with contextlib.closing(server):
+            self.port = server.sockets[0].getsockname()[1]
+            self.loop = asyncio.get_running_loop()
+            ready.set()
+            await self.ended.wait()
 
 
 @contextmanager

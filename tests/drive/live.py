@@ -46,7 +46,8 @@ class StubSession:
         self.reference = self.present_reference = FILE
         self.answers: dict[str, Any] = {
             "knows_file": lambda file: True,
-            "strip": lambda low, high: None,
+            "strip": lambda low, high, column: None,
+            "episodes": lambda env, last, columns, before: (),
             "episode_ticks": lambda: None,
             "segment": lambda: None,
             "rescored_curve": lambda name, env: None,

@@ -257,7 +257,7 @@ def page_on(
         open_workbench(str(file), *arguments, cwd=file.parent, checks=checks) as opened,
         page_at(browser, opened.url, width, height, drawn) as (page, errors),
     ):
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+        expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
         yield page, errors, opened
 
 
@@ -272,8 +272,10 @@ def picture_of_view(page: Page, clip: FloatRect) -> NDArray[np.uint8]:
 
 
 def open_tab(page: Page, name: str) -> None:
-    """Click the tab until it is open: a message that appears above the tabs moves them away from the mouse."""
+    """Click the tab until it is open. One in the left dock is not there while the dock is closed."""
     tab = page.get_by_role("tab", name=name)
+    if name in ("Envs", "Episodes") and not tab.is_visible():
+        page.keyboard.press("b")
 
     def opened() -> bool:
         tab.click()

@@ -19,6 +19,7 @@ import viser
 from markupsafe import escape
 from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage
 
+from tests.drive.charts import Chart, charts_in
 from tests.drive.own_controls import Controls, SeenButton, SeenField
 from workbench.commands import COMMANDS
 from workbench.machine.loop import result_of
@@ -177,9 +178,10 @@ class Panels:
     def htmls(self) -> list[viser.GuiHtmlHandle]:
         return self._of(viser.GuiHtmlHandle)
 
-    def charts(self, hidden: bool = False) -> list[viser.GuiUplotHandle]:
-        """The visible charts; with `hidden`, the hidden ones too."""
-        return self._of(viser.GuiUplotHandle, hidden)
+    def charts(self) -> list[Chart]:
+        """The visible charts, from the top."""
+        handles = sorted(self.htmls(), key=lambda handle: handle.order)
+        return charts_in("".join(one.content for one in handles if 'class="wb-chart"' in one.content))
 
     def images(self) -> list[viser.GuiImageHandle]:
         return self._of(viser.GuiImageHandle)

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import viser
-
+from tests.drive.charts import Chart
 from tests.drive.panels import Clock, Panels, forget_what_was_drawn
 from tests.drive.waiting import until
 from workbench.app.review_page import ReviewPage
@@ -67,7 +66,7 @@ class Reviewed(Panels):
         self.review.do(Seek(step=position))
         self.draw()
 
-    def chart(self, title: str) -> viser.GuiUplotHandle:
+    def chart(self, title: str) -> Chart:
         (chart,) = (chart for chart in self.part("Curves").charts() if chart.title == title)
         return chart
 

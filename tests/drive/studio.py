@@ -10,8 +10,8 @@ from tests.drive.page import picture_of_view
 from tests.drive.waiting import until
 
 WIDTH, HEIGHT = 1080, 640
-VIEW: FloatRect = {"x": 40, "y": 0, "width": WIDTH - 430, "height": HEIGHT - 200}
-"""The part of the 3-D view that nothing covers."""
+VIEW: FloatRect = {"x": 40, "y": 84, "width": WIDTH - 430, "height": HEIGHT - 84 - 224}
+"""The part of the 3-D view below the icons, with the drawer open."""
 
 
 def choose(page: Page, name: str) -> None:

@@ -62,14 +62,14 @@ def asked_load(fake: FakeWorkerSession) -> Load:
 
 
 def test_moments_are_shown_only_once_a_task_is_loaded(fake: FakeWorkerSession) -> None:
-    assert fake.view.state == "starting" and fake.view.curves is None and fake.session.env_rows() is None
+    assert fake.view.state == "starting" and fake.session.env_rows() is None
     fake.tell(Loading("importing"))
     assert (fake.view.state, fake.view.activity) == ("loading", "importing")
     fake.play(3)
     view = fake.view
     assert (view.state, view.activity, view.playing, view.steps_per_second) == ("running", "", True, 20.0)
     assert (view.timeline.last, view.step_serial, view.timeline.moments) == (3, 3, 4)
-    assert view.step.elapsed_steps.tolist() == [3, 3, 3] and view.curves.serial == 3
+    assert view.step.elapsed_steps.tolist() == [3, 3, 3] and view.timeline.last_tick == 3
 
 
 def test_the_selected_env_is_limited_to_the_envs_that_exist(fake: FakeWorkerSession) -> None:
@@ -78,16 +78,6 @@ def test_the_selected_env_is_limited_to_the_envs_that_exist(fake: FakeWorkerSess
     assert (fake.view.selected_env, fake.view.settings.speed) == (2, 2.0)
     fake.session.change(selected_env=-5)
     assert fake.view.selected_env == 0
-
-
-def test_curves_are_of_the_selected_env_and_count_control_steps(played: FakeWorkerSession) -> None:
-    played.reset()
-    first = played.view.curves
-    assert played.view.curves is first, "reading the view computes nothing"
-    played.step()
-    played.session.change(selected_env=1)
-    now = played.view.curves
-    assert (first.serial, first.env, now.serial, now.env) == (3, 0, 4, 1)
 
 
 @pytest.mark.parametrize("level", ["same", "patched", "cameras"])
@@ -134,7 +124,7 @@ def test_a_new_scene_starts_a_new_past_and_shows_nothing_of_the_old_one(played: 
     assert (after.pictures, after.told, after.inspection, after.rules) == ({}, None, None, None)
     assert after.of(RescoreView).state == "none" and after.of(RescoreView).total == 0
     assert not after.failed_cameras and after.selected_env == 1 and after.timeline_cleared
-    assert (after.timeline.first, after.timeline.moments) == (4, 1) and after.curves.serial == 0
+    assert (after.timeline.first, after.timeline.moments) == (4, 1) and after.timeline.last_tick == 0
 
 
 def test_findings_while_playing_disappear_with_their_version_unless_the_next_has_them_too(

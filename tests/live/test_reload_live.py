@@ -53,8 +53,8 @@ def played(session: Session, steps: int) -> SessionView:
     """The view, paused, after playing some steps."""
     session.change(speed=8.0)
     session.do(PlayRun())
-    count = session.view().curves.serial
-    wait_until(session, lambda v: v.curves.serial >= count + steps, "some steps")
+    count = session.view().timeline.last_tick
+    wait_until(session, lambda v: v.timeline.last_tick >= count + steps, "some steps")
     session.do(PauseRun())
     wait_until(session, lambda v: not v.playing and v.state == "paused", "the pause")
     # Events that the worker sends after pausing arrive before its answer.
@@ -73,11 +73,11 @@ def test_a_patch_keeps_moment_past_and_selection_and_updates_the_numbers_while_p
     np.testing.assert_array_equal(view.step.poses, before.step.poses)
     if view.step.action is not None:
         np.testing.assert_allclose(view.step.reward, before.step.reward + 1, rtol=1e-5)
-    assert view.curves.serial == before.curves.serial
+    assert view.timeline.last_tick == before.timeline.last_tick
     assert view.selected_env == 1 and not view.playing
     session.do(Step())
-    after = wait_until(session, lambda v: v.curves.serial > view.curves.serial, "the next step")
-    assert after.curves.serial == view.curves.serial + 1
+    after = wait_until(session, lambda v: v.timeline.last_tick > view.timeline.last_tick, "the next step")
+    assert after.timeline.last_tick == view.timeline.last_tick + 1
 
 
 def test_playing_goes_on_through_a_patch(session: Session, task_file: Path, good: str) -> None:

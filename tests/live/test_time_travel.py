@@ -120,7 +120,7 @@ def test_a_moment_without_an_action_has_its_recorded_reward_or_none(session: Ses
     assert not view.timeline.not_carried
     strip = session.look(lambda run: run.strip(begin, view.timeline.last_tick))
     # A strip contains control steps, not the reset and the jump back after them.
-    assert np.array_equal(strip.reward[1:], [reward[0] for reward in rewards])
+    assert np.array_equal(strip.values[1:], [reward[0] for reward in rewards])
     session.happen(MomentShown(start + 2))
     assert not jump(session, lambda: session.do(ContinueFromHere(scope="into all"))).timeline.not_carried
 

@@ -182,13 +182,13 @@ def test_steps_are_counted_consistently_and_a_reset_is_not_one(played: FakeWorke
     played.reset()
     played.step(2)  # moments 4 to 6
     view = played.view
-    assert view.timeline.steps == view.curves.serial == 5 and view.timeline.moments == 7
+    assert view.timeline.steps == view.timeline.last_tick == 5 and view.timeline.moments == 7
     session.do(Seek(step=4))
     view = played.view
     assert (view.timeline.tick, view.timeline.steps_ago, at(played)) == (4, 1, 5)
     strip = session.look(lambda run: run.strip(-9, 99))
     assert (strip.low, strip.high) == (0, 5)
-    assert np.isnan(strip.reward[0]) and strip.reward[1:].tolist() == [1, 2, 3, 1, 2]
+    assert np.isnan(strip.values[0]) and strip.values[1:].tolist() == [1, 2, 3, 1, 2]
     # Tick 3 is the last step of the first episode, and the reset that starts the second.
     session.do(Seek(step=3))
     assert at(played) == 3 and session.look(Run.episode_ticks) == (0, 3)
@@ -224,13 +224,15 @@ def test_a_strip_covers_one_env_between_two_steps(fake: FakeWorkerSession) -> No
 
     whole = strip(-10, 99)
     assert (whole.low, whole.high) == (0, 4) and dict(whole.events) == {0: RESET, 3: SUCCESS | WENT_BACK}
-    assert whole.branches == ((3, 1),) and whole.segments == ((0, 3, False), (3, 4, True))
+    assert whole.branches == ((3, 1),) and whole.segments == ((0, 3, False, "success"), (3, 4, True, ""))
     part = strip(1, 2)
-    assert (part.low, part.high, part.branches) == (1, 2, ()) and part.segments == ((1, 2, False),)
-    assert part.reward.tolist() == [1, 2]
+    assert (part.low, part.high, part.branches) == (1, 2, ()) and part.segments == ((1, 2, False, ""),)
+    assert part.values.tolist() == [1, 2]
     fake.session.change(selected_env=0)
     other = strip(0, 5)
-    assert other.segments == ((0, 4, False),) and other.branches == () and dict(other.events) == {0: RESET}
+    assert (
+        other.segments == ((0, 4, False, ""),) and other.branches == () and dict(other.events) == {0: RESET}
+    )
 
 
 # --- going back --------------------------------------------------------------------------------------------

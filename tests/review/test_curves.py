@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-import viser
 
+from tests.drive.charts import Chart
 from tests.drive.episodes import made
+from tests.drive.panels import Panels
 from workbench.live.panels.reward_panel import NumberRow
+from workbench.page.widgets.templates import colour
 from workbench.review.curves_panel import ReviewCurves, compared
 from workbench.review.view import Opened, ReviewView, find_events
 
@@ -40,50 +41,44 @@ def aligned(*recordings: tuple[int, int], selected: int = 0, position: int = 0) 
     )
 
 
-def drawn(server: viser.ViserServer, view: ReviewView, chart: str = "reward") -> list[list[Any]]:
-    """Data sent to a chart: the positions, a line per recording, and the dot; None marks gaps."""
-    curves = ReviewCurves(server)
-    curves.draw(view)
-    handle = curves._charts[chart].handle
-    assert handle is not None and handle.visible
-    return [[None if y is None or np.isnan(y) else float(y) for y in data] for data in handle.data]
+def drawn(panels: Panels, view: ReviewView, title: str = "reward") -> Chart:
+    ReviewCurves(panels.server).draw(view)
+    (chart,) = (chart for chart in panels.charts() if chart.title == title)
+    return chart
 
 
 @pytest.mark.parametrize("selected", [0, 1])
 @pytest.mark.parametrize("position", [-5, -2, 0, 3, 5])
-def test_the_dot_lies_on_the_selected_line_at_the_position(
-    server: viser.ViserServer, selected: int, position: int
+def test_the_cursor_is_at_the_position_and_the_legend_has_each_recordings_value_there(
+    panels: Panels, selected: int, position: int
 ) -> None:
-    view = aligned((10, 5), (6, 2), selected=selected, position=position)
-    positions, *lines, dot = drawn(server, view)
-    assert positions == list(range(-5, 6))
+    chart = drawn(panels, aligned((10, 5), (6, 2), selected=selected, position=position))
+    assert chart.cursor == pytest.approx(position, abs=0.01)
     # The reward equals the number of its step; the first state has none.
-    assert lines[0] == [None, *range(1, 11)]
-    assert lines[1] == [None] * 4 + [1, 2, 3, 4, 5, 6] + [None]
-    at = positions.index(position)
-    assert dot == [lines[selected][at] if i == at else None for i in range(11)]
+    a, b = chart.of(colour(0)), chart.of(colour(1))
+    np.testing.assert_allclose(a, [[step - 5, step] for step in range(1, 11)], atol=0.02)
+    np.testing.assert_allclose(b, [[step - 2, step] for step in range(1, 7)], atol=0.02)
+    expected = [(at, steps) for at, steps in ((position + 5, 10), (position + 2, 6))]
+    assert chart.legend == tuple(
+        (name, f"{at}" if 1 <= at <= steps else "NaN")
+        for name, (at, steps) in zip("AB", expected, strict=True)
+    )
 
 
-def test_in_a_long_recording_the_dot_is_on_the_point_nearest_to_the_position(
-    server: viser.ViserServer,
-) -> None:
-    steps, anchor = 1000, 400
-    for position in (-400, -399, 0, 1, 599, 600):
-        positions, line, dot = drawn(server, aligned((steps, anchor), position=position))
-        assert (positions[0], positions[-1]) == (-400 + 1, 600) and 400 < len(positions) <= 600
-        (at,) = [i for i, value in enumerate(dot) if value is not None] or [0]
-        assert abs(positions[at] - position) <= 3
-        value = position + anchor  # the value at the position, not at the point
-        assert dot[at] == (None if value == 0 else value)
-        assert line[at] in (None, positions[at] + anchor)
+def test_in_a_long_recording_the_value_is_that_of_the_point_nearest_to_the_position(panels: Panels) -> None:
+    chart = drawn(panels, aligned((1000, 400), position=123))
+    points = chart.of(colour(0))
+    assert 400 < len(points) <= 600 and chart.cursor == pytest.approx(123, abs=0.1)
+    ((_, value),) = chart.legend
+    assert abs(float(value) - 523) <= 3
 
 
-def test_a_peak_of_one_step_in_a_long_recording_is_drawn(server: viser.ViserServer) -> None:
+def test_a_peak_of_one_step_in_a_long_recording_is_drawn(panels: Panels) -> None:
     episode = made(3000)
     reward = np.zeros(3000, np.float32)
     reward[1234] = 7.0
     episode = replace(episode, reward=reward)
     view = aligned((3000, 0))
     view = replace(view, opened=(Opened("0", "0.rrd", episode, find_events(episode)),))
-    positions, line, _ = drawn(server, view)
-    assert [at for at, value in zip(positions, line, strict=True) if value == 7.0] == [1235]
+    points = drawn(panels, view).of(colour(0))
+    assert points[points[:, 1] > 6.9, 0] == pytest.approx([1235], abs=0.1)

@@ -23,7 +23,6 @@ import tyro
 from playwright.sync_api import Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.drive.charts import drawn
 from tests.drive.page import TASK, browser_at, page_on
 from workbench.machine.doctor import find_chromium
 
@@ -93,23 +92,23 @@ def main(options: Options) -> None:
         ):
             page.get_by_role("button", name="Play", exact=True).click()
             page.get_by_role("tab", name="Reward").click()
-            expect(page.locator(".uplot canvas").first).to_be_visible(timeout=300_000)
+            expect(page.locator(".wb-chart-area:visible").first).to_be_visible(timeout=300_000)
             before = megabytes(psutil.Process(opened.process.pid))
             for number in range(options.saves):
                 kind, saved_at = kind_of(number), time.monotonic()
                 file.write_text(version(good, number))
-                column_counts = []
+                line_counts = []
                 for check in range(1, CHART_CHECKS + 1):
                     page.wait_for_timeout(
                         max(0.0, 1000 * (saved_at + check * options.every / CHART_CHECKS - time.monotonic()))
                     )
-                    column_counts.append(len(drawn(page)))
+                    line_counts.append(page.locator(".wb-chart-area:visible polyline").count())
                 empty, checks = (
-                    empty + sum(not columns for columns in column_counts),
-                    checks + len(column_counts),
+                    empty + sum(not lines for lines in line_counts),
+                    checks + len(line_counts),
                 )
                 print(
-                    f"{number + 1} {kind}: {column_counts} columns drawn | {memory_of(page, opened.process.pid)}",
+                    f"{number + 1} {kind}: {line_counts} lines drawn | {memory_of(page, opened.process.pid)}",
                     flush=True,
                 )
                 if options.pictures is not None:

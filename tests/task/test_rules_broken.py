@@ -331,8 +331,8 @@ def test_the_page_keeps_the_mark_until_the_file_is_fixed(child_process: None, tm
         session.do(PauseRun())
         findings = [finding.rule for event in events for finding in event.new]
         assert findings == ["not-applied", "reward-rows"], "each rule is reported once"
-        curves = session.view().curves
-        assert curves is not None and curves.newest.tolist() == [0.0, 1.0], "True is drawn as 1"
+        step = session.view().step
+        assert step is not None and step.reward.tolist() == [0.0, 1.0], "True is drawn as 1"
         assert not any(re.search("RuleWarning", text) for text in session.view().printed.texts)
         file.write_text(TASK.format(body=LOST.replace("self.cube.set_pose", "len")))
         wait_until(session, lambda view: view.rules is None and view.task_serial == 2, "the end of the mark")

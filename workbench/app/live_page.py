@@ -12,7 +12,7 @@ import numpy as np
 import viser
 
 from workbench.app import state
-from workbench.app.marks import EPISODES, STUDIO, Marks
+from workbench.app.marks import EPISODES, Marks
 from workbench.app.pages import draw_apart
 from workbench.app.palette_entries import TaskCommands
 from workbench.app.session import Session
@@ -21,13 +21,13 @@ from workbench.cameras.commands import SelectCamera
 from workbench.cameras.events import CameraChosen
 from workbench.cameras.frustums import LARGE_METRES, SMALL_METRES, CameraFrustums, without_the_viewpoint
 from workbench.cameras.panel import CamerasPanel
+from workbench.cameras.studio_panel import TAB as CAMERAS
 from workbench.cameras.studio_panel import StudioPanel
 from workbench.cameras.view import shown_cameras
 from workbench.checks.panel import TAB as CHECKS
 from workbench.checks.panel import ChecksPanel
 from workbench.checks.profile_panel import StepProfilePanel
 from workbench.live.commands import ChoosePictures
-from workbench.live.env_commands import ToggleOnlySelected
 from workbench.live.events import PagesCounted
 from workbench.live.messages import CameraRequest
 from workbench.live.panels.banners import Banner, BusyBanner
@@ -41,8 +41,7 @@ from workbench.live.panels.reward_panel import CurvesPanel, NumbersPanel
 from workbench.live.panels.run_panel import RunPanel
 from workbench.live.panels.timeline_panel import TimelinePanel
 from workbench.live.panels.version_panel import VersionPanel
-from workbench.live.panels.view_panel import ViewPanel
-from workbench.live.timeline_commands import Seek
+from workbench.live.panels.view_panel import ViewIcons, ViewPanel
 from workbench.live.view import SessionView
 from workbench.machine.kept_choices import close_hints
 from workbench.machine.loop import BlockingPool, post
@@ -57,7 +56,6 @@ from workbench.page.commands import (
     TellOpenTab,
     TellUnfolded,
     ToggleTable,
-    ToggleTheme,
     ToggleTimeline,
 )
 from workbench.page.scene.bodies import DrawStyle
@@ -66,7 +64,7 @@ from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.frame import add_bar
-from workbench.page.widgets.hotkeys import add_hints, key_rows, register
+from workbench.page.widgets.hotkeys import add_hints, register
 from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart, Parts
 from workbench.page.widgets.templates import render
@@ -89,8 +87,6 @@ DOES: frozenset[type[Command]] = frozenset(
         ToggleTable,
         ToggleTimeline,
         FrameScene,
-        ToggleTheme,
-        ToggleOnlySelected,
         CloseHints,
         CloseDialog,
         *CamerasPanel.does,
@@ -104,8 +100,13 @@ PICTURES_HINT = (
     "card. Auto: fast while something moves, exact when it stands still. This page records exact pictures only."
 )
 PANEL_WIDTH_PIXELS = 372
+ENVS_TAB, LOG, ALL_PICTURES = "Envs", "Log", "All pictures"
 ENVS_WIDTHS_PIXELS = 220, 640
-"""Minimum and maximum width of the table of envs; the view keeps half of the page."""
+"""Minimum and maximum width of the table of envs."""
+ENVS_SHARE = 0.2
+"""Share of the page's width for the table of envs. It leaves columns out; the user can drag its edge."""
+WIDE_PIXELS = 1200
+"""Width of a page from which on the table of envs is open at first."""
 
 
 class Page:
@@ -181,12 +182,15 @@ class Page:
             server.gui.add_html(render("help_link"))
         self._in_software = stage.in_software
         self._in_software.ask()
-        run_tab, in_tabs = self._add_tabs(dark)
+        in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock, record_tool)
-        self._add_table_of_envs()
+        with self._timeline.add_tab(LOG):
+            log = LogPanel(server, session.clear_printed)
+        self._icons = ViewIcons(server, self._view_choice, str(session.reference))
+        self._add_left_dock()
         banner = Banner(server, self._link, self._is_own)
         busy_banner = BusyBanner(server, self._link)
-        floating = self._envs, self._timeline, banner, busy_banner
+        floating = self._envs, self._record, self._timeline, log, self._icons, banner, busy_banner
         opening = () if self._opening is None else (self._opening,)
         self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
 
@@ -195,81 +199,63 @@ class Page:
         self._forces = ForceArrows(server)
         self._parts.add(TaskCommands(server, visitors))
         kinds = DOES | state.DOES | self._parts.does | also
-        register(server, visitors, kinds, "live page")
-        with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
-            server.gui.add_html(render("keys", rows=key_rows(visitors.commands, kinds)))
+        register(server, visitors, kinds, "live page", (ENVS_TAB, EPISODES, "Timeline", LOG))
         # viser awaits coroutines, although its types do not say so.
         server.scene.on_click()(self._on_scene_click)  # type: ignore[arg-type]
 
     def _is_own(self, file: str) -> bool:
         return isinstance(self._session.reference, str) and self._session.knows_file(file)
 
-    def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[SessionView]]]:
-        """Returns the Run tab, which gets more content later, and the parts of all tabs."""
+    def _add_tabs(self, dark: bool) -> list[PagePart[SessionView]]:
+        """Add the tabs of the right dock; returns their parts."""
         server, session, clock = self._server, self._session, self._clock
         tabs = server.gui.add_tab_group()
-        run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
-        with run_tab:
+        with tabs.add_tab("Run", viser.Icon.PLAYER_PLAY):
             self._hints = add_hints(server)
             self._run = RunPanel(server, session)
-            self._solve = SolvePanel(server, session, self._link)
-            self._view_panel = ViewPanel(server, dark, self._view_choice)
             version = VersionPanel(server, self._link)
             options = EnvOptionsPanel(server, session)
-        with tabs.add_tab("Cameras", viser.Icon.CAMERA):
-            degrees = "auto", "exact", "fast"
-            self._degree = choice(
-                server, "Pictures", ChoosePictures, "pictures", degrees, "auto", hint=PICTURES_HINT
-            )
-            self._cameras = CamerasPanel(
-                server,
-                studio_shows=lambda: self._studio.shows,
-                clock=clock,
-            )
-        with tabs.add_tab(STUDIO, viser.Icon.CAMERA_PLUS):
-            self._studio = StudioPanel(
-                server, session, self._view_panel, lambda: self._open_tabs.pages_at(STUDIO), clock
-            )
+            self._view_panel = ViewPanel(server, dark, self._view_choice)
+        with tabs.add_tab(CAMERAS, viser.Icon.CAMERA):
+            self._studio = StudioPanel(server, session, lambda: self._open_tabs.pages_at(CAMERAS), clock)
+            with server.gui.add_folder(ALL_PICTURES, expand_by_default=False):
+                degrees = "auto", "exact", "fast"
+                self._degree = choice(
+                    server, "Pictures", ChoosePictures, "pictures", degrees, "auto", hint=PICTURES_HINT
+                )
+                self._cameras = CamerasPanel(server, studio_shows=lambda: self._studio.shows, clock=clock)
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             reward = [
-                NumbersPanel(server),
+                NumbersPanel(server, session),
                 RescoredAbove(server),
-                CurvesPanel(server, lambda tick: session.do(Seek(step=tick))),
+                CurvesPanel(server, session),
             ]
             self._rescored = PastRescorePanel(
                 server, session, lambda name, env: session.rescored_curve(name, env)
             )
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, clock)
-        with tabs.add_tab(EPISODES, viser.Icon.MOVIE):
-            self._record = RecordPanel(server)
-            server.gui.add_html(tools_html([tool("Review recordings", ShowRecordings())]))
-        with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
-            checks = ChecksPanel(server, checks_tab, self._link)
+        with tabs.add_tab("Try", viser.Icon.FLASK):
+            self._solve = SolvePanel(server, session, self._link)
             seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
             profile = StepProfilePanel(server, self._link)
-        with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
-            log = LogPanel(server, session.clear_printed)
-        parts = [
-            self._run,
-            self._solve,
-            self._view_panel,
-            version,
-            options,
-            self._studio,
-            *reward,
-            self._rescored,
-        ]
-        return run_tab, [*parts, self._inspect, self._record, checks, seeds, profile, log]
+        with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
+            checks = ChecksPanel(server, checks_tab, self._link)
+        of_run = self._run, version, options, self._view_panel
+        of_reward = *reward, self._rescored
+        return [*of_run, self._studio, *of_reward, self._inspect, self._solve, seeds, profile, checks]
 
-    def _add_table_of_envs(self) -> None:
+    def _add_left_dock(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)
-        with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
+        with self._env_window.add_tab(ENVS_TAB, viser.Icon.LIST_DETAILS):
             self._envs = EnvPanel(self._server, self._session)
+        with self._env_window.add_tab(EPISODES, viser.Icon.MOVIE):
+            self._record = RecordPanel(self._server)
+            self._server.gui.add_html(tools_html([tool("Review recordings", ShowRecordings())]))
         self._env_window.dock_left()
-        # Minimized at first: it takes half of a small screen's view.
-        self._env_window.minimize()
-        self._envs_open = False
+        self._envs_open = bool(self._view_choice.table)
+        if not self._envs_open:
+            self._env_window.minimize()
         self._envs_fitted = 0
         """Width of the page in pixels for which the width of the table was set last."""
 
@@ -310,6 +296,7 @@ class Page:
             self._session.change(cameras=wanted)
 
     def _draw_panels(self, view: SessionView) -> None:
+        self._open_envs_at_first(view)
         self._parts.draw(view)
         self._degree.show(view.settings.pictures)
         self._cameras.draw(shown_cameras(view))
@@ -323,6 +310,8 @@ class Page:
             case ShowRecordings():
                 self._on_review()
             case ShowTab(tab=tab, fold=fold):
+                if tab in (ENVS_TAB, EPISODES):
+                    self._open_envs()
                 self._open_tabs.open(visitor, tab, fold)
             case TellOpenTab(tab=tab):
                 self._open_tabs.said(visitor, tab)
@@ -336,16 +325,12 @@ class Page:
                 visitor.send(render("toggle_timeline"))
             case FrameScene():
                 self.frame(session.view())
-            case ToggleTheme():
-                self._view_panel.toggle_dark()
-            case ToggleOnlySelected():
-                self._view_panel.toggle_only_selected()
             case CloseHints():
                 self._hints.content = ""
                 self._choices.begin(close_hints)
             case SelectCamera():
                 session.do(command, visitor.name)
-                self._open_tabs.open(visitor, STUDIO)
+                self._open_tabs.open(visitor, CAMERAS)
             case CloseDialog():
                 if self._opening is not None:
                     self._opening.close()
@@ -363,7 +348,7 @@ class Page:
             self._envs_open = True
             self._fit_envs()
             self._envs.unfold()
-        elif panel == STUDIO:
+        elif panel == CAMERAS:
             self._studio.unfold()
         elif panel == INSPECT:
             self._inspect.unfold()
@@ -371,22 +356,37 @@ class Page:
     def _fit_envs(self) -> None:
         """Set the table's width to that of its columns, once for each page width: the user may have dragged its edge."""
         wanted = self._envs.wanted_width()
-        page = min((visitor.page_width for visitor in self._visitors.all() if visitor.page_width), default=0)
+        page = self._narrowest()
         if page in (0, self._envs_fitted) or not wanted:
             return
         least, most = ENVS_WIDTHS_PIXELS
-        self._env_window.set_width(max(least, min(wanted, most, page / 2 - PANEL_WIDTH_PIXELS)))
+        self._env_window.set_width(max(least, min(wanted, most, page * ENVS_SHARE)))
         self._envs_fitted = page
 
+    def _narrowest(self) -> int:
+        """Width in pixels of the narrowest page; 0 if none is known."""
+        return min((visitor.page_width for visitor in self._visitors.all() if visitor.page_width), default=0)
+
+    def _open_envs_at_first(self, view: SessionView) -> None:
+        """Open the table of several envs, where there is room for it and the user has not closed it."""
+        several = view.task is not None and view.task.num_envs > 1
+        if self._view_choice.table is None and several and self._narrowest() >= WIDE_PIXELS:
+            self._open_envs()
+
     def _toggle_envs(self) -> None:
-        self._envs_open = not self._envs_open
         if self._envs_open:
-            self._fit_envs()
-            self._envs.unfold()
-            self._env_window.expand()
-        else:
+            self._envs_open = self._view_choice.table = False
             self._envs.fold()
             self._env_window.minimize()
+        else:
+            self._open_envs()
+
+    def _open_envs(self) -> None:
+        """Open the left dock."""
+        self._envs_open = self._view_choice.table = True
+        self._fit_envs()
+        self._envs.unfold()
+        self._env_window.expand()
 
     # --- the 3-D view ----------------------------------------------------------------------------
 
@@ -407,7 +407,7 @@ class Page:
         ):
             # Between two versions a step of the old one may arrive with the new task.
             return
-        one = self._view_panel.only_selected and task.num_envs > 1
+        one = self._icons.only_selected and task.num_envs > 1
         env = min(view.selected_env, task.num_envs - 1)
         if view.scene_serial != self._scene_serial or self._layout is None:
             self._scene_serial = view.scene_serial
@@ -420,7 +420,7 @@ class Page:
             self._scene.build(task.geometry, self._layout, step.poses, env if one else None, looks)
         self._scene.move(step.poses, self._layout, env if one else None)
         self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
-        pictures = self._cameras.shown_pictures(seen) if self._cameras.show_frustums else {}
+        pictures = self._cameras.shown_pictures(seen) if self._view_choice.frustums else {}
         alone = one or task.num_envs == 1
         if alone:
             pictures = without_the_viewpoint(pictures, view.pictures)
@@ -447,7 +447,7 @@ class Page:
 
     def _viewpoint(self, view: SessionView, aspect: float) -> Viewpoint:
         assert self._layout is not None and view.task is not None, "asked only where a scene is drawn"
-        if self._view_panel.only_selected or view.task.num_envs == 1:
+        if self._icons.only_selected or view.task.num_envs == 1:
             human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
             fovy = next((c.fovy for c in view.task.cameras if human and c.name == human.camera), FOV_RADIANS)
             acting = None
@@ -467,7 +467,7 @@ class Page:
         if (camera := self._frustums.under_ray(*ray)) is not None:
             self._session.happen(CameraChosen(camera))
             return
-        if self._view_panel.only_selected:
+        if self._icons.only_selected:
             return
         env = env_under_ray(layout, *ray)
         if env is not None and env < view.task.num_envs:

@@ -10,6 +10,7 @@ import viser
 from workbench.app.session import Session
 from workbench.cameras.commands import PutMovedCamerasBack, ShowCameraChange
 from workbench.cameras.events import CameraChosen, EditWanted
+from workbench.cameras.studio_panel import TAB as CAMERAS
 from workbench.cameras.view import EditRequest, StudioView
 from workbench.checks.commands import ShowChecks
 from workbench.checks.panel import TAB as CHECKS
@@ -29,7 +30,7 @@ from workbench.record.commands import StopRecording
 from workbench.record.panel import envs_in_words
 from workbench.record.state import RecordingStatus
 
-EPISODES, STUDIO = "Episodes", "Studio"
+EPISODES = "Episodes"
 
 
 class Marks(PagePart[SessionView]):
@@ -89,7 +90,7 @@ class Marks(PagePart[SessionView]):
             return
         self._session.happen(CameraChosen(moved[0]))
         self._session.happen(EditWanted(EditRequest("edit", moved[0])))
-        self._tabs.open(visitor, STUDIO)
+        self._tabs.open(visitor, CAMERAS)
 
 
 def moved_cameras(view: SessionView) -> tuple[CameraKey, ...]:

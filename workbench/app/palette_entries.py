@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
-
 import viser
 
 from workbench.cameras.commands import SelectCamera
+from workbench.cameras.studio_panel import TAB as CAMERAS
 from workbench.live.commands import UseControlMode
 from workbench.live.env_commands import SelectEnv
+from workbench.live.panels.run_panel import control_modes
 from workbench.live.view import SessionView
 from workbench.page.command import Command
 from workbench.page.widgets.hotkeys import add
@@ -17,7 +17,6 @@ from workbench.page.widgets.visitors import Visitors
 
 MAX_ENVS = 256
 """Maximum number of envs with an entry; more entries would delay every page."""
-STUDIO = "Studio"
 
 
 class TaskCommands(PagePart[SessionView]):
@@ -34,7 +33,7 @@ class TaskCommands(PagePart[SessionView]):
         return (
             view.task.num_envs,
             [camera.key for camera in view.task.cameras],
-            _modes(view),
+            control_modes(view),
             view.task.control_mode,
         )
 
@@ -55,7 +54,7 @@ def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
     return [
         *((f"Env {env}", SelectEnv(env=env), "") for env in range(min(task.num_envs, MAX_ENVS))),
         *(
-            (f"Camera {one.name}", SelectCamera(kind=one.kind, name=one.name), f"in {STUDIO}")
+            (f"Camera {one.name}", SelectCamera(kind=one.kind, name=one.name), f"in {CAMERAS}")
             for one in task.cameras
         ),
         *(
@@ -64,13 +63,6 @@ def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
                 UseControlMode(mode=mode),
                 "in effect" if mode == task.control_mode else "makes the envs again",
             )
-            for mode in _modes(view)
+            for mode in control_modes(view)
         ),
     ]
-
-
-def _modes(view: SessionView) -> list[str]:
-    """The control modes that the robot has."""
-    made = () if view.task is None else view.task.made.modes
-    choices = next((keyword.choices for keyword in made if keyword.name == "control_mode"), ()) or ()
-    return [mode for text in choices if isinstance(mode := json.loads(text), str)]

@@ -24,7 +24,7 @@ from workbench.library.rows import OpenVersion
 from workbench.live.commands import TogglePlay
 from workbench.live.messages import CameraRequest
 from workbench.live.panels.timeline_panel import MAX_MARKS, TimeBar, event_tools, play_tool, strip_values
-from workbench.live.panels.view_panel import ViewPanel
+from workbench.live.panels.view_panel import ViewIcons, ViewPanel
 from workbench.live.timeline_commands import (
     GoToFirst,
     GoToLast,
@@ -43,12 +43,11 @@ from workbench.page.commands import (
     TellDrawnInSoftware,
     TellUnfolded,
     ToggleTable,
-    ToggleTheme,
     ToggleTimeline,
 )
 from workbench.page.widgets.fields import Field, choice
 from workbench.page.widgets.frame import add_bar
-from workbench.page.widgets.hotkeys import key_rows, register
+from workbench.page.widgets.hotkeys import register
 from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart, Parts
 from workbench.page.widgets.templates import render
@@ -92,7 +91,6 @@ DOES: frozenset[type[Command]] = frozenset(
         ToggleTable,
         ToggleTimeline,
         FrameScene,
-        ToggleTheme,
         RescoreChosen,
         CloseDialog,
         *CamerasPanel.does,
@@ -163,8 +161,9 @@ class ReviewPage:
         shared.stage.in_software.ask()
         review_tab, in_tabs = self._add_tabs(dark)
         self._timeline = ReviewTimeline(server, review)
+        icons = ViewIcons(server, shared.stage.choice)
         self._in_3d = ReviewIn3D(server, review, shared.stage)
-        self._parts = Parts((self._panel, self._timeline, *in_tabs, self._opening), clock)
+        self._parts = Parts((self._panel, self._timeline, icons, *in_tabs, self._opening), clock)
         if self._sweep is not None:
             self._parts.add(self._sweep)
         kinds = DOES | self._parts.does | also
@@ -174,8 +173,6 @@ class ReviewPage:
             kinds if shared.session is not None else kinds - {ShowLive},
             "review page",
         )
-        with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
-            server.gui.add_html(render("keys", rows=key_rows(shared.visitors.commands, kinds)))
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
         """Returns the Review tab, which gets more content later, and the parts of all tabs."""
@@ -318,7 +315,7 @@ class ReviewPage:
     def _draw_scene(self, view: ReviewView) -> None:
         chosen = view.chosen
         cameras = () if chosen is None else self._reader.cameras(chosen.episode)
-        pictures = self._pictures if self._cameras.show_frustums else {}
+        pictures = self._pictures if self._shared.stage.choice.frustums else {}
         self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures)
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
@@ -435,8 +432,6 @@ class ReviewPage:
                 visitor.send(render("toggle_timeline"))
             case FrameScene():
                 self._in_3d.frame()
-            case ToggleTheme():
-                self._view_panel.toggle_dark()
             case RescoreChosen():
                 self._rescore_chosen()
             case CloseDialog():
@@ -503,7 +498,7 @@ class ReviewTimeline(TimeBar[ReviewView]):
             ("step", tool("Step forward", StepForward())),
             ("last", tool("Last step", GoToLast())),
         ]
-        self._transport.content = render("transport", tools=buttons)
+        self._transport.content = render("toolbar", kind="transport", label="Transport", tools=buttons)
         self._speed.show(view.speed)
         self._walk.content = tools_html(event_tools())
         wanted = (view.position, view.selected, view.opened_serial, view.anchors, view.align)
@@ -514,8 +509,9 @@ class ReviewTimeline(TimeBar[ReviewView]):
             self._fixed = fixed_values(view)
         self._drawn = wanted
         one, state = view.opened[view.selected], view.states[view.selected]
-        self._strip.content = render(
-            "review_timeline", view=view, one=one, state=state, seek=lambda at: Seek(step=at), **self._fixed
+        values = {"view": view, "one": one, "state": state, "seek": lambda at: Seek(step=at), **self._fixed}
+        self._strip.content, self._legend.content = (
+            render(name, **values) for name in ("review_strip", "review_legend")
         )
 
 

@@ -1,1 +1,1 @@
-"""The Cameras and Studio tabs: place cameras, measure what they see, write them into the file."""
+"""The Cameras tab: place cameras, measure what they see, write them into the file."""

@@ -156,12 +156,6 @@ class ChooseSnap(Command, frozen=True):
     snap: str
 
 
-class ShowOneEnv(Command, frozen=True):
-    """Show only the selected env, or all."""
-
-    one: bool
-
-
 class ShowModality(Command, frozen=True):
     """Show the camera's colours, depth, normals or segmentation."""
 
@@ -314,12 +308,6 @@ class ChooseShader(Command, frozen=True):
     """Render the chosen camera's picture with this shader pack."""
 
     shader: str
-
-
-class ShowFrustums(Command, frozen=True):
-    """Show or hide the camera frustums with their pictures in the 3D view."""
-
-    on: bool
 
 
 class ShowPictures(Command, frozen=True):

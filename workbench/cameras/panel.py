@@ -1,4 +1,4 @@
-"""The Cameras tab: pictures of the selected env's cameras; and the Studio's picture of the chosen camera, with pixel picks."""
+"""Pictures of the selected env's cameras; and the Studio's picture of the chosen camera, with pixel picks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.cameras.apply import PREVIEW_MODALITIES
-from workbench.cameras.commands import PickPixel, ShowFrustums, ShowPictures
+from workbench.cameras.commands import PickPixel, ShowPictures
 from workbench.cameras.view import PickedPixel, ShownCameras, StudioCamera, StudioView
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraKind, Picture
 from workbench.live.messages import CameraRequest
@@ -124,16 +124,15 @@ class CamerasPanel:
         studio_shows: Returns the modality that the Studio shows of the camera that is being placed.
     """
 
-    does = (ShowFrustums, ShowPictures)
+    does = (ShowPictures,)
 
     def __init__(
         self,
         server: viser.ViserServer,
-        no_camera: str = "This task has no camera yet. Add sensor on the Studio tab makes one.",
+        no_camera: str = "This task has no camera yet.",
         studio_shows: Callable[[], str] = lambda: COLOUR,
         clock: Clock = time.monotonic,
     ) -> None:
-        self.show_frustums = True
         self._no_camera, self._studio_shows = no_camera, studio_shows
         self._server, self._clock = server, clock
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
@@ -142,22 +141,16 @@ class CamerasPanel:
         self._cameras_serial = -1
         self._due = DrawThrottle(PICTURE_PERIOD_SECONDS, clock)
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task has loaded."))
-        hint = "Draw these cameras, with their pictures, in the 3D view."
-        self._frustums = tick(server, "Show in 3D view", ShowFrustums, "on", True, hint=hint)
-        self._frustums.visible = False
         self._folder = server.gui.add_folder(None)
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
-            case ShowFrustums(on=on):
-                self.show_frustums = on
             case ShowPictures(kind=kind, name=name, modality=modality, on=on):
                 if (kind, name, modality) not in self._ticked:
                     raise Refused(f"No camera {name} gives {modality}.")
                 self._ticked[kind, name, modality] = on
 
     def draw(self, seen: ShownCameras | None) -> None:
-        self._frustums.show(self.show_frustums)
         for key, camera in self._cameras.items():
             for modality, field in camera.ticks.items():
                 field.show(self._ticked[(*key, modality)])
@@ -210,7 +203,6 @@ class CamerasPanel:
             note = ""
         self._note.content = render("note", text=note)
         self._note.visible = bool(note)
-        self._frustums.visible = not note
         if note:
             return
         first_of_kind = {}

@@ -1,4 +1,4 @@
-"""The Studio tab: choose a camera, place it, and write it into the file."""
+"""The Studio, on the Cameras tab: choose a camera, place it, and write it into the file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from workbench.cameras.commands import (
     ResetCamera,
     ScalePreview,
     ShowModality,
-    ShowOneEnv,
     ToggleLookThrough,
     TurnCameraDown,
     TurnCameraLeft,
@@ -48,7 +47,6 @@ from workbench.cameras.report_panel import CameraReportPanel
 from workbench.cameras.suggest_panel import CameraSuggest
 from workbench.cameras.view import StudioCamera, StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings
-from workbench.live.panels.view_panel import ViewPanel
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
@@ -64,7 +62,7 @@ from workbench.pictures.camera_conventions import target_of
 NO_CAMERA = "none"
 SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
 SCALES = {"full": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
-TAB = "Studio"
+TAB = "Cameras"
 STEP_METRES = 0.01
 """Distance by which a key moves the camera."""
 TURN_DEGREES = 1.0
@@ -85,7 +83,6 @@ TURNS: dict[type[Command], tuple[float, float]] = {
     TurnCameraDown: (0, -TURN_DEGREES),
 }
 """Rotation (left, up) of each command."""
-VIEW = "Envs in the 3D view (O). With one alone the handles are large."
 HANDLES = (
     "pose: move or rotate the camera; its target moves with it.\n"
     "eye and target: move the eye, and it keeps looking at its target; or move the target."
@@ -98,7 +95,7 @@ IN_ITS_EYE = "You are at its position. Move the view to see its handles."
 
 
 class StudioPanel(PagePart[SessionView]):
-    """The tab. Only the chosen camera has gizmos and numbers; it is chosen here or by clicking its frustum.
+    """The Studio. Only the chosen camera has gizmos and numbers; it is chosen here or by clicking its frustum.
 
     From the top: the button that shows the change of the file; the picture, in which every movement is checked; the
     frequently used tools (look through, undo); the pose; the lens, folded.
@@ -113,7 +110,6 @@ class StudioPanel(PagePart[SessionView]):
         ChooseHandles,
         ChooseAxes,
         ChooseSnap,
-        ShowOneEnv,
         ShowModality,
         *CameraNumbers.does,
     )
@@ -122,7 +118,6 @@ class StudioPanel(PagePart[SessionView]):
         self,
         server: viser.ViserServer,
         session: LiveSession,
-        view_panel: ViewPanel,
         pages: Callable[[], frozenset[int]],
         clock: Clock = time.monotonic,
     ) -> None:
@@ -131,7 +126,7 @@ class StudioPanel(PagePart[SessionView]):
             pages: returns the client ids of the pages that have this tab open.
         """
         self._pages = pages
-        self._server, self._session, self._view_panel = server, session, view_panel
+        self._server, self._session = server, session
         self._placing = Placing(session)
         self._in_its_eye = False
         self._is_empty = False
@@ -142,10 +137,14 @@ class StudioPanel(PagePart[SessionView]):
         self._choice = choice(server, "Camera", ChooseCamera, "name", (NO_CAMERA,), NO_CAMERA)
         self._note = gui.add_html(render("note", text="Cameras appear when the task has loaded."))
         self._picture = StudioPicture(server, clock)
+        self._shows = gui.add_html("", visible=False)
         self._facts = gui.add_html("", visible=False)
         self._tools = gui.add_html("", visible=False)
         self._look = LookThrough(server, self._placing)
-        self._handles = gui.add_html("", visible=False)
+        with gui.add_folder(
+            "Handles and preview", expand_by_default=False, visible=False
+        ) as self._handles_folder:
+            self._handles = gui.add_html("")
         self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
         self._writing = WriteToFile(server, session, self._new_from_viewer, above)
         report, compare = CameraReportPanel(server, session), CameraCompare(server, session)
@@ -229,7 +228,7 @@ class StudioPanel(PagePart[SessionView]):
         self._is_empty = chosen is None
         self._facts.visible = chosen is not None
         self._tools.visible = camera is not None
-        self._handles.visible = camera is not None
+        self._handles_folder.visible = self._shows.visible = camera is not None
         self._numbers.draw(camera)
         self._picture.draw(view)
         self._pick.draw(view, shown=self._picture.visible)
@@ -241,8 +240,8 @@ class StudioPanel(PagePart[SessionView]):
             self._facts.content = self._facts_of(chosen, view)
         if camera is not None:
             self._tools.content = self._tools_of(camera, studio)
-            several = view.task is not None and view.task.num_envs > 1
-            self._handles.content = self._handles_of(studio.preview_scale, several)
+            self._handles.content = self._handles_of(studio.preview_scale)
+            self._shows.content = tools_html(self._shown_kinds())
 
     def _draw_choice(self, view: SessionView) -> None:
         studio = view.of(StudioView)
@@ -296,20 +295,9 @@ class StudioPanel(PagePart[SessionView]):
             ],
         )
 
-    def _handles_of(self, scale: float, several: bool) -> str:
-        """Buttons for the gizmos (pose or eye and target, axes, steps) and for the picture (modality, size).
-
-        Args:
-            several: whether there is more than one env. In a view of many envs the handles are small.
-        """
-        one = self._view_panel.only_selected
+    def _handles_of(self, scale: float) -> str:
+        """Buttons for the gizmos (pose or eye and target, axes, steps) and the size of the picture."""
         rows = [
-            _choice(
-                "View",
-                VIEW,
-                {"all envs": ShowOneEnv(one=False), "this env": ShowOneEnv(one=True)},
-                ShowOneEnv(one=one),
-            ),
             _choice(
                 "Handles",
                 HANDLES,
@@ -327,19 +315,18 @@ class StudioPanel(PagePart[SessionView]):
                 "Snap", SNAP, {name: ChooseSnap(snap=name) for name in SNAPS}, ChooseSnap(snap=self._snap)
             ),
             _choice(
-                "Shows",
-                "What the picture above shows.",
-                {kind: ShowModality(kind=kind) for kind in self._picture.kinds},
-                ShowModality(kind=self._picture.shows),
-            ),
-            _choice(
                 "Size",
                 SIZE,
                 {name: ScalePreview(scale=size) for name, size in SCALES.items()},
                 ScalePreview(scale=scale),
             ),
         ]
-        return tools_html(*(rows if several else rows[1:]))
+        return tools_html(*rows)
+
+    def _shown_kinds(self) -> list[Tool | Label]:
+        """Buttons for the modality of the picture above."""
+        kinds: dict[str, Command] = {kind: ShowModality(kind=kind) for kind in self._picture.kinds}
+        return _choice("Shows", "What the picture shows.", kinds, ShowModality(kind=self._picture.shows))
 
     # --- commands ----------------------------------------------------------------------------------------
 
@@ -359,8 +346,6 @@ class StudioPanel(PagePart[SessionView]):
                 if name not in SNAPS:
                     raise Refused(f"There is no snap {name!r}: they are {', '.join(SNAPS)}.")
                 self._snap = name
-            case ShowOneEnv(one=one):
-                self._view_panel.show_only_selected(one)
             case ShowModality(kind=kind):
                 self._picture.show_kind(kind)
             case _ if isinstance(command, CameraNumbers.does):
@@ -383,7 +368,7 @@ class StudioPanel(PagePart[SessionView]):
         """Move the camera by a key. The arrow keys without modifiers belong to the timeline."""
         # Only with this tab open: nothing on other tabs shows that a camera moves.
         if self._placing.camera is None or not self._pages():
-            raise Refused("Choose a camera in the Studio first.")
+            raise Refused("Choose a camera on the Cameras tab first.")
         if (step := MOVES.get(type(command))) is not None:
             self._move(partial(nudged, step=step), "key")
         else:

@@ -90,6 +90,12 @@ class ToggleCurve(Command, frozen=True):
     name: str
 
 
+class ChooseBeside(Command, frozen=True):
+    """Draw the curves over this env's last episodes, or over those of the other envs."""
+
+    beside: Literal["last", "batch"]
+
+
 class SetSeed(Command, frozen=True):
     """Reset all envs with this seed."""
 

@@ -91,4 +91,4 @@ class TurnEnvs(Command, frozen=True):
 class ShowEnvs(Command, frozen=True):
     """Show all envs or only the selected one."""
 
-    which: Literal["all envs", "the selected env"]
+    all_envs: bool

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.envs.camera_data import CameraKind, Picture
+from workbench.live.history.curves import REWARD, Column
 from workbench.live.history.env_table import EnvRows
-from workbench.live.history.moments import History, Moment
+from workbench.live.history.moments import FAIL, SUCCESS, TRUNCATED, EpisodeNumbers, History, Moment
 from workbench.live.messages import CameraRequest, DrawPast, Restore
 from workbench.task.description import ShownPictures, Stepped
 
@@ -62,6 +64,19 @@ class TimelineView:
         return self.last_tick - self.tick
 
 
+Ending = Literal["", "success", "fail", "limit"]
+
+
+def _ending(flags: Iterable[int]) -> Ending:
+    """How a segment with these events ended; empty for one that runs on, or was cut short by a reset."""
+    all_flags = 0
+    for one in flags:
+        all_flags |= one
+    if all_flags & FAIL:
+        return "fail"
+    return "success" if all_flags & SUCCESS else "limit" if all_flags & TRUNCATED else ""
+
+
 @dataclass(frozen=True)
 class Strip:
     """A part of one env's history, for the strip under the slider. All places are ticks (see `TimelineView`)."""
@@ -71,12 +86,12 @@ class Strip:
     """Lowest and highest tick, both included."""
     events: tuple[tuple[int, int], ...]
     """Tick and event flags (`history.RESET` ... combined); everything at one tick is one event."""
-    reward: NDArray[np.float32]
-    """(high - low + 1,) reward after each control step; NaN where there is none."""
+    values: NDArray[np.float32]
+    """(high - low + 1,) number after each control step, by default the reward; NaN where there is none."""
     branches: tuple[tuple[int, int], ...]
     """Ticks at which the env went back, each with the tick that it went back to."""
-    segments: tuple[tuple[int, int, bool], ...]
-    """First and last tick of each segment (see `History`), and whether it starts with a jump back."""
+    segments: tuple[tuple[int, int, bool, Ending], ...]
+    """First and last tick of each segment (see `History`), whether it starts with a jump back, and how it ended."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +166,7 @@ class Past:
         return self.seek(serials[min(serials, key=lambda known: abs(known - step))])
 
     def seek_tick(self, tick: int, episode_of: int | None = None) -> Past:
-        """Go to the moment after a control step (`Curves.serial`), or to the nearest kept one.
+        """Go to the moment after a control step (`Moment.tick`), or to the nearest kept one.
 
         Args:
             episode_of: stay within the shown episode of this env. The last step of the previous episode has the same tick as
@@ -229,8 +244,12 @@ class Past:
         moment = self.history.at(serial)
         return 0 if moment is None else moment.tick
 
-    def strip(self, env: int, low: int, high: int) -> Strip:
-        """The history of one env between two ticks, inclusive."""
+    def strip(self, env: int, low: int, high: int, column: Column = REWARD) -> Strip:
+        """The history of one env between two ticks, inclusive.
+
+        Args:
+            column: the number that is shown.
+        """
         history = self.history
         ticks = history.ticks(history.first, history.last)
         low = min(max(low, int(ticks[0])), int(ticks[-1]))
@@ -239,11 +258,12 @@ class Past:
         first, end = int(np.searchsorted(ticks, low)), int(np.searchsorted(ticks, high, side="right"))
         here = slice(first, end)
         serials, base = (history.first + first, history.first + end - 1), history.first
-        reward = np.full(high - low + 1, np.nan, np.float32)
+        values = np.full(high - low + 1, np.nan, np.float32)
         stepped = np.diff(ticks, prepend=ticks[0] - 1)[here] > 0
-        reward[ticks[here][stepped] - low] = history.rewards(env, *serials)[stepped]
+        values[ticks[here][stepped] - low] = history.numbers(env, *serials, column)[stepped]
         events: dict[int, int] = {}
-        for serial, flags in history.events(env, *serials):
+        happened = history.events(env, *serials)
+        for serial, flags in happened:
             tick = int(ticks[serial - base])
             events[tick] = events.get(tick, 0) | flags
 
@@ -255,17 +275,33 @@ class Past:
             low,
             high,
             tuple(events.items()),
-            reward,
+            values,
             tuple(
                 (tick_of(at), tick_of(origin)) for at, origin in jumps.items() if low <= tick_of(at) <= high
             ),
             tuple(
-                (max(begin, low), min(last, high), start in jumps)
+                (
+                    max(begin, low),
+                    min(last, high),
+                    start in jumps,
+                    _ending(flags for serial, flags in happened if start <= serial <= stop),
+                )
                 for start, stop in history.segments(env)
                 for begin, last in [(tick_of(start), tick_of(stop))]
                 if last >= low and begin <= high
             ),
         )
+
+    def episodes(
+        self, env: int, last: int, columns: Sequence[Column], before: int
+    ) -> tuple[EpisodeNumbers, ...]:
+        """Numbers of this env's episode at the shown moment, whole, and of the ones before; see `History.episodes`.
+
+        Args:
+            last: serial of the live moment; the history may have newer ones by now.
+        """
+        end = last if self.pinned is None else min(self.history.segment_at(env, self.at)[1], last)
+        return self.history.episodes(env, end, columns, before)
 
     def episode(self, env: int) -> tuple[int, int]:
         """Serials of the first and the last moment of this env's episode that contains the shown moment. The moments in

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -15,8 +15,9 @@ from workbench.envs.camera_data import CameraKey, Picture
 from workbench.envs.inspection import Inspection, Section
 from workbench.envs.step_result import StepResult
 from workbench.live.events import RunEffect, RunToEnter
+from workbench.live.history.curves import REWARD, Column
 from workbench.live.history.env_table import EnvRows
-from workbench.live.history.moments import EnvMoment, ShownMoment
+from workbench.live.history.moments import EnvMoment, EpisodeNumbers, ShownMoment
 from workbench.live.load_attempts import LoadInputs, Recovery
 from workbench.live.messages import (
     Load,
@@ -209,9 +210,15 @@ class Run:
         it every frame."""
         return None if self.past is None else self.past.env_rows()
 
-    def strip(self, low: int, high: int) -> Strip | None:
+    def strip(self, low: int, high: int, column: Column = REWARD) -> Strip | None:
         """The selected env's history between two ticks; None before a task is loaded."""
-        return None if self.kept is None else self.kept.strip(self.env, low, high)
+        return None if self.kept is None else self.kept.strip(self.env, low, high, column)
+
+    def episodes(
+        self, env: int, last: int, columns: Sequence[Column], before: int
+    ) -> tuple[EpisodeNumbers, ...]:
+        """See `Past.episodes`; none before a task is loaded."""
+        return () if self.kept is None else self.kept.episodes(env, last, columns, before)
 
     def episode_ticks(self) -> tuple[int, int] | None:
         """First and last tick of the selected env's episode that contains the shown moment; jumps back do not end an episode."""

@@ -65,7 +65,7 @@ class SeekBack(Command, frozen=True):
 
 
 class SeekOnCurve(Command, frozen=True):
-    """Show the state after this control step, which was clicked on a curve."""
+    """Show the state after this control step of the episode, which was clicked on a curve."""
 
     step: int
 
@@ -85,6 +85,12 @@ class ContinueFromHere(Command, frozen=True):
     scope: Literal["this", "all", "into all"] = "this"
     """``this``: the selected env from its shown state; ``all``: each env from its own; ``into all``: all envs from the
     selected one's."""
+
+
+class ChooseStripCurve(Command, frozen=True):
+    """Draw this entry on the strip."""
+
+    curve: str
 
 
 class ZoomTimeline(Command, frozen=True):

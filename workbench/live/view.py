@@ -13,7 +13,6 @@ from workbench.envs.camera_data import CameraKey, Picture
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection
 from workbench.envs.step_result import StepResult
-from workbench.live.history.curves import Curves
 from workbench.live.messages import ReloadReport, RulesBroken, Settings
 from workbench.live.past import TimelineView
 from workbench.live.process.captured_output import NOTHING_PRINTED, Printed
@@ -69,7 +68,6 @@ class SessionView:
     """Why another process restored the version that ran when `problem` occurred; see `TaskFailed.spoiled`."""
     refused: Problem | None = None
     """Why the present version of the file does not run."""
-    curves: Curves | None = None
     settings: Settings = Settings()
     """Settings chosen on the page."""
     told: NDArray[np.float32] | None = None
@@ -137,7 +135,6 @@ def view_of(run: Run, **known: Any) -> SessionView:
         return now
     view = replace(
         now,
-        curves=past.history.steps.curves(run.env),
         timeline_cleared=run.after_load == "gone",
         timeline=past.view(run.env, run.settings.cameras, run.settings.pictures),
         odd=past.history.findings,

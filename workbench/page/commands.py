@@ -62,6 +62,12 @@ class FrameScene(Command, frozen=True):
     key = "f"
 
 
+class ShowFrustums(Command, frozen=True):
+    """Show or hide the camera frustums with their pictures in the 3D view."""
+
+    on: bool
+
+
 class ToggleTheme(Command, frozen=True):
     """Switch between the dark and the light theme."""
 

@@ -142,8 +142,8 @@ def _place(verdict: Verdict[PastRun]) -> tuple[int, int]:
     return verdict.of.env, verdict.of.at(verdict.look_at)
 
 
-def chart_data(curve: RescoredCurve, shown: int | None) -> tuple[NDArray, ...]:
-    """Data for uPlot: x, the recorded curve, the new curve, and a dot at the shown moment, if any.
+def chart_data(curve: RescoredCurve, shown: int | None) -> tuple[NDArray, NDArray, NDArray, float | None]:
+    """x, the recorded curve, the new curve, and the place of the shown moment on x, if it is there.
 
     A long curve is cut to its newest part, or to the part around the shown moment.
     """
@@ -151,8 +151,8 @@ def chart_data(curve: RescoredCurve, shown: int | None) -> tuple[NDArray, ...]:
     part = part_round(len(curve.tick), place)
     x, old, new = (v[part] for v in (curve.tick, curve.old, curve.new))
     if shown is None or shown not in curve.serial[part]:
-        return x, old, new
-    return x, old, new, np.where(curve.serial[part] == shown, np.where(np.isnan(new), old, new), np.nan)
+        return x, old, new, None
+    return x, old, new, float(curve.tick[np.searchsorted(curve.serial, shown)])
 
 
 def in_a_line(rescored: RescoreView) -> str:

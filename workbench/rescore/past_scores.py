@@ -27,7 +27,7 @@ class PastRun:
     serials: NDArray[np.int64]
     """(T + 1,) serials of its moments."""
     tick: int = 0
-    """Control steps before its first moment, counted as in `Curves` and the timeline."""
+    """Control steps before its first moment, counted as on the timeline."""
 
     @property
     def name(self) -> str:
@@ -43,7 +43,7 @@ class RescoredCurve:
     """One number of one env at the recorded control steps, oldest first."""
 
     tick: NDArray[np.int64]
-    """(T,) ticks, counted as in `Curves.serial`."""
+    """(T,) ticks, counted as in `Moment.tick`."""
     serial: NDArray[np.int64]
     """(T,) serials of the moments."""
     old: NDArray[np.float32]

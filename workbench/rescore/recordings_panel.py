@@ -267,10 +267,8 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         part = part_round(chosen.length, chosen.first_difference)
         steps = np.arange(1, chosen.length + 1)
         name = f"seed {chosen.seed}" if chosen.seed >= 0 else chosen.of.name
-        self._draw_chart(
-            f"reward of {name}, then and now",
-            *(values[part] for values in (steps, chosen.old_reward, chosen.new_reward)),
-        )
+        old, new = chosen.old_reward[part], chosen.new_reward[part]
+        self._draw_chart(f"reward of {name}, then and now", steps[part], old, new)
 
 
 def _end_of(name: str) -> str:

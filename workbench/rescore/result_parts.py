@@ -56,7 +56,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         self._pages = Paged(MAX_ROWS)
 
     def _add_chart(self) -> None:
-        self._chart = LineChart(self._server, self._server.gui.add_folder(None), height=160)
+        self._chart = LineChart(self._server, height=160)
 
     def _draw_status(self, rescored: RescoreView, title: str = "", idle: str = "") -> None:
         self._failed_since = rescored.why if rescored.state == "failed" else ""
@@ -73,10 +73,10 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
             self._list.content = render("rescored_list", rows=rows, more=pages, column=self._column)
 
     def _draw_chart(
-        self, title: str, x: NDArray, old: NDArray, new: NDArray, dot: NDArray | None = None
+        self, title: str, x: NDArray, old: NDArray, new: NDArray, at: float | None = None
     ) -> None:
         lines = ChartLine("as recorded", old, RECORD_COLOUR, 1.2), ChartLine("rescored", new)
-        self._chart.draw(title, x, lines, dot, span_of([line.values for line in lines]))
+        self._chart.draw(title, x, lines, at, span_of([line.values for line in lines]))
 
     def _row(self, place: int) -> dict[str, Any]:
         verdict = self._listed[place]

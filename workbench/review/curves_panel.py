@@ -16,7 +16,7 @@ from workbench.live.history.curves import spans_of
 from workbench.live.panels.reward_panel import COLOURS as LINE_COLOURS
 from workbench.live.panels.reward_panel import NumberRow, number_rows
 from workbench.live.timeline_commands import Seek
-from workbench.page.command import Command, Refused, name_of
+from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import by_name, choice
 from workbench.page.widgets.line_chart import ChartLine, LineChart, span_of
 from workbench.page.widgets.parts import PagePart
@@ -64,21 +64,17 @@ class ReviewNumbers(PagePart[ReviewView]):
 class ReviewCurves(PagePart[ReviewView]):
     """Charts of one entry each, with one line per aligned recording: the reward and a chosen entry.
 
-    The action and the reward terms have many lines, so they are drawn only for the selected recording. The position is a
-    dot on one line: a vertical line at the position would have to be sent with every frame.
+    The action and the reward terms have many lines, so they are drawn only for the selected recording.
     """
 
     every = 0.15
     does = (ChooseReviewCurve,)
 
     def __init__(self, server: viser.ViserServer) -> None:
-        folder = server.gui.add_folder(None)
         self._entry = choice(server, "Also", ChooseReviewCurve, "curve", (), "")
         self._charts = {
-            name: LineChart(server, folder, height, order)
-            for order, (name, height) in enumerate(CHARTS.items(), start=1)
+            name: LineChart(server, height, lambda step: Seek(step=step)) for name, height in CHARTS.items()
         }
-        self._hint = server.gui.add_html("", visible=False)
         self._lines_drawn: object = None
         self._found: dict[str, dict[str, Lines]] = {}
         self._offered: dict[str, tuple[str, str]] = {}
@@ -94,8 +90,6 @@ class ReviewCurves(PagePart[ReviewView]):
         # By id: a recording that gets its scene later is still the same recording.
         self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
         shown = shown_together(view)
-        self._hint.visible = bool(shown)
-        self._hint.content = render("curve_hint", curve=name_of(Seek), gone=None, kept=0)
         also = self._offer(view, shown)
         self._draw_entry("reward", REWARD, view, shown)
         self._draw_entry("also", also, view, shown)
@@ -150,7 +144,7 @@ class ReviewCurves(PagePart[ReviewView]):
             name = letter(index) if len(view.opened) > 1 else entry
             over = column_at(states, values, view.anchors[index], axis_of(view))
             drawn.append(ChartLine(name, over, colour(index), 1.7))
-        self._put(chart, entry, view, drawn, drawn[cursor] if drawn else None)
+        self._put(chart, entry, view, drawn, drawn[cursor] if drawn else None, view.position)
 
     def _draw_lines(self, chart: str, entry: str, view: ReviewView) -> None:
         """Draw an entry with several lines for the selected recording."""
@@ -169,22 +163,24 @@ class ReviewCurves(PagePart[ReviewView]):
         title: str,
         view: ReviewView,
         drawn: list[ChartLine],
-        dotted: ChartLine | None = None,
+        chosen: ChartLine | None = None,
+        at: int | None = None,
     ) -> None:
-        """Draw the lines, reduced to their peaks if there are many positions, and one line's dot at the present position."""
-        # The dotted line first, since the steps are those of the first line's peaks.
-        ordered = sorted(drawn, key=lambda line: line is not dotted)
+        """Draw the lines, reduced to their peaks if there are many positions.
+
+        Args:
+            chosen: The line whose peaks are exact.
+            at: The present position.
+        """
+        # The chosen line first, since the steps are those of the first line's peaks.
+        ordered = sorted(drawn, key=lambda line: line is not chosen)
         if not ordered:
             self._charts[chart].hide()
             return
         x, values = spans_of(np.stack([line.values for line in ordered]), first=view.first).points()
         found = {id(line): own for line, own in zip(ordered, values, strict=True)}
         lines = [replace(line, values=found[id(line)]) for line in drawn]
-        dot = None
-        if dotted is not None and len(x):
-            dot = np.full(len(x), np.nan)
-            dot[np.abs(x - view.position).argmin()] = dotted.values[view.position - view.first]
-        self._charts[chart].draw(title, x, lines, dot, span_of([line.values for line in lines]))
+        self._charts[chart].draw(title, x, lines, at, span_of([line.values for line in lines]))
 
 
 def _mode_of(episode: Episode) -> str:

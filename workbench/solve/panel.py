@@ -1,4 +1,4 @@
-"""The folder *Solve* of the Run tab: planning options, the returns of the rollouts, and their paths in the 3-D view."""
+"""The folder *Solve* of the Try tab: planning options, the returns of the rollouts, and their paths in the 3-D view."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.live.commands import UseControlMode
+from workbench.live.commands import ChooseActions, UseControlMode
 from workbench.live.history.env_table import EnvRows
 from workbench.live.run import movable_bodies
 from workbench.live.session_protocol import LiveSession
@@ -46,6 +46,8 @@ from workbench.solve.state import SolveView
 THIS_ENV, ALL_ENVS = "the selected env", "all envs, in turn"
 PLANNED_ENVS = {THIS_ENV: "selected", ALL_ENVS: "all"}
 METHODS = {"MPPI": "mppi", "predictive sampling": "predictive", "CEM": "cem"}
+SOLVE_NOW = "Solve the selected env"
+SOLVE_HINT = "Choose the source of actions solve: planned by rollouts of the task with its own reward"
 SAVE_SOLVED = "Save the solved episode"
 TOOL = "the robot's tool"
 BETTER_MODE = "pd_ee_delta_pose"
@@ -58,7 +60,7 @@ PREDICTED, ACHIEVED = "#228be6", "#f08c00"
 
 
 class SolvePanel(PagePart[SessionView]):
-    """The folder; shown while the source of actions is *solve*.
+    """The folder; while the source of actions is another one, a button that chooses *solve*.
 
     Args:
         server: The page.
@@ -76,6 +78,7 @@ class SolvePanel(PagePart[SessionView]):
         self._shows_rollouts = True
         self._place = 0
         """Index of the chosen rollout among the drawn ones."""
+        self._begin = gui.add_html("")
         self._folder = gui.add_folder("Solve", visible=False)
         with self._folder:
             self._status = gui.add_html("")
@@ -84,7 +87,7 @@ class SolvePanel(PagePart[SessionView]):
             self._mode = gui.add_html("")
             self._build_settings()
             self._build_rollouts()
-            self._chart = LineChart(server, self._folder, CHART_HEIGHT_PIXELS)
+            self._chart = LineChart(server, CHART_HEIGHT_PIXELS)
 
     def _build_settings(self) -> None:
         server = self._server
@@ -195,6 +198,8 @@ class SolvePanel(PagePart[SessionView]):
         task, solve = view.task, view.of(SolveView)
         shown = view.settings.action_source == "solve" and task is not None
         self._folder.visible = shown
+        begin = Tool(SOLVE_NOW, ChooseActions(source="solve"), SOLVE_HINT, off=task is None)
+        self._begin.content = "" if shown else tools_html([begin])
         if not shown or task is None:
             self._chart.hide()
             self._told = solve.solved

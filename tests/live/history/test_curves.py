@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from tests.drive.session import moment
 from workbench.envs.step_result import OtherEntry, StepResult
 from workbench.live.history.curves import (
-    MAX_COLUMNS,
     REWARD,
     SUCCESS,
     Column,
     Columns,
-    Curves,
     Group,
-    StepCurves,
+    columns_of,
+    number_of,
     spans_of,
+    without_curve,
 )
 
 N = 3
@@ -33,32 +33,6 @@ def step(number: int, **terms: Any) -> StepResult:
     entries = {f"reward_terms/{name}": np.asarray(value, np.float32) for name, value in terms.items()}
     result = moment(np.full(N, number), success=(2,) if number == 2 else ()).step
     return replace(result, evaluate={**result.evaluate, **entries})
-
-
-def line(curves: Curves, column: Column, mean: bool = False) -> tuple[list[float], list[float]]:
-    x, (values,) = curves.lines([(column, mean)])
-    return x.tolist(), values.tolist()
-
-
-def test_a_step_is_a_point_of_each_env_and_of_the_mean() -> None:
-    steps = StepCurves(N)
-    for number in (1, 2, 3):
-        steps.add(step(number, reach=[number, 2 * number, 0]))
-    curves = steps.curves(1)
-    assert curves.serial == steps.count == 3
-    assert line(curves, REWARD) == ([1, 2, 3], [1, 2, 3])
-    assert line(curves, REACH) == ([1, 2, 3], [2, 4, 6])
-    assert line(curves, REACH, mean=True) == ([1, 2, 3], [1, 2, 3])
-    assert line(steps.curves(2), SUCCESS)[1] == [0, 1, 0]
-
-
-def test_a_later_step_does_not_change_curves_that_were_read() -> None:
-    steps = StepCurves(N)
-    steps.add(step(1, reach=[1, 1, 1]))
-    curves = steps.curves(0)
-    for number in range(2000):
-        steps.add(step(number))
-    assert line(curves, REACH) == ([1], [1]) and curves.newest.tolist() == [1] * N
 
 
 NUMBERS = arrays(
@@ -76,82 +50,64 @@ INFINITE_AT_THE_END[:, -1] = np.inf
 @given(NUMBERS)
 @example(INFINITE_AT_THE_END)
 @settings(max_examples=15)
-def test_the_whole_run_fits_bounded_memory_and_keeps_each_peak_at_its_step(
-    rewards: NDArray[np.float32],
-) -> None:
-    steps = StepCurves(2)
-    base = moment(np.full(N, 1)).step
-    for number in range(rewards.shape[1]):
-        steps.add(replace(base, reward=rewards[:, number], evaluate={}))
-    curves = steps.curves(1)
-    spans, whole = curves.spans, spans_of(rewards[1:])
-    assert spans.width == whole.width and spans.low.shape[1] <= 400
-    for kept, made in ((spans.low, whole.low), (spans.high, whole.high), (spans.gap, whole.gap)):
-        np.testing.assert_array_equal(kept[:1], made)
-    known = np.isfinite(whole.low)
-    np.testing.assert_array_equal(spans.low_at[:1][known], whole.low_at[known])
-    np.testing.assert_array_equal(spans.high_at[:1][known], whole.high_at[known])
-    x, (one,) = curves.lines([(REWARD, False)])
+def test_a_long_line_becomes_few_points_and_keeps_each_peak_at_its_step(values: NDArray[np.float32]) -> None:
+    x, (one, _) = spans_of(values).points()
     assert (np.diff(x) > 0).all() and len(x) <= 3 * 400 + 1
-    if np.isfinite(rewards[1]).any():
-        finite = rewards[1][np.isfinite(rewards[1])]
+    finite = values[0][np.isfinite(values[0])]
+    if len(finite):
         assert (np.nanmin(one), np.nanmax(one)) == (finite.min(), finite.max())
     drawn = np.isfinite(one)
-    np.testing.assert_array_equal(rewards[1][x[drawn].astype(int) - 1], one[drawn])
-    lost = ~np.isfinite(rewards[1])
-    assert np.isnan(one).any() == lost.any()
+    np.testing.assert_array_equal(values[0][x[drawn].astype(int) - 1], one[drawn])
+    assert np.isnan(one).any() == (~np.isfinite(values)).any() or len(finite) < len(values[0])
 
 
-def test_entries_terms_and_joints_are_columns_named_after_them() -> None:
-    steps = StepCurves(N, joints=("hinge", "slide"))
+def everything() -> StepResult:
+    """A step with an entry of every kind."""
     entries = {
         "height": np.arange(3.0),
-        "at": np.zeros((N, 3)),
+        "at": np.arange(9.0).reshape(N, 3),
         "picture": np.zeros((N, 64)),
         "none": np.zeros((N, 0)),
     }
-    result = step(1, reach=[1, 2, 0])
+    result = step(2, reach=[1, 2, 0])
     mean = OtherEntry("float", numbers=np.array(0.5))
-    steps.add(
-        replace(
-            result,
-            evaluate={**result.evaluate, **entries},
-            others={"mean": mean, "phase": OtherEntry("str", ("push",))},
-            qpos=np.array([[0.1, 1.0], [0.2, 2.0], [0.3, 3.0]], np.float32),
-        )
+    return replace(
+        result,
+        evaluate={**result.evaluate, **entries},
+        others={"mean": mean, "phase": OtherEntry("str", ("push",))},
+        qpos=np.array([[0.1, 1.0], [0.2, 2.0], [0.3, 3.0]], np.float32),
     )
-    curves = steps.curves(2)
-    assert [column.label for column in curves.columns] == [
+
+
+JOINTS = ("hinge", "slide")
+
+
+def test_entries_terms_and_joints_are_columns_named_after_them() -> None:
+    columns = columns_of(everything(), JOINTS)
+    assert [column.label for column in columns] == [
         *("reward", "success", "reach", "fail", "height", "at[0]", "at[1]", "at[2]", "mean", "hinge", "slide")
     ]
-    assert line(curves, Column(Group.JOINT, "slide"))[1] == [3.0]
-    assert line(curves, Column(Group.EVALUATE, "mean"))[1] == [0.5]
+    assert columns[REWARD].tolist() == [2.0] * N and columns[SUCCESS].tolist() == [False, False, True]
+    assert columns[REACH].tolist() == [1, 2, 0]
+
+
+def test_one_number_equals_its_column() -> None:
+    result = everything()
+    for column, values in columns_of(result, JOINTS).items():
+        assert [number_of(result, column, env, JOINTS) for env in range(N)] == values.tolist(), column
+    for column in (Column(Group.TERM, "lift"), Column(Group.JOINT, "lift"), Column(Group.EVALUATE, "at", 3)):
+        assert np.isnan(number_of(result, column, 0, JOINTS))
+    assert np.isnan(number_of(replace(result, qpos=None), Column(Group.JOINT, "hinge"), 0, JOINTS))
 
 
 def test_a_value_that_is_not_one_number_per_env_has_no_curve_and_is_listed() -> None:
-    steps = StepCurves(N)
     result = step(1, reach=[1, 2, 3], both=[[1, 2]] * N)
     mean, note = OtherEntry("float", numbers=np.array(0.5)), OtherEntry("str", ("none",))
     result = replace(result, others={"reward_terms/mean": mean, "reward_terms/note": note, "other": note})
-    for _ in range(2):
-        steps.add(result)
-    curves = steps.curves(0)
-    assert [column.name for column in curves.columns if column.group is Group.TERM] == ["reach"]
-    assert curves.no_curve == ("both", "mean", "note")
-    steps.add(replace(result, others={"reward_terms": note}, evaluate={}))
-    assert steps.curves(0).no_curve == ("reward_terms",)
-    steps.add(step(1, reach=[1, 2, 3]))
-    assert steps.curves(0).no_curve == ()
-
-
-def test_columns_are_limited_and_dropped_ones_make_room() -> None:
-    steps = StepCurves(N)
-    steps.add(step(1, **{f"term{i}": [0] * N for i in range(MAX_COLUMNS + 5)}))
-    kept = steps.curves(0).columns
-    assert len(kept) == MAX_COLUMNS and kept[:2] == (REWARD, SUCCESS)
-    steps.add(step(2, other=[1] * N))
-    assert [column.name for column in steps.curves(0).columns] == ["reward", "success", "other", "fail"]
-    assert line(steps.curves(0), REWARD) == ([1, 2], [1, 2])
+    assert [column.name for column in columns_of(result) if column.group is Group.TERM] == ["reach"]
+    assert without_curve(result) == ("both", "mean", "note")
+    assert without_curve(replace(result, others={"reward_terms": note}, evaluate={})) == ("reward_terms",)
+    assert without_curve(step(1, reach=[1, 2, 3])) == ()
 
 
 def test_requested_rows_keep_their_step_numbers_and_a_missing_value_is_nan() -> None:

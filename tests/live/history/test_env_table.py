@@ -90,7 +90,7 @@ def test_rows_equal_the_reference_for_each_env_and_in_the_past(
     episodes = [Episode() for _ in range(N)]
     last: list[Episode | None] = [None] * N
     seen = [deepcopy((episodes, last))]
-    ended, succeeded = [0] * N, [0] * N
+    ended, succeeded, failed = [0] * N, [0] * N, [0] * N
     flags: list[dict[int, int]] = [{} for _ in range(N)]
     for kind, first, entries, limits in events:
         if kind == "back":
@@ -119,13 +119,14 @@ def test_rows_equal_the_reference_for_each_env_and_in_the_past(
                 if running and episode.end >= 0:
                     ended[env] += 1
                     succeeded[env] += episode.outcome == Outcome.SUCCESS
+                    failed[env] += episode.outcome == Outcome.FAIL
                 for name, flag in (("success", SUCCESS), ("fail", FAIL)):
                     if episode.first.get(name) == episode.steps:
                         flags[env][tick] = flags[env].get(tick, 0) | flag
             shared.step(reward=first, truncated=tuple(np.flatnonzero(limits)), **entries_in_event(entries))
         seen.append(deepcopy((episodes, last)))
 
-    assert session.view().curves.serial == tick
+    assert session.view().timeline.last_tick == tick
     for env in range(N):
         session.change(selected_env=env)
         found = {
@@ -152,6 +153,7 @@ def test_rows_equal_the_reference_for_each_env_and_in_the_past(
         assert rows.last.total.tolist() == [0 if e is None else e.total for e in before]
         if place is None:
             assert (rows.ended.tolist(), rows.succeeded.tolist()) == (ended, succeeded)
+            assert rows.failed.tolist() == failed
     session.happen(MomentShown(None))
 
 

@@ -1,7 +1,8 @@
-"""The curves of the Reward tab: which ones, of which env, and what a click does."""
+"""The curves of the Reward tab: which ones, of which episodes, and what a press does."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,27 +13,48 @@ from tests.drive.live import Live
 from tests.drive.scenes import running, step_of
 from workbench.envs.step_result import StepResult
 from workbench.live.commands import ToggleCurve
-from workbench.live.history.curves import Curves, Group, StepCurves
+from workbench.live.events import EpisodeStepShown
+from workbench.live.history.curves import Column, Group, columns_of
+from workbench.live.history.moments import EpisodeNumbers
+from workbench.live.panels.reward_panel import BESIDE_COLOUR, COLOURS
 from workbench.live.past import TimelineView
-from workbench.live.timeline_commands import Seek, SeekOnCurve
+from workbench.live.timeline_commands import SeekOnCurve
 from workbench.live.view import SessionView
 
 JOINTS = ("hinge", "slide")
+ONE = COLOURS[0]
 
 
-def step(number: int, num_envs: int, success: float | None = 0.0, **entries: Any) -> StepResult:
-    evaluate = {} if success is None else {"success": np.full(num_envs, success, bool)}
-    result = step_of(np.zeros((num_envs, 1, 7), np.float32), **evaluate, **entries)
-    reward = np.arange(num_envs, dtype=np.float32) + number * num_envs
-    return replace(result, reward=reward, qpos=np.full((num_envs, 2), number, np.float32))
-
-
-def curves(length: int, num_envs: int, env: int = 0, success: float | None = 0.0, **entries: Any) -> Curves:
+def step(number: int, num_envs: int, **entries: Any) -> StepResult:
     """The reward of env k at step t is k + t N."""
-    steps = StepCurves(num_envs, JOINTS)
-    for number in range(1, length + 1):
-        steps.add(step(number, num_envs, success, **entries))
-    return steps.curves(env)
+    evaluate = {"success": np.zeros(num_envs, bool), **entries}
+    result = step_of(np.zeros((num_envs, 1, 7), np.float32), **evaluate)
+    reward = np.arange(num_envs, dtype=np.float32) + number * num_envs
+    moved = np.full((num_envs, 2), number, np.float32)
+    return replace(result, reward=reward, qpos=moved, elapsed_steps=np.full(num_envs, number, np.int32))
+
+
+class Episodes:
+    """A session in which each env is at step `length` of its episode, after `ended` equal ones."""
+
+    def __init__(self, live: Live, length: int, num_envs: int, ended: int = 0, **entries: Any) -> None:
+        self.live, self.length, self.num_envs, self.ended = live, length, num_envs, ended
+        self.entries = entries
+        live.session.answers["episodes"] = self.read
+
+    def read(self, env: int, last: int, columns: Sequence[Column], before: int) -> tuple[EpisodeNumbers, ...]:
+        steps = np.arange(1, self.length + 1)
+        made = [columns_of(step(int(number), self.num_envs, **self.entries), JOINTS) for number in steps]
+        values = {column: np.array([one[column][env] for one in made], np.float32) for column in columns}
+        return (EpisodeNumbers(steps, values, None),) * (1 + min(before, self.ended))
+
+    def view(self, env: int = 0, past: int | None = None) -> SessionView:
+        """A view after these steps; `past` is the shown step, if not the last."""
+        shown = step(self.length if past is None else past, self.num_envs, **self.entries)
+        timeline = TimelineView(0, self.length, past, tick=self.length, moments=self.length + 1)
+        view = running(self.num_envs, selected_env=env)
+        assert view.task is not None
+        return replace(view, step=shown, timeline=timeline, task=replace(view.task, joints=JOINTS))
 
 
 @pytest.fixture
@@ -42,144 +64,105 @@ def live(open_live: Live) -> Live:
     return open_live
 
 
-def reward(length: int, num_envs: int, env: int) -> list[float]:
-    return [env + number * num_envs for number in range(1, length + 1)]
+def reward(length: int, num_envs: int, env: int) -> list[list[float]]:
+    return [[number, env + number * num_envs] for number in range(1, length + 1)]
 
 
-def seen(length: int, num_envs: int, env: int = 0, past: int | None = None, **entries: Any) -> SessionView:
-    """A view after `length` steps; `past` is the shown step, if not the last."""
-    view = running(num_envs, curves=curves(length, num_envs, env, **entries), selected_env=env)
-    shown = step(length if past is None else past, num_envs)
-    timeline = TimelineView(0, length, past, tick=length if past is None else past)
-    assert view.task is not None
-    return replace(view, step=shown, timeline=timeline, task=replace(view.task, joints=JOINTS))
-
-
-def test_selected_env_against_the_mean(live: Live) -> None:
-    live.show(seen(5, 4, env=2))
+def test_the_episode_is_drawn_over_the_last_ten(live: Live) -> None:
+    live.show(Episodes(live, 5, 4, ended=20).view(env=2))
     chart = live.part("Reward").charts()[0]
-    x, mean, one = chart.data
-    assert x.tolist() == [1, 2, 3, 4, 5]
-    assert mean.tolist() == [1.5 + 4 * number for number in x] and one.tolist() == reward(5, 4, 2)
-    assert [series.get("label") for series in chart.series] == ["step", "mean of the batch", "env 2"]
+    np.testing.assert_allclose(chart.of(ONE), reward(5, 4, 2), atol=0.05)
+    assert chart.names == ["env 2"] and chart.cursor == pytest.approx(5, abs=0.01)
+    assert len(chart.of(BESIDE_COLOUR)) == 10 * 5
+
+
+def test_it_can_be_drawn_over_the_other_envs(live: Live) -> None:
+    episodes = Episodes(live, 5, 4, ended=20)
+    live.show(episodes.view(env=3))
+    live.part("Reward").set("Over", "the other envs")
+    live.show(episodes.view(env=3))
+    beside = live.part("Reward").charts()[0].of(BESIDE_COLOUR)
+    others = [point for env in (2, 1, 0) for point in reward(5, 4, env)]
+    np.testing.assert_allclose(beside, others, atol=0.05)
 
 
 @pytest.mark.thorough
-def test_a_long_run_is_sent_as_few_points(live: Live) -> None:
-    live.show(seen(3000, 2))
+def test_a_long_episode_is_drawn_as_few_points(live: Live) -> None:
+    live.show(Episodes(live, 3000, 2).view())
     for chart in live.part("Reward").charts():
-        assert {len(values) for values in chart.data} == {len(chart.data[0])} and len(chart.data[0]) < 1000
-        assert chart.data[0][0] == 1 and chart.data[0][-1] == 3000
+        points = chart.of(ONE)
+        assert len(points) < 1300
+        assert points[0, 0] == pytest.approx(1, abs=2) and points[-1, 0] == pytest.approx(3000, abs=2)
 
 
-def test_other_env_shows_its_own_past(live: Live) -> None:
-    live.show(seen(50, 4))
-    live.show(seen(50, 4, env=3))
-    chart = live.part("Reward").charts()[0]
-    assert chart.data[2].tolist() == reward(50, 4, 3)
-    assert chart.series[2].get("label") == "env 3"
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("length", [50, 3000])
-def test_the_shown_moment_is_a_dot_on_the_selected_envs_line(live: Live, length: int) -> None:
-    live.show(seen(length, 4, env=3, past=17))
+def test_the_cursor_is_at_the_shown_step(live: Live) -> None:
+    live.show(Episodes(live, 50, 4).view(env=3, past=17))
     drawn = live.part("Reward").charts()
     assert [chart.title for chart in drawn] == ["reward", "success"]
-    x, *_, dot = drawn[0].data
-    (at,) = np.flatnonzero(np.isfinite(dot))
-    assert abs(x[at] - 17) <= 8 and dot[at] == 3 + 17 * 4
-    assert [series.get("label") for series in drawn[0].series][-2:] == ["env 3", "shown"]
-    live.show(seen(length, 4, env=3))
-    assert "shown" not in [series.get("label") for series in live.part("Reward").charts()[0].series]
+    assert drawn[0].cursor == pytest.approx(17, abs=0.05) and drawn[0].legend == (("env 3", "71"),)
 
 
 def test_each_part_of_the_reward_has_a_line_of_the_selected_env(live: Live) -> None:
     terms: dict[str, Any] = {
         "reward_terms/reach": np.array([1.0, 2, 3]),
         "reward_terms/<b>": np.array([-1.0, -2, -3]),
+        "reward_terms/sum": np.zeros((3, 9)),
     }
-    view = seen(4, 3, env=1, **terms)
-    assert view.curves is not None
-    live.show(replace(view, curves=replace(view.curves, no_curve=("sum",))))
+    live.show(Episodes(live, 4, 3, **terms).view(env=1))
     *_, chart = live.part("Reward").charts()
-    assert chart.title == "reward terms, env 1"
-    assert [series.get("label") for series in chart.series] == ["step", "reach", "<b>"]
-    assert [values.tolist() for values in chart.data[1:]] == [[2.0] * 4, [-2.0] * 4]
-    assert "No curve of sum" in live.part("Reward").html() and "<b>" not in live.part(
-        "Reward"
-    ).html().replace("<b>⚑", "")
+    assert chart.title == "reward terms" and chart.legend == (("reach", "2"), ("<b>", "-2"))
+    assert chart.of(COLOURS[0])[:, 1] == pytest.approx([2.0] * 4, abs=0.01)
+    assert chart.of(COLOURS[1])[:, 1] == pytest.approx([-2.0] * 4, abs=0.01)
+    assert "No curve of sum" in live.part("Reward").html()
 
 
 def test_any_entry_or_joint_can_be_chosen_and_the_choice_is_kept_per_task(live: Live) -> None:
     entries = {"height": np.array([0.1, 0.2]), "at": np.ones((2, 3)), "touches": np.array([True, False])}
-    view = seen(3, 2, env=1, **entries)
+    view = Episodes(live, 3, 2, **entries).view(env=1)
     live.show(view)
     for entry in ((Group.EVALUATE, "height"), (Group.EVALUATE, "at"), (Group.JOINT, "slide")):
         live.part("Reward").ask(ToggleCurve(group=entry[0].value, name=entry[1]))
     live.part("Reward").ask(ToggleCurve(group="evaluate", name="success"))
     live.show(view)
-    assert [chart.title for chart in live.part("Reward").charts()] == [
-        "reward",
-        "height",
-        "at, env 1",
-        "joints, env 1",
-    ]
+    titles = ["reward", "height", "at", "joints"]
+    assert [chart.title for chart in live.part("Reward").charts()] == titles
     _, height, at, joints = live.part("Reward").charts()
-    np.testing.assert_allclose(height.data[1:], [[0.15] * 3, [0.2] * 3], rtol=1e-6)
-    assert [series.get("label") for series in at.series] == ["step", "at[0]", "at[1]", "at[2]"]
-    assert joints.data[1].tolist() == [1, 2, 3]
+    assert height.of(ONE)[:, 1] == pytest.approx([0.2] * 3, abs=0.01)
+    assert at.names == ["at[0]", "at[1]", "at[2]"]
+    np.testing.assert_allclose(joints.of(ONE), [[1, 1], [2, 2], [3, 3]], atol=0.01)
     assert view.task is not None
     live.show(replace(view, task=replace(view.task, class_name="Other")))
     assert [chart.title for chart in live.part("Reward").charts()] == ["reward", "success"]
     live.show(view)
-    assert [chart.title for chart in live.part("Reward").charts()] == [
-        "reward",
-        "height",
-        "at, env 1",
-        "joints, env 1",
-    ]
+    assert [chart.title for chart in live.part("Reward").charts()] == titles
 
 
-def test_a_click_on_a_curve_seeks_its_step_and_a_dropped_step_is_refused(live: Live) -> None:
-    view = seen(50, 2)
-    live.show(view)
-    live.do(SeekOnCurve(step=7))
-    assert live.asked == [Seek(step=7)]
-    kept = TimelineView(30, 50, 30, tick=31)
-    live.show(replace(view, timeline=kept))
-    assert (
-        "Step 7 is no longer in memory: step 31 is shown, the oldest one there" in live.part("Reward").html()
-    )
-    live.do(SeekOnCurve(step=40))
-    live.show(replace(view, timeline=replace(kept, shown=39, tick=40)))
-    assert "no longer in memory" not in live.part("Reward").html()
+def test_a_press_on_a_curve_shows_that_step_of_the_selected_envs_episode(live: Live) -> None:
+    live.show(Episodes(live, 50, 2).view(env=1))
+    live.part("Reward").ask(SeekOnCurve(step=1))
+    assert live.asked == [EpisodeStepShown(1, 1)]
 
 
 def test_no_curve_is_drawn_without_a_past(live: Live) -> None:
-    live.show(running(4, curves=None))
-    live.show(seen(1, 4))
+    live.show(running(4))
+    live.show(Episodes(live, 1, 4).view())
     assert (
         live.part("Reward").charts() == []
         and "Curves appear after the second step." in live.part("Reward").html()
     )
-    live.show(seen(2, 4))
+    live.show(Episodes(live, 2, 4).view())
     assert len(live.part("Reward").charts()) == 2 and "Curves appear" not in live.part("Reward").html()
-    live.show(seen(1, 4))
+    live.show(Episodes(live, 1, 4).view())
     assert live.part("Reward").charts() == []
 
 
-def test_envs_whose_reward_is_nan_are_counted_and_left_out_of_the_mean(live: Live) -> None:
-    steps = StepCurves(4)
-    for number in range(50):
-        result = step(number, 4)
-        if number >= 40:
-            result.reward[:3] = np.nan
-        steps.add(result)
-    live.show(replace(seen(50, 4), curves=steps.curves(0)))
-    chart = live.part("Reward").charts()[0]
-    assert chart.data[1][40:].tolist() == [3 + 4 * number for number in range(40, 50)]
-    assert np.isnan(chart.data[2][40:]).all()
-    assert "NaN in 3 of 4 envs; the mean is of the others" in live.part("Reward").html()
-    live.show(seen(50, 4))
+def test_envs_whose_reward_is_nan_are_counted(live: Live) -> None:
+    view = Episodes(live, 50, 4).view()
+    assert view.step is not None
+    lost = replace(
+        view.step, reward=np.array([np.nan, np.nan, np.nan, 1], np.float32), action=np.zeros((4, 1))
+    )
+    live.show(replace(view, step=lost))
+    assert "NaN in 3 of 4 envs" in live.part("Reward").html("wb-warn")
+    live.show(view)
     assert "NaN" not in live.part("Reward").html()

@@ -12,7 +12,6 @@ from tests.drive.env_rows import FELL, rows_of
 from tests.drive.live import Live
 from tests.drive.scenes import running
 from workbench.live.env_commands import (
-    FilterEnvs,
     NextFailedEnv,
     NextFlaggedEnv,
     ShowEnvAtEvent,
@@ -46,6 +45,7 @@ def many(**changes: Any) -> EnvRows:
         "last": last,
         "ended": odd,
         "succeeded": none,
+        "failed": none,
     }
     return rows_of(**{**values, **changes})
 
@@ -68,6 +68,11 @@ class Table:
     @property
     def html(self) -> str:
         return self.live.part("Envs").html()
+
+    def choose(self, shown: str) -> list[int]:
+        self.live.part("Envs").set("Show", shown)
+        self.live.again(0.1)
+        return self.envs()
 
     def ask(self, command: Command) -> list[int]:
         self.live.part("Envs").ask(command)
@@ -96,15 +101,15 @@ def test_pages_filters_and_rows_can_be_pressed(table: Table) -> None:
     )  # pressed on a page that was drawn before the last page of the table was shown
     table.live.again()
     assert table.envs() == list(range(ROWS_PER_PAGE, MANY))
-    assert table.ask(FilterEnvs(which="flagged")) == [MANY - 2, MANY - 1]
+    assert table.choose("flagged") == [MANY - 2, MANY - 1]
     assert "&lt;b&gt;odd" in table.html and "<b>odd" not in table.html
 
 
 def test_a_new_filter_or_order_starts_on_the_first_page(table: Table) -> None:
     table.ask(TurnEnvs(by=1))
-    assert table.ask(FilterEnvs(which="running")) == list(range(ROWS_PER_PAGE))
-    assert table.ask(FilterEnvs(which="failed")) == list(range(1, MANY, 2))
-    assert table.ask(FilterEnvs(which="all")) == list(range(ROWS_PER_PAGE))
+    assert table.choose("running") == list(range(ROWS_PER_PAGE))
+    assert table.choose("without success last") == list(range(1, MANY, 2))
+    assert table.choose("all envs") == list(range(ROWS_PER_PAGE))
     table.ask(TurnEnvs(by=1))
     assert table.ask(SortEnvs(column="return")) == list(range(ROWS_PER_PAGE))
     table.ask(TurnEnvs(by=1))

@@ -66,7 +66,7 @@ def test_cells_show_the_state_of_an_env() -> None:
     running, solved, _, cut, after, odd = cells_of(rows, np.arange(6))
     assert (running.state, running.steps, running.total) == ("running", "3", "1")
     assert (running.last, running.last_steps) == ("success", "41")
-    assert running.tally == "3 of 5 episodes ended in success"
+    assert running.tally == "5 episodes ended: 3 success, 1 failed, 1 time limit"
     assert (solved.state, solved.first_true, solved.last) == ("success", ("33", "20"), "")
     assert (cut.state, cut.total) == ("truncated", "")
     assert (after.last, after.last_steps) == ("fail", "9") and after.first_true == ("", "")

@@ -64,7 +64,7 @@ class EnvMoment:
         return int(slider.bounds[0]), int(slider.bounds[1]), slider.value
 
     def strip(self) -> str:
-        return self.panels.html("wb-timeline")
+        return self.panels.html("wb-timeline") + self.panels.html("wb-legend-row")
 
     def hand(self) -> np.ndarray:
         (hand, *_) = self.panels.bodies("arm hand")

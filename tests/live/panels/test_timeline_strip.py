@@ -9,7 +9,7 @@ import pytest
 from tests.drive.scenes import running
 from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.live.panels.timeline_panel import LINE_HEIGHT as HEIGHT
-from workbench.live.panels.timeline_panel import MAX_MARKS, REWARD_POINTS, reward_lines, strip_html
+from workbench.live.panels.timeline_panel import MAX_MARKS, STRIP_POINTS, reward_lines, strip_html
 from workbench.live.past import Strip, TimelineView
 
 
@@ -18,9 +18,9 @@ def strip(**changes: object) -> Strip:
         "low": 100,
         "high": 200,
         "events": ((100, RESET), (150, SUCCESS | TRUNCATED), (160, RESET), (180, WENT_BACK)),
-        "reward": np.linspace(0, 1, 101, dtype=np.float32),
+        "values": np.linspace(0, 1, 101, dtype=np.float32),
         "branches": ((180, 120),),
-        "segments": ((100, 159, False), (160, 179, False), (180, 200, True)),
+        "segments": ((100, 159, False, "success"), (160, 179, False, ""), (180, 200, True, "")),
     }
     return Strip(**{**values, **changes})  # type: ignore[arg-type]
 
@@ -45,7 +45,7 @@ def cursor(html: str) -> float:
 
 
 def test_marks_are_at_their_steps_and_name_the_most_important_event() -> None:
-    html = strip_html(strip(), running(4, timeline=past()))
+    html, legend = strip_html(strip(), running(4, timeline=past()))
     assert marks(html) == [
         (0.0, "reset", "reset, 100 steps ago"),
         (50.0, "success", "success, 50 steps ago"),
@@ -54,34 +54,34 @@ def test_marks_are_at_their_steps_and_name_the_most_important_event() -> None:
     ]
     assert re.findall(r'<path d="([^"]*)"', html) == ["M 20.0 0 Q 50.0 -26 80.0 0"]
     assert ">live<" in html and cursor(html) == 100.0
-    legend = re.findall(r'wb-key wb-mark-(\w+)"></i>([^<]*)<', html)
-    assert legend == [("success", "success"), ("back", "went back"), ("reset", "reset")]
+    found = re.findall(r'wb-key wb-mark-(\w+)"></i>([^<]*)<', legend)
+    assert found == [("success", "success"), ("back", "went back"), ("reset", "reset")]
 
 
 def test_a_band_is_a_stretch_without_a_jump() -> None:
-    html = strip_html(strip(), running(4, timeline=past()))
+    html, _ = strip_html(strip(), running(4, timeline=past()))
     bands = re.findall(r'<rect x="([\d.]+)" y="-14" width="([\d.]+)" height="46" class="([^"]*)"', html)
     assert bands == [
-        ("0.0", "59.0", "wb-band"),
-        ("60.0", "19.0", "wb-band wb-odd"),
-        ("80.0", "20.0", "wb-band wb-branch"),
+        ("0.0", "58.8", "wb-band wb-ended-success"),
+        ("60.0", "18.8", "wb-band wb-odd"),
+        ("80.0", "19.8", "wb-band wb-branch"),
     ]
 
 
 def test_a_branch_from_a_recording_or_from_before_the_strip_is_shown() -> None:
-    html = strip_html(strip(branches=()), running(4, timeline=past()))
+    html, _ = strip_html(strip(branches=()), running(4, timeline=past()))
     assert marks(html)[-1] == (80.0, "back", "from a recording, 20 steps ago") and "<path" not in html
-    html = strip_html(strip(low=150, branches=((180, 120),)), running(4, timeline=past()))
+    html, _ = strip_html(strip(low=150, branches=((180, 120),)), running(4, timeline=past()))
     assert re.findall(r'<path d="([^"]*)"', html) == ["M 0.0 0 Q 30.0 -26 60.0 0"]
 
 
-@pytest.mark.parametrize("count", [2, REWARD_POINTS, REWARD_POINTS + 1, 15_000])
+@pytest.mark.parametrize("count", [2, STRIP_POINTS, STRIP_POINTS + 1, 15_000])
 def test_a_one_step_spike_stays_in_the_line(count: int) -> None:
     reward = np.zeros(count, np.float32)
     reward[count // 3] = 5.0
     (line,) = reward_lines(reward)
     points = [tuple(map(float, point.split(","))) for point in line.split()]
-    assert len(points) <= REWARD_POINTS
+    assert len(points) <= STRIP_POINTS
     assert min(y for _, y in points) == 0.0 and max(y for _, y in points) == HEIGHT == 30.0
     assert all(0 <= x <= 100 for x, _ in points)
 
@@ -97,21 +97,21 @@ def test_a_missing_reward_is_a_gap_and_a_constant_one_a_straight_line() -> None:
     ]
     many = np.tile(np.array([np.nan, 1, 2], np.float32), 1000)
     assert len(reward_lines(many)) == 1, "narrower than a pixel"
-    html = strip_html(strip(reward=many[:101]), running(4, timeline=past()))
+    html, _ = strip_html(strip(values=many[:101]), running(4, timeline=past()))
     assert "nan" not in html and html.count("<polyline") > 1
     view = running(4, timeline=past())
     assert view.task is not None
     without = replace(view, task=replace(view.task, reward_mode="none"))
-    assert "<polyline" not in strip_html(strip(reward=np.zeros(101, np.float32)), without)
+    assert "<polyline" not in strip_html(strip(values=np.zeros(101, np.float32)), without)[0]
 
 
 def test_of_many_events_each_part_of_the_strip_shows_the_worst() -> None:
     ends = ((tick, (FAIL if tick % 1000 == 0 else TRUNCATED) | RESET) for tick in range(0, 100_000, 50))
-    html = strip_html(
+    html, _ = strip_html(
         strip(low=0, high=100_000, events=tuple(ends), branches=()), running(4, timeline=past())
     )
     drawn = marks(html)
     assert len(drawn) == MAX_MARKS and min(drawn)[0] == 0.0 and max(drawn)[0] > 99
     assert sum(style == "fail" for _, style, _ in drawn) == 100
-    both = strip_html(strip(events=((190, REWARD_NONFINITE | RESET),)), running(4, timeline=past()))
+    both, _ = strip_html(strip(events=((190, REWARD_NONFINITE | RESET),)), running(4, timeline=past()))
     assert marks(both) == [(90.0, "odd", "reward is NaN or infinite, 10 steps ago")]

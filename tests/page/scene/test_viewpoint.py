@@ -11,12 +11,13 @@ from tests.drive.scenes import running, table_scene
 from tests.drive.tabs import camera_message, handshake
 from tests.drive.waiting import until
 from workbench.envs.camera_data import Picture
-from workbench.live.panels.view_panel import ViewPanel
+from workbench.live.env_commands import ShowEnvs, ToggleOnlySelected
+from workbench.live.panels.view_panel import ViewIcons, ViewPanel
+from workbench.page.commands import ShowFrustums, ToggleTheme
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import lay_out
 from workbench.page.scene.viewpoint import (
     FOV_RADIANS,
-    ONE,
     Framing,
     ViewChoice,
     Viewpoint,
@@ -115,22 +116,35 @@ def test_a_page_is_reframed_on_resize_until_the_user_moves_the_view(
         assert np.allclose(client.camera.position, moved), "the view is kept after the review"
 
 
-def test_choices_in_the_view_panel_apply_to_later_pages(panels: Panels) -> None:
+def test_choices_of_the_view_apply_to_later_pages(panels: Panels) -> None:
     choice = ViewChoice()
     panel = ViewPanel(panels.server, dark=True, chosen=choice)
     panels.visitors.do = panel.do
-    panel.draw(running(1))
-    assert not panels.shows("Show")
-    panel.draw(running(4))
-    panels.set("Show", ONE)
     panels.set("Detail", "coarse")
     panels.set("Theme", "light")
     panel.draw(running(4))
-    assert [panels.field(name).value for name in ("Show", "Detail", "Theme")] == [ONE, "coarse", "light"]
-    assert panel.only_selected and panel.looks == DrawStyle(50_000, False)
-    panel.toggle_only_selected()
-    panel.toggle_dark()
+    assert [panels.field(name).value for name in ("Detail", "Theme")] == ["coarse", "light"]
+    assert panel.looks == DrawStyle(50_000, False)
+    panels.do(ToggleTheme())
     panel.draw(running(4))
-    assert [panels.field(name).value for name in ("Show", "Theme")] == ["all envs", "dark"]
+    assert panels.field("Theme").value == "dark"
     with panels.server.gui.add_folder("The next page"):
         assert ViewPanel(panels.server, chosen=choice).looks == DrawStyle(50_000, True)
+
+
+def test_the_selected_env_or_all_envs_are_shown_as_chosen_for_the_task(panels: Panels) -> None:
+    choice = ViewChoice()
+    icons = ViewIcons(panels.server, choice, "push.py")
+    panels.visitors.do = icons.do
+    icons.draw(running(1))
+    assert "env 0" not in panels.html("wb-view-icons"), "there is nothing to choose of a single env"
+    icons.draw(running(4))
+    assert icons.only_selected and "env 0" in panels.html("wb-view-icons")
+    panels.ask(ShowEnvs(all_envs=True))
+    assert not icons.only_selected
+    assert not ViewIcons(panels.server, choice, "push.py").only_selected, "also after the review"
+    assert ViewIcons(panels.server, choice, "pick.py").only_selected
+    panels.do(ToggleOnlySelected())
+    assert icons.only_selected
+    panels.ask(ShowFrustums(on=False))
+    assert not choice.frustums

@@ -1,39 +1,44 @@
-"""An existing chart is only sent data; what a browser draws is tested in ``tests/browser/test_charts.py``."""
+"""Charts of lines over steps."""
 
 from __future__ import annotations
 
-import numpy as np
-import viser
+from html import unescape
 
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.charts import charts_in
 from tests.drive.panels import Panels
-from workbench.page.widgets.line_chart import ROTATED_CHARTS, YES_OR_NO, ChartLine, LineChart, span_of
+from workbench.live.timeline_commands import Seek
+from workbench.page.widgets.line_chart import YES_OR_NO, ChartLine, LineChart, chart_html, span_of, ticks
+from workbench.page.widgets.templates import asks
 
 X = np.arange(3.0)
 Y = np.array([0.5, np.nan, 1.0])
 LINES = (ChartLine("one", Y),)
 
 
-def test_new_data_reuse_the_chart_and_other_lines_need_a_new_one(server: viser.ViserServer) -> None:
-    chart = LineChart(server, server.gui.add_folder(None), 150)
-    chart.draw("reward", X, LINES)
-    first = chart.handle
-    chart.draw("reward", X, (ChartLine("one", Y + 1),))
-    assert chart.handle is first and first is not None
-    np.testing.assert_array_equal(first.data[1], Y + 1)
-    for lines, dot, span in (
-        (LINES, None, None),
-        (LINES, Y, None),
-        (LINES, Y, YES_OR_NO),
-        ((ChartLine("one", Y, "#000000"),), Y, YES_OR_NO),
-        ((ChartLine("one", Y, "#000000", 1.0),), Y, YES_OR_NO),
-    ):
-        before = chart.handle
-        chart.draw("reward of env 1", X, lines, dot, span)
-        assert chart.handle is not before
+def test_a_line_is_drawn_at_its_numbers_with_gaps_and_the_legend_has_the_value_at_the_cursor() -> None:
+    lines = ChartLine("", np.array([0.0, 1.0, 2.0]), "#868e96"), ChartLine("<one>", Y, "#228be6")
+    (chart,) = charts_in(chart_html("reward", X, lines, at=2.0))
+    assert chart.title == "reward" and chart.legend == (("<one>", "1"),) and chart.cursor == pytest.approx(2)
+    np.testing.assert_allclose(chart.of("#868e96"), [[0, 0], [1, 1], [2, 2]], atol=0.01)
+    np.testing.assert_allclose(chart.of("#228be6")[[0, -1]], [[0, 0.5], [2, 1]], atol=0.01)
+    assert len(chart.lines) == 3, "the gap splits the second line into two"
+
+
+def test_a_press_sends_the_step_under_it() -> None:
+    html = chart_html(
+        "reward", np.arange(5, 55), [ChartLine("one", np.arange(50.0))], press=lambda k: Seek(step=k)
+    )
+    assert f'data-do="{asks(Seek(step=5))}"' in unescape(html) and "data-along='[\"step\", 5, 54]'" in html
+    assert "data-do" not in chart_html("reward", X, LINES)
 
 
 def test_a_chart_without_numbers_or_with_a_single_x_is_hidden(panels: Panels) -> None:
-    chart = LineChart(panels.server, panels.server.gui.add_folder(None), 150)
+    chart = LineChart(panels.server, 150)
     nothing = ChartLine("two", np.array([np.nan, np.inf, np.nan]))
     chart.draw("reward", X, (nothing, *LINES))
     for x, lines in ((X, ()), (X, (nothing,)), (X[:1], (ChartLine("one", Y[:1]),))):
@@ -43,21 +48,21 @@ def test_a_chart_without_numbers_or_with_a_single_x_is_hidden(panels: Panels) ->
         chart.draw("reward", X, LINES)
 
 
-def test_charts_share_one_place_and_one_of_them_is_shown(panels: Panels) -> None:
-    folder = panels.server.gui.add_folder(None)
-    upper, lower = LineChart(panels.server, folder, 150), LineChart(panels.server, folder, 150)
-    upper.draw("reward", X, LINES)
-    lower.draw("success", X, LINES)
-    seen = [upper.handle]
-    for env in range(5):
-        upper.draw(f"reward of env {env}", X, LINES)
-        assert upper.handle is not None and lower.handle is not None and upper.handle not in seen[-2:]
-        assert upper.handle.title == f"reward of env {env}" and upper.handle.order < lower.handle.order
-        seen.append(upper.handle)
-        assert sorted(panels.charts(), key=lambda chart: chart.order) == [upper.handle, lower.handle]
-    assert len(panels.charts(hidden=True)) == ROTATED_CHARTS + 1
-    upper.hide()
-    assert panels.charts() == [lower.handle]
+@pytest.mark.parametrize("value", [0.0, -3.0, 1e9])
+def test_a_constant_is_a_line_in_the_middle(value: float) -> None:
+    html = chart_html("reward", X, [ChartLine("one", np.full(3, value))])
+    assert 'points="0,50 50,50 100,50"' in html
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6))
+def test_an_axis_has_a_few_round_numbers_within_its_ends(low: float, size: float) -> None:
+    high = low + size
+    if not low < high:
+        return
+    found = ticks(low, high)
+    slack = 1e-6 * size
+    assert len(found) <= 5 and all(low - slack <= one <= high + slack for one in found)
+    assert len(found) >= 1
 
 
 def test_booleans_have_a_fixed_range_and_numbers_the_range_of_the_data() -> None:

@@ -178,7 +178,7 @@ def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
     return; it renders no picture. It reports a length that differs from 1 by more than 0.001. Cameras of the
     robot are left out.
 
-    The page shows the picture that ManiSkill renders. *Studio* writes a unit quaternion, with which the
+    The page shows the picture that ManiSkill renders. It writes a unit quaternion, with which the
     camera looks where the call of `look_at` aims.
     """
     configs = checkup.look(hook_configs)

@@ -5,22 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from workbench.envs.step_result import TERM_PREFIX, StepResult
 
-MAX_COLUMNS = 64
-"""Maximum number of columns: the first ones of `columns_of` are kept."""
 MAX_PARTS = 8
 """Maximum number of numbers in one entry; a longer entry has no curve."""
 _MAX_SPANS = 400
 """Maximum number of spans of a curve, two points each: more do not fit into the panel's 300 pixels."""
-_MAX_SPANS_TIMES_ENVS = 2**17
-"""Limit of spans times envs: with `MAX_COLUMNS` columns of 17 bytes the curves take at most 140 MB, 7 MB for 16 envs."""
-_MIN_SPANS = 64
 _FIRST_ROWS = 1024
 
 
@@ -152,7 +147,29 @@ def without_curve(step: StepResult) -> tuple[str, ...]:
     )
 
 
-# --- all steps in bounded memory ----------------------------------------------------------------------
+def number_of(step: StepResult, column: Column, env: int, joints: Sequence[str] = ()) -> float:
+    """The number of one env in one column of `columns_of`; NaN if the step has none."""
+    group, name, part = column
+    if group is Group.REWARD:
+        return float(step.reward[env])
+    if group is Group.JOINT:
+        return (
+            float("nan")
+            if step.qpos is None or name not in joints
+            else float(step.qpos[env, joints.index(name)])
+        )
+    values = step.evaluate.get(TERM_PREFIX + name if group is Group.TERM else name)
+    if values is not None and values.size:
+        flat = values.reshape(len(step.reward), -1)
+        return float(flat[env, part or 0]) if (part or 0) < flat.shape[1] else float("nan")
+    other = step.others.get(name)
+    there = other is not None and other.numbers is not None and other.numbers.size == 1
+    return (
+        float(other.numbers.reshape(-1)[0]) if there and other and other.numbers is not None else float("nan")
+    )
+
+
+# --- few points for many steps ------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +227,7 @@ class Spans:
 
 
 def spans_of(values: NDArray[np.floating], most: int = _MAX_SPANS, first: int = 1) -> Spans:
-    """The spans of whole lines (L, T), at most `most` of them; equal to those that `StepCurves` builds step by step.
+    """The spans of whole lines (L, T), at most `most` of them.
 
     Args:
         first: the step of the first number.
@@ -239,142 +256,3 @@ def spans_of(values: NDArray[np.floating], most: int = _MAX_SPANS, first: int = 
         values[:, -1] if count else np.full(lines, np.nan),
         first,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Curves:
-    """Curves of one env and of the mean over the batch, over all control steps."""
-
-    serial: int
-    """Control steps so far, resets left out: the step of the newest numbers. The first is 1, as in a recording."""
-    env: int
-    columns: tuple[Column, ...]
-    spans: Spans
-    """Two lines for each of `columns`, in turn: the env's, and the mean of the envs whose number is finite."""
-    newest: NDArray[np.float32]
-    """(N,) rewards of the newest step."""
-    no_curve: tuple[str, ...] = ()
-    """Names of the last step's reward terms that are not one number per env."""
-
-    def lines(self, wanted: Sequence[tuple[Column, bool]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(K,) steps and (L, K) numbers of these columns, each of the env or (True) the mean; NaN for a missing column.
-        See `Spans.points`."""
-        places = {column: 2 * k for k, column in enumerate(self.columns)}
-        rows = [places[column] + mean for column, mean in wanted]
-        of = self.spans
-        picked: list[Any] = [part[rows] for part in (of.low, of.high, of.low_at, of.high_at, of.gap, of.last)]
-        return Spans(of.width, of.end, *picked, first=of.first).points()
-
-
-_Parts = tuple[NDArray, NDArray, NDArray, NDArray, NDArray]
-"""``low``, ``high``, ``low_at``, ``high_at`` and ``gap`` of spans, each (N + 1, C, B); the last row is the mean."""
-
-
-class StepCurves:
-    """The numbers of all envs over all control steps, in bounded memory: when the spans are full, each two are joined into
-    one of twice the width."""
-
-    def __init__(self, num_envs: int, joints: Sequence[str] = ()) -> None:
-        """
-        Args:
-            joints: names of `StepResult.qpos`.
-        """
-        self._num_envs, self._joints = num_envs, tuple(joints)
-        self._most = min(_MAX_SPANS, max(_MIN_SPANS, _MAX_SPANS_TIMES_ENVS // (num_envs + 1))) // 2 * 2
-        self._columns: list[Column] = []
-        self._width = 1
-        self._parts = self._empty(0)
-        self._last = np.full((num_envs + 1, 0), np.nan, np.float32)
-        self._newest = np.full(num_envs, np.nan, np.float32)
-        self._no_curve: tuple[str, ...] = ()
-        self._found: Curves | None = None
-        self.count = 0
-        """Control steps so far."""
-
-    def add(self, step: StepResult) -> None:
-        """Add a control step; do not add resets, since they have no reward."""
-        found = columns_of(step, self._joints)
-        self._no_curve, self._newest, self._found = without_curve(step), step.reward, None
-        self._make_columns(found)
-        values = np.full((self._num_envs + 1, len(self._columns)), np.nan, np.float32)
-        for k, column in enumerate(self._columns):
-            if column in found:
-                values[:-1, k] = found[column]
-        values[-1] = mean_of_numbers(values[:-1])
-        if self.count // self._width == self._most:
-            self._join()
-        span = self.count // self._width
-        self.count += 1
-        low, high, low_at, high_at, gap = (part[..., span] for part in self._parts)
-        finite = np.isfinite(values)
-        lower, higher = finite & ~(low <= values), finite & ~(high > values)
-        low[lower], high[higher] = values[lower], values[higher]
-        low_at[lower] = high_at[higher] = self.count
-        gap |= ~finite
-        self._last = values
-
-    def curves(self, env: int) -> Curves:
-        """Curves of one env, as copies, since spans change until they are full and when they are joined."""
-        if self._found is None or self._found.env != env:
-            rows, used = [min(env, self._num_envs - 1), self._num_envs], -(-self.count // self._width)
-
-            def taken(part: NDArray) -> NDArray:
-                return part[rows].swapaxes(0, 1).reshape(2 * len(self._columns), *part.shape[2:])
-
-            low, high, low_at, high_at, gap = (taken(part[..., :used]) for part in self._parts)
-            last = taken(self._last)
-            spans = Spans(self._width, self.count, low, high, low_at, high_at, gap, last)
-            columns = tuple(self._columns)
-            self._found = Curves(self.count, env, columns, spans, self._newest, self._no_curve)
-        return self._found
-
-    def _make_columns(self, found: Mapping[Column, NDArray]) -> None:
-        new = [column for column in found if column not in self._columns]
-        if not new:
-            return
-        if len(self._columns) + len(new) > MAX_COLUMNS:
-            # Drop columns that a new version of the task no longer has.
-            places = [k for k, column in enumerate(self._columns) if column in found]
-            self._columns = [self._columns[k] for k in places]
-            low, high, low_at, high_at, gap = (part[:, places] for part in self._parts)
-            self._parts = low, high, low_at, high_at, gap
-        new = new[: MAX_COLUMNS - len(self._columns)]
-        self._columns += new
-        self._extend(self._parts, self._empty(len(new)), axis=1)
-
-    def _join(self) -> None:
-        """Join each two spans."""
-        self._width *= 2
-        left, right = ([part[..., side::2] for part in self._parts] for side in (0, 1))
-        lower = np.isnan(left[0]) | (right[0] < left[0])
-        higher = np.isnan(left[1]) | (right[1] >= left[1])
-        joined = (
-            np.where(lower, right[0], left[0]),
-            np.where(higher, right[1], left[1]),
-            np.where(lower, right[2], left[2]),
-            np.where(higher, right[3], left[3]),
-            left[4] | right[4],
-        )
-        low, high, low_at, high_at, gap = (
-            part[..., self._most // 2 :] for part in self._empty(len(self._columns))
-        )
-        self._extend(joined, (low, high, low_at, high_at, gap), axis=2)
-
-    def _extend(self, parts: _Parts, further: _Parts, axis: int) -> None:
-        low, high, low_at, high_at, gap = (
-            np.concatenate(pair, axis=axis) for pair in zip(parts, further, strict=True)
-        )
-        self._parts = low, high, low_at, high_at, gap
-
-    def _empty(self, columns: int) -> _Parts:
-        shape = self._num_envs + 1, columns, self._most
-        low, high = (np.full(shape, np.nan, np.float32) for _ in range(2))
-        low_at, high_at = (np.zeros(shape, np.int32) for _ in range(2))
-        return low, high, low_at, high_at, np.zeros(shape, bool)
-
-
-def mean_of_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(...) mean of (N, ...) over the envs with a finite value; NaN where there is none."""
-    there = np.isfinite(values)
-    total, count = np.where(there, values, 0.0).sum(axis=0, dtype=np.float64), there.sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)

@@ -77,6 +77,9 @@ class EnvRows:
     """(N,) number of episodes that ended since the task was loaded."""
     succeeded: NDArray[np.int64]
     """(N,) number of the ended episodes that ended in success."""
+    failed: NDArray[np.int64]
+    """(N,) number of the ended episodes that ended by fail, or were terminated without success. The rest reached the time
+    limit."""
     rewards: NDArray[np.float32]
     """(N, `KEPT_REWARDS`) rewards, oldest first; NaN before the episode's start. (N, 0) in a moment of the history."""
 
@@ -134,6 +137,7 @@ class EnvTable:
             last=LastEpisode(zero, never, nothing, {}),
             ended=none,
             succeeded=none,
+            failed=none,
             rewards=self._rewards[:, :0].copy(),
         )
         self._begin(np.ones(count, bool), first)
@@ -212,6 +216,7 @@ class EnvTable:
                 end=np.where(ends, step.elapsed_steps, now.end),
                 ended=now.ended + ends,
                 succeeded=now.succeeded + (ends & success),
+                failed=now.failed + (ends & ~success & step.terminated),
             )
 
     def _break(self, rule: str, sight: OutlierSighting, step: StepResult) -> bool:

@@ -18,7 +18,7 @@ from workbench.envs.gpu_rules import Finding
 from workbench.envs.outliers import OutlierKind
 from workbench.envs.snapshots.packing import WholeSnapshot
 from workbench.envs.step_result import TERM_PREFIX, StepResult
-from workbench.live.history.curves import Columns, StepCurves
+from workbench.live.history.curves import REWARD, Column, Columns, number_of
 from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, EnvTable
 from workbench.live.messages import PastPictures, Pictures, ReplayPath
 from workbench.task.description import NO_MOMENT, Restored, Stepped
@@ -30,6 +30,8 @@ _OVERHEAD_BYTES = 2500
 _PICTURES_SHARE = 0.5
 """Share of the memory limit for pictures: they are by far the largest (a human camera's is 0.8 MB; a step of 16
 PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be rendered again."""
+_MAX_ENDED = 64
+"""Maximum number of ended episodes whose numbers are kept ready for curves."""
 _RECENT_MOMENTS = 200
 """Number of newest moments in which a picture's moment is searched: pictures arrive some steps late."""
 
@@ -100,7 +102,7 @@ class Moment:
     """(N,) mask as in `Stepped.reset_mask`."""
     seeds: NDArray[np.int64] | None
     tick: int
-    """`Curves.serial` of this moment."""
+    """Number of control steps up to this moment, of the whole batch."""
     event_flags: NDArray[np.uint8]
     """(N,) event flags (`RESET` ...), combined."""
     restored: Restored | None
@@ -131,6 +133,18 @@ class Moment:
 EnvMoment = tuple[Moment, int]
 """A moment of an episode, and the env's number in it. The number differs where the env continued from another env's
 moment."""
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeNumbers:
+    """Numbers of one env's episode, up to some moment."""
+
+    steps: NDArray[np.int64]
+    """(T,) control steps of the episode, as far as they are kept."""
+    values: dict[Column, NDArray[np.float32]]
+    """(T,) numbers after each of these steps."""
+    before: int | None
+    """Serial of the moment before the reset with which the episode began; None if that moment is not kept."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +195,11 @@ class History:
         self._jumps: deque[Moment] = deque()
         self._columns = Columns(num_envs, first_serial)
         self._ticks = Columns(1, first_serial)
-        self.steps = StepCurves(num_envs, joints)
+        self._joints = tuple(joints)
+        self._ended: dict[tuple[int, int], EpisodeNumbers] = {}
+        """Numbers of ended episodes, by env and serial of the last moment."""
+        self.count = 0
+        """Control steps so far."""
 
     # --- events ------------------------------------------------------------------------------------
 
@@ -200,8 +218,7 @@ class History:
             None if origin is None else origin.rows,
             lambda env: self._rewards_until(env, origin, KEPT_REWARDS),
         )
-        if not jumps:
-            self.steps.add(stepped.step)
+        self.count += not jumps
         snapshot = None
         if stepped.snapshot and parts.content is not None:
             snapshot = WholeSnapshot(stepped.snapshot, parts.content)
@@ -212,7 +229,7 @@ class History:
             step=stepped.step,
             jumped=stepped.reset_mask,
             seeds=stepped.seeds,
-            tick=self.steps.count,
+            tick=self.count,
             event_flags=self._events(stepped, rows),
             restored=restored,
             number=stepped.number,
@@ -347,9 +364,51 @@ class History:
         event_flags = self._columns.between("event_flags", low, min(high, self.last))[:, env]
         return [(low + int(k), int(event_flags[k])) for k in np.flatnonzero(event_flags)]
 
-    def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
-        """(K,) rewards of this env between two moments, both included; NaN where it was reset."""
-        return self._columns.between("reward", max(low, self.first), min(high, self.last))[:, env]
+    def numbers(self, env: int, low: int, high: int, column: Column = REWARD) -> NDArray[np.float32]:
+        """(K,) numbers of this env between two moments, both included; the reward is NaN where it was reset."""
+        low, high = max(low, self.first), min(high, self.last)
+        if column == REWARD:
+            return self._columns.between("reward", low, high)[:, env]
+        found = (number_of(moment.step, column, env, self._joints) for moment in self.between(low, high))
+        return np.fromiter(found, np.float32)
+
+    def episodes(
+        self, env: int, serial: int, columns: Sequence[Column], before: int
+    ) -> tuple[EpisodeNumbers, ...]:
+        """Numbers of this env's episode up to a moment, and of at most `before` episodes before it; the newest first. Episodes
+        without a control step are left out, except the first."""
+        found = [self._episode_numbers(env, serial, columns)]
+        last = found[0].before
+        while last is not None and len(found) <= before:
+            key = env, last
+            known = self._ended.pop(key, None)
+            if known is None or not known.values.keys() >= {*columns}:
+                known = self._episode_numbers(env, last, columns)
+            # The episodes that were asked for last stay.
+            self._ended[key] = known
+            if len(known.steps):
+                found.append(known)
+            last = known.before
+        while len(self._ended) > _MAX_ENDED:
+            del self._ended[next(iter(self._ended))]
+        return tuple(found)
+
+    def _episode_numbers(self, env: int, serial: int, columns: Sequence[Column]) -> EpisodeNumbers:
+        moments = [*self.episode_backwards(env, serial)][::-1]
+        steps = [one for one in moments if not one[0].jumped.any()]
+        values = {
+            column: np.array(
+                [number_of(moment.step, column, of, self._joints) for moment, of in steps], np.float32
+            )
+            for column in columns
+        }
+        first = moments[0][0] if moments else None
+        begins = first is not None and first.jumped.any() and self.first < first.serial
+        return EpisodeNumbers(
+            np.array([moment.step.elapsed_steps[of] for moment, of in steps], np.int64),
+            values,
+            first.serial - 1 if first is not None and begins else None,
+        )
 
     def jumps_back(self, env: int) -> list[tuple[int, int]]:
         """Serials of the moments at which this env went back, each with the serial that it went back to."""
@@ -494,7 +553,8 @@ class History:
                     terms.setdefault(name, np.full(values.shape, np.nan, np.float32))[to] = values[of]
 
         kept = np.flatnonzero(~jumped | stepped.resumed)
-        if self._moments and len(kept):
+        if self._moments:
+            # Also if every env was reset: an entry that disappears for one moment would move all below it on the page.
             take(self._moments[-1].step, kept, kept)
         if restored is not None and origin is not None:
             take(origin.step, list(restored.env_idx), list(restored.source))

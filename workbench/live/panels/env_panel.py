@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -24,37 +24,35 @@ from workbench.live.events import EpisodeStepShown, SettingsChanged
 from workbench.live.history.env_table import EnvRows, Outcome
 from workbench.live.panels.env_columns import DOT_PIXELS, EnvColumn, levels, wanted_width
 from workbench.live.panels.moment import MomentPart
-from workbench.live.panels.timeline_panel import polylines
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.machine.text import number_text
 from workbench.page.command import Command, Refused
 from workbench.page.commands import TellUnfolded
+from workbench.page.widgets.fields import choice
+from workbench.page.widgets.line_chart import polylines
 from workbench.page.widgets.paged import Paged
-from workbench.page.widgets.templates import render
+from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.visitors import Visitor
 
 Filter = Literal["all", "failed", "running", "flagged"]
-FILTERS: dict[Filter, tuple[str, str, str]] = {
-    "all": ("all", "Every env", "There is no env."),
-    "failed": (
-        "last failed",
-        "The last finished episode ended without success: by fail, or at the time limit",
-        "No env's last episode failed.",
-    ),
-    "running": (
-        "running",
-        "The current episode has not ended yet",
-        "No env is running.",
-    ),
-    "flagged": (
-        "flagged",
-        "Something odd in the current or the previous episode",
-        "No env is flagged.",
-    ),
+FILTERS: dict[Filter, tuple[str, str]] = {
+    "all": ("all envs", "There is no env."),
+    "failed": ("without success last", "Every env's last episode ended in success."),
+    "running": ("running", "No env is running."),
+    "flagged": ("flagged", "No env is flagged."),
 }
-"""Label of the button, hint, and text of an empty table. "last failed", not "failed": a running env may have failed
-before, and "failed 16" next to "running 16" confuses."""
+"""Label of the choice, and text of an empty table."""
+FILTER_HINT = (
+    "without success last: the last finished episode ended by fail or at the time limit. "
+    "flagged: something odd in the current or the previous episode."
+)
+WORDS = {
+    Outcome.RUNNING: "running",
+    Outcome.SUCCESS: "success",
+    Outcome.FAIL: "failed",
+    Outcome.TRUNCATED: "time limit",
+}
 TABLE = "envs"
 """Name of the panel in the page's report that the panel was unfolded."""
 MAX_DEFAULT_ENTRIES = 6
@@ -108,8 +106,8 @@ def gives_way(entries: tuple[str, ...], chosen: Mapping[str, bool], sorted_by: s
     more = [f"first {name}" for name in others if name not in ("success", "fail")]
     fail, success = ([f"first {name}"] if name in others else [] for name in ("fail", "success"))
     # Flags go first: flagged envs also have a mark above the tabs.
-    in_turn = ["flags", *more, "last", *fail, REWARD_CURVE, "steps", *(f"first {name}" for name in added)]
-    ranked = [column for column in (*in_turn, *success, "return") if column != sorted_by]
+    in_turn = ["flags", *more, "last", *fail, *success, *(f"first {name}" for name in added)]
+    ranked = [column for column in (*in_turn, REWARD_CURVE, "steps", "return") if column != sorted_by]
     return {column: rank for rank, column in enumerate(ranked)}
 
 
@@ -181,11 +179,27 @@ def make_rows(
                 "last": ("cut short" if last == "running" else last) if had_one else "",
                 "last_steps": str(int(rows.last.steps[env])),
                 "last_state": last,
-                "tally": f"{rows.succeeded[env]} of {rows.ended[env]} episodes ended in success",
+                "tally": f"{counted(int(rows.ended[env]), 'episode')} ended: {ended_text(rows, [env])}",
                 "flags": tuple(now + before),
             }
         )
     return made
+
+
+def ended_text(rows: EnvRows, envs: Sequence[int] | slice = slice(None)) -> str:
+    """How the ended episodes of these envs ended: ``3 success, 1 failed, 2 time limit``."""
+    return ", ".join(f"{count} {word}" for _, word, count in ended_counts(rows, envs))
+
+
+def ended_counts(rows: EnvRows, envs: Sequence[int] | slice = slice(None)) -> list[tuple[str, str, int]]:
+    """Name, word and number of the ended episodes of these envs for each way to end."""
+    success, fail, all_of_them = (int(n[envs].sum()) for n in (rows.succeeded, rows.failed, rows.ended))
+    counts = {
+        Outcome.SUCCESS: success,
+        Outcome.FAIL: fail,
+        Outcome.TRUNCATED: all_of_them - success - fail,
+    }
+    return [(outcome.name.lower(), WORDS[outcome], count) for outcome, count in counts.items()]
 
 
 def _keys(rows: EnvRows, column: str) -> NDArray[np.float64]:
@@ -270,6 +284,8 @@ class EnvPanel(MomentPart):
 
     def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
         self._session = session
+        names = {label: name for name, (label, _) in FILTERS.items()}
+        self._which = choice(server, "Show", FilterEnvs, "which", names, "all", hint=FILTER_HINT)
         self._handle = server.gui.add_html("")
         server.gui.add_html(render("tell", command=TellUnfolded(panel=TABLE)))
         self._sort = "env", False
@@ -333,6 +349,7 @@ class EnvPanel(MomentPart):
             return
         self._drawn_task = view.task_serial
         rows = self._session.env_rows()
+        self._which.show(self._filter, off=rows is None)
         content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
         self._handle.content = content
 
@@ -351,16 +368,9 @@ class EnvPanel(MomentPart):
         shown = make_rows(rows, envs[places.start : places.stop], self._chosen)
         return render(
             "envs",
-            none_so=FILTERS[self._filter][2],
-            pills=[
-                {
-                    "name": shown_as,
-                    "hint": means,
-                    "count": int(np.count_nonzero(mask(rows, name))),
-                    "on": name == self._filter,
-                    "press": FilterEnvs(which=name),
-                }
-                for name, (shown_as, means, _) in FILTERS.items()
+            none_so=FILTERS[self._filter][1],
+            tally=[
+                (one.name.lower(), WORDS[one], int(np.count_nonzero(rows.outcome == one))) for one in Outcome
             ],
             choose=ToggleEnvEntries() if rows.first_true else None,
             entries=self._entries(rows) if self._choosing else (),

@@ -1,29 +1,35 @@
-"""The Reward tab: a table of the task's numbers, and curves of reward, success and reward terms."""
+"""The Reward tab: a table of the task's numbers, and curves of the episode in sight."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
 from workbench.envs.step_result import TERM_PREFIX, OtherEntry, StepResult
-from workbench.live.commands import ToggleCurve
-from workbench.live.history.curves import REWARD, SUCCESS, Column, Curves, Group, columns_of
+from workbench.live.commands import ChooseBeside, ToggleCurve
+from workbench.live.events import EpisodeStepShown
+from workbench.live.history.curves import REWARD, SUCCESS, Column, Group, columns_of, spans_of, without_curve
+from workbench.live.history.moments import EpisodeNumbers
+from workbench.live.panels.env_panel import ended_counts
 from workbench.live.panels.moment import MomentPart
+from workbench.live.session_protocol import LiveSession
 from workbench.live.timeline_commands import SeekOnCurve
 from workbench.live.view import SessionView
 from workbench.machine.text import mean_text, nonfinite_text, number_text
-from workbench.page.command import Command, name_of
+from workbench.page.command import Command
+from workbench.page.widgets.fields import choice
 from workbench.page.widgets.line_chart import YES_OR_NO, ChartLine, LineChart
 from workbench.page.widgets.templates import render, short_text
 from workbench.page.widgets.visitors import Visitor
 
-CHART_PIXELS, LINES_CHART_PIXELS = 150, 170
+CHART_PIXELS, LINES_CHART_PIXELS = 130, 150
 """Height of a chart with one entry, and of a chart with many lines."""
-BATCH_COLOUR = "#868e96"
+BESIDE_COLOUR = "#868e96"
 COLOURS = (
     "#228be6", "#f08c00", "#2f9e44", "#be4bdb", "#e03131", "#12b886",
     "#fab005", "#7950f2", "#fd7e14", "#15aabf", "#e64980", "#868e96",
@@ -31,12 +37,15 @@ COLOURS = (
 MAX_LINES = len(COLOURS)
 MAX_CHARTS = 12
 """Maximum number of entries of ``evaluate`` with a chart."""
+MAX_BESIDE = 10
+"""Maximum number of other episodes in a chart."""
 MAX_NAMED = 12
 CHOICE = "Choose curves"
 HOW_TO = (
     'For a curve of each part of the reward, put info["reward_terms"] = {"reach": reach, ...} (tensors of shape '
     "(num_envs,)) into the info that compute_dense_reward receives."
 )
+BESIDE = {"its last ten episodes": "last", "the other envs": "batch"}
 AT_FIRST = (Group.REWARD, Group.TERM)
 """Groups that are drawn unless the user turns them off; success is drawn too."""
 Entry = tuple[Group, str]
@@ -44,20 +53,18 @@ Entry = tuple[Group, str]
 
 
 class CurvesPanel(MomentPart):
-    """Curves of the selected env and of the mean over the batch, over all steps. Selecting another env shows its whole
-    past.
+    """Curves of the selected env's episode over its last episodes, or over the episodes of the other envs.
 
-    The user chooses the curves; the choice is kept per task. A press on a curve shows its step.
-
-    Args:
-        seek: Shows the moment after a control step.
+    The user chooses the curves; the choice is kept per task. A press on a curve, or a drag along it, shows the step.
     """
 
-    does = (ToggleCurve, SeekOnCurve)
+    does = (ToggleCurve, SeekOnCurve, ChooseBeside)
 
-    def __init__(self, server: viser.ViserServer, seek: Callable[[int], None] = lambda tick: None) -> None:
-        self._server, self._seek = server, seek
+    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
+        self._server, self._session = server, session
         gui = server.gui
+        self._beside: Literal["last", "batch"] = "last"
+        self._over = choice(server, "Over", ChooseBeside, "beside", BESIDE, self._beside)
         self._choice_folder = gui.add_folder(CHOICE, expand_by_default=False, visible=False)
         with self._choice_folder:
             self._choice = gui.add_html("")
@@ -67,34 +74,36 @@ class CurvesPanel(MomentPart):
         """Entries that the user has turned on or off, by task."""
         self._turned = 0
         self._task = ""
-        self._asked: int | None = None
-        """Step that was pressed last."""
-        self._hint = gui.add_html("", visible=False)
         self._lost = gui.add_html("", visible=False)
         self._empty = gui.add_html(render("note", text="Curves appear after the second step."))
         self._about_terms = gui.add_html("", visible=False)
 
     def key(self, view: SessionView) -> object:
-        drawn = None if view.curves is None else view.curves.serial
-        return drawn, view.task_serial, view.step_serial, view.selected_env, view.timeline.shown, self._turned
+        return view.task_serial, view.step_serial, view.selected_env, view.timeline.shown, self._turned
+
+    def urgent(self, view: SessionView) -> object:
+        return super().urgent(view), self._turned
 
     def draw(self, view: SessionView) -> None:
-        curves, task = view.curves, view.task
-        there = curves is not None and curves.serial >= 2
-        self._empty.visible = not there
-        self._hint.visible = self._choice_folder.visible = there
-        self._draw_notes(view, curves if there else None)
-        if curves is None or not there:
-            for chart in self._charts.values():
-                chart.hide()
-            return
-        self._task = "" if task is None else f"{task.file} {task.class_name}"
-        entries = {entry_of(column): None for column in curves.columns}
-        if task is not None and task.reward_mode == "none":
-            entries.pop(entry_of(REWARD), None)
-        chosen = [entry for entry in entries if self._is_on(entry)]
-        self._draw_choice(list(entries), chosen)
-        drawn = self._draw_charts(view, curves, chosen)
+        task, step = view.task, view.step
+        there = task is not None and step is not None and view.timeline.moments > 0
+        self._choice_folder.visible = there
+        self._over.visible = there and task is not None and task.num_envs > 1
+        self._over.show(self._beside)
+        drawn: set[Entry] = set()
+        if there and task is not None and step is not None:
+            self._task = f"{task.file} {task.class_name}"
+            columns = [
+                column
+                for column in columns_of(step, task.joints)
+                if column != REWARD or task.reward_mode != "none"
+            ]
+            entries = list(dict.fromkeys(map(entry_of, columns)))
+            chosen = [entry for entry in entries if self._is_on(entry)]
+            self._draw_choice(entries, chosen)
+            drawn = self._draw_charts(view, step, [one for one in columns if entry_of(one) in chosen])
+        self._empty.visible = not drawn
+        self._draw_notes(view)
         for key, chart in self._charts.items():
             if key not in drawn:
                 chart.hide()
@@ -107,7 +116,6 @@ class CurvesPanel(MomentPart):
 
     def _toggle(self, entry: Entry) -> None:
         self._toggled[self._task] = self._toggled.get(self._task, set()) ^ {entry}
-        self._turned += 1
 
     def _draw_choice(self, entries: Sequence[Entry], chosen: Sequence[Entry]) -> None:
         def press(entry: Entry) -> ToggleCurve:
@@ -125,51 +133,53 @@ class CurvesPanel(MomentPart):
 
     # --- charts --------------------------------------------------------------------------------------
 
-    def _draw_charts(self, view: SessionView, curves: Curves, chosen: Sequence[Entry]) -> set[Entry]:
-        """Draw the chosen curves; returns the keys of the charts."""
-        env, drawn = view.selected_env, set()
-        singles = [entry for entry in chosen if entry[0] in (Group.REWARD, Group.EVALUATE)]
-        for entry in singles[: MAX_CHARTS + 2]:
-            columns = [column for column in curves.columns if entry_of(column) == entry]
-            if columns[0].part is not None:
-                self._draw_lines(entry, f"{entry[1]}, env {env}", curves, columns)
-            else:
-                self._draw_one(entry, view, curves, columns[0])
-            drawn.add(entry)
-        for group, title in ((Group.TERM, "reward terms"), (Group.JOINT, "joints")):
-            columns = [
-                column for column in curves.columns if column.group is group and self._is_on(entry_of(column))
-            ]
-            if columns:
-                self._draw_lines((group, ""), f"{title}, env {env}", curves, columns)
-                drawn.add((group, ""))
+    def _draw_charts(self, view: SessionView, step: StepResult, columns: Sequence[Column]) -> set[Entry]:
+        """Draw the curves of these columns; returns the keys of the visible charts."""
+        by_chart: dict[Entry, list[Column]] = {}
+        for column in columns:
+            together = column.group in (Group.TERM, Group.JOINT)
+            by_chart.setdefault((column.group, "") if together else entry_of(column), []).append(column)
+        singles = [key for key in by_chart if key[1]]
+        env = view.selected_env
+        episodes = self._episodes(view, columns)
+        begun = [one for one in episodes if len(one.steps)]
+        if not begun:
+            return set()
+        first = min(int(one.steps[0]) for one in begun)
+        last = max(int(one.steps[-1]) for one in begun)
+        at = int(step.elapsed_steps[env])
+        drawn: set[Entry] = set()
+        for key, own in by_chart.items():
+            if key in singles[MAX_CHARTS + 2 :]:
+                continue
+            alone = len(own) == 1
+            chosen = [(own[0], one) for one in episodes[:0:-1]] if alone else []
+            chosen += [(column, episodes[0]) for column in own[:MAX_LINES]]
+            x, values = spans_of(
+                np.stack([_along(one, column, first, last) for column, one in chosen]), first=first
+            ).points()
+            lines = [ChartLine("", line, BESIDE_COLOUR, 0.8) for line in values[: len(chosen) - len(own)]]
+            for column, line, colour in zip(own, values[len(lines) :], COLOURS, strict=False):
+                lines.append(ChartLine(f"env {env}" if alone else column.label, line, colour, 1.8))
+            yes_or_no = all(is_yes_or_no(step, column) for column in own)
+            titles = {Group.TERM: "reward terms", Group.JOINT: "joints"}
+            title = key[1] or titles[key[0]]
+            self._chart(key).draw(title, x, lines, at, YES_OR_NO if yes_or_no else None)
+            if self._chart(key).visible:
+                drawn.add(key)
         return drawn
 
-    def _draw_one(self, entry: Entry, view: SessionView, curves: Curves, column: Column) -> None:
-        x, (one, mean) = curves.lines(((column, False), (column, True)))
-        env, batch = (
-            ChartLine(f"env {view.selected_env}", one),
-            ChartLine("mean of the batch", mean, BATCH_COLOUR, 1.4),
-        )
-        dot = None
-        if view.timeline.shown is not None and view.step is not None and len(x):
-            dot = np.full(len(x), np.nan)
-            dot[np.abs(x - view.timeline.tick).argmin()] = value_at(view, column)
-        yes_or_no = column == SUCCESS or (view.step is not None and is_yes_or_no(view.step, column))
-        several = len(curves.newest) > 1
-        self._chart(entry).draw(
-            column.name, x, [batch, env] if several else [env], dot, YES_OR_NO if yes_or_no else None
-        )
-
-    def _draw_lines(self, key: Entry, title: str, curves: Curves, columns: Sequence[Column]) -> None:
-        """Several lines of the selected env in one chart."""
-        x, values = curves.lines([(column, False) for column in columns[:MAX_LINES]])
-        lines = [
-            ChartLine(column.label, line, colour, 1.6)
-            for column, line, colour in zip(columns, values, COLOURS, strict=False)
-            if np.isfinite(line).any()
-        ]
-        self._chart(key).draw(title, x, lines)
+    def _episodes(self, view: SessionView, columns: Sequence[Column]) -> list[EpisodeNumbers]:
+        """The selected env's episode, and then the ones that it is drawn over."""
+        env, last = view.selected_env, view.timeline.last
+        before = MAX_BESIDE if self._beside == "last" or view.task is None or view.task.num_envs == 1 else 0
+        found = list(self._session.look(lambda run: run.episodes(env, last, columns, before)))
+        if before or view.task is None:
+            return found
+        others = [other for other in range(view.task.num_envs) if other != env][:MAX_BESIDE]
+        for other in others:
+            found += self._session.look(lambda run, other=other: run.episodes(other, last, columns, 0))
+        return found
 
     def _chart(self, key: Entry) -> LineChart:
         if key not in self._charts:
@@ -181,51 +191,49 @@ class CurvesPanel(MomentPart):
             }
             order = first.get(key, 10.0 + len(self._charts))
             height = CHART_PIXELS if key[1] else LINES_CHART_PIXELS
-            self._charts[key] = LineChart(self._server, self._folder, height, order)
+            with self._folder:
+                self._charts[key] = LineChart(
+                    self._server, height, lambda step: SeekOnCurve(step=step), order=order
+                )
         return self._charts[key]
 
     # --- notes ---------------------------------------------------------------------------------------
 
-    def _draw_notes(self, view: SessionView, curves: Curves | None) -> None:
-        """
-        Args:
-            curves: None if none are drawn.
-        """
-        lost = "" if curves is None else said_of(curves.newest)
+    def _draw_notes(self, view: SessionView) -> None:
+        step = view.step
+        lost = "" if step is None or step.action is None else said_of(step.reward)
         self._lost.content, self._lost.visible = render("warning", text=lost), bool(lost)
-        past, asked = view.timeline, self._asked
-        gone = asked is not None and past.shown is not None and past.shown == past.first and asked < past.tick
-        self._hint.content = render(
-            "curve_hint", curve=name_of(SeekOnCurve), gone=asked if gone else None, kept=past.tick
-        )
-        dense = curves is not None and view.task is not None and "dense" in view.task.reward_mode
-        terms = curves is not None and any(column.group is Group.TERM for column in curves.columns)
-        text = HOW_TO if dense and not terms else ""
-        text = no_curve_text(curves.no_curve) if curves is not None and curves.no_curve else text
+        dense = step is not None and view.task is not None and "dense" in view.task.reward_mode
+        terms = step is not None and any(column.group is Group.TERM for column in columns_of(step))
+        no_curve = () if step is None else without_curve(step)
+        text = no_curve_text(no_curve) if no_curve else HOW_TO if dense and not terms else ""
         self._about_terms.content, self._about_terms.visible = render("note", text=text), bool(text)
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
             case ToggleCurve(group=group, name=name):
                 self._toggle((Group(group), name))
+            case ChooseBeside(beside=beside):
+                self._beside = beside
             case SeekOnCurve(step=step):
-                self._asked = step
-                self._seek(step)
+                self._session.happen(EpisodeStepShown(self._session.view().selected_env, step))
+        self._turned += 1
+
+
+def _along(episode: EpisodeNumbers, column: Column, first: int, last: int) -> NDArray[np.float32]:
+    """(last - first + 1,) numbers of an episode by step; NaN where it has none."""
+    line = np.full(last - first + 1, np.nan, np.float32)
+    line[episode.steps - first] = episode.values[column]
+    return line
 
 
 def entry_of(column: Column) -> Entry:
     return column.group, column.name
 
 
-def value_at(view: SessionView, column: Column) -> float:
-    """Value of the selected env at the shown moment; NaN if it has none."""
-    assert view.step is not None
-    joints = () if view.task is None else view.task.joints
-    values = columns_of(view.step, joints).get(column)
-    return float("nan") if values is None else float(values[min(view.selected_env, len(values) - 1)])
-
-
 def is_yes_or_no(step: StepResult, column: Column) -> bool:
+    if column == SUCCESS:
+        return True
     values = step.evaluate.get(column.name)
     return column.group is Group.EVALUATE and values is not None and values.dtype.kind == "b"
 
@@ -387,10 +395,12 @@ def _batch(values: NDArray) -> str:
 
 
 class NumbersPanel(MomentPart):
-    """The table of the task's numbers."""
+    """The table of the task's numbers, and how its episodes ended."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
+        self._session = session
         self._handle = server.gui.add_html("")
+        self._outcomes = server.gui.add_html("")
 
     def key(self, view: SessionView) -> object:
         return view.task_serial, view.step_serial, view.selected_env
@@ -407,3 +417,7 @@ class NumbersPanel(MomentPart):
             num_envs=0 if task is None else task.num_envs,
             has_success=step is not None and "success" in step.evaluate,
         )
+        table = self._session.env_rows()
+        counts = [] if table is None else ended_counts(table)
+        total = sum(count for _, _, count in counts)
+        self._outcomes.content = render("outcomes", counts=counts, total=total) if total else ""

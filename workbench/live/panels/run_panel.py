@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Literal
 
@@ -18,8 +19,8 @@ from workbench.live.commands import (
     ResetSelected,
     SetPolicy,
     SetSeed,
+    UseControlMode,
 )
-from workbench.live.env_commands import NextEnv, PreviousEnv, SelectEnv
 from workbench.live.events import ActionTold
 from workbench.live.messages import EpisodeEnd
 from workbench.live.session_protocol import LiveSession
@@ -119,7 +120,7 @@ EPISODE_ENDS: dict[str, EpisodeEnd] = {
 }
 SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
 RESET_ALL, RESET_THIS = "Reset all", "Reset this env"
-PREVIOUS, NEXT = "‹ previous", "next ›"
+MODE_HINT = "Another control mode rebuilds the envs."
 CHOOSE = "choose one"
 KNOWN_HINT = (
     "Functions with one parameter, from the files in the task's folder and in the folder where the command was started; "
@@ -136,21 +137,11 @@ class RunPanel(PagePart[SessionView]):
         self._session = session
         gui = server.gui
 
-        self._resets = gui.add_html("")
-
-        self._env_folder = gui.add_folder("Environment", visible=False)
-        with self._env_folder:
-            self._env = slider(server, "Selected", SelectEnv, "env", (0, 1))
-            gui.add_html(tools_html([tool(PREVIOUS, PreviousEnv()), tool(NEXT, NextEnv())]))
-
-        with gui.add_folder("Episode"):
-            self._seed = Field(server, "Seed", SetSeed, "seed", "0", hint="A new seed resets every env.")
-            self._end = choice(server, "At the end", ChooseEpisodeEnd, "rule", EPISODE_ENDS, "reset")
-
         with gui.add_folder("Actions"):
             self._source = choice(
                 server, "Source", ChooseActions, "source", SOURCES, "hold", hint=SOURCE_HINT
             )
+            self._mode = choice(server, "Control", UseControlMode, "mode", (), "", hint=MODE_HINT)
             self._policy = Field(
                 server,
                 "Policy",
@@ -163,6 +154,11 @@ class RunPanel(PagePart[SessionView]):
             self._policy.visible = self._known.visible = self._policy_hint.visible = False
             self._sliders = ActionSliders(server, session)
 
+        with gui.add_folder("Episode"):
+            self._seed = Field(server, "Seed", SetSeed, "seed", "0", hint="A new seed resets every env.")
+            self._end = choice(server, "At the end", ChooseEpisodeEnd, "rule", EPISODE_ENDS, "reset")
+            self._resets = gui.add_html("")
+
     def do(self, command: Command, visitor: Visitor) -> None:
         self._sliders.do(command)
 
@@ -170,16 +166,17 @@ class RunPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         can_act = view.task is not None and view.state != "stopped"
-        envs = 1 if view.task is None else view.task.num_envs
         if view.task is not None:
-            self._env_folder.visible = envs > 1
             self._sliders.build(view.task.actions)
         resets = (RESET_ALL, ResetAll()), (RESET_THIS, ResetSelected())
         self._resets.content = tools_html([tool(name, command, off=not can_act) for name, command in resets])
-        self._env.show(view.selected_env, bounds=(0, max(1, envs - 1)), off=not can_act)
         self._seed.show(str(view.seed))
         self._end.show(view.settings.episode_end, off=not can_act)
         self._source.show(view.settings.action_source, off=not can_act)
+        modes = control_modes(view)
+        self._mode.visible = len(modes) > 1
+        now = "" if view.task is None else view.task.control_mode or ""
+        self._mode.show(now, options={mode: mode for mode in modes}, off=not can_act)
         self._policy.show(view.settings.policy or "")
         policy, known = view.settings.policy, view.known_policies
         policy_wanted = view.settings.action_source == "policy"
@@ -190,3 +187,10 @@ class RunPanel(PagePart[SessionView]):
             policy if policy in known else "", options={CHOOSE: "", **{one: one for one in known}}
         )
         self._sliders.draw(view)
+
+
+def control_modes(view: SessionView) -> list[str]:
+    """The control modes that the robot has."""
+    made = () if view.task is None else view.task.made.modes
+    choices = next((keyword.choices for keyword in made if keyword.name == "control_mode"), ()) or ()
+    return [mode for text in choices if isinstance(mode := json.loads(text), str)]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Sequence
-from itertools import groupby
+from collections.abc import Callable, Collection
 from typing import TypeVar
 
 import numpy as np
@@ -14,11 +13,13 @@ from numpy.typing import NDArray
 
 from workbench.live.commands import SetSpeed, Step, TogglePlay
 from workbench.live.events import MomentShown
+from workbench.live.history.curves import REWARD, Column, columns_of
 from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.live.panels.moment import MomentPart
 from workbench.live.past import Strip, TimelineView
 from workbench.live.session_protocol import LiveSession
 from workbench.live.timeline_commands import (
+    ChooseStripCurve,
     ContinueFromHere,
     GoToFirst,
     GoToLast,
@@ -35,8 +36,9 @@ from workbench.live.view import SessionView
 from workbench.machine.text import number_text
 from workbench.page.command import Command
 from workbench.page.commands import ToggleTimeline
-from workbench.page.widgets.fields import Field, choice, slider
+from workbench.page.widgets.fields import Field, by_name, choice, slider
 from workbench.page.widgets.hotkeys import with_key
+from workbench.page.widgets.line_chart import polylines
 from workbench.page.widgets.parts import Clock, PagePart
 from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.tools import Tool, tool, tools_html
@@ -63,10 +65,10 @@ View = TypeVar("View", contravariant=True)
 
 
 class TimeBar(PagePart[View]):
-    """The transport, a row of 60 px under the view, and the timeline that opens below it.
+    """The transport, a row of 60 px under the view, and the drawer that opens below it.
 
-    The row has buttons, the speed and the strip. The timeline has a slider, a legend and further buttons; whether it is open
-    is a matter of each page (`ToggleTimeline`).
+    The row has buttons, the speed and the strip. The drawer's first tab, *Timeline*, has a legend, a slider and further
+    buttons; whether the drawer is open is a matter of each page (`ToggleTimeline`).
 
     Args:
         name: Name of the slider.
@@ -74,29 +76,45 @@ class TimeBar(PagePart[View]):
     """
 
     def __init__(self, server: viser.ViserServer, name: str, kind: type[Command], field: str) -> None:
-        gui = server.gui
+        self._server, gui = server, server.gui
         self._panel = gui.add_panel(visible=False, order=10.0)
-        with self._panel.add_tab("Timeline"):
+        with self._panel.add_tab(""):
             self._transport = gui.add_html("")
             self._speed = self._add_speed(server)
             self._strip = gui.add_html("")
+            self._add_entry(server)
             hint = with_key(ToggleTimeline)
             gui.add_html(render("unfold_timeline", command=ToggleTimeline(), hint=hint))
+        self._drawer = gui.add_panel(visible=False, order=11.0)
+        with self._drawer.add_tab("Timeline"):
+            gui.add_html(render("drawer"))
+            self._legend = gui.add_html("")
             self._slider = slider(server, name, kind, field, (-1, 0))
             self._add_rows(gui)
             self._walk = gui.add_html("")
-        # The style sheet puts it under the view: viser docks panels at the sides only.
+        # The style sheet puts them under the view: viser docks panels at the sides only.
         self._panel.float(x=0, y=-1)
+        self._drawer.float(x=0, y=-1)
+
+    def add_tab(self, name: str) -> viser.GuiTabHandle:
+        """Add a tab to the drawer, to be filled."""
+        tab = self._drawer.add_tab(name)
+        with tab:
+            self._server.gui.add_html(render("drawer"))
+        return tab
 
     def _add_speed(self, server: viser.ViserServer) -> Field:
         """Add the choice of speed to the row."""
         raise NotImplementedError
 
+    def _add_entry(self, server: viser.ViserServer) -> None:
+        """Add the choice of the strip's curve to the row."""
+
     def _add_rows(self, gui: viser.GuiApi) -> None:
         """Add rows between the slider and the buttons."""
 
     def _draw_panel(self, there: bool) -> bool:
-        self._panel.visible = there
+        self._panel.visible = self._drawer.visible = there
         return there
 
     def _show_slider(self, low: int, high: int, value: int) -> None:
@@ -110,7 +128,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     memory; the worker draws pictures only after the slider has rested at one moment.
     """
 
-    does = (SeekBack, ZoomTimeline, GoToFirst)
+    does = (SeekBack, ZoomTimeline, GoToFirst, ChooseStripCurve)
 
     def __init__(
         self,
@@ -126,6 +144,8 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         super().__init__(server, "step of the past", SeekBack, "steps")
         self._session, self._clock, self._record = session, clock, record
         self._episode_only = False
+        self._curve = REWARD.label
+        """Name of the entry on the strip; the reward if the task has no such entry."""
         self._range = (0, 0)
         """Ticks at the slider's ends."""
         self._newest = 0
@@ -137,6 +157,12 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     def _add_speed(self, server: viser.ViserServer) -> Field:
         hint = "Simulated seconds in one second."
         return choice(server, "Speed", SetSpeed, "speed", SPEEDS, 1.0, hint=hint)
+
+    def _add_entry(self, server: viser.ViserServer) -> None:
+        name = REWARD.label
+        self._entry = choice(
+            server, "Curve", ChooseStripCurve, "curve", (name,), name, hint="What the strip shows"
+        )
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
         # Exactly one of these two is shown, and they have the same height: nothing moves under the pointer.
@@ -160,6 +186,8 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
                     session.happen(MomentShown(0))
             case ZoomTimeline(episode_only=wanted):
                 self._episode_only, self._range_at = wanted, -math.inf
+            case ChooseStripCurve(curve=curve):
+                self._curve = curve
 
     def _seek_to(self, tick: int) -> Seek:
         return Seek(step=tick, episode_only=self._episode_only)
@@ -167,11 +195,14 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     # --- drawing -----------------------------------------------------------------------------------
 
     def urgent(self, view: SessionView) -> object:
-        return super().urgent(view), self._episode_only
+        return super().urgent(view), self._episode_only, self._curve
 
     def draw(self, view: SessionView) -> None:
         self._draw_panel(True)
         self._draw_transport(view)
+        curves = strip_curves(view)
+        chosen = self._curve if self._curve in curves else REWARD.label
+        self._entry.show(chosen, options=by_name(tuple(curves)))
         if view.task is not None and view.timeline.moments > 0:
             self._draw_slider(view)
             self._draw_buttons(view)
@@ -183,7 +214,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         """Draw that nothing is kept: no task, or its envs were just built."""
         self._range, self._newest, self._range_at, self._strip_of = (0, 0), 0, -math.inf, None
         self._show_slider(0, 0, 0)
-        self._strip.content = self._hint.content = self._walk.content = ""
+        self._strip.content = self._legend.content = self._hint.content = self._walk.content = ""
         self._travel.visible, self._hint.visible = False, True
 
     def _draw_transport(self, view: SessionView) -> None:
@@ -199,7 +230,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         ]
         if self._record is not None:
             buttons.append(("record", self._record(view)))
-        self._transport.content = render("transport", tools=buttons)
+        self._transport.content = render("toolbar", kind="transport", label="Transport", tools=buttons)
         speed = None if math.isinf(view.settings.speed) else view.settings.speed
         # The command line takes speeds that are not in the list.
         speeds = SPEEDS if speed in SPEEDS.values() else SPEEDS | {f"{speed:g} ×": speed}
@@ -239,14 +270,24 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
 
     def _draw_strip(self, view: SessionView) -> None:
         past = view.timeline
-        wanted = (past.first, past.last, past.shown, view.selected_env, self._range, self._episode_only)
+        column = strip_curves(view).get(self._curve, REWARD)
+        wanted = (
+            past.first,
+            past.last,
+            past.shown,
+            view.selected_env,
+            self._range,
+            self._episode_only,
+            column,
+        )
         if wanted == self._strip_of:
             return
         self._strip_of = wanted
         low, high = self._range
-        strip = self._session.look(lambda run: run.strip(low, high))
+        strip = self._session.look(lambda run: run.strip(low, high, column))
         if strip is not None:
-            self._strip.content = strip_html(strip, view, self._seek_to)
+            content = strip_html(strip, view, self._seek_to, column)
+            self._strip.content, self._legend.content = content
 
 
 def play_tool(playing: bool, off: bool = False) -> tuple[str, Tool]:
@@ -275,8 +316,8 @@ def continue_tools(view: SessionView) -> list[Tool]:
     ]
 
 
-REWARD_POINTS = 240
-"""Number of points of the reward's line, minimum and maximum of each interval in turn: a spike of one step stays
+STRIP_POINTS = 240
+"""Number of points of the strip's line, minimum and maximum of each interval in turn: a spike of one step stays
 visible."""
 LINE_HEIGHT = 30.0
 """Height of the line in units of the SVG; the marks are above."""
@@ -342,30 +383,47 @@ def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
     return [(tick, FLAGS[flag], name) for tick, flag, name in marks.values()]
 
 
+def strip_curves(view: SessionView) -> dict[str, Column]:
+    """The entries that the strip can show, by name."""
+    if view.step is None or view.task is None:
+        return {REWARD.label: REWARD}
+    found: dict[str, Column] = {}
+    for column in columns_of(view.step, view.task.joints):
+        # A term and an entry of evaluate may have one name.
+        found[column.label if column.label not in found else f"{column.group.value} {column.label}"] = column
+    return found
+
+
 def strip_html(
-    strip: Strip, view: SessionView, seek: Callable[[int], Seek] = lambda tick: Seek(step=tick)
-) -> str:
-    """The strip of one env with its shown moment.
+    strip: Strip,
+    view: SessionView,
+    seek: Callable[[int], Seek] = lambda tick: Seek(step=tick),
+    column: Column = REWARD,
+) -> tuple[str, str]:
+    """The strip of one env with its shown moment, and its legend.
 
     Args:
         seek: returns the command for a press on a tick.
+        column: the number that the strip shows.
     """
-    has_reward = view.task is None or view.task.reward_mode != "none"
+    is_known = column != REWARD or view.task is None or view.task.reward_mode != "none"
     # ManiSkill's reward is 0 if a task has none.
-    reward = strip.reward if has_reward else np.full_like(strip.reward, np.nan)
-    marks, finite = marks_of(strip), reward[np.isfinite(reward)]
-    return render(
-        "timeline",
-        strip=strip,
-        seek=seek,
-        past=view.timeline,
-        marks=marks,
-        ago=ago_in_words(view.timeline),
-        where=where(view),
-        span=[_number(float(value)) for value in (finite.min(), finite.max())] if len(finite) else None,
-        megabytes=megabytes,
-        **strip_values(strip.low, strip.high, reward, {style for _, style, _ in marks}),
-    )
+    numbers = strip.values if is_known else np.full_like(strip.values, np.nan)
+    marks, finite = marks_of(strip), numbers[np.isfinite(numbers)]
+    values = {
+        "strip": strip,
+        "seek": seek,
+        "past": view.timeline,
+        "marks": marks,
+        "ago": ago_in_words(view.timeline),
+        "where": step_in_words(view),
+        "time": time_in_words(view),
+        "span": [_number(float(value)) for value in (finite.min(), finite.max())] if len(finite) else None,
+        "megabytes": megabytes,
+        "curve": column.label,
+        **strip_values(strip.low, strip.high, numbers, {style for _, style, _ in marks}),
+    }
+    return render("strip", **values), render("legend", **values)
 
 
 def _number(value: float) -> str:
@@ -388,12 +446,12 @@ def step_in_words(view: SessionView) -> str:
     return f"{env}step {int(step.elapsed_steps[view.selected_env])}{limit}"
 
 
-def where(view: SessionView) -> str:
-    """Env, step of its episode and simulated time of the shown moment."""
-    words = step_in_words(view)
-    if not words or view.task is None or view.step is None:
-        return words
-    return f"{words}, {view.step.elapsed_steps[view.selected_env] * view.task.control_dt:.2f} s"
+def time_in_words(view: SessionView) -> str:
+    """Simulated time of the shown moment in its episode, as text."""
+    task, step = view.task, view.step
+    if task is None or step is None or view.selected_env >= len(step.elapsed_steps):
+        return ""
+    return f"{step.elapsed_steps[view.selected_env] * task.control_dt:.2f} s"
 
 
 def reward_lines(reward: NDArray[np.float32]) -> list[str]:
@@ -406,22 +464,15 @@ def reward_lines(reward: NDArray[np.float32]) -> list[str]:
     if low == high:
         low, high = low - 1.0, high + 1.0
     known = np.where(np.isfinite(reward), reward, np.nan)
-    if len(known) <= REWARD_POINTS:
+    if len(known) <= STRIP_POINTS:
         places, values = np.arange(len(known)), known
     else:
-        edges = np.linspace(0, len(known), REWARD_POINTS // 2 + 1).astype(int)[:-1]
+        edges = np.linspace(0, len(known), STRIP_POINTS // 2 + 1).astype(int)[:-1]
         values = np.stack([np.fmin.reduceat(known, edges), np.fmax.reduceat(known, edges)], 1).reshape(-1)
         places = np.repeat(edges, 2)
     x = 100 * places / max(len(known) - 1, 1)
     y = LINE_HEIGHT * (1 - (values - low) / (high - low))
     return polylines([None if np.isnan(b) else f"{a:.2f},{b:.1f}" for a, b in zip(x, y, strict=True)])
-
-
-def polylines(points: Sequence[str | None]) -> list[str]:
-    """``points`` of SVG polylines through these points, with a gap at each None."""
-    runs = [[point for point in run if point] for there, run in groupby(points, key=bool) if there]
-    # SVG does not draw a polyline of one point; one of length zero with round ends is a dot.
-    return [" ".join(run if len(run) > 1 else run * 2) for run in runs]
 
 
 def megabytes(size: int) -> str:

@@ -18,7 +18,7 @@ from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tool, tools_html
 from workbench.task.problem import Problem
 
-LAST_LOADS = "Last reloads"
+BY_HAND, LAST_LOADS = "Reload by hand", "Last reloads"
 MAX_NAMED = 8
 """Maximum number of named items that were not carried over; the rest is counted."""
 
@@ -38,7 +38,8 @@ class VersionPanel(PagePart[SessionView]):
             )
             self._task.visible = False
             self._html = server.gui.add_html("")
-            self._again = server.gui.add_html("")
+            with server.gui.add_folder(BY_HAND, expand_by_default=False):
+                self._again = server.gui.add_html("")
             self._loads_folder = server.gui.add_folder(LAST_LOADS, expand_by_default=False, visible=False)
             with self._loads_folder:
                 self._loads = server.gui.add_html("")

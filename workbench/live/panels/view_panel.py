@@ -1,17 +1,20 @@
-"""The folder *View*: all envs or one, level of detail, dark or light. Also on the review page."""
+"""Icons over the 3-D view, and the folder *View*. Also on the review page."""
 
 from __future__ import annotations
 
 import viser
 
-from workbench.live.env_commands import ShowEnvs
+from workbench.live.env_commands import NextEnv, PreviousEnv, ShowEnvs, ToggleOnlySelected
 from workbench.live.view import SessionView
 from workbench.page.command import Command
-from workbench.page.commands import ChooseDetail, ChooseTheme
+from workbench.page.commands import ChooseDetail, ChooseTheme, FrameScene, ShowFrustums, ToggleTheme
 from workbench.page.scene.bodies import DrawStyle
-from workbench.page.scene.viewpoint import ALL, DETAILS, ONE, ViewChoice
+from workbench.page.scene.viewpoint import DETAILS, ViewChoice
 from workbench.page.widgets.fields import choice
+from workbench.page.widgets.hotkeys import with_key
 from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import Tool, tool
 from workbench.page.widgets.visitors import Visitor
 
 DARK, LIGHT = "dark", "light"
@@ -19,19 +22,71 @@ BRAND = (28, 112, 190)
 """Colour of the page's buttons, RGB."""
 
 
-class ViewPanel(PagePart[object]):
-    """The folder *View*."""
+class ViewIcons(PagePart[object]):
+    """What the 3-D view shows: the selected env or all, the cameras, the whole scene.
 
-    does = (ShowEnvs, ChooseDetail, ChooseTheme)
+    Args:
+        choice: the choices; they outlive the page.
+        task: key of the open task among the choices.
+    """
+
+    does = (ShowEnvs, ToggleOnlySelected, ShowFrustums)
+
+    def __init__(self, server: viser.ViserServer, choice: ViewChoice, task: str = "") -> None:
+        self._choice, self._task = choice, task
+        panel = server.gui.add_panel(order=12.0)
+        with panel.add_tab(""):
+            self._html = server.gui.add_html("")
+        # The style sheet puts it into the upper right corner of the view.
+        panel.float(x=0, y=0)
+
+    @property
+    def only_selected(self) -> bool:
+        """Whether the view shows only the selected env."""
+        return self._task not in self._choice.all_envs
+
+    def draw(self, view: object) -> None:
+        several = isinstance(view, SessionView) and view.task is not None and view.task.num_envs > 1
+        one, cameras = self.only_selected, self._choice.frustums
+        icons: list[tuple[str, Tool]] = []
+        if isinstance(view, SessionView) and several:
+            icons = [
+                ("left", tool("Previous env", PreviousEnv())),
+                ("right", tool("Next env", NextEnv())),
+                (
+                    "one",
+                    Tool("The selected env", ShowEnvs(all_envs=False), with_key(ToggleOnlySelected), on=one),
+                ),
+                ("all", Tool("All envs", ShowEnvs(all_envs=True), with_key(ToggleOnlySelected), on=not one)),
+            ]
+        shown = Tool("Cameras", ShowFrustums(on=not cameras), ShowFrustums.help(), on=cameras)
+        icons += [("cameras", shown), ("home", tool("Frame the scene", FrameScene()))]
+        env = f"env {view.selected_env}" if isinstance(view, SessionView) and several else ""
+        self._html.content = render("toolbar", kind="view-icons", label="View", tools=icons, text=env)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ShowEnvs(all_envs=True):
+                self._choice.all_envs.add(self._task)
+            case ShowEnvs():
+                self._choice.all_envs.discard(self._task)
+            case ToggleOnlySelected():
+                self._choice.all_envs ^= {self._task}
+            case ShowFrustums(on=on):
+                self._choice.frustums = on
+
+
+class ViewPanel(PagePart[object]):
+    """The folder *View*: level of detail, dark or light."""
+
+    does = (ChooseDetail, ChooseTheme, ToggleTheme)
 
     def __init__(
         self, server: viser.ViserServer, dark: bool = True, chosen: ViewChoice | None = None
     ) -> None:
         self._server, self.dark = server, dark
         self._choice = chosen = chosen or ViewChoice()
-        with server.gui.add_folder("View"):
-            self._show = choice(server, "Show", ShowEnvs, "which", (ALL, ONE), chosen.show)
-            self._show.visible = False
+        with server.gui.add_folder("View", expand_by_default=False):
             self._detail = choice(
                 server,
                 "Detail",
@@ -47,38 +102,22 @@ class ViewPanel(PagePart[object]):
         self._apply_theme()
 
     @property
-    def only_selected(self) -> bool:
-        return self._choice.show == ONE
-
-    @property
     def looks(self) -> DrawStyle:
         return DrawStyle(DETAILS[self._choice.detail], self.dark)
 
-    def show_only_selected(self, only: bool) -> None:
-        self._choice.show = ONE if only else ALL
-
-    def toggle_only_selected(self) -> None:
-        self.show_only_selected(not self.only_selected)
-
-    def toggle_dark(self) -> None:
-        self.dark = not self.dark
-        self._apply_theme()
-
     def draw(self, view: object) -> None:
-        several = isinstance(view, SessionView) and view.task is not None and view.task.num_envs > 1
-        self._show.visible = several
-        self._show.show(self._choice.show)
         self._detail.show(self._choice.detail)
         self._theme.show(DARK if self.dark else LIGHT)
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
-            case ShowEnvs(which=which):
-                self._choice.show = which
             case ChooseDetail(detail=detail):
                 self._choice.detail = detail
             case ChooseTheme(theme=theme):
                 self.dark = theme == DARK
+                self._apply_theme()
+            case ToggleTheme():
+                self.dark = not self.dark
                 self._apply_theme()
 
     def _apply_theme(self) -> None:

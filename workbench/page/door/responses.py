@@ -26,7 +26,6 @@ SCRIPTS = (
     "browser.js",
     "input.js",
     "panels.js",
-    "curve_clicks.js",
 )
 """Scripts of ``web_assets/`` injected into viser's index.html, in load order."""
 STYLES = "panels/page.css"

@@ -27,7 +27,6 @@ import viser._threadpool_exceptions
 import viser.infra
 import viser.infra._infra
 import websockets.asyncio.server
-from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
@@ -121,7 +120,8 @@ def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
 
 
 def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
-    """Tabs of a page, and folds inside or outside tabs: labels of tab and fold, empty for none; in order of creation."""
+    """Tabs of a page's tab groups, and folds inside or outside tabs: labels of tab and fold, empty for none; in order of
+    creation."""
     containers = server.gui._container_handle_from_uuid
     for handle in list(containers.values()):
         if isinstance(handle, viser.GuiTabHandle):
@@ -132,17 +132,6 @@ def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
             while isinstance(around, viser.GuiFolderHandle):
                 around = containers.get(around._impl.parent_container_id)
             yield (around._label if isinstance(around, viser.GuiTabHandle) else ""), handle.label
-
-
-def send_lines(
-    handle: viser.GuiUplotHandle,
-    data: tuple[NDArray[np.float64], ...],
-    sent: tuple[NDArray[np.float64] | list[float | None], ...],
-) -> None:
-    """Set a chart's data, but send `sent`, with None for gaps, to the browsers: viser's property would send NaN."""
-    props: Any = handle._impl.props
-    props.data = data
-    handle._queue_update("data", sent)
 
 
 def wait_until_taken(server: viser.ViserServer, timeout: float) -> None:

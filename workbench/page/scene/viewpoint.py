@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Hashable, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import viser
@@ -256,12 +256,16 @@ class View3D:
 
 DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
 """Number of triangles in the view by level of detail. A browser without a graphics card needs the fewest."""
-ALL, ONE = "all envs", "the selected env"
 
 
 @dataclass
 class ViewChoice:
-    """Choices in the View panel. They outlive a page, which is rebuilt with each change between review and live page."""
+    """What the user chose to see. It outlives a page, which is rebuilt with each change between review and live page."""
 
-    show: str = ALL
+    all_envs: set[str] = field(default_factory=set)
+    """The tasks of which all envs are shown; of the others only the selected one."""
+    frustums: bool = True
+    """Whether the cameras are drawn in the view."""
     detail: str = "normal"
+    table: bool | None = None
+    """Whether the table of envs is open; None before it was opened or closed."""

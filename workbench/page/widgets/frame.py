@@ -13,7 +13,7 @@ def add_bar(server: viser.ViserServer) -> viser.GuiTabHandle:
     viser docks panels at the sides only. This one floats, and the style sheet gives it the first row of the page.
     """
     panel = server.gui.add_panel(order=-20.0)
-    bar = panel.add_tab("Bar")
+    bar = panel.add_tab("")
     with bar:
         server.gui.add_html(render("bar"))
     panel.float(x=0, y=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import viser
 
@@ -30,7 +30,11 @@ def key_rows(commands: CommandList, kinds: Collection[type[Command]]) -> list[tu
 
 
 def register(
-    server: viser.ViserServer, visitors: Visitors, kinds: Collection[type[Command]], contexts: str
+    server: viser.ViserServer,
+    visitors: Visitors,
+    kinds: Collection[type[Command]],
+    contexts: str,
+    tabs: Sequence[str] = (),
 ) -> None:
     """Add these commands to the palette of every page, and their keys to the page for ``input.js``. Call it outside any
     container.
@@ -38,6 +42,7 @@ def register(
     Args:
         kinds: commands that the page carries out.
         contexts: contexts whose keys always work, separated by spaces.
+        tabs: tabs outside the main panel.
     """
     keys = [
         (key.key, key.context, key.command, key.repeats)
@@ -56,7 +61,7 @@ def register(
     for kind in visitors.commands:
         if kind in kinds and kind.is_in_palette():
             add(server, visitors, kind.help(), kind(), key_in_words(kind.key))
-    for tab, fold in places(server):
+    for tab, fold in (*((tab, "") for tab in tabs), *places(server)):
         label, about = (fold, f"in {tab}" if tab else "") if fold else (f"{tab} tab", "")
         add(server, visitors, label, ShowTab(tab=tab, fold=fold), about)
 

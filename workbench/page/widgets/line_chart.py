@@ -1,29 +1,24 @@
-"""Line charts over steps, with gaps where a value is not finite."""
+"""Line charts over steps, as SVG, with gaps where a value is not finite."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 import viser
-import viser.uplot as uplot
 from numpy.typing import NDArray
 
-from workbench.page.door.viser_private import send_lines
+from workbench.machine.text import number_text
+from workbench.page.command import Command
+from workbench.page.widgets.templates import render
 
-ROTATED_CHARTS = 3
-"""Number of charts used in turn, one of them shown. With two, a busy browser may miss that two changes followed each
-other."""
 MAX_POINTS = 600
 """Maximum number of points of a curve. More do not fit in the panel's 300 pixels."""
 SELECTED_COLOUR = "#228be6"
-STEP = uplot.Series(label="step")
-"""The x axis; the first of every chart's series."""
-CURSOR = uplot.Series(
-    label="shown", stroke="#f08c00", width=0, points={"show": True, "size": 10, "fill": "#f08c00"}
-)
-
+MAX_TICKS = 4
 Span = tuple[float, float]
 YES_OR_NO: Span = (-0.05, 1.05)
 """Range of a curve of 0 and 1."""
@@ -34,6 +29,7 @@ class ChartLine:
     """One curve of a chart."""
 
     name: str
+    """Its name in the legend; an empty one leaves it out there."""
     values: NDArray
     """(K,) values; a value that is not finite is a gap."""
     colour: str = SELECTED_COLOUR
@@ -41,116 +37,125 @@ class ChartLine:
 
 
 class LineChart:
-    """A chart in a folder, created when there is something to draw.
+    """A chart in the present container, hidden until there is something to draw.
 
-    viser keeps the visible part of the x axis as a share of the data's range, and mixes two charts when uPlot rebuilds its
-    chart, which happens on a change of anything but the data: from then on the axis shows another part of the data, in the
-    end none. So a visible chart gets only new data, and other lines are drawn in another chart. uPlot finds no range for
-    data with NaN, and draws through it: NaN is sent as a gap.
+    Args:
+        height: Height of the plot in pixels.
+        press: Returns the command of a press on a step, or of a drag along the steps; None for no presses.
+        order: Position in the container; by default after the present content.
     """
 
     def __init__(
         self,
         server: viser.ViserServer,
-        folder: viser.GuiFolderHandle,
         height: int,
+        press: Callable[[int], Command] | None = None,
         order: float | None = None,
     ) -> None:
-        self._server, self._folder, self._height, self._order = server, folder, height, order
-        self._charts: list[viser.GuiUplotHandle] = []
-        """The charts; at most one is visible, the last."""
-        self._made_for: object = None
+        self._height, self._press = height, press
+        self._html = server.gui.add_html("", order=order, visible=False)
 
     @property
-    def handle(self) -> viser.GuiUplotHandle | None:
-        """The last drawn chart, if any."""
-        return self._charts[-1] if self._charts else None
+    def visible(self) -> bool:
+        return self._html.visible
 
     def hide(self) -> None:
-        if self.handle is not None:
-            self.handle.visible = False
+        self._html.visible = False
 
     def draw(
         self,
         title: str,
         x: NDArray,
         lines: Sequence[ChartLine],
-        dot: NDArray | None = None,
+        at: float | None = None,
         span: Span | None = None,
     ) -> None:
         """Draw lines; hide the chart if no line has a finite value, or K < 2.
 
         Args:
             title: Title above the chart.
-            x: (K,) steps.
-            lines: Lines over all of `x`.
-            dot: (K,) finite at the single dot, NaN elsewhere.
+            x: (K,) steps, ascending.
+            lines: Lines over all of `x`, the last one on top.
+            at: Step of the cursor; the legend shows the values there.
             span: Range of the y axis; None fits the data.
         """
-        if len(x) < 2 or not any(np.isfinite(line.values).any() for line in lines):
-            self.hide()
-            return
-        dots = () if dot is None else (dot,)
-        data = tuple(
-            np.asarray(values, np.float64) for values in (x, *(line.values for line in lines), *dots)
-        )
-        series = (STEP, *map(_series, lines), *(CURSOR for _ in dots))
-        wanted = (title, series, span)
-        # The number of data rows must match the series in every state that the browser may receive.
-        with self._server.atomic():
-            if self.handle is None or wanted != self._made_for:
-                self._change_to(title, data, series, span)
-            chart = self._charts[-1]
-            send_lines(chart, data, tuple(with_gaps(values) for values in data))
-            chart.visible = True
-        self._made_for = wanted
-
-    def _change_to(
-        self,
-        title: str,
-        data: tuple[NDArray[np.float64], ...],
-        series: tuple[uplot.Series, ...],
-        span: Span | None,
-    ) -> None:
-        """Draw in a hidden chart, which starts with a fresh x axis.
-
-        The old chart is hidden, not removed: a busy browser would report an error for data of a removed chart.
-        """
-        scales = {"x": uplot.Scale(time=False)} | ({} if span is None else {"y": uplot.Scale(range=span)})
-        self.hide()
-        if len(self._charts) == ROTATED_CHARTS:
-            chart = self._charts.pop(0)
-            chart.title, chart.series, chart.scales = title, series, scales
-            self._charts.append(chart)
-            return
-        with self._folder:
-            chart = self._server.gui.add_uplot(
-                data,
-                series,
-                title=title,
-                scales=scales,
-                axes=(uplot.Axis(size=30), uplot.Axis(size=56)),
-                legend=uplot.Legend(show=True),
-                height=self._height,
-                padding=(6, 22, 0, 0),
-                # All charts have the same position in the folder.
-                order=self._order,
-                visible=False,
-            )
-        self._order = chart.order
-        self._charts.append(chart)
+        self._html.visible = len(x) > 1 and any(np.isfinite(line.values).any() for line in lines)
+        if self._html.visible:
+            self._html.content = chart_html(title, x, lines, self._height, at, span, self._press)
 
 
-def _series(line: ChartLine) -> uplot.Series:
-    return uplot.Series(label=line.name, stroke=line.colour, width=line.width, points={"show": False})
+def chart_html(
+    title: str,
+    x: NDArray,
+    lines: Sequence[ChartLine],
+    height: int = 150,
+    at: float | None = None,
+    span: Span | None = None,
+    press: Callable[[int], Command] | None = None,
+) -> str:
+    """HTML of a chart; see `LineChart.draw`."""
+    low, high = span or _span_of_all(lines)
+    first, last = float(x[0]), float(x[-1])
+
+    def across(step: float) -> float:
+        return round(100 * (step - first) / (last - first), 3)
+
+    def down(value: float) -> float:
+        return round(100 * (high - value) / (high - low), 2)
+
+    place = None if at is None else int(np.abs(x - at).argmin())
+    return render(
+        "chart",
+        title=title,
+        height=height,
+        lines=[(line, _polylines(line.values, x, across, down)) for line in lines],
+        legend=[
+            (line, "" if place is None else number_text(float(line.values[place]), ".3g"))
+            for line in lines
+            if line.name
+        ],
+        across=[(across(step), f"{step:g}") for step in ticks(first, last)],
+        down=[(down(value), f"{value:g}") for value in ticks(low, high)],
+        cursor=None if at is None or not first <= at <= last else across(at),
+        press=None if press is None else press(round(first)),
+        ends=(round(first), round(last)),
+    )
 
 
-def with_gaps(values: NDArray[np.float64]) -> NDArray[np.float64] | list[float | None]:
-    """A line for uPlot, with None, which uPlot shows as a gap, for values that are not finite."""
-    finite = np.isfinite(values)
-    if finite.all():
-        return values
-    return [value if there else None for value, there in zip(values.tolist(), finite.tolist(), strict=True)]
+def _span_of_all(lines: Sequence[ChartLine]) -> Span:
+    values = np.concatenate([np.asarray(line.values, np.float64) for line in lines])
+    finite = values[np.isfinite(values)]
+    low, high = float(finite.min()), float(finite.max())
+    # A constant is drawn in the middle.
+    return (low, high) if low < high else (low - max(abs(low), 1.0) / 2, low + max(abs(low), 1.0) / 2)
+
+
+def _polylines(
+    values: NDArray, x: NDArray, across: Callable[[float], float], down: Callable[[float], float]
+) -> list[str]:
+    there = np.isfinite(values)
+    return polylines(
+        [
+            f"{across(float(step)):g},{down(float(value)):g}" if known else None
+            for step, value, known in zip(x, values, there, strict=True)
+        ]
+    )
+
+
+def polylines(points: Sequence[str | None]) -> list[str]:
+    """``points`` of SVG polylines through these points, with a gap at each None."""
+    runs = [[point for point in run if point] for there, run in groupby(points, key=bool) if there]
+    # SVG does not draw a polyline of one point; one of length zero with round ends is a dot.
+    return [" ".join(run if len(run) > 1 else run * 2) for run in runs]
+
+
+def ticks(low: float, high: float, most: int = MAX_TICKS) -> list[float]:
+    """Round numbers from `low` to `high`, at most `most`: multiples of 1, 2 or 5 times a power of ten."""
+    size = high - low
+    power = 10.0 ** math.floor(math.log10(size / most))
+    step = next(power * times for times in (1, 2, 5, 10, 20) if size / (power * times) < most)
+    first = math.ceil(low / step - 1e-9)
+    return [float(f"{number * step:.12g}") for number in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
 def part_round(count: int, place: int | None) -> slice:
