@@ -8,6 +8,7 @@
 "use strict";
 {
   const KEEPS = "workbench tab of ";
+  const OPEN = "workbench open ";
   const COMES = 5000; // milliseconds within which the tabs appear
   const SETTLES = 1000; // milliseconds from the first tab on; until all exist viser reopens the first
   const FOLD_COMES = 2000;
@@ -43,7 +44,7 @@
   wb.arrivals.openTab = ({ dataset }) => {
     const tab = [...document.querySelectorAll("[role=tab]")].find((one) => nameOf(one) === dataset.openTab);
     if (tab) keep(tab);
-    if (tab?.closest("[data-floating-window]")?.querySelector(".wb-drawer")) document.documentElement.setAttribute("data-timeline-open", "");
+    if (tab?.closest("[data-floating-window]")?.querySelector(".wb-drawer")) html.setAttribute("data-timeline-open", "");
     if (tab) press(tab);
     if (dataset.openFold) openFold(dataset.openFold, performance.now() + FOLD_COMES);
   };
@@ -56,7 +57,21 @@
   });
   const heldIn = ({ ctrlKey, metaKey, altKey }) => ctrlKey || metaKey || altKey;
 
-  wb.arrivals.toggle = ({ dataset }) => document.documentElement.toggleAttribute(`data-${dataset.toggle}`);
+  // What is open stays so in this tab of the browser, over the review and a reload.
+  const html = document.documentElement;
+  wb.arrivals.toggle = ({ dataset }) => {
+    const name = `data-${dataset.toggle}`;
+    html.toggleAttribute(name);
+    sessionStorage.setItem(OPEN + name, html.hasAttribute(name) ? "1" : "");
+  };
+  if (sessionStorage.getItem(`${OPEN}data-timeline-open`)) html.setAttribute("data-timeline-open", "");
+
+  // Help opens at the topic of the open tab.
+  addEventListener("pointerdown", ({ target }) => {
+    const link = target.closest?.("[data-topics]");
+    const open = tabsOf(marker()).find(isOpen);
+    if (link) link.href = `/help/${(open && JSON.parse(link.dataset.topics)[nameOf(open)]) || ""}`;
+  }, true);
 
   function followTabs() {
     const mark = marker();

@@ -91,17 +91,15 @@ def take_film(desk: Desk, path: Path) -> None:
 
     def find(frame: int) -> None:
         if frame == 0:
-            page.get_by_role("button", name="last failed").click()
+            page.get_by_label("Show", exact=True).first.select_option(label="without success last")
         elif frame == 1:
             desk.press("e")
         elif frame == 2:
-            desk.press("b", "o", "f")
+            desk.press("o", "f")
         time.sleep(4)
 
-    desk.press("b")
-    time.sleep(3)
     film.scene("Find the env that failed", 3.5, 5, find)
-    desk.tab("Studio")
+    desk.tab("Cameras")
     desk.choose("Camera", "base_camera · sensor")
     expect(page.get_by_text("Show the change", exact=True)).to_be_visible()
     time.sleep(4)

@@ -100,9 +100,10 @@ def take(browser: Browser, name: str, view: View) -> None:
         if view.show:
             desk.choose("Show", view.show)
         if view.all_cameras:
+            page.get_by_text("All pictures", exact=True).click()
             for tick in page.get_by_role("checkbox", name="rgb").all():
                 tick.check(force=True)
-            page.get_by_text("Show in 3D view").scroll_into_view_if_needed()
+            page.get_by_text("All pictures", exact=True).scroll_into_view_if_needed()
         desk.press(*view.keys)
         time.sleep(4)
         turn(page, view)

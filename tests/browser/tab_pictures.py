@@ -83,10 +83,6 @@ def take_live(page: Page, folder: Path) -> None:
     for name in LIVE_TABS:
         tab(page, name)
         if name == "Cameras":
-            for tick in page.locator("input[type=checkbox]:visible").all()[2:4]:
-                tick.check(force=True)
-            expect(page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
-        if name == "Studio":
             page.get_by_label("Camera", exact=True).select_option(label="eye · sensor")
             expect(page.get_by_text("Show the change", exact=True)).to_be_visible()
         shoot(page, folder, f"live-{name.lower()}")

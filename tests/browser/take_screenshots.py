@@ -64,7 +64,7 @@ class Desk:
             time.sleep(0.1)
 
     def choose(self, label: str, option: str) -> None:
-        self.page.get_by_label(label, exact=True).locator("visible=true").first.select_option(label=option)
+        self.page.get_by_label(label, exact=True).locator("visible=true").last.select_option(label=option)
 
     def edit(self, old: str, new: str) -> None:
         """Save the example with `old` replaced by `new`."""
@@ -121,7 +121,7 @@ def live_page(
         file.write_text(task or TASK.read_text())
         shutil.copy(POLICY, file.parent)
         with open_workbench(str(file), *arguments, cwd=file.parent, checks=checks) as opened:
-            page, _ = new_page(browser)
+            page, _ = new_page(browser, timeline=False)
             page.goto(opened.url)
             expect(page.locator(".wb-status").get_by_text("paused", exact=True)).to_be_visible(
                 timeout=120_000
@@ -148,6 +148,7 @@ def shoot_page(browser: Browser) -> None:
     """While the task plays: the Run tab, the cameras, and a misspelt name in the file."""
     with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
         desk.tab("Cameras")
+        desk.page.get_by_text("All pictures", exact=True).click()
         expect(desk.page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
         desk.tab("Run")
         take_policy(desk)
@@ -159,8 +160,9 @@ def shoot_page(browser: Browser) -> None:
         desk.shoot("run")
         desk.press("Space")
         desk.tab("Cameras")
-        for tick in desk.page.locator("input[type=checkbox]:visible").all()[1:4]:
+        for tick in desk.page.locator("input[type=checkbox]:visible").all()[:3]:
             tick.check(force=True)
+        desk.page.get_by_text("base_camera · sensor", exact=True).last.evaluate("e => e.scrollIntoView()")
         desk.shoot("cameras")
         desk.tab("Reward")
         desk.edit('"cube_to_goal": distance', '"cube_to_goal": distanec')
@@ -180,7 +182,7 @@ def shoot_reload(browser: Browser) -> None:
             desk.edit(*edit)
             expect(desk.page.get_by_text(level).first).to_be_visible(timeout=60_000)
             desk.page.get_by_text("Code version", exact=True).scroll_into_view_if_needed()
-            desk.page.get_by_role("button", name="Rebuild the scene", exact=True).scroll_into_view_if_needed()
+            desk.page.get_by_text("Reload by hand", exact=True).scroll_into_view_if_needed()
             for theme in THEMES:
                 desk.wear(theme)
                 time.sleep(FRAME_SECONDS)
@@ -222,14 +224,14 @@ def shoot_envs(browser: Browser) -> None:
         take_policy(desk)
         desk.tab("Reward")
         desk.step(62)
-        desk.press("b", "Shift+E", "f")
+        desk.press("Shift+E", "f")
         desk.shoot("envs")
 
 
 def shoot_studio(browser: Browser) -> None:
     """A camera is chosen and moved with keys, and the change is shown; then it is measured over the envs."""
     with live_page(browser, "--num-envs", "4") as desk:
-        desk.tab("Studio")
+        desk.tab("Cameras")
         desk.choose("Camera", "base_camera · sensor")
         expect(desk.page.get_by_text("Show the change", exact=True)).to_be_visible()
         desk.press(*12 * ["Alt+ArrowLeft"], *12 * ["Alt+Shift+ArrowRight"])
@@ -243,7 +245,7 @@ def shoot_measured_camera(browser: Browser) -> None:
     """A camera measured over all envs: the table, the depths, and the pictures."""
     with live_page(browser, "--num-envs", "16") as desk:
         desk.step(20)
-        desk.tab("Studio")
+        desk.tab("Cameras")
         desk.choose("Camera", "base_camera · sensor")
         desk.page.get_by_text("Measure", exact=True).click()
         measure = desk.page.get_by_role("button", name="Measure this camera")
@@ -266,7 +268,7 @@ def shoot_branch(browser: Browser) -> None:
         time.sleep(2)
         desk.step(25)
         desk.tab("Reward")
-        desk.press(*5 * ["ArrowLeft"])
+        desk.press(*5 * ["ArrowLeft"], "t")
         desk.shoot("branch")
 
 
@@ -303,6 +305,7 @@ def shoot_solve(browser: Browser) -> None:
     """Some steps of a plan, paused: the rollouts and their returns."""
     with live_page(browser, "--num-envs", "1", "--env", "control_mode=pd_ee_delta_pose") as desk:
         desk.choose("Source", "solve")
+        desk.tab("Try")
         for step in range(1, 4):
             desk.button("Step")
             expect(desk.page.locator(".wb-timeline").get_by_text(f"step {step} /")).to_be_visible(
@@ -326,6 +329,7 @@ def shoot_busy(browser: Browser) -> None:
         desk.step(25)
         desk.file.write_text("\n".join(lines) + "\n")
         expect(desk.page.get_by_role("button", name="Interrupt", exact=True)).to_be_visible(timeout=60_000)
+        desk.press("t")
         desk.tab("Log")
         desk.shoot("busy")
 
@@ -350,7 +354,7 @@ def shoot_review(browser: Browser) -> None:
         file.write_text(TASK.read_text().replace("CUBE_HALF_SIZE = 0.02", "CUBE_HALF_SIZE = 0.025"))
         record(file, recordings, "--episodes", "2", "--num-envs", "8", "--no-pictures")
         with open_workbench(str(recordings), cwd=Path(folder), what="review") as opened:
-            page, _ = new_page(browser)
+            page, _ = new_page(browser, timeline=False)
             page.goto(opened.url)
             rows = page.locator(".wb-library").get_by_text(re.compile("seed0000"))
             expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
@@ -396,7 +400,7 @@ def shoot_sweep(browser: Browser) -> None:
         command += ["--actions", f"{POLICY.name}:act", "--out", "sizes"]
         subprocess.run(command, check=True, cwd=folder)
         with open_workbench("sizes", cwd=Path(folder), what="review") as opened:
-            page, _ = new_page(browser)
+            page, _ = new_page(browser, timeline=False)
             page.goto(opened.url)
             expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
             close_notice(page)
@@ -422,7 +426,7 @@ def shoot_tutorial(browser: Browser) -> None:
         (words,) = commands(typed)
         subprocess.run([sys.executable, "-m", "workbench.cli.main", *words[1:]], check=True, cwd=folder)
         with open_workbench("recordings", cwd=folder, what="review") as opened:
-            page, _ = new_page(browser)
+            page, _ = new_page(browser, timeline=False)
             page.goto(opened.url)
             expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
             close_notice(page)

@@ -27,7 +27,7 @@ def page(task_file: Path, browser: Browser) -> Iterator[Page]:
     arguments = ("--num-envs", str(ENVS), "--env", "render_backend=none")
     with page_on(task_file, *arguments, browser=browser) as (page, errors, _):
         open_tab(page, "Inspect")
-        expect(page.get_by_text("panda_joint7", exact=True)).to_be_visible()
+        expect(page.get_by_role("cell", name="panda_joint7", exact=True)).to_be_visible()
         until(lambda: envs(page) == list(range(ENVS)), "the rows")
         play_until_step(page, 6)
         yield page

@@ -71,7 +71,7 @@ def test_a_link_to_a_section_shows_that_section(served: GatedServer, browser: Br
 def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, browser: Browser) -> None:
     with example_without_pictures(browser) as desk:
 
-        def leads_to_help(press: str) -> None:
+        def leads_to_help(press: str, title: str = "Workbench") -> None:
             with desk.page.expect_popup() as opened:
                 if press == "palette":
                     desk.press("Control+k")
@@ -80,15 +80,16 @@ def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, brows
                     desk.press("Enter")
                 else:
                     desk.page.get_by_role("link", name="Help", exact=True).click()
-            expect(opened.value.get_by_role("heading", level=1)).to_have_text("Workbench")
+            expect(opened.value.get_by_role("heading", level=1)).to_have_text(title)
             opened.value.close()
 
-        leads_to_help("link")
+        desk.tab("Checks")
+        leads_to_help("link", "Checks")
         leads_to_help("palette")
         desk.leave_inputs()
         desk.press("v")
         expect(desk.page.get_by_role("tab", name="Library")).to_be_visible()
-        leads_to_help("link")
+        leads_to_help("link", "Record episodes and review them")
         leads_to_help("palette")
         desk.leave_inputs()
         desk.press("v")

@@ -24,7 +24,7 @@ SIZES = [(1280, 720), (1440, 900), (1920, 1080)]
 DEFECTS = {
     "buttons touch": ".wb-pills { gap: 0 !important }",
     "cut": "label { display: block; width: 12px; overflow: hidden; white-space: nowrap }",
-    "a scroll bar lies over": ".wb-row { margin-right: -25px }",
+    "a scroll bar lies over": ".wb-numbers { width: calc(100% + 12px) !important }",
     "panels on each other": "[data-floating-window]:has(.wb-transport) { margin-right: -60px !important }",
     "text over a button's edge": ".wb-button { max-width: 30px; min-width: 0 !important }",
     "on each other": ".wb-status > .wb-news { margin-left: -30px }",

@@ -109,6 +109,7 @@ def test_a_patch_keeps_the_step_and_is_reported_and_a_rebuild_can_be_requested(a
     expect(
         at_start.page.get_by_text("only compute_dense_reward changed").locator("visible=true").first
     ).to_be_visible()
+    at_start.page.get_by_text("Reload by hand", exact=True).click()
     at_start.button("Rebuild the scene").click()
     expect(at_start.page.get_by_text("rebuilt was requested").locator("visible=true").first).to_be_visible()
     at_start.tab("Reward")

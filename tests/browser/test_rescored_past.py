@@ -23,6 +23,7 @@ def desk(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
     with example_without_pictures(browser, height=1000) as desk:
         page = desk.page
         # The server is shared: it may still have the rescored past of an edit by another file's tests.
+        page.get_by_text("Reload by hand", exact=True).click()
         page.get_by_role("button", name="Rebuild the scene", exact=True).click()
         until(lambda: desk.moments_kept() <= 2, "a new past")
         page.get_by_role("button", name="Play", exact=True).click()

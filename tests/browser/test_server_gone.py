@@ -11,11 +11,14 @@ from playwright.sync_api import Browser, expect
 
 from tests.drive.far_line import line_to
 from tests.drive.page import TASK, new_page, open_tab, open_workbench
+from tests.drive.waiting import until
 from workbench.commands import COMMANDS
 from workbench.page.door.gated_server import ServerOptions, open_server
 from workbench.page.widgets.visitors import PATH, Visitors
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
+NAME = "document.querySelector('[data-page]')?.dataset.page"
+"""The name with which the server addresses the page; a page that reconnects gets another one."""
 
 
 def test_a_lost_server_is_reported_with_its_address(browser: Browser, tmp_path: Path) -> None:
@@ -72,7 +75,9 @@ def test_a_reconnected_page_keeps_its_tab_and_env_and_its_commands_work(
             open_tab(page, "Inspect")
             expect_unchanged()
         expect(page.get_by_role("alert").filter(has_text=str(line.port))).to_be_in_viewport()
+        name = page.evaluate(NAME)
         with line_to(opened.url, port=line.port):
+            until(lambda: page.evaluate(NAME) not in (None, name), "the page's new name")
             expect(page.get_by_role("alert").filter(has_text=str(line.port))).to_have_count(0)
             expect_unchanged()
             page.keyboard.press("Space")

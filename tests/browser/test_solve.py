@@ -37,6 +37,7 @@ def test_a_task_is_solved_saved_and_exported_with_the_mouse_only(desk: Desk) -> 
     page = desk.page
     desk.tab("Run")
     choose(desk, "Source", "solve")
+    desk.button("Its options, and what it finds").click()
     expect(page.get_by_text(re.compile("actions are planned by rollouts"))).to_be_visible()
     desk.button("Play").click()
     save = desk.button("Save the solved episode")
@@ -68,7 +69,7 @@ def test_a_pressed_seed_opens_in_the_review_and_back_returns_to_its_row(desk: De
     """The review last showed its Share tab, with another episode."""
     page = desk.page
     desk.button("Back to the live env").click()
-    page.get_by_role("tab", name=re.compile("^Checks")).click()
+    desk.tab("Try")
     page.get_by_text("Solve many seeds", exact=True).click()
     page.get_by_label("Seeds", exact=True).locator("visible=true").fill("1")
     desk.button("Solve").click()

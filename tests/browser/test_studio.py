@@ -97,6 +97,9 @@ def arc_about_x(page: Page) -> tuple[float, float] | None:
 def test_a_press_on_a_frustum_chooses_its_camera(page: Page, opened: Page) -> None:
     choose(opened, NO_CAMERA)
     expect(opened.get_by_text("Choose a camera here, or click its frustum")).to_be_visible()
+    opened.keyboard.press("o")
+    expect(opened.get_by_role("button", name="All envs")).to_have_attribute("aria-pressed", "true")
+    opened.wait_for_timeout(1500)  # until the view is framed
 
     def orange() -> tuple[NDArray[np.intp], ...]:
         r, g, b = np.moveaxis(view(opened), -1, 0)
@@ -108,6 +111,7 @@ def test_a_press_on_a_frustum_chooses_its_camera(page: Page, opened: Page) -> No
     opened.mouse.click(x, y)
     expect(opened.get_by_text(re.compile("^As in push_cube.py, line"))).to_be_visible()
     assert numbers(opened, "Position") == [0.45, 0, 0.6] and numbers(opened, "Looks at") == [0.08, 0, 0]
+    opened.keyboard.press("o")
 
 
 def test_a_camera_is_dragged_written_to_the_file_checked_and_undone(page: Page, task_file: Path) -> None:

@@ -36,7 +36,7 @@ def test_a_loop_shows_a_banner_that_can_interrupt_it_with_its_traceback(desk: De
         desk.page.get_by_text(re.compile(r"has been in evaluate for \d+ s — risky\.py:\d+"))
     ).to_be_visible()
     # The page's own controls keep working.
-    desk.button("next ›").click()
+    desk.button("Next env").click()
     until(lambda: "env 1: step" in desk.page.inner_text("body"), "the next env")
     desk.button("Interrupt").click()
     expect(desk.page.get_by_text(re.compile("was interrupted in evaluate"))).to_be_visible()

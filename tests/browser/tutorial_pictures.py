@@ -59,7 +59,7 @@ def take_steps(desk: Desk) -> None:
     desk.step(30)
     desk.shoot("tutorial_reward", kind="webp")
     do(desk, 8)
-    desk.tab("Studio")
+    desk.tab("Cameras")
     desk.choose("Camera", "base_camera · sensor")
     expect(page.get_by_text("Show the change", exact=True)).to_be_visible()
     desk.press(*8 * ["Alt+ArrowLeft"], *8 * ["Alt+Shift+ArrowRight"])

@@ -193,17 +193,19 @@ BLOCKED_RERUN_HOSTS = re.compile(r"fonts\.googleapis\.com|rerun-io/rerun/release
 
 
 def new_page(
-    browser: Browser, width: int = 1280, height: int = 720, drawn: bool = True
+    browser: Browser, width: int = 1280, height: int = 720, drawn: bool = True, timeline: bool = True
 ) -> tuple[Page, list[str]]:
-    """A page with the timeline open, and the console errors and uncaught exceptions that it has so far.
+    """A page, and the console errors and uncaught exceptions that it has so far.
 
     Args:
+        timeline: Open the timeline under the view.
         drawn: Draw the 3-D view continuously; otherwise only for `picture_of_view`.
     """
     page = browser.new_page(viewport={"width": width, "height": height})
-    page.add_init_script(
-        "addEventListener('DOMContentLoaded', () => document.documentElement.setAttribute('data-timeline-open', ''))"
-    )
+    if timeline:
+        page.add_init_script(
+            "addEventListener('DOMContentLoaded', () => document.documentElement.setAttribute('data-timeline-open', ''))"
+        )
     if not drawn:
         page.add_init_script(DRAW_ON_REQUEST_JS)
     errors: list[str] = []

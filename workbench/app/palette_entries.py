@@ -1,4 +1,4 @@
-"""Palette entries of the open task: its envs, cameras and control modes by name."""
+"""Palette entries of the open task: its envs, cameras, control modes and curves by name."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from workbench.cameras.studio_panel import TAB as CAMERAS
 from workbench.live.commands import UseControlMode
 from workbench.live.env_commands import SelectEnv
 from workbench.live.panels.run_panel import control_modes
+from workbench.live.panels.timeline_panel import strip_curves
+from workbench.live.timeline_commands import ChooseStripCurve
 from workbench.live.view import SessionView
 from workbench.page.command import Command
 from workbench.page.widgets.hotkeys import add
@@ -35,6 +37,7 @@ class TaskCommands(PagePart[SessionView]):
             [camera.key for camera in view.task.cameras],
             control_modes(view),
             view.task.control_mode,
+            tuple(strip_curves(view)),
         )
 
     def draw(self, view: SessionView) -> None:
@@ -65,4 +68,5 @@ def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
             )
             for mode in control_modes(view)
         ),
+        *((f"Curve {name}", ChooseStripCurve(curve=name), "on the strip") for name in strip_curves(view)),
     ]

@@ -26,10 +26,11 @@ from workbench.live.messages import EpisodeEnd
 from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
+from workbench.page.commands import ShowTab
 from workbench.page.widgets.fields import Field, choice, slider
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
-from workbench.page.widgets.tools import tool, tools_html
+from workbench.page.widgets.tools import Tool, tool, tools_html
 from workbench.page.widgets.visitors import Visitor
 from workbench.task.description import ActionDimension
 
@@ -120,6 +121,7 @@ EPISODE_ENDS: dict[str, EpisodeEnd] = {
 }
 SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
 RESET_ALL, RESET_THIS = "Reset all", "Reset this env"
+TO_TRY = "Its options, and what it finds"
 MODE_HINT = "Another control mode rebuilds the envs."
 CHOOSE = "choose one"
 KNOWN_HINT = (
@@ -140,6 +142,9 @@ class RunPanel(PagePart[SessionView]):
         with gui.add_folder("Actions"):
             self._source = choice(
                 server, "Source", ChooseActions, "source", SOURCES, "hold", hint=SOURCE_HINT
+            )
+            self._about_solve = gui.add_html(
+                tools_html([Tool(TO_TRY, ShowTab(tab="Try"), "Open the Try tab")])
             )
             self._mode = choice(server, "Control", UseControlMode, "mode", (), "", hint=MODE_HINT)
             self._policy = Field(
@@ -177,6 +182,7 @@ class RunPanel(PagePart[SessionView]):
         self._mode.visible = len(modes) > 1
         now = "" if view.task is None else view.task.control_mode or ""
         self._mode.show(now, options={mode: mode for mode in modes}, off=not can_act)
+        self._about_solve.visible = view.settings.action_source == "solve"
         self._policy.show(view.settings.policy or "")
         policy, known = view.settings.policy, view.known_policies
         policy_wanted = view.settings.action_source == "policy"
