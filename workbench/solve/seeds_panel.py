@@ -27,7 +27,7 @@ from workbench.planning.verdicts import MIN_SEEDS
 from workbench.solve.seeds import RUNNING, SeedsView
 
 TITLE = "Solve many seeds"
-SOLVE, STOP_SOLVING = "Solve", "Stop solving"
+SOLVE, STOP_SOLVING = "Solve the seeds", "Stop solving"
 HINT = f"Seeds are counted from 0. With fewer than {MIN_SEEDS}, problems of the reward may not show."
 
 
