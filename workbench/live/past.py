@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -263,6 +264,7 @@ class Past:
         values[ticks[here][stepped] - low] = history.numbers(env, *serials, column)[stepped]
         events: dict[int, int] = {}
         happened = history.events(env, *serials)
+        at = [serial for serial, _ in happened]
         for serial, flags in happened:
             tick = int(ticks[serial - base])
             events[tick] = events.get(tick, 0) | flags
@@ -284,7 +286,7 @@ class Past:
                     max(begin, low),
                     min(last, high),
                     start in jumps,
-                    _ending(flags for serial, flags in happened if start <= serial <= stop),
+                    _ending(flags for _, flags in happened[bisect_left(at, start) : bisect_right(at, stop)]),
                 )
                 for start, stop in history.segments(env)
                 for begin, last in [(tick_of(start), tick_of(stop))]

@@ -82,7 +82,7 @@ def test_it_can_be_drawn_over_the_other_envs(live: Live) -> None:
     live.part("Reward").set("Over", "the other envs")
     live.show(episodes.view(env=3))
     beside = live.part("Reward").charts()[0].of(BESIDE_COLOUR)
-    others = [point for env in (2, 1, 0) for point in reward(5, 4, env)]
+    others = [point for env in (0, 1, 2) for point in reward(5, 4, env)]
     np.testing.assert_allclose(beside, others, atol=0.05)
 
 
@@ -114,6 +114,14 @@ def test_each_part_of_the_reward_has_a_line_of_the_selected_env(live: Live) -> N
     assert chart.of(COLOURS[0])[:, 1] == pytest.approx([2.0] * 4, abs=0.01)
     assert chart.of(COLOURS[1])[:, 1] == pytest.approx([-2.0] * 4, abs=0.01)
     assert "No curve of sum" in live.part("Reward").html()
+
+
+def test_of_many_lines_in_one_chart_the_first_ones_are_drawn(live: Live) -> None:
+    terms: dict[str, Any] = {f"reward_terms/{k}": np.full(3, float(k)) for k in range(len(COLOURS) + 8)}
+    live.show(Episodes(live, 4, 3, ended=3, **terms).view())
+    *_, chart = live.part("Reward").charts()
+    assert chart.names == [str(k) for k in range(len(COLOURS))]
+    assert [chart.of(colour)[0, 1] for colour in COLOURS[:3]] == pytest.approx([0, 1, 2], abs=0.1)
 
 
 def test_any_entry_or_joint_can_be_chosen_and_the_choice_is_kept_per_task(live: Live) -> None:

@@ -149,18 +149,21 @@ class CurvesPanel(MomentPart):
         last = max(int(one.steps[-1]) for one in begun)
         at = int(step.elapsed_steps[env])
         drawn: set[Entry] = set()
-        for key, own in by_chart.items():
+        for key, together in by_chart.items():
             if key in singles[MAX_CHARTS + 2 :]:
                 continue
-            alone = len(own) == 1
-            chosen = [(own[0], one) for one in episodes[:0:-1]] if alone else []
-            chosen += [(column, episodes[0]) for column in own[:MAX_LINES]]
+            own, alone = together[:MAX_LINES], len(together) == 1
+            chosen = [(column, episodes[0]) for column in own]
+            chosen += [(own[0], one) for one in episodes[1:]] if alone else []
+            # The episode in sight first: its peaks are exact, also in a long one.
             x, values = spans_of(
                 np.stack([_along(one, column, first, last) for column, one in chosen]), first=first
             ).points()
-            lines = [ChartLine("", line, BESIDE_COLOUR, 0.8) for line in values[: len(chosen) - len(own)]]
-            for column, line, colour in zip(own, values[len(lines) :], COLOURS, strict=False):
-                lines.append(ChartLine(f"env {env}" if alone else column.label, line, colour, 1.8))
+            lines = [ChartLine("", line, BESIDE_COLOUR, 0.8) for line in values[len(own) :]]
+            lines += [
+                ChartLine(f"env {env}" if alone else column.label, line, colour, 1.8)
+                for column, line, colour in zip(own, values, COLOURS, strict=False)
+            ]
             yes_or_no = all(is_yes_or_no(step, column) for column in own)
             titles = {Group.TERM: "reward terms", Group.JOINT: "joints"}
             title = key[1] or titles[key[0]]
