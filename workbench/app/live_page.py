@@ -59,6 +59,7 @@ from workbench.page.commands import (
     ToggleTimeline,
 )
 from workbench.page.scene.bodies import DrawStyle
+from workbench.page.scene.body_pick import BodyMark, body_under_ray
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.editor_links import editor_link
@@ -194,7 +195,7 @@ class Page:
         opening = () if self._opening is None else (self._opening,)
         self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
 
-        self._mark = SelectionMark(server)
+        self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
         self._frustums = CameraFrustums(server)
         self._forces = ForceArrows(server)
         self._parts.add(TaskCommands(server, visitors))
@@ -428,6 +429,7 @@ class Page:
         placed = self._studio.draw_in_view(view, offset)
         self._frustums.draw(task.cameras, pictures, offset, SMALL_METRES if alone else LARGE_METRES, placed)
         self._forces.draw(self._inspect.forces(view), offset)
+        self._body_mark.draw(task.geometry, step.poses, env, self._inspect.body, offset)
         self._solve.draw_in_view(view, offset)
         # A scene of another size is framed again; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
@@ -467,11 +469,17 @@ class Page:
         if (camera := self._frustums.under_ray(*ray)) is not None:
             self._session.happen(CameraChosen(camera))
             return
-        if self._icons.only_selected:
+        alone = self._icons.only_selected or view.task.num_envs == 1
+        env = view.selected_env if alone else env_under_ray(layout, *ray)
+        if env is None or env >= view.task.num_envs or view.step is None:
             return
-        env = env_under_ray(layout, *ray)
-        if env is not None and env < view.task.num_envs:
+        if not alone:
             self._session.change(selected_env=env)
+        geometry, poses = view.task.geometry, view.step.poses
+        if poses.shape[:2] == (geometry.num_envs, len(geometry.body_names)):
+            origin = ray[0] - (0 if alone else layout.offsets[env])
+            body = body_under_ray(geometry, poses, env, origin, ray[1])
+            self._inspect.select("" if body is None else geometry.body_names[body])
 
 
 def _shown_of(view: SessionView) -> tuple[object, object]:

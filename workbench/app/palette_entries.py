@@ -1,4 +1,4 @@
-"""Palette entries of the open task: its envs, cameras, control modes and curves by name."""
+"""Palette entries of the open task: its envs, cameras, control modes, bodies and curves by name."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import viser
 
 from workbench.cameras.commands import SelectCamera
 from workbench.cameras.studio_panel import TAB as CAMERAS
-from workbench.live.commands import UseControlMode
+from workbench.live.commands import SelectBody, UseControlMode
 from workbench.live.env_commands import SelectEnv
 from workbench.live.panels.run_panel import control_modes
 from workbench.live.panels.timeline_panel import strip_curves
@@ -38,6 +38,7 @@ class TaskCommands(PagePart[SessionView]):
             control_modes(view),
             view.task.control_mode,
             tuple(strip_curves(view)),
+            view.task.geometry.body_names,
         )
 
     def draw(self, view: SessionView) -> None:
@@ -68,5 +69,6 @@ def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
             )
             for mode in control_modes(view)
         ),
+        *((f"Body {name}", SelectBody(body=name), "marked in the view") for name in task.geometry.body_names),
         *((f"Curve {name}", ChooseStripCurve(curve=name), "on the strip") for name in strip_curves(view)),
     ]

@@ -166,6 +166,12 @@ class ChooseInspected(Command, frozen=True):
     what: Literal["nothing", "joints", "contacts", "poses", "observation", "state"]
 
 
+class SelectBody(Command, frozen=True):
+    """Select this body of the selected env, in the view and in Inspect; empty for none."""
+
+    body: str
+
+
 class ShowForces(Command, frozen=True):
     """Show or hide the contact forces of the selected env, as arrows in the 3D view."""
 

@@ -9,6 +9,7 @@ import pytest
 from tests.drive.live import Live
 from tests.drive.scenes import running
 from workbench.envs.inspection import Inspection, JointReadings, Leaf, Touching
+from workbench.live.commands import SelectBody
 from workbench.live.panels.inspect_panel import (
     CHOICES,
     MAX_ARROW_METRES,
@@ -18,6 +19,7 @@ from workbench.live.panels.inspect_panel import (
     joint_rows,
     pose_rows,
 )
+from workbench.page.commands import TellUnfolded
 
 
 def leaf(name: str, *values: float, shape: tuple[int, ...] | None = None) -> Leaf:
@@ -132,6 +134,25 @@ def test_changes_since_the_last_reading_of_the_same_env_are_marked(live_page: Li
         changed(*one)
         for one in ((0, 1, 1.0), (0, 2, 2.0), (0, 3, 2.0), (1, 3, 5.0), (1, 4, 6.0), (0, 4, 9.0))
     ] == [0, 1, 0, 0, 1, 0]
+
+
+def test_the_selected_body_is_shown_first_with_its_pose_and_its_contacts(live_page: Live) -> None:
+    inspect = live_page.part("Inspect")
+    reading = Inspection(1, 5, contacts=(PRESSED,))
+    view = running(2, selected_env=1, inspection=reading)
+    live_page.show(view)
+    assert "wb-body" not in inspect.html()
+    live_page.do(TellUnfolded(panel="Inspect"))
+    live_page.do(SelectBody(body="cube"))
+    assert "contacts" in live_page.asked[-1].sections
+    live_page.show(view)
+    body = inspect.html("wb-body")
+    assert 'data-copy="sapien.Pose(p=[' in body and "touches &lt;i&gt;table" in body and "5 N" in body
+    live_page.show(running(2, selected_env=0, inspection=reading))
+    assert "5 N" not in inspect.html("wb-body"), "the contacts are of another env"
+    live_page.do(SelectBody(body="gone"))
+    live_page.show(view)
+    assert "wb-body" not in inspect.html()
 
 
 def test_only_chosen_quantities_are_read_and_contacts_for_the_arrows(live_page: Live) -> None:

@@ -13,7 +13,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.envs.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section
-from workbench.live.commands import ChooseInspected, ShowForces
+from workbench.live.commands import ChooseInspected, SelectBody, ShowForces
 from workbench.live.events import ReadingChosen
 from workbench.live.inspect_polling import READ_PERIOD_SECONDS
 from workbench.live.session_protocol import LiveSession
@@ -153,13 +153,16 @@ class InspectPanel(PagePart[SessionView]):
     Nothing is read until a page has opened the tab, since reading takes the worker's time.
     """
 
-    does = (ChooseInspected, ShowForces)
+    does = (ChooseInspected, SelectBody, ShowForces)
 
     def __init__(
         self, server: viser.ViserServer, session: LiveSession, clock: Clock = time.monotonic
     ) -> None:
         self._session = session
         self._chosen, self._shows_forces = JOINTS, False
+        self.body = ""
+        """Name of the selected body; empty for none."""
+        self._of_body = server.gui.add_html("", visible=False)
         self._show = choice(
             server,
             "Show",
@@ -190,11 +193,13 @@ class InspectPanel(PagePart[SessionView]):
         self._forces.show(self._shows_forces)
         self._take(view)
         no_step = self._no_step_yet(view)
-        wanted = (chosen, view.task_serial, view.selected_env, id(self._now), no_step)
-        if chosen == POSES:
+        wanted = (chosen, view.task_serial, view.selected_env, id(self._now), no_step, self.body)
+        if chosen == POSES or self.body:
             wanted = (*wanted, view.step_serial)
-        if not self._due.is_due(wanted, urgent=chosen):
+        if not self._due.is_due(wanted, urgent=(chosen, self.body)):
             return
+        content = body_html(self.body, view, None if no_step else self._now)
+        self._of_body.content, self._of_body.visible = content, bool(content)
         self._handle.content = inspect_html(chosen, view, self._now, self._before, no_step)
 
     def do(self, command: Command, visitor: Visitor) -> None:
@@ -202,6 +207,8 @@ class InspectPanel(PagePart[SessionView]):
             case ChooseInspected(what=what):
                 self._chosen = what
                 self.unfold()
+            case SelectBody(body=body):
+                self.select(body)
             case ShowForces(on=on):
                 self._shows_forces = on
                 self._choose()
@@ -212,6 +219,11 @@ class InspectPanel(PagePart[SessionView]):
         known = view.timeline.shown is None and not self._no_step_yet(view)
         shown = self._shows_forces and here and known
         return self._now if shown else None
+
+    def select(self, body: str) -> None:
+        """Select the body with this name; empty for none."""
+        self.body = body
+        self._choose()
 
     def unfold(self) -> None:
         """Start reading, because a page has opened the tab."""
@@ -230,7 +242,7 @@ class InspectPanel(PagePart[SessionView]):
         """Tell the session which sections to read."""
         needed = {
             CHOICES[self._chosen] if self._opened else None,
-            "contacts" if self._shows_forces else None,
+            "contacts" if self._shows_forces or (self.body and self._opened) else None,
         }
         self._session.happen(ReadingChosen(tuple(section for section in SECTIONS if section in needed)))
 
@@ -298,8 +310,41 @@ def inspect_html(
         articulations=articulations,
         contacts=contacts,
         poses=poses,
+        select=lambda name: SelectBody(body=name),
         vector=vector,
         strength=strength,
+    )
+
+
+def body_html(body: str, view: SessionView, now: Inspection | None) -> str:
+    """Pose and contacts of the selected body; empty if none is selected, or the task has no such body.
+
+    Args:
+        now: the last reading; None if the env's contacts are not known.
+    """
+    env, step = view.selected_env, view.step
+    geometry = None if view.task is None else view.task.geometry
+    if step is None or geometry is None or body not in geometry.body_names:
+        return ""
+    if step.poses.shape[1] != len(geometry.body_names):
+        return ""
+    row = geometry.body_names.index(body)
+    poses = pose_rows((body,), step.poses[env, row : row + 1])
+    contacts = None
+    if now is not None and now.env == env and now.contacts is not None and view.timeline.shown is None:
+        contacts = [
+            (pair.bodies[body == pair.bodies[0]], strength(pair.force))
+            for pair in now.contacts
+            if body in pair.bodies
+        ]
+    return render(
+        "inspect_body",
+        name=body,
+        kind=geometry.body_kinds[row],
+        env=env,
+        pose=poses[0] if poses else None,
+        contacts=contacts,
+        clear=SelectBody(body=""),
     )
 
 
