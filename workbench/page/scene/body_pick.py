@@ -59,7 +59,7 @@ def _first_hit(mesh: Mesh, origin: NDArray, direction: NDArray, most: float) -> 
         turned = np.cross(away, along)
         v = turned @ direction / size
         at = np.einsum("ij,ij->i", across, turned) / size
-    hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (at > 0)
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (at > 0)
     return float(at[hit].min(initial=np.inf))
 
 
