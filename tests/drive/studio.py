@@ -1,4 +1,4 @@
-"""Operates the Studio tab with mouse and keys."""
+"""Operates the Studio, on the Cameras tab, with mouse and keys."""
 
 from __future__ import annotations
 

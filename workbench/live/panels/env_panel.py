@@ -105,7 +105,7 @@ def gives_way(entries: tuple[str, ...], chosen: Mapping[str, bool], sorted_by: s
     others = [name for name in reversed(entries) if name not in added]
     more = [f"first {name}" for name in others if name not in ("success", "fail")]
     fail, success = ([f"first {name}"] if name in others else [] for name in ("fail", "success"))
-    # Flags go first: flagged envs also have a mark above the tabs.
+    # Flags go first: flagged envs also have a mark in the bar.
     in_turn = ["flags", *more, "last", *fail, *success, *(f"first {name}" for name in added)]
     ranked = [column for column in (*in_turn, REWARD_CURVE, "steps", "return") if column != sorted_by]
     return {column: rank for rank, column in enumerate(ranked)}
