@@ -58,7 +58,7 @@ help:
 	@echo "make test      lint, types and the tests that need no GPU and little time (ARGS=options of pytest)"
 	@echo "make test-fast ruff and the quickest of the tests that need no process, renderer or browser: about a minute"
 	@echo "make test-all  the slow tests too"
-	@echo "make test-order all of them in random order (SEED=1 makes one order again)"
+	@echo "make test-order all of them in random order, with new examples of the property tests (SEED=1 makes one order again)"
 	@echo "make test MANISKILL=nightly  the same tests with ManiSkill's nightly build, in .venv-nightly; likewise make open"
 	@echo "make mutants   would a test notice? Slips are planted in copies of MODULES (page/door/access ..., or all)"
 	@echo "make test-gpu  on a machine with CUDA: what of GPU simulation and GPU pictures works, within 8 minutes"
@@ -91,7 +91,8 @@ test-all: lint
 test-order: set-up-test
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
 	echo "this order again: make test-order SEED=$(SEED)"; \
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --random-order-seed=$(SEED) $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --random-order-seed=$(SEED) \
+	  --hypothesis-profile=new-examples --hypothesis-seed=$(SEED) $(ARGS)
 
 test-gpu:
 	@if [ -z "$(GPU_PYTHON)" ]; then echo "test-gpu needs Python 3.11 or 3.12; name one: make test-gpu GPU_PYTHON=/path/to/python3.12" >&2; exit 1; fi
