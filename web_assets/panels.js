@@ -44,7 +44,7 @@
   wb.arrivals.openTab = ({ dataset }) => {
     const tab = [...document.querySelectorAll("[role=tab]")].find((one) => nameOf(one) === dataset.openTab);
     if (tab) keep(tab);
-    if (tab?.closest("[data-floating-window]")?.querySelector(".wb-drawer")) html.setAttribute("data-timeline-open", "");
+    if (tab?.closest("[data-floating-window]")?.querySelector(".wb-drawer")) setOpen("data-timeline-open", true);
     if (tab) press(tab);
     if (dataset.openFold) openFold(dataset.openFold, performance.now() + FOLD_COMES);
   };
@@ -59,11 +59,11 @@
 
   // What is open stays so in this tab of the browser, over the review and a reload.
   const html = document.documentElement;
-  wb.arrivals.toggle = ({ dataset }) => {
-    const name = `data-${dataset.toggle}`;
-    html.toggleAttribute(name);
-    sessionStorage.setItem(OPEN + name, html.hasAttribute(name) ? "1" : "");
-  };
+  function setOpen(name, isOpen) {
+    html.toggleAttribute(name, isOpen);
+    sessionStorage.setItem(OPEN + name, isOpen ? "1" : "");
+  }
+  wb.arrivals.toggle = ({ dataset }) => setOpen(`data-${dataset.toggle}`, !html.hasAttribute(`data-${dataset.toggle}`));
   if (sessionStorage.getItem(`${OPEN}data-timeline-open`)) html.setAttribute("data-timeline-open", "");
 
   // Help opens at the topic of the open tab.

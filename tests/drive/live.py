@@ -98,7 +98,7 @@ class Live(Panels):
         """Draw this view, `seconds` after the last one."""
         if view.task is not None and view.task.num_envs != self._envs:
             self._envs, self._scenes = view.task.num_envs, self._scenes + 1
-        view = replace(view, scene_serial=view.scene_serial + self._scenes)
+        view = replace(view, scene_serial=view.scene_serial + self._scenes, env_table=rows or view.env_table)
         self.session.shown, self.session.rows = view, rows
         self.clock.passes(seconds)
         pressed, self.session.asked = self.session.asked, []

@@ -227,7 +227,7 @@ class Page:
                 self._cameras = CamerasPanel(server, studio_shows=lambda: self._studio.shows, clock=clock)
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             reward = [
-                NumbersPanel(server, session),
+                NumbersPanel(server),
                 RescoredAbove(server),
                 CurvesPanel(server, session),
             ]

@@ -71,8 +71,7 @@ class Marks(PagePart[SessionView]):
         )
 
     def draw(self, view: SessionView) -> None:
-        rows = self._session.env_rows()
-        flagged = None if rows is None else flagged_text(rows)
+        flagged = None if view.env_table is None else flagged_text(view.env_table)
         self._html.content = render(
             "marks",
             rec=recording_mark(view),

@@ -13,6 +13,7 @@ from workbench.envs.camera_data import CameraKey, Picture
 from workbench.envs.gpu_rules import Finding
 from workbench.envs.inspection import Inspection
 from workbench.envs.step_result import StepResult
+from workbench.live.history.env_table import EnvRows
 from workbench.live.messages import ReloadReport, RulesBroken, Settings
 from workbench.live.past import TimelineView
 from workbench.live.process.captured_output import NOTHING_PRINTED, Printed
@@ -55,6 +56,8 @@ class SessionView:
     """The shown step: the newest, or a past one (`timeline`)."""
     step_serial: int = 0
     """Serial of the shown moment."""
+    env_table: EnvRows | None = None
+    """The table of envs at the shown moment, without the rewards; `Run.env_rows` has them."""
     pictures: Mapping[CameraKey, Picture] = field(default_factory=dict)
     pictures_serial: int = 0
     picture_milliseconds: float | None = None
@@ -141,10 +144,12 @@ def view_of(run: Run, **known: Any) -> SessionView:
     )
     moment = past.shown
     if moment is None:
-        return view
+        newest = past.history.at(past.history.last)
+        return view if newest is None else replace(view, env_table=newest.rows)
     return replace(
         view,
         step=moment.step,
+        env_table=moment.rows,
         step_serial=moment.serial,
         pictures=past.pictures(run.env),
         told=moment.step.action,

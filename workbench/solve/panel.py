@@ -205,7 +205,7 @@ class SolvePanel(PagePart[SessionView]):
             self._told = solve.solved
             return
         plan = view.settings.plan
-        self._status.content = solve_html(solve, self._session.env_rows(), view.selected_env, self._link)
+        self._status.content = solve_html(solve, view.env_table, view.selected_env, self._link)
         self._draw_saving(view)
         better = Tool(USE_MODE, UseControlMode(mode=BETTER_MODE), USE_MODE_HINT)
         self._mode.content = tools_html([better] if offers_better_mode(view) else [])

@@ -400,8 +400,7 @@ def _batch(values: NDArray) -> str:
 class NumbersPanel(MomentPart):
     """The table of the task's numbers, and how its episodes ended."""
 
-    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
-        self._session = session
+    def __init__(self, server: viser.ViserServer) -> None:
         self._handle = server.gui.add_html("")
         self._outcomes = server.gui.add_html("")
 
@@ -420,7 +419,6 @@ class NumbersPanel(MomentPart):
             num_envs=0 if task is None else task.num_envs,
             has_success=step is not None and "success" in step.evaluate,
         )
-        table = self._session.env_rows()
-        counts = [] if table is None else ended_counts(table)
+        counts = [] if view.env_table is None else ended_counts(view.env_table)
         total = sum(count for _, _, count in counts)
         self._outcomes.content = render("outcomes", counts=counts, total=total) if total else ""

@@ -206,7 +206,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         if view.task is not None and view.timeline.moments > 0:
             self._draw_slider(view)
             self._draw_buttons(view)
-            self._draw_strip(view)
+            self._draw_strip(view, curves.get(self._curve, REWARD))
         else:
             self._draw_empty()
 
@@ -268,9 +268,8 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         self._hint.content = hint
         self._travel.visible, self._hint.visible = bool(travel), not travel
 
-    def _draw_strip(self, view: SessionView) -> None:
+    def _draw_strip(self, view: SessionView, column: Column) -> None:
         past = view.timeline
-        column = strip_curves(view).get(self._curve, REWARD)
         wanted = (
             past.first,
             past.last,
