@@ -190,6 +190,8 @@ def browser_at(chromium: str) -> Iterator[Browser]:
 
 BLOCKED_RERUN_HOSTS = re.compile(r"fonts\.googleapis\.com|rerun-io/rerun/releases|tel\.rerun\.io")
 """Requests of rerun's viewer to other servers, which our content policy rightly blocks."""
+RERUN_CUT_OFF = re.compile(r"Failed to fetch.*/rerun/viewer-", re.DOTALL)
+"""What rerun's viewer throws where its frame is closed while it fetches. A refused fetch has a response instead."""
 
 
 def new_page(
@@ -214,8 +216,12 @@ def new_page(
         if message.type == "error" and not BLOCKED_RERUN_HOSTS.search(message.text):
             errors.append(message.text)
 
+    def on_exception(error: Error) -> None:
+        if not RERUN_CUT_OFF.search(f"{error} {error.stack}"):
+            errors.append(str(error))
+
     page.on("console", on_console)
-    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("pageerror", on_exception)
     page.set_default_timeout(60_000)
     _pages.append((page, errors))
     return page, errors
