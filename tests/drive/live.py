@@ -59,6 +59,9 @@ class StubSession:
     def env_rows(self) -> EnvRows | None:
         return self.rows
 
+    def newest_env_table(self) -> EnvRows | None:
+        return self.rows
+
     def look(self, read: Callable[[Any], Any]) -> Any:
         return read(self)
 

@@ -16,7 +16,7 @@ from tests.drive.session import FakeWorkerSession, camera, draw_past, fake_worke
 from tests.drive.waiting import until
 from workbench.envs.camera_data import CameraKind, Picture
 from workbench.live.commands import PlayRun, ResetAll, Step
-from workbench.live.events import EpisodeStepShown, MomentShown, PagesCounted
+from workbench.live.events import EnvEventShown, EpisodeStepShown, MomentShown, PagesCounted
 from workbench.live.history.moments import RESET, SUCCESS, WENT_BACK
 from workbench.live.messages import CameraRequest, DrawPast, PastPictures, Pictures, Placed, Restore
 from workbench.live.past import Strip
@@ -208,6 +208,35 @@ def test_in_the_past_the_table_of_envs_shows_the_past(played: FakeWorkerSession)
     then = played.session.env_rows()
     assert then.steps.tolist() == [2, 2, 2] and then.total.tolist() == [3, 3, 3]
     assert [np.isfinite(row).sum() for row in then.rewards] == [2, 2, 2]
+
+
+def test_an_event_of_an_env_is_found_in_earlier_episodes_too(played: FakeWorkerSession) -> None:
+    session = played.session
+    played.step(fail=(1,))
+    failed = played.view.timeline.last
+    played.reset((1,))
+    played.step(reward=(1, np.nan, 1))
+    lost = played.view.timeline.last
+    played.reset((1,))
+    played.step(2)
+    session.happen(MomentShown(1))
+    session.happen(EnvEventShown(1, "failed"))
+    assert (at(played), session.view().selected_env) == (failed, 1)
+    session.happen(EnvEventShown(1, "flagged"))
+    assert at(played) == lost
+    session.happen(EnvEventShown(2, "failed"))
+    assert (at(played), session.view().selected_env) == (lost, 2), "env 2 has not failed"
+    assert session.view().env_table is not None and session.view().env_table.failed.tolist() == [0, 1, 0]
+
+
+def test_an_episode_that_a_task_ends_by_a_rule_of_its_own_failed(fake: FakeWorkerSession) -> None:
+    fake.play(1)
+    fake.step(evaluate={}, fail=(2,))
+    fake.reset((2,))
+    fake.session.happen(EnvEventShown(2, "failed"))
+    assert at(fake) == fake.view.timeline.last - 1
+    strip = fake.session.look(lambda run: run.strip(0, 9))
+    assert strip is not None and [ending for *_, ending in strip.segments] == ["fail", ""]
 
 
 def test_a_strip_covers_one_env_between_two_steps(fake: FakeWorkerSession) -> None:

@@ -149,6 +149,5 @@ def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
     outlier = (rows.outliers.get(env) or rows.last.outliers[env])[0]
     when = f"step {outlier.step}" + ("" if env in rows.outliers else " of the previous episode")
     envs = "" if rows.num_envs == 1 else f"{count} of {rows.num_envs} envs "
-    press = "Click to see it" if env in rows.outliers else "Click to select it"
-    hint = f"In env {env}, {when}: {outlier.text}. {press}; the table of envs (B) has them all."
+    hint = f"In env {env}, {when}: {outlier.text}. Click to see it; the table of envs (B) has them all."
     return f"⚑ {envs}flagged: {outlier.reason}", hint

@@ -34,6 +34,7 @@ from workbench.live.effects import Asked, Later
 from workbench.live.env_commands import NextEnv, PreviousEnv, SelectEnv
 from workbench.live.events import (
     ActionTold,
+    EnvEventShown,
     EnvsReset,
     EpisodeStepShown,
     FileOpened,
@@ -222,6 +223,9 @@ def _apply(run: Run, event: object, now: Now) -> Change:
         case EpisodeStepShown(env=env, step=step):
             run, effects = _change_settings(run, selected_env=env)
             return _show(run, None if run.kept is None else run.kept.seek_step(env, step)), effects
+        case EnvEventShown(env=env, event=kind):
+            run, effects = _change_settings(run, selected_env=env)
+            return _show(run, None if run.kept is None else run.kept.seek_env_event(env, kind)), effects
         case PastPicturesWanted(at=at):
             return _draw_past(run) if at == run.stands_at else (run, [])
         case ActionTold():

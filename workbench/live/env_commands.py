@@ -30,14 +30,14 @@ class PreviousEnv(Command, frozen=True):
 
 
 class NextFailedEnv(Command, frozen=True):
-    """Next env whose last episode failed."""
+    """Next env whose last episode failed, at its end."""
 
     key = "e"
     context = "live"
 
 
 class NextFlaggedEnv(Command, frozen=True):
-    """Next flagged env."""
+    """Next flagged env, at its outlier."""
 
     key = "shift+e"
     context = "live"
@@ -51,7 +51,7 @@ class ToggleOnlySelected(Command, frozen=True):
 
 
 class ShowFirstFlagged(Command, frozen=True):
-    """Select the first flagged env, at its first outlier."""
+    """Select the first flagged env, at its outlier."""
 
 
 class ShowEnvAtEvent(Command, frozen=True):

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from workbench.envs.inspection import Section
 from workbench.envs.recorded_run import RecordedRun
 from workbench.live.effects import Asked, Later
+from workbench.live.history.env_table import EnvEvent
 from workbench.live.messages import Event, Loaded, Request, TaskFailed
 from workbench.live.process.heartbeat import Busy
 from workbench.live.process.supervisor import Death
@@ -134,6 +135,14 @@ class EpisodeStepShown:
 
 
 @dataclass(frozen=True)
+class EnvEventShown:
+    """Select an env and show its newest event of this kind, in the present or an earlier episode."""
+
+    env: int
+    event: EnvEvent
+
+
+@dataclass(frozen=True)
 class PastPicturesWanted:
     """Draw the missing pictures of the shown moment, if it is still the same."""
 
@@ -185,6 +194,7 @@ RunEvent = (
     | FileOpened
     | MomentShown
     | EpisodeStepShown
+    | EnvEventShown
     | PastPicturesWanted
     | ActionTold
     | ReadingChosen

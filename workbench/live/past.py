@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from workbench.envs.camera_data import CameraKind, Picture
 from workbench.live.history.curves import REWARD, Column
-from workbench.live.history.env_table import EnvRows
+from workbench.live.history.env_table import EnvEvent, EnvRows, event_step
 from workbench.live.history.moments import FAIL, SUCCESS, TRUNCATED, EpisodeNumbers, History, Moment
 from workbench.live.messages import CameraRequest, DrawPast, Restore
 from workbench.task.description import ShownPictures, Stepped
@@ -165,6 +165,16 @@ class Past:
         if not serials:
             return self
         return self.seek(serials[min(serials, key=lambda known: abs(known - step))])
+
+    def seek_env_event(self, env: int, event: EnvEvent) -> Past:
+        """Go to the end of this env's newest episode that failed, or to the first outlier of its newest episode with one; stay
+        if none is kept."""
+        for _, stop in reversed(self.history.segments(env)):
+            moment = self.history.at(stop)
+            step = None if moment is None else event_step(moment.rows, env, event)
+            if step is not None:
+                return self.seek(stop).seek_step(env, step)
+        return self
 
     def seek_tick(self, tick: int, episode_of: int | None = None) -> Past:
         """Go to the moment after a control step (`Moment.tick`), or to the nearest kept one.

@@ -210,6 +210,11 @@ class Run:
         it every frame."""
         return None if self.past is None else self.past.env_rows()
 
+    def newest_env_table(self) -> EnvRows | None:
+        """The table of envs at the newest moment, without the rewards; None before a task is loaded."""
+        newest = None if self.past is None else self.past.history.at(self.past.history.last)
+        return None if newest is None else newest.rows
+
     def strip(self, low: int, high: int, column: Column = REWARD) -> Strip | None:
         """The selected env's history between two ticks; None before a task is loaded."""
         return None if self.kept is None else self.kept.strip(self.env, low, high, column)

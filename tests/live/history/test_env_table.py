@@ -121,7 +121,8 @@ def test_rows_equal_the_reference_for_each_env_and_in_the_past(
                     succeeded[env] += episode.outcome == Outcome.SUCCESS
                     failed[env] += episode.outcome == Outcome.FAIL
                 for name, flag in (("success", SUCCESS), ("fail", FAIL)):
-                    if episode.first.get(name) == episode.steps:
+                    ends = running and episode.end >= 0 and episode.outcome == Outcome.FAIL and flag == FAIL
+                    if episode.first.get(name) == episode.steps or ends:
                         flags[env][tick] = flags[env].get(tick, 0) | flag
             shared.step(reward=first, truncated=tuple(np.flatnonzero(limits)), **entries_in_event(entries))
         seen.append(deepcopy((episodes, last)))

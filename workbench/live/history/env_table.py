@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,10 @@ class Outcome(IntEnum):
     SUCCESS = 1
     FAIL = 2
     TRUNCATED = 3
+
+
+EnvEvent = Literal["failed", "flagged"]
+"""The end of an episode without success, or the first outlier of an episode."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,13 @@ class EnvRows:
     def bytes_a_step(num_envs: int) -> int:
         """Bytes that one more moment's rows usually take."""
         return 8 * num_envs + 400
+
+
+def event_step(rows: EnvRows, env: int, event: EnvEvent) -> int | None:
+    """The step of the present episode of an env at which this happened; None if it has not."""
+    if event == "flagged":
+        return rows.outliers[env][0].step if env in rows.outliers else None
+    return int(rows.end[env]) if rows.outcome[env] in (Outcome.FAIL, Outcome.TRUNCATED) else None
 
 
 class EnvTable:

@@ -19,7 +19,7 @@ from workbench.envs.outliers import OutlierKind
 from workbench.envs.snapshots.packing import WholeSnapshot
 from workbench.envs.step_result import TERM_PREFIX, StepResult
 from workbench.live.history.curves import REWARD, Column, Columns, number_of
-from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, EnvTable
+from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, EnvTable, Outcome
 from workbench.live.messages import PastPictures, Pictures, ReplayPath
 from workbench.task.description import NO_MOMENT, Restored, Stepped
 
@@ -570,4 +570,6 @@ class History:
         for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (REWARD_NONFINITE, lost)):
             if what in rows.first:
                 event_flags[rows.first[what] == step.elapsed_steps] |= flag
+        # A task without the entry `fail` may end an episode by a rule of its own.
+        event_flags[(rows.outcome == Outcome.FAIL) & (rows.end == step.elapsed_steps)] |= FAIL
         return event_flags

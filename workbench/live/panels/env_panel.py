@@ -20,8 +20,8 @@ from workbench.live.env_commands import (
     ToggleEnvEntry,
     TurnEnvs,
 )
-from workbench.live.events import EpisodeStepShown, SettingsChanged
-from workbench.live.history.env_table import EnvRows, Outcome
+from workbench.live.events import EnvEventShown, EpisodeStepShown, SettingsChanged
+from workbench.live.history.env_table import EnvEvent, EnvRows, Outcome
 from workbench.live.panels.env_columns import DOT_PIXELS, EnvColumn, levels, wanted_width
 from workbench.live.panels.moment import MomentPart
 from workbench.live.session_protocol import LiveSession
@@ -475,18 +475,18 @@ class EnvPanel(MomentPart):
             self._chosen = {**self._chosen, name: name not in entry_names(rows, self._chosen)}
 
     def _select_first_flagged(self) -> None:
-        """Select the first flagged env, at its first outlier."""
-        rows = self._session.env_rows()
+        """Select the first flagged env of the shown moment, at its newest outlier."""
+        rows = self._session.view().env_table
         env = None if rows is None else first_flagged(rows)
         if env is not None:
-            self._choose_env(env)
+            self._session.happen(EnvEventShown(env, "flagged"))
 
-    def _select_next(self, wanted: Filter) -> None:
-        """Select the next env, by number and wrapping around, that passes a filter, if any does."""
-        rows = self._session.env_rows()
-        if rows is None:
-            return
-        envs = np.flatnonzero(mask(rows, wanted))
-        if len(envs):
-            later = envs[envs > self._session.view().selected_env]
-            self._choose_env(int(later[0] if len(later) else envs[0]))
+    def _select_next(self, wanted: EnvEvent) -> None:
+        """Select the next env, by number and wrapping around, whose present or previous episode failed or has an outlier, at
+        this event. The newest moment decides, so that pressing again goes through all of them."""
+        rows = self._session.look(lambda run: run.newest_env_table())
+        envs = np.zeros(0, int) if rows is None else np.flatnonzero(mask(rows, wanted))
+        if not len(envs):
+            raise Refused(f"No env has {'failed' if wanted == 'failed' else 'an outlier'}.")
+        later = envs[envs > self._session.view().selected_env]
+        self._session.happen(EnvEventShown(int(later[0] if len(later) else envs[0]), wanted))
