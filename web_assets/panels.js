@@ -106,7 +106,7 @@
     for (const heading of headings()) {
       const isEmpty = heading.querySelector(`:scope > ${ARROW}`).style.display === "none";
       if (isEmpty) for (const name of ["tabindex", "role", "aria-expanded", "data-fold"]) heading.removeAttribute(name);
-      else set(heading, { tabindex: "0", role: "button", "aria-expanded": String(isUnfolded(heading)), "data-fold": heading.textContent.trim() });
+      else set(heading, { tabindex: "0", role: "button", "aria-expanded": String(isUnfolded(heading)), "data-fold": heading.textContent.trim().split(" \u00b7 ")[0] }); // without its value
     }
     for (const [icon, label] of Object.entries(ICONS)) {
       for (const svg of document.querySelectorAll(`.mantine-ActionIcon-root svg.tabler-icon-${icon}`)) set(svg.closest("button"), { "aria-label": label });

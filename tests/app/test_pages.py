@@ -49,6 +49,8 @@ def app(
 
 
 @pytest.mark.slow
+# A page may close while its viewpoint is sent.
+@pytest.mark.filterwarnings("ignore:Queued a SetCamera:UserWarning")
 def test_twenty_swaps_leave_nothing_behind_and_the_session_keeps_running(
     app: App, gated_server: GatedServer, server: viser.ViserServer, panels: Panels
 ) -> None:

@@ -54,7 +54,7 @@ class Board:
             "Export",
             "Solve many seeds",
         ):
-            heading = self.page.get_by_text(name, exact=True)
+            heading = self.page.locator(f"[data-fold='{name}']")
             if heading.count() and heading.first.is_visible():
                 heading.first.click()
                 self.page.wait_for_timeout(300)
@@ -131,7 +131,7 @@ def test_the_envs_are_rebuilt_with_the_tasks_own_options(board: Board) -> None:
     page = board.page
     status = page.locator(".wb-status")
     expect(status).to_contain_text("pd_joint_pos")
-    page.get_by_text("How the envs are made", exact=True).click()
+    page.locator("[data-fold='How the envs are made']").click()
     page.locator(".wb-env-options [data-do]").click()
     expect(status).to_contain_text("pd_joint_delta_pos")
 

@@ -31,7 +31,7 @@ def expect_on_every_tab(desk: Desk, mark: Locator) -> None:
     desk.tab("Run")  # before the Cameras tab was opened for the first time
     desk.page.mouse.move(WIDTH - 150, HEIGHT - 100)
     desk.page.mouse.wheel(0, 3000)
-    expect(desk.page.get_by_text("View", exact=True)).to_be_in_viewport()
+    expect(desk.page.locator("[data-fold=View]")).to_be_in_viewport()
     expect(mark).to_be_in_viewport(ratio=1)
     desk.page.mouse.wheel(0, -3000)
     for tab in TABS:

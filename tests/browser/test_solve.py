@@ -70,7 +70,7 @@ def test_a_pressed_seed_opens_in_the_review_and_back_returns_to_its_row(desk: De
     page = desk.page
     desk.button("Back to the live env").click()
     desk.tab("Try")
-    page.get_by_text("Solve many seeds", exact=True).click()
+    page.locator("[data-fold='Solve many seeds']").click()
     page.get_by_label("Seeds", exact=True).locator("visible=true").fill("1")
     desk.button("Solve the seeds").click()
     expect(page.get_by_text(re.compile(r"^seed 0 at step \d+ of \d+$"))).to_be_visible(timeout=120_000)

@@ -75,7 +75,7 @@ def button(page: Page, name: str) -> None:
 
 def unfold(page: Page, folder: str, inside: Locator) -> None:
     if not inside.is_visible():
-        page.get_by_text(folder, exact=True).click()
+        page.locator(f"[data-fold='{folder}']").click()
     expect(inside).to_be_visible()
 
 
@@ -169,7 +169,7 @@ def test_a_camera_is_moved_by_typing_and_keys_and_undone(page: Page) -> None:
     until(lambda: numbers(page, "Position") == [0.45, 0, 0.6], "where it was")
     page.keyboard.press("Control+Shift+z")
     until(lambda: numbers(page, "Radians") == [1.5708], "the lens again")
-    page.get_by_text("Lens and image", exact=True).click()
+    page.locator("[data-fold='Lens and image']").click()
 
 
 def test_a_camera_placed_at_the_viewpoint_stays_there_while_looking_through_it(page: Page) -> None:

@@ -37,6 +37,7 @@ from workbench.cameras.view import StudioCamera
 from workbench.envs.camera_data import CameraSettings
 from workbench.page.command import Command
 from workbench.page.widgets.fields import Field, by_name, choice
+from workbench.page.widgets.parts import name_fold
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
 from workbench.pictures.camera_conventions import (
@@ -60,6 +61,7 @@ FOV, INTRINSIC = LENSES = get_args(LensForm)
 XYZ, ANGLES = get_args(Axis), get_args(Angle)
 UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
 """Number of digits of the shown numbers, by kind."""
+LENS = "Lens and image"
 GOES_ALONG = "The target moves with the position. To keep it fixed, set Handles to eye and target."
 STAYS = "Each moves alone: the camera keeps looking at its target."
 SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
@@ -103,7 +105,7 @@ class CameraNumbers:
         with server.gui.add_folder("Pose") as where:
             self._build_points()
             self._build_orientation()
-        with server.gui.add_folder("Lens and image", expand_by_default=False) as lens:
+        with server.gui.add_folder(LENS, expand_by_default=False) as lens:
             self._build_lens()
             self._build_picture()
         self._folders = where, lens
@@ -237,6 +239,11 @@ class CameraNumbers:
         self._focal.show(rounded((k[0, 0], k[1, 1]), PIXELS))
         self._centre.show(rounded((k[0, 2], k[1, 2]), PIXELS))
         self._size.show((now.width, now.height))
+        name_fold(
+            self._folders[1],
+            LENS,
+            f"{math.degrees(_fov(now)):.0f}\N{DEGREE SIGN}, {now.width} \N{MULTIPLICATION SIGN} {now.height}",
+        )
         self._range.show(rounded((now.near, now.far), UNIT))
         if now.shader_pack not in self._shaders:
             # A task may use its own shader pack.

@@ -8,7 +8,7 @@ from workbench.checks.commands import StopProfile, TimeStep
 from workbench.checks.profile import ProfileView
 from workbench.live.view import SessionView
 from workbench.page.widgets.editor_links import LinkTo, no_links
-from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.parts import PagePart, name_fold
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html
 
@@ -31,7 +31,8 @@ class StepProfilePanel(PagePart[SessionView]):
 
     def __init__(self, server: viser.ViserServer, link: LinkTo = no_links) -> None:
         self._link = link
-        with server.gui.add_folder(TITLE, expand_by_default=False):
+        self._folder = server.gui.add_folder(TITLE, expand_by_default=False)
+        with self._folder:
             self._tools = server.gui.add_html("")
             self._html = server.gui.add_html("")
 
@@ -42,6 +43,8 @@ class StepProfilePanel(PagePart[SessionView]):
         running = view.of(ProfileView).state == "running"
         pressed = tool(STOP_PROFILE, StopProfile()) if running else tool(PROFILE, TimeStep())
         self._tools.content = tools_html([pressed] if running or view.task is not None else [])
+        profile = view.of(ProfileView).profile
+        name_fold(self._folder, TITLE, "" if profile is None else milliseconds(profile.milliseconds))
         self._html.content = profile_html(view.of(ProfileView), self._link)
 
 

@@ -18,7 +18,7 @@ from workbench.live.view import SessionView
 from workbench.page.command import Command
 from workbench.page.widgets.editor_links import LinkTo, no_links
 from workbench.page.widgets.fields import Field
-from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.parts import PagePart, name_fold
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Visitor
@@ -56,7 +56,8 @@ class SolveSeedsPanel(PagePart[SessionView]):
         """Ids of unfolded rules."""
         # When the user comes back from a recording, the rows are shown again.
         before = session.view().of(SeedsView)
-        with server.gui.add_folder(TITLE, expand_by_default=before.state != "none"):
+        self._folder = server.gui.add_folder(TITLE, expand_by_default=before.state != "none")
+        with self._folder:
             self._seeds = Field(server, "Seeds", ChooseSeeds, "seeds", str(before.chosen), hint=HINT)
             self._tools = server.gui.add_html("")
             self._html = server.gui.add_html("")
@@ -71,6 +72,9 @@ class SolveSeedsPanel(PagePart[SessionView]):
         pressed = tool(STOP_SOLVING, StopSolving()) if running else tool(SOLVE, SolveSeeds())
         self._tools.content = tools_html([pressed] if running or view.task is not None else [])
         self._seeds.show(str(seeds.chosen), off=running)
+        report = seeds.report
+        solved = "" if report is None else f"{len(report.solved)} of {len(report.seeds)} solved"
+        name_fold(self._folder, TITLE, solved)
         self._html.content = seeds_html(seeds, self._link)
         found = [] if seeds.report is None else verdict_cards(seeds.report, seeds.stale)
         self._list.visible = bool(found)

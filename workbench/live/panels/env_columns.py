@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-CHARACTER_PIXELS, PADDING_PIXELS, NARROW_PADDING_PIXELS = 6.2, 14.6, 9.2
+CHARACTER_PIXELS, PADDING_PIXELS, NARROW_PADDING_PIXELS = 6.7, 15.7, 9.9
 """Widths of an average character, and of the padding between two columns."""
-DOT_PIXELS = 13.0
+DOT_PIXELS = 14.0
 """Width of the dot before the name of a state."""
 MARGIN_PIXELS = 36.0
 """Width of the margins of the table in its panel plus the sort arrow in a heading."""

@@ -25,13 +25,14 @@ from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import Field, Plain, choice, tick
-from workbench.page.widgets.parts import PagePart
-from workbench.page.widgets.templates import render
+from workbench.page.widgets.parts import PagePart, name_fold
+from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Visitor
 from workbench.task.description import TaskOptions, changed_options, command_line
 from workbench.task.reference import lasting
 
+TITLE = "How the envs are made"
 LABELS = {
     "robot_uids": "Robot",
     "control_mode": "Control",
@@ -63,7 +64,8 @@ class EnvOptionsPanel(PagePart[SessionView]):
         self._fields: list[Field] = []
         """Input fields of the keywords."""
         gui = server.gui
-        with gui.add_folder("How the envs are made", expand_by_default=False):
+        self._folder = gui.add_folder(TITLE, expand_by_default=False)
+        with self._folder:
             self._envs = Field(server, "Envs", SetNumEnvs, "num_envs", self._num_envs)
             self._form = gui.add_folder(None)
             self._tools = gui.add_html("")
@@ -78,6 +80,10 @@ class EnvOptionsPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         made = (HowMade() if view.task is None else view.task.made), replace(view.options, seed=0)
+        if view.task is not None:
+            name_fold(
+                self._folder, TITLE, f"{counted(view.task.num_envs, 'env')}, {view.task.device.split()[0]}"
+            )
         before = self._made
         if made != before:
             self._made = made

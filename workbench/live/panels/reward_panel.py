@@ -24,6 +24,7 @@ from workbench.machine.text import mean_text, nonfinite_text, number_text
 from workbench.page.command import Command
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.line_chart import YES_OR_NO, ChartLine, LineChart
+from workbench.page.widgets.parts import name_fold
 from workbench.page.widgets.templates import render, short_text
 from workbench.page.widgets.visitors import Visitor
 
@@ -101,6 +102,7 @@ class CurvesPanel(MomentPart):
             entries = list(dict.fromkeys(map(entry_of, columns)))
             chosen = [entry for entry in entries if self._is_on(entry)]
             self._draw_choice(entries, chosen)
+            name_fold(self._choice_folder, CHOICE, f"{len(chosen)} of {len(entries)}")
             drawn = self._draw_charts(view, step, [one for one in columns if entry_of(one) in chosen])
         self._empty.visible = not drawn
         self._draw_notes(view)

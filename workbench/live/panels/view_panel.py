@@ -12,11 +12,12 @@ from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.viewpoint import DETAILS, ViewChoice
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.hotkeys import with_key
-from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.parts import PagePart, name_fold
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tool
 from workbench.page.widgets.visitors import Visitor
 
+TITLE = "View"
 DARK, LIGHT = "dark", "light"
 BRAND = (28, 112, 190)
 """Colour of the page's buttons, RGB."""
@@ -86,7 +87,8 @@ class ViewPanel(PagePart[object]):
     ) -> None:
         self._server, self.dark = server, dark
         self._choice = chosen = chosen or ViewChoice()
-        with server.gui.add_folder("View", expand_by_default=False):
+        self._folder = server.gui.add_folder(TITLE, expand_by_default=False)
+        with self._folder:
             self._detail = choice(
                 server,
                 "Detail",
@@ -107,7 +109,9 @@ class ViewPanel(PagePart[object]):
 
     def draw(self, view: object) -> None:
         self._detail.show(self._choice.detail)
-        self._theme.show(DARK if self.dark else LIGHT)
+        theme = DARK if self.dark else LIGHT
+        self._theme.show(theme)
+        name_fold(self._folder, TITLE, f"{self._choice.detail}, {theme}")
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:

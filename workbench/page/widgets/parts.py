@@ -6,12 +6,16 @@ import time
 from collections.abc import Callable, Iterable
 from typing import ClassVar, Generic, TypeVar
 
+import viser
+
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.visitors import Done, Visitor
 
 Clock = Callable[[], float]
 """Returns seconds: `time.monotonic`, or a test's clock. All parts of a page share one."""
 View = TypeVar("View", contravariant=True)
+BEFORE_FOLD_VALUE = " \N{MIDDLE DOT} "
+"""Separates a folder's name from its value; the scripts (``panels.js``) find folders by the name."""
 
 
 class PagePart(Generic[View]):
@@ -44,6 +48,11 @@ class PagePart(Generic[View]):
     def do(self, command: Command, visitor: Visitor) -> Done:
         """Carry out a command in `does`. Runs on the loop (`machine.loop`), and must not block. Raises `Refused`."""
         raise NotImplementedError
+
+
+def name_fold(folder: viser.GuiFolderHandle, name: str, value: str) -> None:
+    """Show what a folder contains beside its name, so that it need not be unfolded to see it."""
+    folder.label = f"{name}{BEFORE_FOLD_VALUE}{value}" if value else name
 
 
 class DrawThrottle:
