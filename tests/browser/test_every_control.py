@@ -43,21 +43,15 @@ class Board:
     pressed: set[str]
 
     def unfold_all(self) -> None:
-        """Open every fold by its heading."""
-        for name in (
-            "How the envs are made",
-            "Reload by hand",
-            "All pictures",
-            "Handles and preview",
-            "Choose curves",
-            "Measure",
-            "Export",
-            "Solve many seeds",
-        ):
-            heading = self.page.locator(f"[data-fold='{name}']")
-            if heading.count() and heading.first.is_visible():
-                heading.first.click()
-                self.page.wait_for_timeout(300)
+        """Open every fold, also those in other folds."""
+        folded = self.page.locator("[data-fold][aria-expanded=false]")
+        for _ in range(MAX_PRESSES):
+            here = [heading for heading in folded.all() if heading.is_visible()]
+            if not here:
+                return
+            here[0].click()
+            self.page.wait_for_timeout(300)
+        raise AssertionError("there are always more folds to open")
 
     def next_part(self) -> tuple[str, Locator] | None:
         """A visible part that was not pressed yet."""

@@ -77,7 +77,7 @@ def runs(page: Page, title: str, envs: str = "2 envs") -> None:
 
 def view_of(page: Page) -> NDArray[np.uint8]:
     """Pixels in the middle of the 3-D view."""
-    return picture_of_view(page, {"x": 150, "y": 320, "width": 500, "height": 200})
+    return picture_of_view(page, {"x": 300, "y": 350, "width": 400, "height": 130})
 
 
 def open_list(page: Page) -> None:

@@ -214,7 +214,7 @@ def linked(rule: str, folder: str = "../rules") -> str:
 
 def code(sentence: str) -> str:
     """Put names of functions and attributes in backticks."""
-    name = r"@?(?:\w+\.)*\w*_\w+(?:\.\w+)*(?:\([\w, ]*\))?|\w+\.\w+\(\)|\w+\(\w*_\w+\)|evaluate\(\)"
+    name = r"@?(?:\w+\.)*\w*_\w+(?:\.\w+)*(?:\([\w, ]*\))?|(?:\w+\.)+\w+\(\)|\w+\(\w*_\w+\)|evaluate\(\)"
     # Text in backticks stays unchanged.
     return re.sub(
         rf"`[^`]*`|(?<!\w)({name})", lambda found: f"`{found[1]}`" if found[1] else found[0], sentence

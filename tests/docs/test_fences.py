@@ -60,7 +60,7 @@ PRINTS = {
     "api": lambda printed: "table-workspace" in printed,
 }
 """Checks of the Python output that a page promises, by page."""
-FEWER = {("--seeds", "16"): "2", ("--successes", "20"): "2", ("--episodes", "8"): "2"}
+FEWER = {("--seeds", "8"): "2", ("--successes", "20"): "2", ("--episodes", "8"): "2"}
 """Maps a flag and its number on a page to a smaller number for the test: the page's numbers take many minutes."""
 
 

@@ -143,7 +143,7 @@ class CameraGizmo:
         return True
 
     def _went_on(self, phase: str) -> _Taken | None:
-        """State of the camera at the start of the drag, for an update of a drag; else None."""
+        """Register a drag event; returns the camera's state at the start of the drag if `phase` is "update", else None."""
         taken, self._held_at = self.held, time.monotonic()
         if (phase == "start" or not taken) and not self._take():
             return None

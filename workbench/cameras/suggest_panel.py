@@ -235,10 +235,10 @@ class CameraSuggest(PagePart[SessionView]):
         )
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> None:
-        """Draw the box of the bounds.
+        """Draw the box that bounds the search for the camera's position.
 
         Args:
-            offset: (3,) of the selected env in the view.
+            offset: (3,) position of the selected env in the view, metres.
         """
         camera = view.of(StudioView).chosen
         nowhere = camera is None or (camera.info.mount is not None and camera.mount_pose is None)

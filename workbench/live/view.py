@@ -136,20 +136,20 @@ def view_of(run: Run, **known: Any) -> SessionView:
     past = run.past
     if past is None:
         return now
+    at = past.history.at(past.at)
     view = replace(
         now,
         timeline_cleared=run.after_load == "gone",
         timeline=past.view(run.env, run.settings.cameras, run.settings.pictures),
         odd=past.history.findings,
+        env_table=None if at is None else at.rows,
     )
     moment = past.shown
     if moment is None:
-        newest = past.history.at(past.history.last)
-        return view if newest is None else replace(view, env_table=newest.rows)
+        return view
     return replace(
         view,
         step=moment.step,
-        env_table=moment.rows,
         step_serial=moment.serial,
         pictures=past.pictures(run.env),
         told=moment.step.action,

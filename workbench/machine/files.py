@@ -100,7 +100,8 @@ def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> b
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Context with a temporary file name in the folder of `path`; after the block the file becomes `path`, unless it raised.
+    """Context that gives a temporary path in the folder of `path`. If the block does not raise, the temporary file is
+    renamed to `path`.
 
     Raises:
         FileExistsError: `path` exists; the message says what to do.

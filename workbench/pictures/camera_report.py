@@ -250,7 +250,7 @@ def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
     """One report over all envs of several reports of one camera: steps of an episode, or several seeds.
 
     Raises:
-        ValueError: there is no report, or they are of several cameras or scenes.
+        ValueError: there is no report, or the reports differ in camera, picture size or scene.
     """
     if not reports:
         raise ValueError("there is no report to join")

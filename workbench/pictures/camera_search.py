@@ -297,7 +297,7 @@ def _wanted(objects: Sequence[SceneObject], name: str, kind: CameraKind, index: 
         found = None if whole is None else replace(whole, name=name, bodies=(body,), robot=False)
     there = ", ".join(thing.name for thing in objects if not (thing.robot or thing.name == "ground"))
     if found is None or found.name == "ground":
-        raise ValueError(f"there is no object {name!r} to be seen; there are: {there}")
+        raise ValueError(f"{name!r} is not an object to search a view of; choose from: {there}")
     if found.robot:
         raise ValueError(
             f"{name!r} is the robot: name links of it ({name}/...), or objects of the task: {there}"

@@ -171,9 +171,9 @@ def find_events(episode: Episode) -> tuple[EpisodeEvent, ...]:
 
 
 def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """All numbers over time: states (K,) and numbers (K,), by entry, then by line.
+    """Curves of the numeric entries: the states (K,) and the values (K,) of each line, by entry name, then by line name.
 
-    Entries with several numbers per state (an action, the terms of a reward) have one line per number.
+    An entry with several values per state (an action, the terms of a reward) has one line per value, at most `MAX_LINES`.
     """
     states = np.arange(len(episode.reward) + 1)
     after = states[1:]

@@ -169,9 +169,10 @@ def with_late_imports(task: LoadedTask) -> LoadedTask:
 
 
 def undo_load(task: LoadedTask) -> bool:
-    """Undo the load that gave `task`, as if it had failed: for a class that imports but cannot be built.
+    """Undo the load that gave `task`: restore the modules and registrations of the version before it.
 
-    Only the newest load can be undone; returns False for any other, and for a task that is not watched.
+    The caller uses this for a class that imports but whose env cannot be built. Only the newest load of a file can be undone:
+    returns False for any other load, and for a task that is not watched.
     """
     load = _load_of(task)
     if load is None or load.unloaded is None or sys.modules.get(load.finder.main) is None:

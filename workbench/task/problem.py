@@ -79,7 +79,7 @@ def treat_ctrl_c_as_error() -> None:
 
 
 def is_ctrl_c(error: BaseException | None) -> bool:
-    """Whether a person pressed Ctrl-C. Must be reraised, never reported as the task's error."""
+    """Whether the exception comes from a person's Ctrl-C. The caller must reraise it, never report it as the task's error."""
     return isinstance(error, _ctrl_c)
 
 

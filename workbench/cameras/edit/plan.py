@@ -36,8 +36,8 @@ def plan_edit(
         sources: the author's files on disk, by path.
 
     Raises:
-        RefusedEdit: also if the settings of the call differ from `before`: then other code sets them, and an edit would have
-            no effect.
+        RefusedEdit: the edit is not possible, or the settings of the call differ from `before`: then other code sets them,
+            and an edit would have no effect.
     """
     check_camera(after)
     mount: list[str] = []

@@ -516,8 +516,8 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
         lost = [thing for thing in objects_of(actor) if id(thing) not in kept]
         if lost and actor.px_body_type == "dynamic":
             yield Found(
-                f"{name} moves, and is not in the state. Call self.add_to_state_dict_registry(merged) with what it was "
-                "merged into.",
+                f"{name} is a dynamic body and not in the state. Call self.add_to_state_dict_registry(...) with {name}, "
+                "or with the actor that it was merged into.",
                 places.get(name) or checkup.places.hook("_load_scene"),
             )
             return

@@ -244,13 +244,13 @@ def _stock_write(
 
 
 def _rows(struct: Any, value: Any, name: str, chosen: NDArray[np.int64]) -> NDArray[np.float32]:
-    """(k, ...) float32: the value of a setter for each of the struct's objects `chosen`.
+    """(k, ...) float32: the rows that a setter writes to the struct's objects `chosen`.
 
-    A stock CPU env takes the first row of a batch of another size. Here a batch for all envs gives the rows of the envs that
-    are being reset, and a single env takes the first row.
+    Stock ManiSkill on the CPU takes the first row of a batch of the wrong size. Here a batch with a row for each object gives
+    the rows of `chosen`. A struct with one object takes the first row. Both report `refused-by-gpu`.
 
     Raises:
-        ValueError: a batch of another size.
+        ValueError: a batch of any other size.
     """
     given: Any = vectorize_pose(value) if name == "pose" else common.to_tensor(value)
     numbers = np.asarray(given.detach().cpu(), np.float32)

@@ -166,11 +166,11 @@ def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
 
 
 def _flat(episode: Episode) -> Episode:
-    """Copy of the episode whose state observations are one vector, if the env returns one."""
+    """The episode with its state observations joined into one vector, if its `obs_mode` contains it; else unchanged."""
     mode = episode.info.env_kwargs.get("obs_mode")
     if not episode.obs or not isinstance(mode, str) or _FLAT not in mode.split("+"):
         return episode
     count = episode.length + 1
     rows = [np.asarray(values, np.float32).reshape(count, -1) for values in episode.obs.values()]
-    # With pictures the vector has a name.
+    # In a mode with pictures, the observation is a dict: the vector is its entry `_FLAT`.
     return replace(episode, obs={"" if mode == _FLAT else _FLAT: np.concatenate(rows, axis=1)})

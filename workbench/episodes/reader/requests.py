@@ -82,7 +82,7 @@ class ReadSweep(msgspec.Struct, frozen=True):
 
 
 class Recover(msgspec.Struct, frozen=True):
-    """Run `writing.finish.recover` on a folder; answered with `Recovered`."""
+    """Run `writing.finish_or_recover.recover` on a folder; answered with `Recovered`."""
 
     folder: Path
 

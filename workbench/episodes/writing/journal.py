@@ -56,7 +56,7 @@ class Journal:
 
     The files of an episode can only be written when it has ended (rerun's index comes last, HDF5 cannot be truncated, both
     need whole columns), and the task's code may hang, exhaust the memory or crash before that. So every row goes into a
-    journal, from which the writer or the next process makes the files (`finish.recover`).
+    journal, from which the writer or the next process makes the files (`finish_or_recover.recover`).
 
     It is an Arrow stream of one table, ``kind``, ``number`` and ``value``, that may end anywhere. A state's pictures come
     before its row, so a state is complete or missing:

@@ -110,7 +110,7 @@ class Shares:
 
 
 def throttled(report: Callable[..., None], seconds: float) -> Callable[..., None]:
-    """A function that calls `report` at most every `seconds`, not in the first `seconds`; other calls are dropped."""
+    """A function that calls `report` at most once in `seconds`, and not in the first `seconds`. It drops all other calls."""
     last = time.monotonic()
 
     def report_if_due(*arguments: Any) -> None:

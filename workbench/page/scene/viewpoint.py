@@ -169,7 +169,7 @@ class Framing:
                 self._point(client, frame)
 
     def frame_untouched(self, frame: Frame) -> None:
-        """Frame each untouched page again whose viewpoint or shape is not the framed one."""
+        """Frame the scene again in each untouched page whose viewpoint or aspect ratio differs from the framed one."""
         for number, client in self._server.get_clients().items():
             position, aspect = self._pointed.get(
                 number, (self._server.initial_camera.position, DEFAULT_ASPECT)

@@ -18,9 +18,9 @@ def render(template: str, **values: Any) -> str:
     """Render ``web_assets/panels/<template>.html`` with these values, all escaped.
 
     viser inserts the text of ``add_html`` into the page unchanged: an exception message with a ``<script>`` would run
-    there. So all HTML is made here; no other module writes a tag. Invisible characters are made visible: one that changes
-    the writing direction makes a name look like another, and half of a surrogate pair, as in a file name that is not UTF-8,
-    cannot be sent to a page at all.
+    there. So all text for ``add_html`` is rendered here. Invisible characters are replaced by visible ones: a character
+    that changes the writing direction makes one name look like another. A lone surrogate, as in a file name that is not
+    UTF-8, cannot be sent to a page at all.
     """
     return _environment().get_template(f"{template}.html").render(**values)
 
