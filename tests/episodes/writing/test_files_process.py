@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from tests.drive.episodes import appended, header_of, journal_of, made
@@ -155,6 +156,9 @@ def test_a_journal_in_use_is_not_recovered_by_another_process(tmp_path: Path, pr
     writer = appended(tmp_path, made(3), pictures=False)
     path = journal_of(writer).path
     os.kill(pid_of(process), signal.SIGSTOP)
+    # Until it has stopped it may still receive the request.
+    stopped = psutil.Process(pid_of(process))
+    until(lambda: stopped.status() == psutil.STATUS_STOPPED, "it has stopped")
     waiting = EpisodeFinisher()
     future = waiting._pool.submit(writer.finish, process)
     until(lambda: unread(process) > 0, "it is asked")
