@@ -97,6 +97,11 @@ def test_each_keyword_has_an_input_of_its_type_with_the_value_in_effect(form: Fo
     assert form.panels.button("Apply").command is None and not form.panels.shows("Discard", "button")
 
 
+def test_the_fold_names_the_number_of_envs_and_their_device(form: Form) -> None:
+    (label,) = (one for one in form.panels.folders() if one is not None and "made" in one)
+    assert label.endswith("4 envs, cpu")
+
+
 def test_only_changed_options_are_applied_all_at_once(form: Form) -> None:
     form.set("Envs", 8)
     form.set("size", 0.001)

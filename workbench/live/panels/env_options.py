@@ -82,7 +82,9 @@ class EnvOptionsPanel(PagePart[SessionView]):
         made = (HowMade() if view.task is None else view.task.made), replace(view.options, seed=0)
         if view.task is not None:
             name_fold(
-                self._folder, TITLE, f"{counted(view.task.num_envs, 'env')}, {view.task.device.split()[0]}"
+                self._folder,
+                TITLE,
+                f"{counted(view.task.num_envs, 'env')}, {view.task.device.partition(',')[0]}",
             )
         before = self._made
         if made != before:
