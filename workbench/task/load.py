@@ -43,6 +43,7 @@ from workbench.task.reference import (
     file_and_class,
     find_module,
     is_module_name,
+    missing_file,
     not_found_text,
     split_reference,
 )
@@ -493,6 +494,8 @@ def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
         return exc.problem
     problem = problem_from_exception(exc, "import", [Path(path) for path in finder.texts])
     message = problem.message
+    if isinstance(exc, FileNotFoundError) and exc.filename == str(finder.file) and problem.file is None:
+        return missing_file(finder.file).problem  # deleted since it was found
     if isinstance(exc, registry.DuplicateName):
         message = str(exc)
     elif isinstance(exc, SystemExit):

@@ -117,7 +117,7 @@ def check_task_file(file: Path) -> None:
         if not file.exists():
             if file.is_symlink():
                 raise task_error(f"{file} is a link to {file.readlink()}, which is no file")
-            raise _missing(file)
+            raise missing_file(file)
         if not file.is_file():
             # Reading a pipe or a device may block forever.
             raise task_error(f"{file} is not an ordinary file")
@@ -129,7 +129,8 @@ def check_task_file(file: Path) -> None:
         raise task_error(f"cannot access the file ({exc.strerror}): {file}") from exc
 
 
-def _missing(file: Path) -> TaskError:
+def missing_file(file: Path) -> TaskError:
+    """The error that there is no such file, with similar names beside it."""
     if not file.parent.is_dir():
         return task_error(f"{file} does not exist, nor does its folder {file.parent}")
     # Compare stems: the common suffix makes unrelated short names similar.

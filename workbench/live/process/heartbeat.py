@@ -209,8 +209,9 @@ Doing = Literal[
     "waiting for a debugger",
 ]
 _DOINGS: tuple[Doing, ...] = get_args(Doing)
-_LAYOUT = struct.Struct("=QdB")
-"""Layout: number of the piece of work, its start in seconds, index into `_DOINGS`."""
+_LAYOUT = struct.Struct("=QdBQ")
+"""Layout: number of the piece of work, its start in seconds, index into `_DOINGS`, and the number again: the two differ
+while the worker writes."""
 _PID, _PID_AT = struct.Struct("=I"), 64
 """Layout and offset of the worker's process id; 0 until the worker has started."""
 _HELD_AT = 128
@@ -239,7 +240,7 @@ def make_heartbeat() -> int:
     """Shared memory as a file descriptor for the child; the caller closes it. Until the child writes, it is starting."""
     fd = os.memfd_create("workbench-heartbeat")
     os.ftruncate(fd, mmap.PAGESIZE)
-    os.pwrite(fd, _LAYOUT.pack(0, time.monotonic(), _DOINGS.index("starting")), 0)
+    os.pwrite(fd, _LAYOUT.pack(0, time.monotonic(), _DOINGS.index("starting"), 0), 0)
     return fd
 
 
@@ -253,7 +254,9 @@ class HeartbeatWriter:
 
     def begin(self, doing: Doing) -> None:
         self._number += 1
-        _LAYOUT.pack_into(self._memory, 0, self._number, time.monotonic(), _DOINGS.index(doing))
+        # Not `pack_into`, which clears the memory first: the server would read a start at second 0, and end the worker.
+        written = _LAYOUT.pack(self._number, time.monotonic(), _DOINGS.index(doing), self._number)
+        self._memory[: _LAYOUT.size] = written
 
     def hold(self, held: bool) -> None:
         """Report that a debugger has suspended the worker, or has let it continue."""
@@ -265,6 +268,7 @@ class HeartbeatReader:
 
     def __init__(self, fd: int) -> None:
         self._memory = mmap.mmap(fd, mmap.PAGESIZE, prot=mmap.PROT_READ)
+        self._last: tuple[int, float, int] = (0, time.monotonic(), _DOINGS.index("starting"))
 
     @property
     def pid(self) -> int:
@@ -272,12 +276,11 @@ class HeartbeatReader:
         return _PID.unpack_from(self._memory, _PID_AT)[0]
 
     def read(self) -> Beat:
-        # There is no lock between the processes: a torn read differs from the next one.
-        for _ in range(100):
-            first = self._memory[: _LAYOUT.size]
-            if first == self._memory[: _LAYOUT.size]:
-                break
-        number, since, doing = _LAYOUT.unpack(first)
+        # There is no lock between the processes, and the worker may be suspended while it writes.
+        number, since, doing, again = _LAYOUT.unpack(self._memory[: _LAYOUT.size])
+        if number == again:
+            self._last = number, since, doing
+        number, since, doing = self._last
         return Beat(number, _DOINGS[min(doing, len(_DOINGS) - 1)], since, self._memory[_HELD_AT] == 1)
 
 
