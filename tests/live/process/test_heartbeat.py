@@ -18,7 +18,7 @@ while time.monotonic() < end:
 
 
 def test_work_never_seems_to_have_begun_before_the_worker(child_process: None) -> None:
-    """A worker that seems to step since the machine was started is ended."""
+    """Else the page says that the worker is busy since the machine was started."""
     heartbeat, started = make_heartbeat(), time.monotonic()
     reader = HeartbeatReader(heartbeat)
     writer = subprocess.Popen([sys.executable, "-c", WRITER, str(heartbeat)], pass_fds=[heartbeat])

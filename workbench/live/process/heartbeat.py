@@ -254,7 +254,7 @@ class HeartbeatWriter:
 
     def begin(self, doing: Doing) -> None:
         self._number += 1
-        # Not `pack_into`, which clears the memory first: the server would read a start at second 0, and end the worker.
+        # Not `pack_into`, which clears the memory first: the server would read a start at second 0, and report the worker as busy.
         written = _LAYOUT.pack(self._number, time.monotonic(), _DOINGS.index(doing), self._number)
         self._memory[: _LAYOUT.size] = written
 
