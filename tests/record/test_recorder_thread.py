@@ -123,6 +123,10 @@ def test_bytes_on_the_disk_no_longer_count_as_waiting(
     monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: taker)
     with fake_worker_session(tmp_path) as fake:
         fake.play(0)
+
+        def until_taken(count: int) -> None:
+            until(lambda: fake.view.of(RecordingStatus).steps == count, "the steps to be taken")
+
         given = 0
         try:
             for _ in range(2):
@@ -130,16 +134,14 @@ def test_bytes_on_the_disk_no_longer_count_as_waiting(
                 fake.session.happen(RecordingWanted((0,)))
                 fake.step(snapshot=b"")
                 given += 1
+                until_taken(given)  # steps of the previous recording count until they are taken
                 size = fake.view.step.nbytes  # pyright: ignore[reportOptionalMemberAccess]
                 at_once = 10_500 // size
                 assert at_once > 2
                 for _ in range(3):
                     fake.step(at_once - 1, snapshot=b"")
                     given += at_once - 1
-                    until(
-                        lambda given=given: fake.view.of(RecordingStatus).steps == given,
-                        "the steps to be taken",
-                    )
+                    until_taken(given)
                     assert (
                         fake.view.of(RecordingStatus).problem is None and fake.view.of(RecordingStatus).active
                     )
@@ -153,6 +155,7 @@ def test_bytes_on_the_disk_no_longer_count_as_waiting(
                     and fake.view.of(RecordingStatus).problem is not None
                 )
                 taker.disk.set()
+                until(lambda given=given: taker.taken == given, "the steps to be taken")
         finally:
             taker.disk.set()
 
