@@ -39,7 +39,7 @@ TESTS = {
         "tests/envs",
         "tests/pictures",
         "tests/task/test_make.py",
-        "tests/record/test_recorder.py",
+        "tests/record/test_gym_wrapper.py",
     ],
     "all": ["-m", "not slow"],
 }

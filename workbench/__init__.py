@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from workbench.envs.snapshots.snapshot import take_snapshot as take_snapshot
     from workbench.episodes.reader.read_episode import read_episode as read_episode
     from workbench.planning.planner import Planner as Planner
-    from workbench.record.recorder import Recorder as Recorder
+    from workbench.record.gym_wrapper import Recorder as Recorder
     from workbench.task.gym_env import make as make
 
 __version__ = "0.1.0"
@@ -29,7 +29,7 @@ __all__ = [
 
 _HOMES = {
     "Planner": "planning.planner",
-    "Recorder": "record.recorder",
+    "Recorder": "record.gym_wrapper",
     "begin_anew": "envs.snapshots.snapshot",
     "list_contacts": "envs.inspect_env",
     "make": "task.gym_env",

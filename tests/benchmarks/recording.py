@@ -41,7 +41,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 import workbench
 from tests.benchmarks.table import Row, keep
 from workbench.episodes.writing import finish_or_recover as make_files
-from workbench.record import recorder as recorder_module
+from workbench.record import gym_wrapper as recorder_module
 
 SIDES = ("RecordEpisode", "Recorder")
 THREAD = "on a thread"

@@ -25,7 +25,7 @@ from workbench.page.command import Command, Refused
 from workbench.page.commands import FrameScene
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 from workbench.page.widgets.fields import Field, tick
-from workbench.page.widgets.hotkeys import register
+from workbench.page.widgets.keys_and_palette import register
 from workbench.page.widgets.templates import asks
 from workbench.page.widgets.visitors import PATH, Visitor, Visitors
 

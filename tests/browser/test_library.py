@@ -18,7 +18,7 @@ from workbench.library.panel import LibraryPanel
 from workbench.page.command import Command
 from workbench.page.commands import CloseDialog
 from workbench.page.door.gated_server import ServerOptions, open_server
-from workbench.page.widgets.hotkeys import register
+from workbench.page.widgets.keys_and_palette import register
 from workbench.page.widgets.visitors import PATH, Visitor, Visitors
 
 pytestmark = pytest.mark.browser

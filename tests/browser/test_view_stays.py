@@ -14,7 +14,7 @@ from workbench.commands import COMMANDS
 from workbench.live.commands import Step
 from workbench.live.timeline_commands import StepBack
 from workbench.page.door.gated_server import ServerOptions, open_server
-from workbench.page.widgets.hotkeys import register
+from workbench.page.widgets.keys_and_palette import register
 from workbench.page.widgets.visitors import PATH, Visitors
 
 pytestmark = pytest.mark.browser

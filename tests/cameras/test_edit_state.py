@@ -23,8 +23,8 @@ from workbench.cameras.commands import (
 from workbench.cameras.events import CameraPlaced, EditWanted
 from workbench.cameras.view import EditRequest, EditState, StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings
-from workbench.task.apply_edits import SourceEdit
 from workbench.task.description import TaskOptions
+from workbench.task.write_edits import SourceEdit
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

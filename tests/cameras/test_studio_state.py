@@ -45,7 +45,7 @@ from workbench.live.events import FileSaved, MomentShown, Now, Send, VersionLoad
 from workbench.live.messages import Loaded, PlaceCamera, Placed, TaskFailed
 from workbench.live.run import Run
 from workbench.page.command import Command, Refused
-from workbench.task.apply_edits import SourceEdit
+from workbench.task.write_edits import SourceEdit
 
 FILE = "/home/me/push.py"
 SETTINGS = CameraSettings((0.4, 0.0, 0.6), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")

@@ -28,7 +28,7 @@ from workbench.cli import main
 from workbench.commands import COMMANDS
 from workbench.envs.gpu_rules import GPU_RULES, DeclaredRule, Rule
 from workbench.page.command import Command
-from workbench.page.widgets.hotkeys import key_rows
+from workbench.page.widgets.keys_and_palette import key_rows
 
 KEYS = DOCS / "reference" / "keys.md"
 CLI = DOCS / "reference" / "cli.md"

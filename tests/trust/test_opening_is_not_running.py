@@ -27,7 +27,7 @@ from workbench.cli.output import Exit
 from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.episodes.reader.reading import find_all_sources
 from workbench.library.folder import Library
-from workbench.live.questions import MakeScene
+from workbench.live.questions_without_task import MakeScene
 from workbench.live.timeline_commands import StopRescoring
 from workbench.live.worker.make_scene import make
 from workbench.record.job import record

@@ -65,7 +65,7 @@ from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
 from workbench.page.widgets.frame import add_bar
-from workbench.page.widgets.hotkeys import add_hints, register
+from workbench.page.widgets.keys_and_palette import add_hints, register
 from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart, Parts
 from workbench.page.widgets.templates import render

@@ -13,7 +13,7 @@ from workbench.live.panels.timeline_panel import strip_curves
 from workbench.live.timeline_commands import ChooseStripCurve
 from workbench.live.view import SessionView
 from workbench.page.command import Command
-from workbench.page.widgets.hotkeys import add
+from workbench.page.widgets.keys_and_palette import add
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.visitors import Visitors
 

@@ -47,7 +47,7 @@ from workbench.page.commands import (
 )
 from workbench.page.widgets.fields import Field, choice
 from workbench.page.widgets.frame import add_bar
-from workbench.page.widgets.hotkeys import register
+from workbench.page.widgets.keys_and_palette import register
 from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart, Parts
 from workbench.page.widgets.templates import render

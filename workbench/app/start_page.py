@@ -10,7 +10,7 @@ from workbench.app.shared import Shared
 from workbench.live.panels.view_panel import BRAND
 from workbench.page.command import Command, Refused
 from workbench.page.commands import ShowRecordings, TellDrawnInSoftware, ToggleTheme
-from workbench.page.widgets.hotkeys import register
+from workbench.page.widgets.keys_and_palette import register
 from workbench.page.widgets.parts import Clock
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Done, Visitor

@@ -15,7 +15,7 @@ from workbench.live.process.heartbeat import Busy
 from workbench.live.timeline_commands import ContinueFromHere
 from workbench.live.view import SessionView
 from workbench.machine.text import rate_text
-from workbench.page.widgets.hotkeys import with_key
+from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.parts import Clock
 from workbench.page.widgets.templates import counted, place, render
 from workbench.record.state import RecordingStatus

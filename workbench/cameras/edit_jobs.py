@@ -42,8 +42,8 @@ from workbench.machine.loop import BlockingPool, begin, do, result_of
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.page.command import Command, Refused
 from workbench.source.parsed import RefusedEdit, plain_line_ends
-from workbench.task.apply_edits import SourceEdit, apply, revert
 from workbench.task.description import TaskDescription
+from workbench.task.write_edits import SourceEdit, apply, revert
 
 IN_FILE: tuple[EditStage, ...] = ("written", "checked", "mismatch")
 """Stages in which the change is in the file."""

@@ -12,10 +12,10 @@ from workbench.cameras.edit.plan import plan_edit
 from workbench.cameras.view import Change, EditRequest, EditState
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraSettings, differences, setting_text
 from workbench.source.parsed import RefusedEdit
-from workbench.task.apply_edits import SourceEdit, why_not_writable
 from workbench.task.copy import CannotCopy, copy_task
 from workbench.task.description import TaskDescription
 from workbench.task.modules import read_exactly
+from workbench.task.write_edits import SourceEdit, why_not_writable
 
 SENTENCES: dict[Change, tuple[str, str, str]] = {
     "edit": ("This changes {old} in {file}.", "{old}: saved to {file} and verified.", ""),

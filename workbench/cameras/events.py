@@ -18,8 +18,8 @@ from workbench.live.events import Send
 from workbench.live.history.moments import ShownMoment
 from workbench.live.messages import Load
 from workbench.pictures.camera_report import CameraReport, OfferedPlacement, SearchSpace
-from workbench.task.apply_edits import SourceEdit
 from workbench.task.description import TaskDescription
+from workbench.task.write_edits import SourceEdit
 
 Triple = tuple[float, float, float]
 Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]

@@ -52,7 +52,7 @@ from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.commands import TellUnfolded
 from workbench.page.widgets.fields import by_name, choice
-from workbench.page.widgets.hotkeys import with_key
+from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.parts import Clock, PagePart, Parts
 from workbench.page.widgets.templates import render, sentence
 from workbench.page.widgets.tools import Label, Tool, tools_html

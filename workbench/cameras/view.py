@@ -15,7 +15,7 @@ from workbench.live.view import SessionView
 from workbench.pictures.camera_report import CameraReport, OfferedPlacement
 
 if TYPE_CHECKING:
-    from workbench.task.apply_edits import SourceEdit
+    from workbench.task.write_edits import SourceEdit
 from workbench.live.process.background_jobs import JobProgress
 
 EditStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]

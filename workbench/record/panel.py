@@ -11,7 +11,7 @@ from workbench.live.panels.moment import MomentPart
 from workbench.live.panels.run_panel import ENVS
 from workbench.live.view import SessionView
 from workbench.page.widgets.fields import choice
-from workbench.page.widgets.hotkeys import with_key
+from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.templates import counted, render
 from workbench.page.widgets.tools import Tool, tool, tools_html
 from workbench.record.commands import (

@@ -13,7 +13,7 @@ from workbench.episodes.episode import acted_by_text
 from workbench.episodes.recorded_source import recorded_version
 from workbench.page.command import Command
 from workbench.page.widgets.fields import by_name, choice, tick
-from workbench.page.widgets.hotkeys import with_key
+from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import letter, render
 from workbench.page.widgets.tools import Tool, tool, tools_html

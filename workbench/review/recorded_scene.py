@@ -10,7 +10,7 @@ from workbench.envs.recorded_run import RUN_KEYWORDS
 from workbench.episodes.episode import Episode
 from workbench.live.process.ask import Background, OnProgress
 from workbench.live.process.background_jobs import JobFailed, ProcessDied
-from workbench.live.questions import MakeScene, SceneMade
+from workbench.live.questions_without_task import MakeScene, SceneMade
 from workbench.machine.loop import result_of
 from workbench.trust.clearance import paths_in_arguments
 

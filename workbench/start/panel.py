@@ -12,7 +12,7 @@ from workbench.machine.loop import begin
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.dialog import Dialog
 from workbench.page.widgets.fields import Field, choice
-from workbench.page.widgets.hotkeys import with_key
+from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render, sentence
 from workbench.page.widgets.tools import tool, tools_html

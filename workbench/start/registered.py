@@ -20,7 +20,7 @@ from PIL import Image
 
 from workbench.live.process.ask import Background
 from workbench.live.process.background_jobs import JobFailed
-from workbench.live.questions import DrawTask, ListTasks
+from workbench.live.questions_without_task import DrawTask, ListTasks
 from workbench.machine.files import read_regular_file, replace_file
 from workbench.machine.folders import cache_folder
 from workbench.machine.loop import BlockingPool, begin, do, on_loop

@@ -23,7 +23,7 @@ from workbench.cameras.edit.run_hooks import hook_camera, owners, recording_call
 from workbench.envs.camera_data import CameraKey, CameraSettings
 from workbench.envs.maniskill_private import parse_cameras
 from workbench.source.parsed import RefusedEdit
-from workbench.task.apply_edits import SourceEdit
+from workbench.task.write_edits import SourceEdit
 
 FILE = "/author/task.py"
 HEADER = """\

@@ -35,7 +35,7 @@ from workbench.cameras.edit.plan import plan_edit
 from workbench.envs.camera_data import CameraKey, CameraKind, CameraSettings
 from workbench.pictures.camera_conventions import angle_between
 from workbench.source.parsed import RefusedEdit
-from workbench.task.apply_edits import SourceEdit
+from workbench.task.write_edits import SourceEdit
 
 NEW = CameraSettings((0.1, 0.25, 1.5), (0.5, 0.5, 0.5, -0.5), 1.25, None, 64, 48, 0.02, 12.0, "default")
 HUMAN = "_default_human_render_camera_configs"

@@ -19,7 +19,7 @@ from workbench.cameras.edit.plan import plan_edit
 from workbench.cameras.edit.run_hooks import hook_camera, recording_calls
 from workbench.envs.camera_data import CameraKey
 from workbench.envs.maniskill_private import parse_cameras
-from workbench.task.apply_edits import SourceEdit
+from workbench.task.write_edits import SourceEdit
 
 pytestmark = pytest.mark.thorough
 

@@ -12,7 +12,7 @@ from mani_skill.utils import sapien_utils
 from transforms3d.euler import euler2quat
 from transforms3d.quaternions import quat2mat
 
-from workbench.cameras.edit.write_pose import look_at, to_euler
+from workbench.cameras.edit.pose_text import look_at, to_euler
 from workbench.pictures.camera_conventions import angle_between
 from workbench.source.traced_edits import quaternion_texts
 

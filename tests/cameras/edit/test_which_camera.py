@@ -13,7 +13,7 @@ from workbench.cameras.edit.hook_cameras import HookCameras, RunHooks
 from workbench.cameras.edit.plan import plan_edit
 from workbench.envs.camera_data import CameraKey, CameraSettings
 from workbench.source.parsed import Place, Read, RefusedEdit
-from workbench.task.apply_edits import SourceEdit
+from workbench.task.write_edits import SourceEdit
 
 TWO = HEADER + dedent(
     """\

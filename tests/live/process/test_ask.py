@@ -23,7 +23,7 @@ from workbench.live.messages import Answer, Load, Progress, Request, Reset
 from workbench.live.process import ask as askers
 from workbench.live.process.ask import Background, OnProgress, Priority, QuestionClient
 from workbench.live.process.background_jobs import Job, JobFailed, ProcessDied
-from workbench.live.questions import MakeScene
+from workbench.live.questions_without_task import MakeScene
 from workbench.machine import loop
 from workbench.machine.loop import do
 from workbench.machine.processes.wire import Call, Question, pack

@@ -57,7 +57,7 @@ from workbench.live.messages import (
     WarmUp,
 )
 from workbench.live.process.heartbeat import Doing, HeartbeatWriter, Interrupts
-from workbench.live.questions import DrawTask, ListTasks, MakeScene
+from workbench.live.questions_without_task import DrawTask, ListTasks, MakeScene
 from workbench.live.worker.connection import ServerConnection
 from workbench.live.worker.go_back import enter_recording, entering_text, go_back, going_back_text
 from workbench.live.worker.guarded_task import REFUSED, GuardedTask

@@ -7,7 +7,7 @@ from typing import get_args
 from workbench.cameras.questions import CameraQuestion
 from workbench.checks.questions import CheckGroup, ProfileStep
 from workbench.live.messages import Load, PlaceCamera, Reset, WarmUp
-from workbench.live.questions import DrawTask, ListTasks, MakeScene
+from workbench.live.questions_without_task import DrawTask, ListTasks, MakeScene
 from workbench.record.questions import CaptureMoment
 from workbench.rescore.verdict import Rescore, RescoreMoments
 from workbench.solve.questions import PlanActions

@@ -13,7 +13,7 @@ from workbench.envs.camera_data import CameraKey, CameraSettings, differences, w
 from workbench.source.definitions import Project
 from workbench.source.parsed import RefusedEdit, SourceFile, arguments
 from workbench.source.traced_edits import Changes
-from workbench.task.apply_edits import FileChange, SourceEdit, check_own
+from workbench.task.write_edits import FileChange, SourceEdit, check_own
 
 
 class CameraEdit(Changes):

@@ -20,10 +20,10 @@ from workbench.cameras.edit.hook_text import (
     returned_expression,
     snippet,
 )
-from workbench.cameras.edit.write_pose import look_at_text
+from workbench.cameras.edit.pose_text import look_at_text
 from workbench.envs.camera_data import CallSite, CameraKey, CameraKind, CameraSettings
 from workbench.source.parsed import FUNCTIONS, RefusedEdit, Replacement, SourceFile
-from workbench.task.apply_edits import SourceEdit, check_own
+from workbench.task.write_edits import SourceEdit, check_own
 
 
 def plan_add(

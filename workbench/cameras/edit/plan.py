@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from workbench.cameras.edit.camera_edit import CameraEdit, check_camera, planning
 from workbench.cameras.edit.hook_cameras import FIELDS, CameraCall, RunHooks, changed_fields, with_fields
-from workbench.cameras.edit.write_pose import (
+from workbench.cameras.edit.pose_text import (
     ANGLE_STEP_RADIANS,
     POSITION_STEP_METRES,
     why_not_a_pose,
@@ -17,7 +17,7 @@ from workbench.envs.camera_data import CameraKey, CameraSettings, setting_text
 from workbench.pictures.camera_conventions import angle_between
 from workbench.source.parsed import RefusedEdit, Replacement
 from workbench.source.traced_edits import Changes, matrix_text, number_text
-from workbench.task.apply_edits import SourceEdit
+from workbench.task.write_edits import SourceEdit
 
 
 def plan_edit(

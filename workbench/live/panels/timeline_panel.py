@@ -37,7 +37,7 @@ from workbench.machine.text import number_text
 from workbench.page.command import Command
 from workbench.page.commands import ToggleTimeline
 from workbench.page.widgets.fields import Field, by_name, choice, slider
-from workbench.page.widgets.hotkeys import with_key
+from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.line_chart import polylines
 from workbench.page.widgets.parts import Clock, PagePart
 from workbench.page.widgets.templates import counted, render

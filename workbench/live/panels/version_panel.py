@@ -12,7 +12,7 @@ from workbench.live.run import PastLoad
 from workbench.live.view import SessionView
 from workbench.page.widgets.editor_links import LinkTo, no_links
 from workbench.page.widgets.fields import by_name, choice
-from workbench.page.widgets.hotkeys import with_key
+from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tool, tools_html

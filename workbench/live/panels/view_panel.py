@@ -11,7 +11,7 @@ from workbench.page.commands import ChooseDetail, ChooseTheme, FrameScene, ShowF
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.viewpoint import DETAILS, ViewChoice
 from workbench.page.widgets.fields import choice
-from workbench.page.widgets.hotkeys import with_key
+from workbench.page.widgets.keys_and_palette import with_key
 from workbench.page.widgets.parts import PagePart, name_fold
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tool

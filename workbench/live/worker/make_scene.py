@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from workbench.live.messages import CannotAnswer
-from workbench.live.questions import MakeScene, SceneMade, TaskPicture
+from workbench.live.questions_without_task import MakeScene, SceneMade, TaskPicture
 from workbench.live.worker.pacing import throttled
 
 if TYPE_CHECKING:

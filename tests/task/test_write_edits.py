@@ -15,8 +15,8 @@ from tests.cameras.edit.real_cameras import FILE, real_settings, run_class
 from tests.cameras.edit.shapes import WRITTEN
 from workbench.cameras.edit.plan import plan_edit
 from workbench.source.parsed import RefusedEdit, plain_line_ends
-from workbench.task.apply_edits import FileChange, SourceEdit, apply, revert
 from workbench.task.modules import exact_text
+from workbench.task.write_edits import FileChange, SourceEdit, apply, revert
 
 SOURCE = WRITTEN["one argument per line, with comments"]
 
