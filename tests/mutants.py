@@ -51,7 +51,7 @@ PROTECTED = {
     "episodes/seal": "trust/test_clearance.py episodes/test_document.py",
     "episodes/writing/episode_writer": "episodes/writing/test_episode_writer.py",
     "machine/files": "episodes/test_new_file.py episodes/test_tags.py episodes/writing/test_publish.py"
-    " machine/test_folders.py task/test_apply_edits.py",
+    " machine/test_folders.py task/test_write_edits.py",
     "task/registry": "task/test_registry.py",
     "task/modules": "task/test_load.py task/test_task_content.py task/test_library_names.py"
     " task/test_named_modules.py",

@@ -137,7 +137,7 @@ def test_state_jobs_and_workers_do_not_import_the_page() -> None:
     jobs = [module for module in MODULES if module.endswith("/job")]
     assert len(jobs) > 3
     assert not with_viser & reached_from(
-        "app/session", "review/state", "app/worker/main_loop", "record/recorder", *jobs
+        "app/session", "review/state", "app/worker/main_loop", "record/gym_wrapper", *jobs
     )
 
 
