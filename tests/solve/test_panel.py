@@ -15,6 +15,7 @@ from workbench.envs.keywords import HowMade, Keyword
 from workbench.live.commands import UseControlMode
 from workbench.live.messages import Settings
 from workbench.live.process.background_jobs import JobProgress
+from workbench.page.commands import TellOpenTab
 from workbench.planning.options import PlanOptions
 from workbench.record.commands import SaveSolved
 from workbench.record.saving_state import SaveStatus
@@ -166,17 +167,27 @@ def test_a_rollout_of_the_last_plan_can_be_viewed_while_paused(solve: Solve) -> 
     assert in_words(replace(PLAN, drawn=(0, 1, 3)), 2).startswith("Rollout 4 of 5: return 1")
 
 
-def test_rollout_paths_are_drawn_unless_the_past_is_shown_or_they_are_hidden(solve: Solve) -> None:
+def test_rollout_paths_are_drawn_where_wanted_and_not_in_the_past(solve: Solve) -> None:
     def path_nodes() -> int:
         return len(solve.live.nodes("/rollouts"))
 
+    solve.draw()
+    assert path_nodes() == 0
+    solve.live.do(TellOpenTab(tab="Try"))
     solve.draw()
     assert path_nodes() == 1
     solve.draw(timeline=replace(running(2).timeline, shown=0))
     assert path_nodes() == 0
     solve.draw()
     assert path_nodes() == 1
-    solve.live.set("Show rollouts", False)
+    solve.live.do(TellOpenTab(tab="Run"))
+    solve.draw()
+    assert path_nodes() == 0
+    solve.live.set("Show rollouts", "on all tabs")
+    solve.draw()
+    assert path_nodes() == 1
+    solve.live.do(TellOpenTab(tab="Try"))
+    solve.live.set("Show rollouts", "off")
     solve.draw()
     assert path_nodes() == 0
 

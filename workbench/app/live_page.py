@@ -73,6 +73,7 @@ from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Done, Visitor, Visitors
 from workbench.record.panel import RecordPanel, record_tool
 from workbench.rescore.past_panel import PastRescorePanel, RescoredAbove
+from workbench.solve.panel import TAB as TRY
 from workbench.solve.panel import SolvePanel
 from workbench.solve.seeds_panel import SolveSeedsPanel
 from workbench.start.panel import Chooser, OpenDialog
@@ -234,10 +235,10 @@ class Page:
             self._rescored = PastRescorePanel(
                 server, session, lambda name, env: session.rescored_curve(name, env)
             )
-        with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
-            self._inspect = InspectPanel(server, session, clock)
-        with tabs.add_tab("Try", viser.Icon.FLASK):
-            self._solve = SolvePanel(server, session, self._link)
+        with tabs.add_tab(INSPECT, viser.Icon.ZOOM_IN):
+            self._inspect = InspectPanel(server, session, self._open_tabs, clock)
+        with tabs.add_tab(TRY, viser.Icon.FLASK):
+            self._solve = SolvePanel(server, session, self._open_tabs, self._link)
             seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
             profile = StepProfilePanel(server, self._link)
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
@@ -316,6 +317,7 @@ class Page:
                 self._open_tabs.open(visitor, tab, fold)
             case TellOpenTab(tab=tab):
                 self._open_tabs.said(visitor, tab)
+                self._inspect.choose_sections()
             case TellUnfolded(panel=panel):
                 self._unfolded(panel)
             case TellDrawnInSoftware():
@@ -351,8 +353,6 @@ class Page:
             self._envs.unfold()
         elif panel == CAMERAS:
             self._studio.unfold()
-        elif panel == INSPECT:
-            self._inspect.unfold()
 
     def _fit_envs(self) -> None:
         """Set the table's width to that of its columns, once for each page width: the user may have dragged its edge."""

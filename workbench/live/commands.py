@@ -8,6 +8,7 @@ import msgspec
 
 from workbench.actions.sources import ActionSource
 from workbench.page.command import Command
+from workbench.page.commands import ShownOn
 
 MAX_SEED = 2**31 - 1
 
@@ -173,9 +174,9 @@ class SelectBody(Command, frozen=True):
 
 
 class ShowForces(Command, frozen=True):
-    """Show or hide the contact forces of the selected env, as arrows in the 3D view."""
+    """Show the contact forces of the selected env, as arrows in the 3D view."""
 
-    on: bool
+    where: ShownOn
 
 
 class RebuildScene(Command, frozen=True):

@@ -6,6 +6,9 @@ from typing import Literal
 
 from workbench.page.command import Command
 
+ShownOn = Literal["off", "on this tab", "on all tabs"]
+"""Where something is drawn in the view: nowhere, while a page has its tab open, or always."""
+
 
 class ShowRecordings(Command, frozen=True):
     """Review recordings."""

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from workbench.page.command import Command
+from workbench.page.commands import ShownOn
 
 MAX_HORIZON_SECONDS = 3.0
 
@@ -54,9 +55,9 @@ class SetPlanEvery(Command, frozen=True):
 
 
 class ShowRollouts(Command, frozen=True):
-    """Show or hide the rollouts as lines in the 3D view."""
+    """Show the rollouts as lines in the 3D view."""
 
-    on: bool
+    where: ShownOn
 
 
 class FollowBody(Command, frozen=True):

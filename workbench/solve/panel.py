@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import get_args
 
 import numpy as np
 import viser
@@ -15,10 +16,12 @@ from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.machine.text import number_text, rate_text
 from workbench.page.command import Command, Refused
+from workbench.page.commands import ShownOn
 from workbench.page.widgets.editor_links import LinkTo, no_links
-from workbench.page.widgets.fields import choice, slider, tick
+from workbench.page.widgets.fields import choice, slider
 from workbench.page.widgets.line_chart import ChartLine, LineChart, part_round
 from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import Tool, tool, tools_html
@@ -43,6 +46,7 @@ from workbench.solve.questions import PlannedEnv
 from workbench.solve.rollout_traces import RolloutTraces
 from workbench.solve.state import SolveView
 
+TAB = "Try"
 THIS_ENV, ALL_ENVS = "the selected env", "all envs, in turn"
 PLANNED_ENVS = {THIS_ENV: "selected", ALL_ENVS: "all"}
 METHODS = {"MPPI": "mppi", "predictive sampling": "predictive", "CEM": "cem"}
@@ -65,17 +69,20 @@ class SolvePanel(PagePart[SessionView]):
     Args:
         server: The page.
         session: The session.
+        tabs: The open tab of each page.
         link: Links the lines of the author's files.
     """
 
     does = (ShowRollouts, LookAtRollout)
 
-    def __init__(self, server: viser.ViserServer, session: LiveSession, link: LinkTo = no_links) -> None:
-        self._server, self._session, self._link = server, session, link
+    def __init__(
+        self, server: viser.ViserServer, session: LiveSession, tabs: OpenTabs, link: LinkTo = no_links
+    ) -> None:
+        self._server, self._session, self._tabs, self._link = server, session, tabs, link
         gui = server.gui
         self._traces = RolloutTraces(server)
         self._told: tuple[tuple[int, int], ...] = ()
-        self._shows_rollouts = True
+        self._rollouts_on: ShownOn = "on this tab"
         self._place = 0
         """Index of the chosen rollout among the drawn ones."""
         self._begin = gui.add_html("")
@@ -152,12 +159,13 @@ class SolvePanel(PagePart[SessionView]):
 
     def _build_rollouts(self) -> None:
         server = self._server
-        self._shows = tick(
+        self._shows = choice(
             server,
             "Show rollouts",
             ShowRollouts,
-            "on",
-            True,
+            "where",
+            get_args(ShownOn),
+            self._rollouts_on,
             hint="Draw the path of a body in each rollout as a line in the 3-D view. The best is bright.",
         )
         self._traced = choice(
@@ -184,8 +192,8 @@ class SolvePanel(PagePart[SessionView]):
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
-            case ShowRollouts(on=on):
-                self._shows_rollouts = on
+            case ShowRollouts(where=where):
+                self._rollouts_on = where
             case LookAtRollout(number=number):
                 plan = self._session.view().of(SolveView).plan
                 if plan is None or number > len(plan.drawn):
@@ -220,7 +228,7 @@ class SolvePanel(PagePart[SessionView]):
         self._temperature.show(plan.temperature)
         self._temperature.visible = plan.method == "mppi"
         self._every.show(plan.every)
-        self._shows.show(self._shows_rollouts)
+        self._shows.show(self._rollouts_on)
         self._draw_traced(view)
         self._draw_looked_at(view)
         self._draw_chart(solve)
@@ -234,7 +242,9 @@ class SolvePanel(PagePart[SessionView]):
         """
         plan = view.of(SolveView).plan
         there = (
-            view.settings.action_source == "solve" and self._shows_rollouts and view.timeline.shown is None
+            view.settings.action_source == "solve"
+            and self._tabs.shows(self._rollouts_on, TAB)
+            and view.timeline.shown is None
         )
         if plan is None or not there:
             self._traces.draw(None, offset, 0)
@@ -259,7 +269,7 @@ class SolvePanel(PagePart[SessionView]):
 
     def _draw_looked_at(self, view: SessionView) -> None:
         plan = view.of(SolveView).plan
-        looks = plan is not None and len(plan.drawn) > 1 and not view.playing and self._shows_rollouts
+        looks = plan is not None and len(plan.drawn) > 1 and not view.playing and self._rollouts_on != "off"
         self._look_at.visible = self._looked_at.visible = looks
         if looks and plan is not None:
             place = self._place_in(plan)

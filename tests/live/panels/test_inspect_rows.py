@@ -19,7 +19,7 @@ from workbench.live.panels.inspect_panel import (
     joint_rows,
     pose_rows,
 )
-from workbench.page.commands import TellUnfolded
+from workbench.page.commands import TellOpenTab
 
 
 def leaf(name: str, *values: float, shape: tuple[int, ...] | None = None) -> Leaf:
@@ -142,7 +142,7 @@ def test_the_selected_body_is_shown_first_with_its_pose_and_its_contacts(live_pa
     view = running(2, selected_env=1, inspection=reading)
     live_page.show(view)
     assert "wb-body" not in inspect.html()
-    live_page.do(TellUnfolded(panel="Inspect"))
+    live_page.do(TellOpenTab(tab="Inspect"))
     live_page.do(SelectBody(body="cube"))
     assert "contacts" in live_page.asked[-1].sections
     live_page.show(view)
@@ -162,11 +162,18 @@ def test_only_chosen_quantities_are_read_and_contacts_for_the_arrows(live_page: 
     live_page.show(running(2))
     inspect = live_page.part("Inspect")
     assert not live_page.asked, "no page has opened the tab"
-    inspect.set("Force arrows", True)
-    assert chosen() == ("contacts",)
+    inspect.set("Force arrows", "on this tab")
+    assert chosen() == ()
+    live_page.do(TellOpenTab(tab="Inspect"))
     inspect.set("Show", "state")
     live_page.again()
-    assert chosen() == ("state", "contacts") and inspect.field("Force arrows").value is True
-    inspect.set("Force arrows", False)
+    assert chosen() == ("state", "contacts")
+    live_page.do(TellOpenTab(tab="Reward"))
+    assert chosen() == ()
+    inspect.set("Force arrows", "on all tabs")
+    assert chosen() == ("contacts",)
+    inspect.set("Force arrows", "off")
+    assert chosen() == ()
+    live_page.do(TellOpenTab(tab="Inspect"))
     inspect.set("Show", "nothing")
     assert chosen() == ()

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import viser
@@ -20,9 +20,10 @@ from workbench.live.session_protocol import LiveSession
 from workbench.live.view import SessionView
 from workbench.machine.text import number_text
 from workbench.page.command import Command
-from workbench.page.commands import TellUnfolded
+from workbench.page.commands import ShownOn
 from workbench.page.scene.env_grid import InView
-from workbench.page.widgets.fields import choice, tick
+from workbench.page.widgets.fields import choice
+from workbench.page.widgets.open_tabs import OpenTabs
 from workbench.page.widgets.parts import Clock, DrawThrottle, PagePart
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
@@ -150,16 +151,24 @@ CHOICES: dict[str, Section | None] = {
 class InspectPanel(PagePart[SessionView]):
     """Reads the chosen section of the selected env from the worker.
 
-    Nothing is read until a page has opened the tab, since reading takes the worker's time.
+    Only what a page shows is read, since reading takes the worker's time.
+
+    Args:
+        tabs: The open tab of each page.
     """
 
     does = (ChooseInspected, SelectBody, ShowForces)
 
     def __init__(
-        self, server: viser.ViserServer, session: LiveSession, clock: Clock = time.monotonic
+        self,
+        server: viser.ViserServer,
+        session: LiveSession,
+        tabs: OpenTabs,
+        clock: Clock = time.monotonic,
     ) -> None:
-        self._session = session
-        self._chosen, self._shows_forces = JOINTS, False
+        self._session, self._tabs = session, tabs
+        self._chosen = JOINTS
+        self._forces_on: ShownOn = "off"
         self.body = ""
         """Name of the selected body; empty for none."""
         self._of_body = server.gui.add_html("", visible=False)
@@ -172,17 +181,16 @@ class InspectPanel(PagePart[SessionView]):
             JOINTS,
             hint="Read from the selected env, five times a second.",
         )
-        self._forces = tick(
+        self._forces = choice(
             server,
             "Force arrows",
             ShowForces,
-            "on",
-            False,
+            "where",
+            get_args(ShownOn),
+            self._forces_on,
             hint="Draw the contact forces of the selected env as arrows in the 3D view.",
         )
         self._handle = server.gui.add_html("")
-        self._opened = False
-        server.gui.add_html(render("tell", command=TellUnfolded(panel=TAB)))
         self._now: Inspection | None = None
         self._before: Inspection | None = None
         self._due = DrawThrottle(READ_PERIOD_SECONDS, clock)
@@ -190,7 +198,7 @@ class InspectPanel(PagePart[SessionView]):
     def draw(self, view: SessionView) -> None:
         chosen = self._chosen
         self._show.show(chosen)
-        self._forces.show(self._shows_forces)
+        self._forces.show(self._forces_on)
         self._take(view)
         no_step = self._no_step_yet(view)
         wanted = (chosen, view.task_serial, view.selected_env, id(self._now), no_step, self.body)
@@ -206,29 +214,24 @@ class InspectPanel(PagePart[SessionView]):
         match command:
             case ChooseInspected(what=what):
                 self._chosen = what
-                self.unfold()
+                self.choose_sections()
             case SelectBody(body=body):
                 self.select(body)
-            case ShowForces(on=on):
-                self._shows_forces = on
-                self._choose()
+            case ShowForces(where=where):
+                self._forces_on = where
+                self.choose_sections()
 
     def forces(self, view: SessionView) -> Inspection | None:
         """The reading whose contacts the 3-D view shows; None while the past is shown, since contacts are read live only."""
         here = self._now is not None and self._now.env == view.selected_env
         known = view.timeline.shown is None and not self._no_step_yet(view)
-        shown = self._shows_forces and here and known
+        shown = self._tabs.shows(self._forces_on, TAB) and here and known
         return self._now if shown else None
 
     def select(self, body: str) -> None:
         """Select the body with this name; empty for none."""
         self.body = body
-        self._choose()
-
-    def unfold(self) -> None:
-        """Start reading, because a page has opened the tab."""
-        self._opened = True
-        self._choose()
+        self.choose_sections()
 
     def _no_step_yet(self, view: SessionView) -> bool:
         """Whether the selected env has made no step since it was built, reset or restored. PhysX finds contacts while it
@@ -238,12 +241,11 @@ class InspectPanel(PagePart[SessionView]):
         lived = self._session.look(lambda run: run.segment()) if view.timeline.shown is None else None
         return lived is not None and lived[0] == lived[1]
 
-    def _choose(self) -> None:
-        """Tell the session which sections to read."""
-        needed = {
-            CHOICES[self._chosen] if self._opened else None,
-            "contacts" if self._shows_forces or (self.body and self._opened) else None,
-        }
+    def choose_sections(self) -> None:
+        """Tell the session which sections to read; call it when a page opens another tab."""
+        is_open = bool(self._tabs.pages_at(TAB))
+        shows_contacts = self._tabs.shows(self._forces_on, TAB) or (self.body and is_open)
+        needed = {CHOICES[self._chosen] if is_open else None, "contacts" if shows_contacts else None}
         self._session.happen(ReadingChosen(tuple(section for section in SECTIONS if section in needed)))
 
     def _take(self, view: SessionView) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from workbench.page.commands import ShownOn
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor, Visitors
 
@@ -18,6 +19,10 @@ class OpenTabs:
         """Client ids of the pages that have this tab open."""
         here = self._visitors.all()
         return frozenset(one.client.client_id for one in here if self._open.get(one.name) == name)
+
+    def shows(self, where: ShownOn, name: str) -> bool:
+        """Whether something of this tab is drawn in the view."""
+        return where == "on all tabs" or (where == "on this tab" and bool(self.pages_at(name)))
 
     def open(self, visitor: Visitor, name: str, fold: str = "") -> None:
         """Open a tab, and a fold in it, on a page."""
