@@ -64,6 +64,10 @@
     sessionStorage.setItem(OPEN + name, isOpen ? "1" : "");
   }
   wb.arrivals.toggle = ({ dataset }) => setOpen(`data-${dataset.toggle}`, !html.hasAttribute(`data-${dataset.toggle}`));
+  wb.arrivals.openAddress = ({ dataset }) => {
+    if ("newTab" in dataset) open(dataset.openAddress, "_blank", "noopener");
+    else location.href = dataset.openAddress; // an editor's scheme: the page stays
+  };
   if (sessionStorage.getItem(`${OPEN}data-timeline-open`)) html.setAttribute("data-timeline-open", "");
 
   // Help opens at the topic of the open tab.
@@ -134,8 +138,9 @@
 
   // A browser allows opening a tab only while it handles a press, and the server gets the command later. Enter is a click too.
   addEventListener("click", ({ target }) => {
-    const label = target.closest?.(".mantine-Spotlight-action")?.querySelector(".mantine-Spotlight-actionLabel");
-    if (label?.textContent === "Help: open the documents") open("/help/", "_blank", "noopener");
+    const action = target.closest?.(".mantine-Spotlight-action");
+    const textOf = (part) => action?.querySelector(`.mantine-Spotlight-action${part}`)?.textContent ?? "";
+    if (textOf("Label").startsWith("Help: ")) open(textOf("Description") || "/help/", "_blank", "noopener");
   }, true);
 
   new MutationObserver(() => {

@@ -21,24 +21,28 @@ from workbench.share import commands as share
 from workbench.solve import commands as solve
 from workbench.start import commands as tasks
 
+_MODULES = {
+    "Run": (run, solve),
+    "Timeline": (timeline,),
+    "Envs": (envs,),
+    "Recording": (recording,),
+    "Page": (checks, page, tasks),
+    "Review": (review, share),
+    "Library": (library,),
+    "The chosen camera": (cameras,),
+}
+"""Modules of commands by the heading under which the page lists their keys."""
+
 COMMANDS = CommandList(
-    kind
-    for module in (
-        run,
-        solve,
-        timeline,
-        envs,
-        recording,
-        checks,
-        page,
-        tasks,
-        review,
-        library,
-        share,
-        cameras,
-    )
-    for kind in vars(module).values()
-    if isinstance(kind, type) and issubclass(kind, Command) and kind is not Command
+    {
+        heading: [
+            kind
+            for module in modules
+            for kind in vars(module).values()
+            if isinstance(kind, type) and issubclass(kind, Command) and kind is not Command
+        ]
+        for heading, modules in _MODULES.items()
+    }
 )
 
 __all__ = ["COMMANDS", "Command", "CommandList", "Refused"]

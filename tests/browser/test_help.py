@@ -71,11 +71,11 @@ def test_a_link_to_a_section_shows_that_section(served: GatedServer, browser: Br
 def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, browser: Browser) -> None:
     with example_without_pictures(browser) as desk:
 
-        def leads_to_help(press: str, title: str = "Workbench") -> None:
+        def leads_to_help(press: str, title: str = "Workbench", of_palette: str = "help: open") -> None:
             with desk.page.expect_popup() as opened:
                 if press == "palette":
                     desk.press("Control+k")
-                    desk.page.get_by_placeholder("Search commands...").fill("help")
+                    desk.page.get_by_placeholder("Search commands...").fill(of_palette)
                     expect(desk.page.get_by_role("button", name=re.compile("^Help")).last).to_be_visible()
                     desk.press("Enter")
                 else:
@@ -86,6 +86,7 @@ def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, brows
         desk.tab("Checks")
         leads_to_help("link", "Checks")
         leads_to_help("palette")
+        leads_to_help("palette", "Solve a task before training on it", "help: solve a task")
         desk.leave_inputs()
         desk.press("v")
         expect(desk.page.get_by_role("tab", name="Library")).to_be_visible()
@@ -94,3 +95,29 @@ def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, brows
         desk.leave_inputs()
         desk.press("v")
         expect(desk.button("Play")).to_be_visible()
+
+
+@pytest.mark.slow
+def test_the_documents_can_be_searched(served: GatedServer, browser: Browser) -> None:
+    with page_at(browser, served.addresses("/help/")[0]) as (page, errors):
+        search = page.get_by_role("searchbox", name="Search the documents")
+        search.fill("contact forces")
+        search.press("Enter")
+        page.wait_for_url("**/help/?search=contact+forces")
+        page.locator("main").get_by_role("link").first.click()
+        expect(page.locator("nav [aria-current=page]")).to_have_count(1)
+        assert errors == []
+
+
+@pytest.mark.slow
+def test_a_file_of_the_task_opens_in_the_editor_from_the_palette(
+    example_without_pictures: At, browser: Browser
+) -> None:
+    with example_without_pictures(browser) as desk:
+        desk.press("Control+k")
+        desk.page.get_by_placeholder("Search commands...").fill(desk.file.name)
+        expect(desk.page.get_by_role("button", name=re.compile("^File")).last).to_be_visible()
+        desk.press("Enter")
+        opens = desk.page.locator("[data-open-address]")
+        expect(opens).to_have_attribute("data-open-address", f"vscode://file{desk.file}:1")
+        expect(desk.button("Play")).to_be_visible()  # the page stayed

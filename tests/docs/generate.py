@@ -90,8 +90,10 @@ def keys_page() -> str:
 
 
 def table(kinds: Sequence[type[Command]]) -> list[str]:
-    rows = [f"| {key} | {what} |" for key, what in key_rows(COMMANDS, kinds)]
-    return ["| key | what it does |", "| --- | --- |", *rows]
+    lines = ["| key | what it does |", "| --- | --- |"]
+    for rows in key_rows(COMMANDS, kinds).values():
+        lines += [f"| {key} | {what} |" for key, what in rows]
+    return lines
 
 
 # --- commands -----------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ class PageParts(HTMLParser):
 
 
 def page_of(topic: Topic) -> PageParts:
-    status, kind, body = reply(topic.name)
+    status, kind, body = reply(topic.name, {})
     assert status == 200 and kind.startswith("text/html")
     return PageParts(body.decode())
 
@@ -69,7 +69,7 @@ def test_every_picture_exists_dark_and_light(topic: Topic) -> None:
     "name", ["../safety.md", "%2e%2e", "/etc/passwd", "docs/safety.md", "README.md/..", "\u202e"]
 )
 def test_an_unknown_topic_gives_the_list_and_no_file_content(name: str) -> None:
-    status, _, body = reply(name)
+    status, _, body = reply(name, {})
     assert status == 404 and "There is no such page" in body.decode() and "root:" not in body.decode()
     assert name not in body.decode()
 
@@ -84,6 +84,15 @@ def test_html_in_the_text_of_a_page_is_shown_as_text() -> None:
 
 def test_no_page_has_a_script_or_a_handler() -> None:
     for topic in topics():
-        body = reply(topic.name)[2].decode()
+        body = reply(topic.name, {})[2].decode()
         assert "<script" not in body and not re.search(r"<[^>]+\son\w+=", body)
     assert "script-src" not in help_pages.HEADERS["Content-Security-Policy"]
+
+
+def test_a_search_lists_the_documents_with_all_words_and_shows_the_words_as_text() -> None:
+    status, _, body = reply("", {"search": "force arrows"})
+    found = body.decode().partition("<main>")[2]
+    assert status == 200 and '<a href="/help/debugging">' in found and "Force arrows" in found
+    assert "/help/install" not in found
+    body = reply("", {"search": "<script> no-such-word"})[2]
+    assert b"<script" not in body and b"No document has all of these words" in body

@@ -246,6 +246,6 @@ def test_a_thumbnail_is_served_only_for_the_id_of_a_listed_task(
     given: Callable[[str], bytes | None] = {"PickCube-v1": b"\xff\xd8\xff"}.get
     monkeypatch.setattr(chosen.catalogue.registered, "picture", given)
     reply = picture_route(chosen.catalogue)
-    assert reply("PickCube-v1.jpg") == (200, "image/jpeg", b"\xff\xd8\xff")
+    assert reply("PickCube-v1.jpg", {}) == (200, "image/jpeg", b"\xff\xd8\xff")
     for name in ("../tasks.json", "PickCube-v1.jpg/..", "", ".jpg", "/etc/passwd"):
-        assert reply(name)[0] == 404
+        assert reply(name, {})[0] == 404

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import posixpath
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ADDRESS = "/help/"
 """Prefix of the route of `reply`."""
 HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; form-action 'none'; "
+    "Content-Security-Policy": "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; form-action 'self'; "
     "frame-ancestors 'self'",
     "Cache-Control": "no-cache",
 }
@@ -114,7 +114,7 @@ def _as_named(name: str) -> str:
 def topics_about(words: str) -> list[Topic]:
     """Topics whose text contains each of these words, in any case and order; topics that begin with them come first. Pages
     of rules only if no other topic matches."""
-    wanted = [word for word in re.findall(r"[\w-]+", words.lower()) if word not in _LITTLE_WORDS]
+    wanted = _words(words)
     if not wanted:
         return []
 
@@ -126,6 +126,11 @@ def topics_about(words: str) -> list[Topic]:
     return sorted(found, key=lambda topic: not holds(topic.text[:_INTRODUCTION_CHARACTERS]))
 
 
+def _words(text: str) -> list[str]:
+    """The words to search for, in lower case."""
+    return [word for word in re.findall(r"[\w-]+", text.lower()) if word not in _LITTLE_WORDS]
+
+
 def by_path(path: str) -> Topic | None:
     return next((topic for topic in topics() if topic.path == path), None)
 
@@ -133,14 +138,31 @@ def by_path(path: str) -> Topic | None:
 # --- in the browser -----------------------------------------------------------------------------------
 
 
-def reply(path: str) -> tuple[int, str, bytes]:
-    """The page of a topic by its name; the overview for an empty one. Reads no file by a name that a browser sends."""
-    topic = find_topic(path or OVERVIEW)
-    status = 200 if topic is not None else 404
+def reply(path: str, query: Mapping[str, str]) -> tuple[int, str, bytes]:
+    """The page of a topic by its name; the overview for an empty one; or the list of topics about the words of the query's
+    ``search``. Reads no file by a name that a browser sends."""
+    words = query.get("search", "").strip()
+    topic = None if words else find_topic(path or OVERVIEW)
     groups = [(group, [one for one in topics() if one.group == group]) for _, group in GROUPS]
-    body = "" if topic is None else html_of(topic)
-    page = render("help_page", topic=topic, groups=groups, body=body, address=ADDRESS)
-    return status, "text/html; charset=utf-8", page.encode()
+    page = render(
+        "help_page",
+        topic=topic,
+        groups=groups,
+        body="" if topic is None else html_of(topic),
+        words=words,
+        found=[(one, _first_line_about(one, words)) for one in topics_about(words)],
+        address=ADDRESS,
+    )
+    return 200 if topic is not None or words else 404, "text/html; charset=utf-8", page.encode()
+
+
+def _first_line_about(topic: Topic, words: str) -> str:
+    """The first line of a topic's text, after its title, that contains one of the words, without marks of Markdown; empty if
+    only the title does."""
+    wanted = _words(words)
+    lines = topic.text.splitlines()[1:]
+    line = next((line for line in lines if any(word in line.lower() for word in wanted)), "")
+    return re.sub(r"[`*|#]", "", re.sub(r"!?\[([^\]]*)\]\([^)]*\)?", r"\1", line)).strip()
 
 
 def html_of(topic: Topic) -> str:

@@ -14,7 +14,7 @@ import viser
 from workbench.app import state
 from workbench.app.marks import EPISODES, Marks
 from workbench.app.pages import draw_apart
-from workbench.app.palette_entries import TaskCommands
+from workbench.app.palette_entries import TaskCommands, add_help_topics
 from workbench.app.session import Session
 from workbench.app.status_line import StatusLine
 from workbench.cameras.commands import SelectCamera
@@ -45,11 +45,12 @@ from workbench.live.panels.view_panel import ViewIcons, ViewPanel
 from workbench.live.view import SessionView
 from workbench.machine.kept_choices import close_hints
 from workbench.machine.loop import BlockingPool, post
-from workbench.page.command import Command
+from workbench.page.command import Command, Refused
 from workbench.page.commands import (
     CloseDialog,
     CloseHints,
     FrameScene,
+    OpenFile,
     ShowRecordings,
     ShowTab,
     TellDrawnInSoftware,
@@ -91,6 +92,7 @@ DOES: frozenset[type[Command]] = frozenset(
         FrameScene,
         CloseHints,
         CloseDialog,
+        OpenFile,
         *CamerasPanel.does,
     }
 )
@@ -202,6 +204,7 @@ class Page:
         self._parts.add(TaskCommands(server, visitors))
         kinds = DOES | state.DOES | self._parts.does | also
         register(server, visitors, kinds, "live page", (ENVS_TAB, EPISODES, "Timeline", LOG))
+        add_help_topics(server, visitors)
         # viser awaits coroutines, although its types do not say so.
         server.scene.on_click()(self._on_scene_click)  # type: ignore[arg-type]
 
@@ -331,6 +334,8 @@ class Page:
             case CloseHints():
                 self._hints.content = ""
                 self._choices.begin(close_hints)
+            case OpenFile(file=file):
+                self._open_file(file, visitor)
             case SelectCamera():
                 session.do(command, visitor.name)
                 self._open_tabs.open(visitor, CAMERAS)
@@ -344,6 +349,13 @@ class Page:
             case _:
                 return self._parts.do(command, visitor)
         return None
+
+    def _open_file(self, file: str, visitor: Visitor) -> None:
+        """Open a file in the user's editor. Raises `Refused` without one."""
+        link = self._link(file, None)
+        if not link.address:
+            raise Refused(f"No editor opens {file}: it is no file of the task, or --editor is none.")
+        visitor.send(render("open_address", link=link))
 
     def _unfolded(self, panel: str) -> None:
         """Handle that a page shows this panel."""

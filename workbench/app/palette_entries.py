@@ -1,9 +1,12 @@
-"""Palette entries of the open task: its envs, cameras, control modes, bodies and curves by name."""
+"""Palette entries of the documents, and of the open task: its envs, cameras, control modes, bodies, curves and files."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import viser
 
+from workbench.app.help_pages import ADDRESS, RULE_PAGES, topics
 from workbench.cameras.commands import SelectCamera
 from workbench.cameras.studio_panel import TAB as CAMERAS
 from workbench.live.commands import SelectBody, UseControlMode
@@ -13,12 +16,20 @@ from workbench.live.panels.timeline_panel import strip_curves
 from workbench.live.timeline_commands import ChooseStripCurve
 from workbench.live.view import SessionView
 from workbench.page.command import Command
+from workbench.page.commands import OpenFile, OpenHelp
 from workbench.page.widgets.keys_and_palette import add
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.visitors import Visitors
 
 MAX_ENVS = 256
 """Maximum number of envs with an entry; more entries would delay every page."""
+
+
+def add_help_topics(server: viser.ViserServer, visitors: Visitors) -> None:
+    """Add an entry for each document. The browser opens the address below the label (``panels.js``)."""
+    for topic in topics():
+        if topic.group != RULE_PAGES:
+            add(server, visitors, f"Help: {topic.title}", OpenHelp(), f"{ADDRESS}{topic.name}")
 
 
 class TaskCommands(PagePart[SessionView]):
@@ -39,6 +50,7 @@ class TaskCommands(PagePart[SessionView]):
             view.task.control_mode,
             tuple(strip_curves(view)),
             view.task.geometry.body_names,
+            view.task.source_files,
         )
 
     def draw(self, view: SessionView) -> None:
@@ -71,4 +83,8 @@ def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
         ),
         *((f"Body {name}", SelectBody(body=name), "marked in the view") for name in task.geometry.body_names),
         *((f"Curve {name}", ChooseStripCurve(curve=name), "on the strip") for name in strip_curves(view)),
+        *(
+            (f"File {Path(file).name}", OpenFile(file=file), f"in the editor: {file}")
+            for file in task.source_files
+        ),
     ]

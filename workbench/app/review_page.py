@@ -12,6 +12,7 @@ import viser
 from workbench.app.go_live import GoLive, GoLivePart
 from workbench.app.open_task import OpenTask
 from workbench.app.pages import draw_apart
+from workbench.app.palette_entries import add_help_topics
 from workbench.app.shared import Shared
 from workbench.cameras.panel import CamerasPanel
 from workbench.cameras.view import ShownCameras
@@ -173,6 +174,7 @@ class ReviewPage:
             kinds if shared.session is not None else kinds - {ShowLive},
             "review page",
         )
+        add_help_topics(server, shared.visitors)
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
         """Returns the Review tab, which gets more content later, and the parts of all tabs."""

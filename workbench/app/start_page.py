@@ -6,6 +6,7 @@ import time
 
 import workbench
 from workbench.app.open_task import OpenTask
+from workbench.app.palette_entries import add_help_topics
 from workbench.app.shared import Shared
 from workbench.live.panels.view_panel import BRAND
 from workbench.page.command import Command, Refused
@@ -47,6 +48,7 @@ class StartPage:
         self._shared = shared
         kinds = frozenset({ShowRecordings, ToggleTheme, *TaskList.does}) | also
         register(server, shared.visitors, kinds, "start page")
+        add_help_topics(server, shared.visitors)
 
     def do(self, command: Command, visitor: Visitor) -> Done:
         """Carry out a command of a page. Raises `Refused`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -77,10 +77,11 @@ class Key:
 
 
 class CommandList:
-    """All commands."""
+    """All commands, in groups with a heading each."""
 
-    def __init__(self, kinds: Iterable[type[Command]]) -> None:
-        self.kinds = tuple(kinds)
+    def __init__(self, groups: Mapping[str, Iterable[type[Command]]]) -> None:
+        self.groups = {heading: tuple(kinds) for heading, kinds in groups.items()}
+        self.kinds = tuple(kind for kinds in self.groups.values() for kind in kinds)
         self._by_name = {name_of(kind): kind for kind in self.kinds}
         assert len(self._by_name) == len(self.kinds), "two commands have one name"
         taken = [(kind.context, kind.key) for kind in self.kinds if kind.key]

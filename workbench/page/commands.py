@@ -85,6 +85,13 @@ class OpenHelp(Command, frozen=True):
     """Help: open the documents."""
 
 
+class OpenFile(Command, frozen=True):
+    """Open a file of the task in the editor."""
+
+    file: str
+    """Absolute path."""
+
+
 class RenewToken(Command, frozen=True):
     """Renew the token and close every page."""
 

@@ -81,7 +81,7 @@ class RerunPages:
         self._shown[key] = paths, moments
         return f"{_SHOW}{key}/"
 
-    def _go_on(self, asked: str) -> tuple[int, str, bytes]:
+    def _go_on(self, asked: str, query: Mapping[str, str]) -> tuple[int, str, bytes]:
         shown = self._shown.get(asked.partition("/")[0])
         if shown is None:
             return 404, "text/plain; charset=utf-8", b"There is no such recording."
@@ -107,7 +107,7 @@ def _stores(moments: Moments) -> Iterator[tuple[str, int]]:
             log.warning("rerun cannot be told to open %s at step %d: %s", path.name, step, error)
 
 
-def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:
+def _viewer_file(name: str, query: Mapping[str, str]) -> tuple[int, str, bytes] | FileReply:
     if name not in VIEWER_FILES:
         return 404, "text/plain; charset=utf-8", b"There is no such file."
     if name == "index.html":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -294,10 +294,10 @@ def _note(section: Section, view: CatalogueView, some: bool, searched: bool) -> 
     return ""
 
 
-def picture_route(catalogue: Catalogue) -> Callable[[str], tuple[int, str, bytes]]:
+def picture_route(catalogue: Catalogue) -> Callable[[str, Mapping[str, str]], tuple[int, str, bytes]]:
     """Route handler for the picture of a listed id: the name is looked up and never used as a path."""
 
-    def reply(name: str) -> tuple[int, str, bytes]:
+    def reply(name: str, query: Mapping[str, str]) -> tuple[int, str, bytes]:
         picture = catalogue.registered.picture(name.removesuffix(".jpg"))
         return (404, "text/plain", b"") if picture is None else (200, "image/jpeg", picture)
 

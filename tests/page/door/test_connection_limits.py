@@ -71,7 +71,7 @@ def test_a_page_with_the_token_has_no_timeout(gated_server, monkeypatch):
     monkeypatch.setattr(strangers, "TOKEN_TIMEOUT_SECONDS", 0.3)
     slow = (200, "application/octet-stream", b"x" * 1000)
     # Both take longer than the timeout without a token.
-    gated_server.add_route("/slow/", lambda path: time.sleep(0.8) or slow)
+    gated_server.add_route("/slow/", lambda path, query: time.sleep(0.8) or slow)
     assert ask(gated_server, "/slow/x")[2] == b"x" * 1000
     with client(gated_server) as page:
         time.sleep(0.6)
@@ -236,7 +236,7 @@ def test_any_attack_prints_only_a_few_short_lines(
     caplog: pytest.LogCaptureFixture,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    def fail(what: object) -> Any:
+    def fail(*what: object) -> Any:
         raise RuntimeError("z" * 100_000)
 
     gated_server.add_route("/fails/", fail)

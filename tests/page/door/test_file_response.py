@@ -34,7 +34,7 @@ def file(gated_server: GatedServer, tmp_path: Path, request: pytest.FixtureReque
     path = tmp_path / "recording.rerun.write"
     prefix = f"/{request.node.name.partition('[')[0]}-{tmp_path.name}/"
     gated_server.add_route(
-        prefix, lambda _: FileReply(path, "application/x-rerun", download_as="Größe 1.rrd")
+        prefix, lambda _, query: FileReply(path, "application/x-rerun", download_as="Größe 1.rrd")
     )
     return f"{prefix}x", path
 
@@ -165,7 +165,7 @@ def test_a_compressed_file_is_decompressed_for_clients_that_cannot(
     plain = b"wasm " * BLOCK_BYTES
     path = tmp_path / "viewer.wasm.gz"
     path.write_bytes(gzip.compress(plain))
-    gated_server.add_route("/packed/", lambda _: FileReply(path, "application/wasm", gzipped=True))
+    gated_server.add_route("/packed/", lambda _, query: FileReply(path, "application/wasm", gzipped=True))
     status, headers, body = ask(gated_server, "/packed/x", Accept_Encoding="br, gzip")
     assert (status, headers["Content-Encoding"], headers["Vary"]) == (200, "gzip", "Accept-Encoding")
     assert body == path.read_bytes() and "Content-Disposition" not in headers
@@ -189,7 +189,7 @@ def test_a_damaged_compressed_file_is_cut_off_without_terminal_output(
     path = tmp_path / "viewer.wasm.gz"
     path.write_bytes(packed)
     prefix = f"/damaged-{damage.replace(' ', '-')}/"
-    gated_server.add_route(prefix, lambda _: FileReply(path, "application/wasm", gzipped=True))
+    gated_server.add_route(prefix, lambda _, query: FileReply(path, "application/wasm", gzipped=True))
     raw, got = started(gated_server, f"{prefix}x")
     announced, count = rest(raw, got)
     assert announced == 6 * BLOCK_BYTES and count < announced

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import gzip
 import html
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -53,8 +53,8 @@ def answer(
     return asyncio.run(admitted_reply(routes or {}, hook, connection, request, AUTHORITY, RateLimitedLog()))
 
 
-def says(body: bytes, kind: str = "text/plain") -> Callable[[str], tuple[int, str, bytes]]:
-    return lambda path: (200, kind, body)
+def says(body: bytes, kind: str = "text/plain") -> Handler:
+    return lambda path, query: (200, kind, body)
 
 
 @pytest.mark.parametrize(
@@ -105,18 +105,18 @@ def test_a_handshake_that_only_viser_recognizes_is_a_bad_request() -> None:
 
 def test_the_longest_prefix_gets_the_remaining_path_decoded_once() -> None:
     def route(name: str) -> Handler:
-        return lambda path: (200, "text/plain", f"{name}: {path}".encode())
+        return lambda path, query: (200, "text/plain", f"{name}: {path} {query}".encode())
 
     routes = {"/a/": (route("a"), {}), "/a/b/": (route("b"), {"X-Of-Route": "1"})}
-    assert answer("/a/x%20y?z", routes).body == b"a: x y"
+    assert answer("/a/x%20y?z=1%202", routes).body == b"a: x y {'z': '1 2'}"
     made = answer("/a/b/x%2520y", routes)
-    assert (made.body, made.headers["X-Of-Route"]) == (b"b: x%20y", "1")
+    assert (made.body, made.headers["X-Of-Route"]) == (b"b: x%20y {}", "1")
     assert made.headers["Cache-Control"] == "no-cache"
     assert answer("/c/x", routes, of_viser("text/plain", b"viser's")).body == b"viser's"
 
 
 def test_a_failing_route_is_reported_and_its_error_logged(caplog: pytest.LogCaptureFixture) -> None:
-    def fails(path: str) -> tuple[int, str, bytes]:
+    def fails(path: str, query: object) -> tuple[int, str, bytes]:
         raise ZeroDivisionError
 
     made = answer("/a/x", {"/a/": (fails, {})})
@@ -177,14 +177,16 @@ def test_a_folder_serves_only_its_own_files(tmp_path: Path) -> None:
     (folder / "link.txt").symlink_to(tmp_path / "secret.txt")
     (folder / "inside.txt").symlink_to(folder / "below" / "a.JS")
     handle = folder_handler(folder)
-    assert handle("below/a.JS") == handle("/below/a.JS") == (200, "text/javascript; charset=utf-8", b"1")
-    assert handle("inside.txt")[2] == b"1"
+    assert (
+        handle("below/a.JS", {}) == handle("/below/a.JS", {}) == (200, "text/javascript; charset=utf-8", b"1")
+    )
+    assert handle("inside.txt", {})[2] == b"1"
     for path in ("", "below", "link.txt", "none.txt", "../secret.txt"):
-        assert handle(path) == (404, "text/plain; charset=utf-8", NO_SUCH_FILE)
+        assert handle(path, {}) == (404, "text/plain; charset=utf-8", NO_SUCH_FILE)
 
 
 def test_a_requested_path_writes_no_control_codes_to_the_terminal(caplog: pytest.LogCaptureFixture) -> None:
-    def fails(path: str) -> tuple[int, str, bytes]:
+    def fails(path: str, query: object) -> tuple[int, str, bytes]:
         raise ZeroDivisionError
 
     answer("/a/%1b[31m", {"/a/": (fails, {})})
@@ -201,6 +203,6 @@ def test_a_sibling_folder_and_a_link_to_itself_are_not_served(tmp_path: Path) ->
     through_a_link = tmp_path / "link"
     through_a_link.symlink_to(folder)
     for handle in (folder_handler(folder), folder_handler(through_a_link)):
-        assert handle("a.txt")[::2] == (200, b"a")
+        assert handle("a.txt", {})[::2] == (200, b"a")
         for path in ("loop", "../served-not/a.txt", str(beside / "a.txt")):
-            assert handle(path)[::2] == (404, NO_SUCH_FILE)
+            assert handle(path, {})[::2] == (404, NO_SUCH_FILE)

@@ -210,7 +210,7 @@ def test_a_renewed_token_locks_out_holders_of_the_old_one(on_port):
 def test_renewing_the_token_cuts_off_a_response_in_progress(on_port):
     begun, go_on = threading.Event(), threading.Event()
 
-    def slow(path: str) -> tuple[int, str, bytes]:
+    def slow(path: str, query: object) -> tuple[int, str, bytes]:
         begun.set()
         go_on.wait(30)
         return 200, "text/plain", b"secret"

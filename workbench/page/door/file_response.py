@@ -36,9 +36,9 @@ class FileReply:
     """Name under which the browser saves the file instead of showing it."""
 
 
-Handler = Callable[[str], tuple[int, str, bytes] | FileReply]
-"""Gets the path after its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns status, content type and
-body, or a file. Runs in a thread, so it may read files."""
+Handler = Callable[[str, Mapping[str, str]], tuple[int, str, bytes] | FileReply]
+"""Gets the path after its prefix (decoded, no ``..``, no backslash, no NUL) and the fields of the query; returns status,
+content type and body, or a file. Runs in a thread, so it may read files."""
 AddRoute = Callable[[str, Handler, Mapping[str, str]], object]
 """Adds a route: its prefix, its handler, and headers of every reply."""
 
@@ -172,7 +172,7 @@ class Downloads:
         self._files[key] = reply
         return f"{PREFIX}{key}/{_quoted(path.name)}"
 
-    def _answer(self, asked: str) -> tuple[int, str, bytes] | FileReply:
+    def _answer(self, asked: str, query: Mapping[str, str]) -> tuple[int, str, bytes] | FileReply:
         reply = self._files.get(asked.partition("/")[0])
         if reply is None:
             return 404, "text/plain; charset=utf-8", b"There is no such file."

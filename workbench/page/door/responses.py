@@ -10,7 +10,7 @@ import mimetypes
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from pathlib import Path
-from urllib.parse import unquote
+from urllib.parse import parse_qsl, unquote
 
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
@@ -114,7 +114,7 @@ async def admitted_reply(
 
     def work() -> Response | FileReply:
         try:
-            made = handler(path[len(prefix) :])
+            made = handler(path[len(prefix) :], dict(parse_qsl(request.path.partition("?")[2])))
         except Exception as error:
             told.happened(("route", prefix), f"The route {prefix} failed on {short_line(path, 200)}.", error)
             made = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
@@ -174,11 +174,11 @@ def _compresses(kind: str) -> bool:
     )
 
 
-def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
+def folder_handler(folder: Path) -> Callable[[str, Mapping[str, str]], tuple[int, str, bytes]]:
     """A handler that serves the files below ``folder``; it does not follow links to files outside."""
     root = folder.resolve()
 
-    def handle(path: str) -> tuple[int, str, bytes]:
+    def handle(path: str, query: Mapping[str, str]) -> tuple[int, str, bytes]:
         try:
             file = (root / path.lstrip("/")).resolve()
         except RuntimeError:  # a symlink loop

@@ -24,9 +24,13 @@ def with_key(kind: type[Command], hint: str = "") -> str:
     return f"{hint or kind.help()} ({key})" if key else hint or kind.help()
 
 
-def key_rows(commands: CommandList, kinds: Collection[type[Command]]) -> list[tuple[str, str]]:
-    """Key and help of each command that has a key, in the order of the list of commands."""
-    return [(key_in_words(kind.key), kind.help()) for kind in commands if kind.key and kind in kinds]
+def key_rows(commands: CommandList, kinds: Collection[type[Command]]) -> dict[str, list[tuple[str, str]]]:
+    """Key and help of each command that has a key, by the heading of its group."""
+    groups = {
+        heading: [(key_in_words(kind.key), kind.help()) for kind in group if kind.key and kind in kinds]
+        for heading, group in commands.groups.items()
+    }
+    return {heading: rows for heading, rows in groups.items() if rows}
 
 
 def register(
@@ -52,7 +56,7 @@ def register(
     server.gui.add_html(
         render(
             "all_keys",
-            rows=key_rows(visitors.commands, kinds),
+            groups=key_rows(visitors.commands, kinds),
             keys=json.dumps(keys),
             contexts=contexts,
         ),
