@@ -48,3 +48,11 @@ def test_saving_of_the_past_is_shown_until_it_is_done(panels: Panels) -> None:
     assert "wb-sight-saving" in panels.html()
     row.draw(view)
     assert "wb-sight" not in panels.html()
+
+
+def test_each_page_sees_that_others_are_open(panels: Panels) -> None:
+    row, view = marks(panels), running(6)
+    row.draw(replace(view, pages=1))
+    assert "pages" not in panels.html()
+    row.draw(replace(view, pages=3))
+    assert "3 pages" in panels.html()

@@ -67,7 +67,7 @@ def keys_page() -> str:
             "# Keys",
             "",
             "`?` on the page shows its keys. Ctrl+K opens a list of all commands by name, including those without a key,",
-            "and of tabs, folds, envs, cameras and control modes: type `env 7`, `base_camera` or `pd_ee_delta_pose`, then Enter. Keys",
+            "and of tabs, folds, envs, cameras, control modes, files and documents: type `env 7`, `base_camera` or `help`, then Enter. Keys",
             "do not work while you type in a text or number field. 1 to 6 open the tabs of the panel at the right. This page is made",
             "from the code.",
             "",

@@ -79,6 +79,7 @@ class Marks(PagePart[SessionView]):
             saving=ShowTab(tab=EPISODES) if view.of(RecordingStatus).saving.progress is not None else None,
             findings=findings_mark(view),
             checks=ShowChecks(),
+            pages=view.pages,
             flagged=flagged and {"text": flagged[0], "hint": flagged[1], "press": ShowFirstFlagged()},
         )
 

@@ -80,6 +80,8 @@ class SessionView:
     options_refused: TaskOptions | None = None
     """Options that were applied last and with which the task failed."""
     seed: int = 0
+    pages: int = 0
+    """Number of open pages."""
     playing: bool = False
     steps_per_second: float = 0.0
     real_time_factor: float = 0.0
