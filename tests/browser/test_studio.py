@@ -47,6 +47,7 @@ def opened(task_file: Path, browser: Browser) -> Iterator[Page]:
             "base_camera · sensor"
         )
         page.get_by_text("Handles and preview", exact=True).click()
+        page.locator("[data-fold='Rotation']").click()
         yield page
         assert not errors
 

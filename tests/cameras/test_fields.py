@@ -112,13 +112,13 @@ def test_all_settings_are_shown_with_one_form_of_lens_and_orientation(desk: Desk
     }
     assert shown(desk, "Lens as") == FOV and shown(desk, "Shader") == "minimal"
     assert not any(desk.panels.shows(label) for label in ("fx, fy", "cx, cy", "w x y z", "Forward", "Up"))
-    desk.panels.set("Rotation", WXYZ)
+    desk.panels.set("Written as", WXYZ)
     desk.draw()
     assert desk.panels.shows("w x y z") and not desk.panels.shows("Degrees")
     assert [float(word) for word in shown(desk, "w x y z").split()] == pytest.approx(
         FILE.quaternion, abs=1e-6
     )
-    desk.panels.set("Rotation", AXES)
+    desk.panels.set("Written as", AXES)
     desk.draw()
     forward, left, up = axes_of(FILE.quaternion)
     assert shown(desk, "Forward") == pytest.approx(forward, abs=1e-4)
@@ -164,9 +164,9 @@ def test_typing_an_eye_keeps_the_target(desk: Desk) -> None:
 
 @with_a_fov
 def test_an_orientation_can_be_typed_as_a_quaternion_or_axes(desk: Desk) -> None:
-    desk.panels.set("Rotation", WXYZ)
+    desk.panels.set("Written as", WXYZ)
     assert desk.types("w x y z", "[0.5, 0.5, 0.5, 0.5]").quaternion == (0.5, 0.5, 0.5, 0.5)
-    desk.panels.set("Rotation", AXES)
+    desk.panels.set("Written as", AXES)
     desk.types("Forward", -0.75, at=2)
     forward, _, up = axes_of(desk.now.quaternion)
     np.testing.assert_allclose(forward, (0.0, 0.8, -0.6), atol=1e-9)
@@ -176,7 +176,7 @@ def test_an_orientation_can_be_typed_as_a_quaternion_or_axes(desk: Desk) -> None
     desk.types("Up", 0.0)
     forward, _, up = axes_of(desk.now.quaternion)
     np.testing.assert_allclose([forward, up], [(0.0, 0.8, -0.6), (0.0, 0.6, 0.8)], atol=1e-9)
-    desk.panels.set("Rotation", RPY)
+    desk.panels.set("Written as", RPY)
     desk.draw()
     assert desk.panels.shows("Degrees")
 
@@ -212,7 +212,7 @@ def test_an_intrinsic_matrix_is_typed_in_pixels_and_scales_with_the_size(desk: D
 )
 @with_a_fov
 def test_an_invalid_number_is_refused_with_a_reason(desk: Desk, label: str, value: Any, why: str) -> None:
-    desk.panels.set("Rotation", WXYZ)
+    desk.panels.set("Written as", WXYZ)
     now = desk.types(label, value)
     assert why in desk.panels.client.notices[0]
     assert not differences(FILE, now)
@@ -224,9 +224,9 @@ def test_a_target_at_the_eye_a_zero_axis_and_an_unknown_shader_are_refused(desk:
     desk.types("Looks at", EYE[1], at=1)
     desk.types("Looks at", EYE[2], at=2)
     assert "same point" in desk.panels.client.notices[-1]
-    desk.panels.set("Rotation", WXYZ)
+    desk.panels.set("Written as", WXYZ)
     desk.types("w x y z", "1 0 0 0")
-    desk.panels.set("Rotation", AXES)
+    desk.panels.set("Written as", AXES)
     desk.types("Forward", 0.0)
     assert "no length" in desk.panels.client.notices[-1]
     desk.panels.do(ChooseShader(shader="none"))

@@ -62,6 +62,7 @@ XYZ, ANGLES = get_args(Axis), get_args(Angle)
 UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
 """Number of digits of the shown numbers, by kind."""
 LENS = "Lens and image"
+ROTATION = "Rotation"
 GOES_ALONG = "The target moves with the position. To keep it fixed, set Handles to eye and target."
 STAYS = "Each moves alone: the camera keeps looking at its target."
 SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
@@ -69,7 +70,7 @@ SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
 
 
 class CameraNumbers:
-    """Two folders in the present container: pose, and lens and picture.
+    """Two folders in the present container: pose (with the rotation, folded), and lens and picture.
 
     All forms of the pose show the same camera and can change it; one of the three forms of the orientation is shown at a
     time. With the pose handle, a new eye position moves the target along; with the eye and target handles, each changes
@@ -104,7 +105,8 @@ class CameraNumbers:
         self._shaders = SHADERS
         with server.gui.add_folder("Pose") as where:
             self._build_points()
-            self._build_orientation()
+            with server.gui.add_folder(ROTATION, expand_by_default=False) as self._rotation_fold:
+                self._build_orientation()
         with server.gui.add_folder(LENS, expand_by_default=False) as lens:
             self._build_lens()
             self._build_picture()
@@ -141,12 +143,11 @@ class CameraNumbers:
     def _build_orientation(self) -> None:
         self._form = choice(
             self._server,
-            "Rotation",
+            "Written as",
             ChooseRotationForm,
             "form",
             ROTATIONS,
             RPY,
-            hint="How its rotation is written below.",
         )
         self._rpy = self._row(
             "Degrees",
@@ -221,7 +222,9 @@ class CameraNumbers:
         self._about.content = render("aside", text=STAYS if alone else GOES_ALONG)
         self._form.show(said)
         self._rpy.visible = said == RPY
-        self._rpy.show(rounded(_angles(now), DEGREES))
+        angles = rounded(_angles(now), DEGREES)
+        self._rpy.show(angles)
+        name_fold(self._rotation_fold, ROTATION, ", ".join(f"{angle:.0f}\N{DEGREE SIGN}" for angle in angles))
         self._wxyz.visible = said == WXYZ
         self._wxyz.show(" ".join(f"{n:.{QUATERNION}f}" for n in rounded(now.quaternion, QUATERNION)))
         self._forward.visible = self._up.visible = self._left.visible = said == AXES
