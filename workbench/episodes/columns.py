@@ -46,10 +46,12 @@ class Layout:
         shapes = {name: shape for name, _, shape in self.key}
         if shapes["poses"] != (bodies, 7):
             raise ValueError(
-                f"poses are {shapes['poses']}, but the scene has {bodies} bodies: ({bodies}, 7)."
+                f"poses have the shape {shapes['poses']}, but the scene has {bodies} bodies: ({bodies}, 7)."
             )
         if shapes["action"] != (actions,):
-            raise ValueError(f"an action of {shapes['action'][0]} numbers, but {actions} action names.")
+            raise ValueError(
+                f"an action has {shapes['action'][0]} numbers; the number of action names is {actions}."
+            )
         for name, dtype, _ in self.key:
             if dtype.kind not in "biuf":
                 where, _, entry = name.partition("/")
@@ -68,10 +70,11 @@ class BatchPacker:
         self._last: Layout | None = None
         self._rows = np.zeros(0, np.uint8)
         self._parts: list[NDArray] = []
-        """Position of each column in `_rows`."""
+        """View of each column in `_rows`."""
 
     def pack(self, columns: Sequence[tuple[str, NDArray]]) -> tuple[Layout, list[bytes]]:
-        """Layout and N rows of `columns`, each a name and an array (N, ...): those of `FIXED` first."""
+        """Pack `columns`, each a name and an array (N, ...), those of `FIXED` first. Returns the layout and N
+        rows."""
         key = tuple([(name, values.dtype, values.shape[1:]) for name, values in columns])
         layout, count = self._last, len(columns[0][1])
         if layout is None or layout.key != key or len(self._rows) != count:
