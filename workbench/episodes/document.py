@@ -417,6 +417,7 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
 
 
 # --- checksums --------------------------------------------------------------------------------------
+#
 # Neither format detects a changed byte: HDF5 has checksums for chunks only, and most columns of an episode
 # are too small to be chunked; rerun has none. Rescoring a changed file would be silently wrong. So the
 # `.json` has the size and hash of the other two files. They are hashed while they are still in the page

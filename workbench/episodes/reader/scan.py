@@ -89,7 +89,7 @@ class Scan:
     """A sentence, if the scan is incomplete."""
 
     def is_unchanged(self) -> bool:
-        """Whether no file was added or removed since; cheap."""
+        """Whether no file was added, removed or replaced since the scan. Checks only the folders' times."""
         if self.fresh or self.problem is not None:
             return False
         try:

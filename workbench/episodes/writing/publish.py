@@ -15,7 +15,7 @@ from workbench.machine.files import give_name
 
 
 class RecordingError(OSError):
-    """An episode could not be written; the message gives advice. No file is left."""
+    """An episode could not be written; the message gives advice. None of its files is published."""
 
 
 def try_folder(folder: Path) -> None:
