@@ -42,7 +42,8 @@ class Layout:
         return json.dumps([[name, dtype.str, shape] for name, dtype, shape in self.key])
 
     def check(self, bodies: int, actions: int) -> None:
-        """Raise ValueError if its rows do not fit a scene with this many bodies and actions, or hold anything but numbers."""
+        """Raise ValueError if rows of this layout do not fit a scene with this many bodies and actions, or
+        contain anything but numbers."""
         shapes = {name: shape for name, _, shape in self.key}
         if shapes["poses"] != (bodies, 7):
             raise ValueError(
@@ -157,7 +158,8 @@ class TextEntry(Struct, frozen=True, array_like=True):
 
 
 TextTrack = tuple[tuple[int, TextEntry | None], ...]
-"""First state and value of each change; None from a state on in which ``evaluate()`` returned no such entry, or numbers."""
+"""First state and value of each change. The value is None if ``evaluate()`` then returned no such entry, or
+numbers."""
 
 
 class TextWriter:

@@ -508,7 +508,7 @@ def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note:
 
     Raises:
         OSError: the file cannot be read, or the folder cannot be written to.
-        ValueError: the file holds something else, which is not overwritten. The message ends a sentence.
+        ValueError: the file holds something else, which is not overwritten. The message is a clause.
     """
     try:
         entries = _notes(path)
@@ -541,8 +541,8 @@ def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None
 
     Raises:
         OSError: it cannot be read or written.
-        ValueError: it is not a workbench recording, or was changed, which a new checksum would hide. The message ends a
-            sentence.
+        ValueError: it is not a workbench recording, or was changed, which a new checksum would hide. The
+            message is a clause.
     """
     content = _read_content(path, MAX_NOTES_BYTES)
     described = parse_json(content)

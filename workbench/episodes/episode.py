@@ -303,5 +303,5 @@ def parse_acted_by(pairs: Iterable[Iterable[Any]] | None) -> ActedBy:
 
 
 def acted_by_text(acted_by: ActedBy) -> str:
-    """``random; from step 41 on: sliders``; empty if unknown. Action k leads to step k + 1."""
+    """Text such as ``random; from step 41 on: sliders``; empty if unknown. Action k leads to step k + 1."""
     return "; ".join(what if begin == 0 else f"from step {begin + 1} on: {what}" for begin, what in acted_by)

@@ -133,7 +133,7 @@ def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tu
 
 
 def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
-    """Whether all entries that both have are equal to the last bit, including velocities."""
+    """Whether all entries that both states have are equal to the last bit, including velocities."""
     both = [name for name in was if name in now and now[name].shape == was[name].shape]
     return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
 

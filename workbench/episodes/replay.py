@@ -146,10 +146,10 @@ def replay_to(
         raise IndexError(f"env_idx {chosen} is out of range for {task.num_envs} envs")
     others = [i for i in range(task.num_envs) if i not in chosen]
     why_not = why_not_replayable(opened, run)
-    kept, reason = _snapshot_of(opened, others)
+    snapshot, reason = _snapshot_of(opened, others)
     why_not = why_not or reason
     corrected = 0
-    with step_only(env, chosen, kept):
+    with step_only(env, chosen, snapshot):
         beginnings = begin_run(opened.loaded, task, dict.fromkeys(chosen, run))
         missed = {what: why for each in beginnings.values() for what, why in each.missed.items()}
         if not why_not:

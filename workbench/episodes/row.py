@@ -26,7 +26,7 @@ class Source:
     part: str | None = None
     """Which recording of several in `path`: ``traj_3``, or the number of the dataset's episode."""
     id: str = ""
-    """The caller's id."""
+    """Id that the caller uses for the recording."""
     name: str = ""
     """Name to show."""
     problem: str | None = None
@@ -62,7 +62,7 @@ class Facts:
     uid: str = ""
     """The recording's own id; empty if it has none."""
     copy_of: str = ""
-    """Id of the recording that it was exported from; empty if unknown or not exported."""
+    """Id of the recording that this one was exported from; empty if unknown or not exported."""
     written: float | None = None
     """Unix seconds."""
     seed: int | None = None
@@ -80,7 +80,7 @@ class Facts:
     acted_by: str = ""
     """Source of the actions; empty if unknown."""
     source_hash: str = ""
-    """Empty if unknown."""
+    """Hash of the task's source; empty if unknown."""
     tags: tuple[str, ...] = ()
     note: str = ""
     recovered: bool = False
@@ -217,7 +217,8 @@ def unix_seconds(value: object) -> float | None:
 
 
 def clean_tags(values: object) -> tuple[str, ...]:
-    """At most `MAX_TAGS` distinct tags, in order; commas separate tags when typed, so they become spaces."""
+    """At most `MAX_TAGS` distinct tags, in order; a comma in a tag becomes a space, because commas separate
+    typed tags."""
     if not isinstance(values, Iterable) or isinstance(values, (str, bytes, Mapping)):
         return ()
     tags = (clean_text(value, MAX_TAG_CHARACTERS).replace(",", " ").strip() for value in values)

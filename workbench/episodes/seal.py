@@ -21,7 +21,8 @@ log = logging.getLogger(__name__)
 KEY_FILE = "recordings.key"
 _KEY_BYTES = 32
 _COVERED = {*SHARED, "seed", "source"} - {"acted_by", "pictures", "moved_cameras", "observed_by"}
-"""Fields that a seal covers. The excluded ones are not sealed by older versions, whose seals stay valid."""
+"""Fields that a seal covers; `_content` adds ``acted_by``. Seals of older versions, which lack the other
+excluded fields, stay valid."""
 _logged: set[str] = set()
 
 

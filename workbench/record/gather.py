@@ -263,10 +263,10 @@ class EpisodeGatherer:
                 self.end(env)
 
 
-def _lost_step(env: int, expected: int, came: int) -> ValueError:
+def _lost_step(env: int, expected: int, arrived: int) -> ValueError:
     return ValueError(
-        f"env {env}: step {expected} was expected, but step {came} arrived; a step was lost, or a reset bypassed "
-        "the recorder"
+        f"env {env}: step {expected} was expected, but step {arrived} arrived; a step was lost, or a reset "
+        "bypassed the recorder"
     )
 
 

@@ -133,7 +133,7 @@ class Written:
     success: bool | None
     """Success at its last state; None for a task without ``success``."""
     start_corrected: bool = False
-    """Whether its seed gave a different start than the demonstration's, so that the demonstration's first state was restored."""
+    """Whether the seed gave another start than the demonstration's, so that its first state was restored."""
     planned: PlannedEpisode | None = None
     """Data about the planning, if the actions were planned."""
     address: str = ""

@@ -160,8 +160,8 @@ class Recorder(gym.Wrapper):
             self._begin()
         if self._gatherer is not None:
             self._gather()  # before the options change
-            kept = {k: v for k, v in (options or {}).items() if k != "env_idx"}
-            self._gatherer.reset_options = kept
+            other_options = {k: v for k, v in (options or {}).items() if k != "env_idx"}
+            self._gatherer.reset_options = other_options
         self._add_step(step, mask)
         return obs, info
 

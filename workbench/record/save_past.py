@@ -159,12 +159,12 @@ class PastSaver:
         lost = sum(seeds[episode.env] != episode.seed for episode in what.episodes)
         envs = what.episodes[0].env if len(what.episodes) == 1 else None
         which = f"{len(writers)} episodes" if envs is None else f"an episode of env {envs}"
-        kept = f"Saved {which}, {steps} step{'' if steps == 1 else 's'}"
+        saved = f"Saved {which}, {steps} step{'' if steps == 1 else 's'}"
         earlier = sum(
             _as_played(what.task, episode).source_hash != what.task.source_hash for episode in what.episodes
         )
         message = (
-            kept
+            saved
             + _unfinished_text(unfinished, len(writers))
             + _lost_seed_text(lost, len(writers))
             + _earlier_text(earlier, len(writers))
@@ -227,25 +227,25 @@ def _cameras_in_source(task: TaskDescription, episode: PastEpisode) -> dict[Came
     }
 
 
-def _unfinished_text(count: int, kept: int) -> str:
+def _unfinished_text(count: int, episodes: int) -> str:
     if not count:
         return ""
-    if kept == 1:
+    if episodes == 1:
         return "; it had not ended"
-    return "; none of them had ended" if count == kept else f"; {count} of them had not ended"
+    return "; none of them had ended" if count == episodes else f"; {count} of them had not ended"
 
 
-def _lost_seed_text(count: int, kept: int) -> str:
+def _lost_seed_text(count: int, episodes: int) -> str:
     if not count:
         return ""
-    what = "" if count == kept else f"{count} "
+    what = "" if count == episodes else f"{count} "
     return f"; {what}without a seed (many envs were reset together): a replay restores the first state"
 
 
-def _earlier_text(count: int, kept: int) -> str:
+def _earlier_text(count: int, episodes: int) -> str:
     if not count:
         return ""
-    what = "it was" if kept == 1 else "they were" if count == kept else f"{count} were"
+    what = "it was" if episodes == 1 else "they were" if count == episodes else f"{count} were"
     return (
         f"; {what} played by an earlier version of the file: source and rewards are of that version, "
         "observations and pictures of the current one"

@@ -31,7 +31,7 @@ class SaveStatus:
     """The version, env and moment that were shown when a save was refused; `message` is valid only while they
     are shown. None if no save was refused."""
     progress: JobProgress | None = None
-    """Progress in moments; None while no job runs."""
+    """Progress of the running job; None while no job runs."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def apply(
 
 
 def without_message(saving: Saving) -> Saving:
-    """Drop the last result, because something else is recorded or another version runs."""
+    """Drop the message about the last result, because something else is recorded or another version runs."""
     if not saving.status.message:
         return saving
     return replace(saving, status=SaveStatus(progress=saving.status.progress))

@@ -65,8 +65,9 @@ def export_lerobot(
 ) -> Exported:
     """Write a dataset of these episodes to a new folder.
 
-    Episodes are read and written one by one, so memory use does not grow with their number. A film holds successive
-    episodes. The folder gets its name when it is complete, so that a full disk leaves nothing behind.
+    Episodes are read and written one by one, so memory use does not grow with their number. A film contains
+    several episodes in a row. The folder gets its name when it is complete, so that a full disk leaves
+    nothing behind.
 
     Args:
         sources: for each episode a name for messages, and a function that reads it.

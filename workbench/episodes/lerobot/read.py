@@ -36,7 +36,7 @@ _NUMBER = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
 def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
-    """The episodes of the dataset in this folder; success means success at some frame.
+    """The episodes of the dataset in this folder; `Facts.success` is success at any frame.
 
     Raises:
         UnreadableRecording: it has an unsupported version, or is broken.

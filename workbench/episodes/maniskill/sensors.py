@@ -27,9 +27,9 @@ def observed_pictures(episode: Episode) -> dict[str, tuple[Modality, ...]]:
     _, wanted = _wanted(episode)
     found: dict[str, tuple[Modality, ...]] = {}
     for track in _sensors(episode):
-        kept: tuple[Modality, ...] = tuple(m for m in wanted if track.pictures.get(m) is not None)
-        if kept and _is_whole(track, episode):
-            found[track.info.name] = kept
+        modalities: tuple[Modality, ...] = tuple(m for m in wanted if track.pictures.get(m) is not None)
+        if modalities and _is_whole(track, episode):
+            found[track.info.name] = modalities
     return found
 
 

@@ -245,7 +245,7 @@ def _entries(found: RecordingFiles, answered: Answered | ReaderEnded) -> list[Li
 
 
 def _thumbnail(jpeg: bytes | None) -> bytes | None:
-    """`jpeg` if it may be sent to the browser."""
+    """`jpeg` if it is a JPEG that is small enough for the browser; else None."""
     return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= MAX_THUMBNAIL_BYTES else None
 
 

@@ -211,7 +211,7 @@ class RerunTable:
         )
 
     def _look(self, entity: str, default: str) -> tuple[str, Material]:
-        """Name, and material. Raises ValueError or TypeError."""
+        """Name and material of a visual. Raises ValueError or TypeError."""
         texture = self._texture(entity)
         look = self._one(entity, LOOK, None)
         if look is not None:

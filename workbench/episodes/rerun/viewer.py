@@ -224,7 +224,7 @@ def web_viewer_folder() -> Path:
 
 
 def viewer_is_cached() -> bool:
-    """Whether `web_viewer_folder` has its files."""
+    """Whether the web viewer's files are stored already."""
     return _cache_path().is_dir()
 
 

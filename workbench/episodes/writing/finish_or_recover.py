@@ -229,6 +229,6 @@ def _id_of(path: Path) -> str | None:
 def _remove_strays(folder: Path) -> None:
     """Delete temporary files without a journal, left by a writer that died during its cleanup."""
     for path in (folder / FOLDER).glob("*"):
-        kept = (path.with_suffix(suffix) for suffix in (".arrow", DAMAGED_SUFFIX))
-        if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not any(one.exists() for one in kept):
+        journals = (path.with_suffix(suffix) for suffix in (".arrow", DAMAGED_SUFFIX))
+        if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not any(one.exists() for one in journals):
             path.unlink(missing_ok=True)
