@@ -452,5 +452,5 @@ class EpisodeFinisher:
             # A panic of rerun's Rust code is not an Exception. The journal stays, and the next start tries again.
             if not isinstance(error, (RecordingError, OSError, ValueError)):
                 report_failure(f"An episode of env {episode.env} could not be written", error)
-            return f"an episode of env {episode.env} could not be written: {error}", 0
+            return f"An episode of env {episode.env} could not be written: {error}", 0
         return made, size
