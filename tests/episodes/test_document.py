@@ -59,7 +59,7 @@ def test_the_keys_of_a_document_tell_which_program_wrote_it(
 )
 def test_a_field_of_the_wrong_type_is_named_by_its_path(tmp_path: Path, wrong: Any, at: str) -> None:
     problem = why(described(tmp_path, **wrong))
-    assert problem.startswith("is not as a recording is described: ") and problem.endswith(at), problem
+    assert problem.startswith("is not in the format of a recording: ") and problem.endswith(at), problem
 
 
 @pytest.mark.parametrize(

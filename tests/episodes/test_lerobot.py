@@ -172,14 +172,15 @@ def test_a_lower_rate_must_divide_the_control_rate(episode: Episode, tmp_path: P
 def test_incompatible_episodes_are_refused_and_no_file_is_left(episode: Episode, tmp_path: Path) -> None:
     narrow = replace(episode, action=episode.action[:, :2], action_names=episode.action_names[:2])
     with pytest.raises(
-        ValueError, match=r"episode 1 does not go into one dataset with episode 0: action has the shape \[2\]"
+        ValueError,
+        match=r"episode 1 does not fit into a dataset with episode 0: the shape of action is \[2\]",
     ):
         export(tmp_path / "set", episode, narrow)
     assert list(tmp_path.iterdir()) == []
     cut = replace(episode, broken_files=(BrokenFile("c.rrd", "was cut short."),))
     made = export(tmp_path / "rest", episode, narrow, cut, episode, options=ExportOptions(only_fitting=True))
     assert made.episodes == 2 and made.frames == 2 * episode.length
-    assert made.not_fitting[0].startswith("episode 1 does not go") and made.not_fitting[1:] == [
+    assert made.not_fitting[0].startswith("episode 1 does not fit") and made.not_fitting[1:] == [
         "c.rrd was cut short."
     ]
     assert len(read_lerobot(tmp_path / "rest", 1).reward) == episode.length

@@ -55,7 +55,7 @@ def test_changed_and_missing_side_files_are_reported(task: Path) -> None:
     text = "load('meshes/part.obj', 'notes.txt')"
     recorded = side_files(str(task), {str(task): text})
     assert list(recorded) == ["meshes/part.obj", "notes.txt"]
-    assert "which the recording does not hold: they are as then." in side_files_text(str(task), recorded)
+    assert "which the recording does not hold: they are unchanged." in side_files_text(str(task), recorded)
     (task.parent / "meshes/part.obj").write_text("v 9 9 9 9")
     (task.parent / "notes.txt").unlink()
     message = side_files_text(str(task), recorded)

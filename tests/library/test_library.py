@@ -206,7 +206,7 @@ def test_any_description_gives_one_row_that_the_index_can_store(fields: dict) ->
         ((facts, picture),) = read_found(Path(name), scan_folder(Path(name)).found["a"])
     wrong = {key for key, value in fields.items() if is_wrong(key, value)}
     named = re.search(
-        r"a\.json is not as a recording is described: .* at \$\.workbench\.(\w+)", facts.problem or ""
+        r"a\.json is not in the format of a recording: .* at \$\.workbench\.(\w+)", facts.problem or ""
     )
     assert facts.kind == "workbench"
     assert named[1] in wrong if wrong and named else (facts.problem is None and not wrong)

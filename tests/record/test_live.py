@@ -94,7 +94,7 @@ def test_an_episode_saved_afterwards_equals_one_recorded_live(session: Session) 
     live = written(session, 2)
     session.happen(SaveWanted())
     wait_until(session, lambda view: bool(view.of(RecordingStatus).saving.message), "the keeping")
-    expected = f"saved 2 episodes, {2 * STEPS} steps; none of them had ended"
+    expected = f"Saved 2 episodes, {2 * STEPS} steps; none of them had ended"
     assert session.view().of(RecordingStatus).saving.message == expected
     every = written(session, 4)
     kept = {episode.info.env_index: episode for episode in every[2:]}

@@ -42,14 +42,17 @@ class Layout:
         return json.dumps([[name, dtype.str, shape] for name, dtype, shape in self.key])
 
     def check(self, bodies: int, actions: int) -> None:
-        """Raise ValueError if its rows do not fit a scene with this many bodies and actions, or hold anything but numbers."""
+        """Raise ValueError if rows of this layout do not fit a scene with this many bodies and actions, or
+        contain anything but numbers."""
         shapes = {name: shape for name, _, shape in self.key}
         if shapes["poses"] != (bodies, 7):
             raise ValueError(
-                f"poses are {shapes['poses']}, but the scene has {bodies} bodies: ({bodies}, 7)."
+                f"poses have the shape {shapes['poses']}, but the scene has {bodies} bodies: ({bodies}, 7)."
             )
         if shapes["action"] != (actions,):
-            raise ValueError(f"an action of {shapes['action'][0]} numbers, but {actions} action names.")
+            raise ValueError(
+                f"an action has {shapes['action'][0]} numbers; the number of action names is {actions}."
+            )
         for name, dtype, _ in self.key:
             if dtype.kind not in "biuf":
                 where, _, entry = name.partition("/")
@@ -68,10 +71,11 @@ class BatchPacker:
         self._last: Layout | None = None
         self._rows = np.zeros(0, np.uint8)
         self._parts: list[NDArray] = []
-        """Position of each column in `_rows`."""
+        """View of each column in `_rows`."""
 
     def pack(self, columns: Sequence[tuple[str, NDArray]]) -> tuple[Layout, list[bytes]]:
-        """Layout and N rows of `columns`, each a name and an array (N, ...): those of `FIXED` first."""
+        """Pack `columns`, each a name and an array (N, ...), those of `FIXED` first. Returns the layout and N
+        rows."""
         key = tuple([(name, values.dtype, values.shape[1:]) for name, values in columns])
         layout, count = self._last, len(columns[0][1])
         if layout is None or layout.key != key or len(self._rows) != count:
@@ -154,7 +158,8 @@ class TextEntry(Struct, frozen=True, array_like=True):
 
 
 TextTrack = tuple[tuple[int, TextEntry | None], ...]
-"""First state and value of each change; None from a state on in which ``evaluate()`` returned no such entry, or numbers."""
+"""First state and value of each change. The value is None if ``evaluate()`` then returned no such entry, or
+numbers."""
 
 
 class TextWriter:

@@ -50,7 +50,7 @@ MAX_BYTES = 64 << 20
 _BLOCK_BYTES = 1 << 20
 _ESCAPED_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 MAX_PATH_PARTS = 40
-"""Maximum number of parts of a recorded path that are tried: the path comes from an untrusted file."""
+"""Maximum number of parts of a recorded path; a longer one, from an untrusted file, is not searched for."""
 
 T = TypeVar("T")
 Vector = tuple[float, float, float]
@@ -264,7 +264,7 @@ class Document:
         return _typed(self.data.get("workbench"), Description, "workbench")
 
     def env(self) -> EnvJson:
-        """Raises WrongDocument."""
+        """ManiSkill's ``env_info``. Raises WrongDocument."""
         return _typed(self.data.get("env_info") or {}, EnvJson, "env_info")
 
     def episode(self, number: int) -> EpisodeJson:
@@ -309,7 +309,7 @@ def read_json(path: Path, most_bytes: int = MAX_BYTES) -> Any:
 
 
 def _read_content(path: Path, most_bytes: int) -> bytes:
-    """Raises as `read_json`."""
+    """Bytes of the file. Raises as `read_json` does."""
     try:
         return read_regular_file(path, most_bytes)
     except FileTooLarge as error:
@@ -319,7 +319,7 @@ def _read_content(path: Path, most_bytes: int) -> bytes:
 
 
 def parse_json(content: bytes | str) -> Any:
-    """Raises WrongDocument."""
+    """The value of a JSON text. Raises WrongDocument."""
     try:
         # msgspec's parser refuses NaN, which a sum of rewards may be.
         data = json.loads(content)
@@ -343,9 +343,10 @@ def json_text(value: object, indent: int | None = None) -> str:
 
 
 def seen_otherwise(info: EpisodeInfo) -> dict[str, Any]:
-    """Metadata of an export about pictures or observations that differ from those of the episode's source; else empty."""
-    said = {"moved_cameras": as_json(info.moved_cameras), "observed_by": info.observed_by}
-    return {name: value for name, value in said.items() if value}
+    """Fields for the metadata of an export, if pictures or observations are not those of the episode's
+    source; else empty."""
+    fields = {"moved_cameras": as_json(info.moved_cameras), "observed_by": info.observed_by}
+    return {name: value for name, value in fields.items() if value}
 
 
 def as_json(value: object) -> Any:
@@ -376,7 +377,8 @@ def _plain(value: object) -> Any:
 def _typed(data: object, kind: type[T], place: str) -> T:
     if not is_shallow(data):
         raise WrongDocument(
-            f"is not as a recording is described: lists and objects nested deeper than {MAX_DEPTH} at $.{place}"
+            "is not in the format of a recording: lists and objects nested deeper than "
+            f"{MAX_DEPTH} at $.{place}"
         )
     try:
         return msgspec.convert(data, kind, str_keys=True)
@@ -384,15 +386,16 @@ def _typed(data: object, kind: type[T], place: str) -> T:
         what, _, within = str(error).partition(" - at `$")
         at = f"${'.' if place else ''}{place}{within.rstrip('`')}"
         raise WrongDocument(
-            f"is not as a recording is described: {what[0].lower()}{what[1:]} at {at}"
+            f"is not in the format of a recording: {what[0].lower()}{what[1:]} at {at}"
         ) from error
 
 
 def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     """The task's file at `source_path` relative to the recording's `folder`; None if it is not found.
 
-    That path is wrong for a copied recording, which is usually opened from the task's own folder. So the end of the path
-    is also tried below the current folder, the recording's own, and those above it; such a file must contain the task's name.
+    In a copied recording the path is wrong, but the copy is usually opened from the task's folder. So each
+    end of the path is also tried below the current folder, the recording's folder and the folders above it. A
+    file that is found there must contain the task's name.
     """
     if not source_path:
         return None
@@ -415,13 +418,14 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
 
 # --- checksums --------------------------------------------------------------------------------------
 #
-# Neither format detects a changed byte: HDF5 has checksums for chunks only, and most columns of an episode are too small
-# to be chunked; rerun has none. Rescoring a changed file would be silently wrong. So the `.json` holds size and hash of the
-# other two files. These are in the page cache when just written: hashing takes a hundredth of the time of writing
-# (measured). The `.json` itself ends with a hash of everything before it.
+# Neither format detects a changed byte: HDF5 has checksums for chunks only, and most columns of an episode
+# are too small to be chunked; rerun has none. Rescoring a changed file would be silently wrong. So the
+# `.json` has the size and hash of the other two files. They are hashed while they are still in the page
+# cache, in a hundredth of the time of writing (measured). The `.json` itself ends with a hash of everything
+# before it.
 #
-# This detects damage, not forgery. After an intended change (`rerun rrd optimize`), remove the file's entry from
-# `workbench.files` in the `.json`; after one of the `.json`, set its hash to null.
+# Checksums detect damage, not forgery. After you changed an `.rrd` or `.h5` (`rerun rrd optimize`), remove
+# its entry from `workbench.files` in the `.json`; after you changed the `.json`, set its hash to null.
 
 _OWN = "workbench_checksum"
 
@@ -474,14 +478,15 @@ def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str
     """Problem with a file of `size` bytes; None if it has the recorded size."""
     if suffix not in checksums or checksums[suffix].size == size:
         return None
-    return f"it has {size} bytes, and had {checksums[suffix].size}"
+    return f"it has {size} bytes, and had {checksums[suffix].size} when it was written"
 
 
 # --- tags and notes -----------------------------------------------------------------------------------
 #
-# Tags and notes are the only part of a library that a person typed, and the index is discarded without asking, so they are
-# stored with the recordings: for ours in the `.json`; for other programs' files, which these programs rewrite (ManiSkill's
-# recorder after each episode), in `NAME.notes`, which `mv NAME.*` moves along.
+# A person typed the tags and notes, and the library's index may be discarded without asking. So they are
+# stored with the recordings: in the `.json` of a workbench recording; in `NAME.notes` for files of other
+# programs, which rewrite their files (ManiSkill's recorder after each episode). `mv NAME.*` moves the
+# `.notes` along.
 
 
 MAX_NOTES_BYTES = 16 << 20
@@ -503,7 +508,7 @@ def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note:
 
     Raises:
         OSError: the file cannot be read, or the folder cannot be written to.
-        ValueError: the file holds something else, which is not overwritten. The message ends a sentence.
+        ValueError: the file holds something else, which is not overwritten. The message is a clause.
     """
     try:
         entries = _notes(path)
@@ -536,8 +541,8 @@ def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None
 
     Raises:
         OSError: it cannot be read or written.
-        ValueError: it is not a workbench recording, or was changed, which a new checksum would hide. The message ends a
-            sentence.
+        ValueError: it is not a workbench recording, or was changed, which a new checksum would hide. The
+            message is a clause.
     """
     content = _read_content(path, MAX_NOTES_BYTES)
     described = parse_json(content)

@@ -40,7 +40,7 @@ class EncodedPictures:
     modality: Modality
     blobs: Sequence[bytes]
     decoded: Callable[[int], NDArray] | None = None
-    """Returns picture `i` decoded, if another process decodes it; raises OSError."""
+    """Decodes picture `i` in another process; may raise OSError. None to decode it in this process."""
 
     def __len__(self) -> int:
         return len(self.blobs)

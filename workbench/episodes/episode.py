@@ -96,16 +96,16 @@ class EpisodeInfo:
     id: Name = field(default_factory=lambda: uuid.uuid4().hex)
     """Globally unique, independent of file names."""
     recovered: bool = False
-    """Whether its writer was killed, and the episode ends there."""
+    """Whether the recording ends early, because its writer was killed."""
     side_files: Annotated[dict[PathText, Name], Entries] = field(default_factory=dict)
     """Hash by path (relative to `source_file`'s folder) of other files that the task reads and the recording lacks."""
     acted_by: ActedBy = ()
     """Sources of the actions: (index of the first action, name such as ``random`` or ``policy act.py:act``). Empty if
     unknown."""
     pictures: PictureDegree = "exact"
-    """Quality of its camera pictures; exact if the recording does not name one."""
+    """Quality of the camera pictures; exact if the recording does not name one."""
     moved_cameras: tuple[MovedCamera, ...] = ()
-    """Cameras that were not where `source` places them, in order; empty if all were."""
+    """Cameras that were not where `source` places them, in order."""
     observed_by: Name = ""
     """`source_hash` of the version that made the observations and pictures, if it is later than `source`."""
     seal: Seal | None = field(default=None, compare=False)
@@ -132,7 +132,7 @@ class CameraTrack:
 
     @property
     def pictures(self) -> dict[Modality, EncodedPictures]:
-        """The modalities that it has."""
+        """The recorded pictures by modality."""
         tracks: dict[Modality, EncodedPictures | None] = {
             "rgb": self.rgb,
             "depth": self.depth,
@@ -142,7 +142,7 @@ class CameraTrack:
 
 
 def file_part(name: str) -> str:
-    """The name of a camera as part of the name of a file."""
+    """`name` of a camera, with only characters that are safe in a file's name."""
     return "".join(c if c.isalnum() or c in " ._-" else "_" for c in name)[:100]
 
 
@@ -303,5 +303,5 @@ def parse_acted_by(pairs: Iterable[Iterable[Any]] | None) -> ActedBy:
 
 
 def acted_by_text(acted_by: ActedBy) -> str:
-    """``random; from step 41 on: sliders``; empty if unknown. Action k leads to step k + 1."""
+    """Text such as ``random; from step 41 on: sliders``; empty if unknown. Action k leads to step k + 1."""
     return "; ".join(what if begin == 0 else f"from step {begin + 1} on: {what}" for begin, what in acted_by)

@@ -32,8 +32,8 @@ def numbers_differ(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> ND
 def too_far(
     old: NDArray, apart: NDArray, least: float = SAME_NUMBER, axis: int | None = None
 ) -> NDArray[np.bool_]:
-    """True where `apart` is too large, relative to the largest of `old`; with `axis` 1 relative to the largest of
-    each row."""
+    """True where `apart` is too large, relative to the largest magnitude in `old`, or in each of its rows if
+    `axis` is 1."""
     if not apart.any():
         return apart > 0
     scale = np.abs(old).max(axis=axis, initial=0.0, where=np.isfinite(old), keepdims=True)

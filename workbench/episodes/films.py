@@ -116,7 +116,7 @@ class FilmWriter:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._stderr,
-            # In its own session: on Ctrl-C ffmpeg would finish the file as if it were complete.
+            # In its own session: Ctrl-C would make ffmpeg finish the file as if it were complete.
             start_new_session=True,
         )
 
@@ -125,7 +125,7 @@ class FilmWriter:
 
     def add(self, frame: NDArray[np.uint8]) -> None:
         if frame.shape != self._shape:
-            raise ValueError(f"A picture has the shape {frame.shape} where the first had {self._shape}.")
+            raise ValueError(f"A picture has the shape {frame.shape}, but the first one has {self._shape}.")
         if self._pad:
             height, width = frame.shape[:2]
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
@@ -164,7 +164,7 @@ class FilmWriter:
     def _error(self) -> OSError:
         self._stderr.seek(0)
         lines = self._stderr.read().decode(errors="replace").strip().splitlines()
-        # The last line names the temporary file first and ends with the reason.
+        # The last line begins with the temporary file's name and ends with the reason.
         reason = lines[-1].rpartition(": ")[2] if lines else f"ffmpeg ended with {self._process.returncode}"
         return OSError(f"The film could not be written: {reason}.")
 
@@ -178,7 +178,9 @@ class FilmPart:
     def __init__(self, film: Path, begin: float, count: int, fps: float) -> None:
         """`begin` in seconds, `count` in frames. Raises ValueError if they are out of range."""
         if not 0 <= count <= MAX_FRAMES or not 0 <= begin < 1e9 or not 0 < fps < 1e6:
-            raise ValueError(f"it claims {count} frames from {begin} s on, {fps} a second, of {film.name}")
+            raise ValueError(
+                f"it claims {count} frames of {film.name} from {begin} s on, at {fps} per second"
+            )
         self._film, self._begin, self._count, self._fps = film, begin, count, fps
         self._blobs: list[bytes] | None = None
         self._taking = threading.Lock()
@@ -199,7 +201,7 @@ class FilmPart:
                 blobs.append(encode_jpeg(frame))
                 size += len(blobs[-1])
                 if size > MAX_BYTES:
-                    raise OSError(f"its frames have more than {MAX_BYTES >> 20} MB")
+                    raise OSError(f"its frames take more than {MAX_BYTES >> 20} MB")
         except (OSError, ValueError) as error:
             raise UnreadableRecording(f"The film {self._film.name} cannot be read: {error}") from error
         if len(blobs) < self._count:
@@ -217,7 +219,7 @@ def film_frames(film: Path, begin: float, count: int) -> Iterator[NDArray[np.uin
     contains the size of each frame.
 
     Raises:
-        OSError: it cannot be read as MP4, or takes too long.
+        OSError: the film cannot be read as MP4, or ffmpeg takes too long.
     """
     open_regular_file(film).close()
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-max_alloc", str(1 << 29)]
@@ -248,7 +250,7 @@ def film_frames(film: Path, begin: float, count: int) -> Iterator[NDArray[np.uin
 
 
 def _read_ppm(stream: io.BufferedReader) -> NDArray[np.uint8] | None:
-    """None at the end."""
+    """The next picture (H, W, 3) of ffmpeg's output; None at the end. Raises OSError."""
     if not (magic := stream.readline(16)):
         return None
     size = stream.readline(32).split()
@@ -256,7 +258,7 @@ def _read_ppm(stream: io.BufferedReader) -> NDArray[np.uint8] | None:
         raise OSError("ffmpeg's output is not a PPM picture")
     width, height = int(size[0]), int(size[1])
     if not 0 < width * height <= MAX_PIXELS:
-        raise OSError(f"it has pictures of {width} x {height}")
+        raise OSError(f"it has pictures of {width} x {height} pixels")
     content = stream.read(3 * width * height)
     if len(content) < 3 * width * height:
         return None
@@ -274,7 +276,7 @@ def _failure(stderr: BinaryIO, status: int) -> str:
 # --- pictures of an episode's cameras ---------------------------------------------------------------
 
 MIN_SIDE_PIXELS = 256
-"""Minimum side of a film: players blur the 128 pixels that policies often see, so pixels are repeated up to this size."""
+"""Minimum side of a film: players blur 128 pixels, a usual size for policies, so pixels are repeated."""
 COLUMNS = 8
 CELL_PIXELS = 176
 """Longer side of a picture on the sheet."""
@@ -294,7 +296,7 @@ def camera_of(episode: Episode, name: str) -> CameraTrack:
     """The camera of that name.
 
     Raises:
-        ValueError: there is none with pictures; the message lists the cameras with pictures.
+        ValueError: no camera with pictures has that name; the message lists the cameras with pictures.
     """
     cameras = cameras_by_name(episode)
     if name not in cameras:

@@ -38,7 +38,7 @@ def relative_sources(main: str, source: Mapping[str, str]) -> tuple[str, dict[st
         NoRecordedSource: the source of the task's own file is missing.
     """
     names = {path: PurePath(path) for path in source}
-    # Absolute when recorded; relative to the main file's folder when read.
+    # Paths are absolute when recorded, and relative to the main file's folder when read.
     folder = PurePath(main).parent
     found: dict[str, str] = {}
     chosen = ""
@@ -69,7 +69,8 @@ MAX_NAMES = 4
 def changed_since(
     then_file: str | None, then: Mapping[str, str], now_file: str | None, now: Mapping[str, str]
 ) -> str:
-    """Names of the symbols that differ, as ``CUBE_HALF_SIZE, evaluate``; empty if none does, or if a text is missing.
+    """Names of the symbols that differ, such as ``CUBE_HALF_SIZE, evaluate``; empty if none differs or a text
+    is missing.
 
     Compares symbol by symbol, as a save does: comparing lines would also report comments, layout and moved code.
 
@@ -83,7 +84,7 @@ def changed_since(
         (old_main, old), (new_main, new) = relative_sources(then_file, then), relative_sources(now_file, now)
     except NoRecordedSource:
         return ""
-    # The file may have a new name, such as a copy.
+    # A copy of the file may have another name.
     old = {new_main if name == old_main else name: text for name, text in old.items()}
     if old == new:
         return ""
@@ -193,9 +194,9 @@ def class_in(file: Path, env_id: str) -> str | None:
 
 
 def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None) -> TaskOptions:
-    """Options of the recording's task: its own robot, modes and control."""
+    """Options that open the recording's task with the recorded robot and modes."""
     kwargs = dict(info.env_kwargs)
-    # Recordings of several robots from older versions have the text of a dict there.
+    # Older versions recorded the control modes of several robots as the text of a dict.
     if info.control_mode is not None and info.control_mode.isidentifier():
         kwargs.setdefault("control_mode", info.control_mode)
     for name in (*RUN_KEYWORDS, "human_render_camera_configs"):
@@ -248,7 +249,8 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
 
 
 def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
-    """Link the side files that exist. The page, where it offers the recorded text, warns of missing and changed ones."""
+    """Link the side files that exist. Where the page offers the recorded text, it warns of missing and
+    changed ones."""
     for name in info.side_files:
         if name.endswith(_IMPORTED):
             continue  # importable, but not among the texts that the person trusted

@@ -37,9 +37,9 @@ def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> di
             continue
         value, width = state.get(name), BODY + 2 * maniskill_private.joints_of(struct)
         if value is None or np.isnan(value).any():
-            missed[name] = "the recording has none of this name: it keeps its state after the reset"
+            missed[name] = "the recording has none of this name, so it keeps its state from the reset"
         elif value.shape != (width,):
-            missed[name] = f"it has {width} numbers now, and {value.shape[-1]} in the recording"
+            missed[name] = f"its state has {width} numbers now, and {value.shape[-1]} in the recording"
     for name, value in state.items():
         kind = name.partition("/")[0]
         if kind in ("actors", "articulations") and name not in structs and not np.isnan(value).all():
@@ -51,7 +51,7 @@ def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
     """Write a recorded state into each of these envs, except its `state_mismatches`; the other envs are not touched.
 
     The env's code may differ (an actor removed, an arm with another joint), so states are matched by name and shape and
-    written with ManiSkill's own setters. Fetches the tensors.
+    written with ManiSkill's own setters. The state tensors are fetched before and after.
     """
     missed = {i: state_mismatches(env, i, state) for i, state in states.items()}
     px = batched_system(env.scene)
@@ -106,7 +106,7 @@ def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
 
 def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
     """Distance of one env's state from a recorded one: metres of the farthest body, and radians of the body or joint
-    (metres of a sliding joint) that turned most. Ignores entries that only one of them has.
+    (metres of a sliding joint) that turned most. Ignores entries that only one of the two states has.
 
     Args:
         now, was: (D,) by name.
@@ -133,7 +133,7 @@ def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tu
 
 
 def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
-    """Whether all entries that both have are equal to the last bit, including velocities."""
+    """Whether all entries that both states have are equal to the last bit, including velocities."""
     both = [name for name in was if name in now and now[name].shape == was[name].shape]
     return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
 

@@ -47,7 +47,7 @@ class ReplayResult:
     corrected: int = 0
     """Number of steps after which the recorded state was restored."""
     start_differs: bool = False
-    """Whether the reset with its seed gave a different state, and the recorded one was restored."""
+    """Whether the reset with the recorded seed gave another state, so that the recorded one was restored."""
     missed: dict[str, str] = field(default_factory=dict)
     """Name and reason of each part of the state that could not be restored."""
 
@@ -57,7 +57,7 @@ class Beginning:
     """Result of putting an env into the first state of a run."""
 
     differs: bool
-    """Whether the reset gave a different state, and the recorded one was restored."""
+    """Whether the reset gave a different state, so that the recorded one was restored."""
     missed: dict[str, str]
     """Name and reason of each part of the state that could not be restored."""
 
@@ -65,8 +65,8 @@ class Beginning:
 def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
     """Put these envs into the first state of their runs: reset with the seed, then restore the state if it differs.
 
-    It may differ because envs that were reset together shared torch's generator, so their random numbers depend on more
-    than the seed.
+    The state after the reset may differ because envs that were reset together share torch's generator, so
+    their random numbers depend on more than the seed.
 
     Raises:
         TaskError: a reset raised.
@@ -80,7 +80,9 @@ def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]
         if options.pop("reconfigure", False):
             missed[i]["reset option reconfigure"] = "the scene is not built again for one env of a batch"
         if run.seed < 0:
-            missed[i]["randomness outside the states"] = "the recording has no seed, so it is drawn again"
+            missed[i]["randomness outside the states"] = (
+                "the recording has no seed, so new random numbers are drawn"
+            )
         seed = [run.seed] if run.seed >= 0 else None
         # One by one: envs that are reset together draw different numbers than each alone.
         with blamed("reset", loaded, task):
@@ -118,21 +120,22 @@ def replay_to(
     env_idx: Sequence[int],
     on_step: Callable[[int], None] = lambda done: None,
 ) -> tuple[StepResult, ReplayResult]:
-    """Put envs into one state of a recorded run, all into the same; the other envs are not disturbed.
+    """Put these envs into state `state` of a recorded run.
 
-    A state that is only restored (`episodes.recorded_state`) has all bodies in place, but lacks what no recording holds:
-    contacts, drive targets, the task's own counters. A replay from the recorded seed with the recorded actions reproduces
-    all of it to the last bit with the same code, and reaches a different state with different code. So the run is replayed,
-    the bodies are compared with the recording after each step, and if they are too far apart the recorded state is
-    restored; the result counts these steps.
+    A state that is only restored (`episodes.recorded_state`) has all bodies in place, but lacks what no
+    recording holds: contacts, drive targets, the task's own counters. A replay from the recorded seed with
+    the recorded actions reproduces these to the last bit if the code is the same; with different code it
+    reaches a different state. So the run is replayed, and the bodies are compared with the recording after
+    each step. If they are too far apart, the recorded state is restored; the result counts these steps.
 
-    The other envs do not move (`step_only`), and what the task keeps for them is restored afterwards.
+    The other envs do not move (`step_only`), and the task's attributes for them are restored afterwards.
 
     Args:
+        state: 0 for the state after the reset, to ``run.length``.
         on_step: called with the number of replayed steps.
 
     Raises:
-        TaskError: the task's code raised during the replay; the envs are left in that state.
+        TaskError: the task's code raised during the replay; the envs stay in the state that they had reached.
         IndexError: the run has no such state, or the task has no such env.
     """
     task, env = opened.env, opened.env.env
@@ -143,10 +146,10 @@ def replay_to(
         raise IndexError(f"env_idx {chosen} is out of range for {task.num_envs} envs")
     others = [i for i in range(task.num_envs) if i not in chosen]
     why_not = why_not_replayable(opened, run)
-    kept, reason = _snapshot_of(opened, others)
+    snapshot, reason = _snapshot_of(opened, others)
     why_not = why_not or reason
     corrected = 0
-    with step_only(env, chosen, kept):
+    with step_only(env, chosen, snapshot):
         beginnings = begin_run(opened.loaded, task, dict.fromkeys(chosen, run))
         missed = {what: why for each in beginnings.values() for what, why in each.missed.items()}
         if not why_not:
@@ -194,7 +197,7 @@ def why_not_replayable(opened: OpenedTask, run: RecordedRun) -> str:
 
 
 def _snapshot_of(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None, str]:
-    """(snapshot of the envs that do not take part, ""), or (None, reason why no step is allowed)."""
+    """(snapshot of the envs that must not move, ""), or (None, reason why no step may be taken)."""
     if not others:
         return None, ""
     try:
@@ -202,7 +205,7 @@ def _snapshot_of(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None
     except Exception as error:  # a task may have attributes that cannot be copied
         return (
             None,
-            f"the other envs cannot be restored after steps, because this task's state cannot be kept ({error})",
+            f"the other envs cannot be put back after a step: this task's state cannot be copied ({error})",
         )
 
 
@@ -218,7 +221,7 @@ def _is_off(env: object, chosen: list[int], wanted: Mapping[str, NDArray]) -> bo
 def _distance(
     env: object, chosen: list[int], wanted: Mapping[str, NDArray]
 ) -> tuple[float | None, float | None]:
-    """Distance in metres and radians of the env that is furthest; None if nothing was recorded."""
+    """Largest distance of these envs from the state `wanted`, in metres and radians; None if it is empty."""
     if not wanted:
         return None, None
     now = read_states(env)
@@ -227,13 +230,13 @@ def _distance(
 
 
 def replay_text(replay_result: ReplayResult) -> str:
-    """A sentence on how the state was reached, and how close it is."""
+    """Text on how the state was reached, and how close it is to the recording; follows the episode's name."""
     if replay_result.way == "put there":
         text = "the recorded state was restored; contacts and the task's own counters start over"
     elif replay_result.way == "corrected":
         text = (
-            f"its actions were replayed, and its state restored at {replay_result.corrected} of {replay_result.steps} steps, "
-            "where they differed"
+            f"its actions were replayed; after {replay_result.corrected} of {replay_result.steps} steps the "
+            "state differed and the recorded one was restored"
         )
     elif replay_result.steps == 0:
         text = "reset with its seed" + (", then its first state restored" * replay_result.start_differs)
@@ -241,7 +244,7 @@ def replay_text(replay_result: ReplayResult) -> str:
         text = "its actions were replayed"
         text += " from its first state" if replay_result.start_differs else " from its seed"
     if replay_result.metres is None:
-        text += "; it holds no states to compare with"
+        text += "; the recording has no states to compare with"
     elif replay_result.metres == 0 and not replay_result.radians:
         text += "; every body has its recorded pose, to the last bit"
     else:

@@ -24,13 +24,13 @@ class Source:
     path: Path
     """A file of a workbench recording, ManiSkill's ``.h5``, or the folder of a LeRobot dataset."""
     part: str | None = None
-    """Which one of several: ``traj_3``, or the number of the dataset's episode."""
+    """Which recording of several in `path`: ``traj_3``, or the number of the dataset's episode."""
     id: str = ""
-    """The caller's id."""
+    """Id that the caller uses for the recording."""
     name: str = ""
     """Name to show."""
     problem: str | None = None
-    """A sentence, if it is too damaged to be read at all."""
+    """A sentence, if the recording is too damaged to be read at all."""
 
     @property
     def stem(self) -> str:
@@ -62,13 +62,13 @@ class Facts:
     uid: str = ""
     """The recording's own id; empty if it has none."""
     copy_of: str = ""
-    """Id of the recording that it was exported from; empty if unknown or not exported."""
+    """Id of the recording that this one was exported from; empty if unknown or not exported."""
     written: float | None = None
     """Unix seconds."""
     seed: int | None = None
     env_index: int | None = None
     length: int | None = None
-    """Actions."""
+    """Number of control steps."""
     max_episode_steps: int | None = None
     """The task's time limit in control steps, if known."""
     total_reward: float | None = None
@@ -80,11 +80,11 @@ class Facts:
     acted_by: str = ""
     """Source of the actions; empty if unknown."""
     source_hash: str = ""
-    """Empty if unknown."""
+    """Hash of the task's source; empty if unknown."""
     tags: tuple[str, ...] = ()
     note: str = ""
     recovered: bool = False
-    """Whether its writer was killed, and the recording ends there."""
+    """Whether the recording ends early, because its writer was killed."""
     problem: str | None = None
     """A sentence, if the files have a problem."""
 
@@ -190,7 +190,7 @@ def number(value: object) -> float | None:
 def total(value: object) -> float | None:
     """A sum of rewards, which may be NaN or infinite."""
     if isinstance(value, float) and not math.isfinite(value):
-        # Always the same NaN object: rows are compared, and NaN equals only itself by identity.
+        # Always the same NaN object: NaN != NaN, so compared rows count as equal only if they share it.
         return math.nan if math.isnan(value) else value
     return number(value)
 
@@ -217,7 +217,8 @@ def unix_seconds(value: object) -> float | None:
 
 
 def clean_tags(values: object) -> tuple[str, ...]:
-    """At most `MAX_TAGS` distinct tags, in order; commas separate tags when typed, so they become spaces."""
+    """At most `MAX_TAGS` distinct tags, in order; a comma in a tag becomes a space, because commas separate
+    typed tags."""
     if not isinstance(values, Iterable) or isinstance(values, (str, bytes, Mapping)):
         return ()
     tags = (clean_text(value, MAX_TAG_CHARACTERS).replace(",", " ").strip() for value in values)

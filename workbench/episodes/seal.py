@@ -21,7 +21,8 @@ log = logging.getLogger(__name__)
 KEY_FILE = "recordings.key"
 _KEY_BYTES = 32
 _COVERED = {*SHARED, "seed", "source"} - {"acted_by", "pictures", "moved_cameras", "observed_by"}
-"""Fields that a seal covers. The excluded ones are not sealed by older versions, whose seals stay valid."""
+"""Fields that a seal covers; `_content` adds ``acted_by``. Seals of older versions, which lack the other
+excluded fields, stay valid."""
 _logged: set[str] = set()
 
 
@@ -43,7 +44,7 @@ class InstallationSeal(Enum):
 
 
 def seal(description: Description, source_file: str | None) -> SealJson | None:
-    """The seal for a new recording with this `description`; None as in `seal_text`.
+    """The seal for a new recording with this `description`; None without a usable key, which is logged once.
 
     Args:
         source_file: the absolute path of the task's file.
@@ -75,7 +76,8 @@ def made_here(info: EpisodeInfo) -> InstallationSeal:
 
 
 def seal_text(text: str, what: str = "text") -> str | None:
-    """Seal a text that this installation reads back, such as a journal's header; None, logged once, without a key.
+    """Seal a text that this installation reads back, such as a journal's header; None without a usable key,
+    which is logged once.
 
     Args:
         what: kind of text; the seal is invalid for another kind.
@@ -106,7 +108,7 @@ def _mac(key: bytes, what: str, text: str) -> str:
 
 
 def _any_key() -> bytes | None:
-    """The key, which is created if there is none; None, logged once, if it cannot be read or written."""
+    """The key, created if there is none; None if it cannot be read or written, which is logged once."""
     try:
         return _key() or _new_key()
     except OSError as error:
@@ -128,12 +130,13 @@ def _new_key() -> bytes:
     if read_private(KEY_FILE) is not None:
         broken = set_aside(KEY_FILE)
         _log_once(
-            f"The key of this installation's recordings was broken and was moved to {broken}; there is a new one."
+            f"The key that seals this installation's recordings was broken and was moved to {broken}; "
+            "there is a new key."
         )
     create_private(KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())  # unless another process just did
     key = _key()
     if key is None:
-        raise OSError("the key that was written cannot be read back")
+        raise OSError("the new key cannot be read back")
     return key
 
 

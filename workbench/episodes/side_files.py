@@ -15,7 +15,7 @@ from workbench.machine.parse_python import parse_python
 
 MAX_FILES = 200
 MAX_LISTED_FILES = 5000
-"""Maximum number of files below the task's folder that are considered: it may be a home folder."""
+"""Maximum number of files below the task's folder that are considered: the folder may be a home folder."""
 NAMING_SUFFIXES = (".urdf", ".xml", ".srdf", ".obj", ".mtl", ".gltf", ".dae")
 """Suffixes of files that name other files."""
 MAX_NAMING_BYTES = 4_000_000
@@ -67,7 +67,7 @@ def hash_of(path: Path) -> str:
 
 
 def side_files_text(task: str | None, recorded: Mapping[str, str]) -> str:
-    """A sentence on the files that the recorded task needs and their current state; empty if there are none.
+    """A sentence on the recorded task's side files, and whether they have changed; empty if there are none.
 
     Args:
         task: the task's file, if it exists.
@@ -78,14 +78,14 @@ def side_files_text(task: str | None, recorded: Mapping[str, str]) -> str:
     changed = list(_changed_files(folder_of(task), recorded).items())
     names = ", ".join(list(recorded)[:3]) + (f" and {len(recorded) - 3} more" if len(recorded) > 3 else "")
     it = "it is" if len(recorded) == 1 else "they are"
-    now = f"{it} as then" if not changed else "; ".join(f"{name} {what}" for name, what in changed[:3])
+    now = f"{it} unchanged" if not changed else "; ".join(f"{name} {what}" for name, what in changed[:3])
     if len(changed) > 3:
         now += f"; {len(changed) - 3} more differ too"
     return f"The task also reads {names}, which the recording does not hold: {now}."
 
 
 def _changed_files(folder: Path | None, recorded: Mapping[str, str]) -> dict[str, str]:
-    """The difference of each file of `recorded` that differs now."""
+    """What is wrong with each file of `recorded` that is missing, changed or unreadable, by name."""
     changed = {}
     for name, hashed in recorded.items():
         path = side_file_path(folder, name)

@@ -157,7 +157,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def value_text(json_text: str) -> str:
-    """A set value for display: a text without its quotes, all else as JSON."""
+    """A set value for display: a string without its quotes, any other value as JSON."""
     try:
         value = json.loads(json_text)
     except ValueError:
@@ -203,7 +203,7 @@ def write_results(path: Path, results: SweepResults) -> None:
 
 
 def _column(texts: Sequence[str]) -> list[Any]:
-    """Values of these JSON texts if one column can hold them, else the texts."""
+    """Values of these JSON texts if they fit one column type, else the texts."""
     values = [json.loads(text) for text in texts]
     for kinds in ((bool,), (int,), (int, float), (str,)):
         if all(type(value) in kinds for value in values):
@@ -212,7 +212,8 @@ def _column(texts: Sequence[str]) -> list[Any]:
 
 
 def read_results(path: Path) -> SweepResults:
-    """Read results from an untrusted file, so only in a confined process; validate them with `clean_results`.
+    """Read results from an untrusted file. Call this only in a confined process, and validate the results
+    with `clean_results`.
 
     Raises:
         NoSweep: it does not hold the results of a sweep.

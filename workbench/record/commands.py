@@ -19,14 +19,14 @@ class StopRecording(Command, frozen=True):
 
 
 class ToggleSavePast(Command, frozen=True):
-    """Save the episode at the shown moment; while that is saved, stop."""
+    """Save the episode at the shown moment, or stop a save that is running."""
 
     key = "shift+k"
     context = "live"
 
 
 class RecordNextEpisode(Command, frozen=True):
-    """Wait for the next reset and record that one episode."""
+    """Wait for the next reset, then record one episode."""
 
 
 class SavePreviousEpisode(Command, frozen=True):

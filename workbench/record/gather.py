@@ -39,7 +39,7 @@ class GatheredEpisode:
     writer: EpisodeWriter
     env: int
     seed: int
-    """Seed of the reset; negative if unknown."""
+    """Seed of the reset that began the episode; negative if unknown."""
     steps: int = 0
     total_reward: float = 0.0
     success: bool | None = None
@@ -126,11 +126,12 @@ class GatheredEpisode:
 class EpisodeGatherer:
     """Gathers the episodes of some envs of one task, for the page, ``workbench record`` and `workbench.Recorder`.
 
-    An episode begins with a reset and ends when its env terminates, is truncated or is reset. `on_episode` then decides
-    whether it becomes files (`EpisodeWriter.finish` takes a fraction of a second, and may run on another thread).
+    An episode begins with a reset and ends when its env terminates, is truncated or is reset. `on_episode`
+    then decides whether its files are made (`EpisodeWriter.finish` takes a fraction of a second, and may run
+    on another thread).
 
-    It also checks that `elapsed_steps` counts 0, 1, 2 ...; after a lost step or an unseen reset the file would look right
-    and be wrong.
+    The gatherer checks that `elapsed_steps` counts 0, 1, 2 ...: after a lost step, or a reset that it did not
+    see, the recording would be wrong without any sign of it.
     """
 
     def __init__(
@@ -151,7 +152,8 @@ class EpisodeGatherer:
             ends: ``over`` also ends an episode when it terminates or is truncated; ``reset`` only when its env is reset, for
                 callers that continue after termination.
             one_each: gather only the next episode of each env.
-            origin: as in `jobs.scheduler.ItemQueue.origin`: an episode names the original paths of the author's files.
+            origin: as in `jobs.scheduler.ItemQueue.origin`, so that episodes name the original paths of the
+                author's files.
         """
         self._task, self._folder, self._on_episode = task, folder, on_episode
         self._ends, self._one_each, self._origin = ends, one_each, origin
@@ -178,9 +180,9 @@ class EpisodeGatherer:
         """Append the next reset or step of the batch.
 
         Raises:
-            ValueError: it does not follow from the previous step, or has values that files cannot represent; the states so
-                far can still be finished.
-            RecordingError: it cannot be written.
+            ValueError: the step does not follow the previous one, or has values that files cannot represent;
+                `finish` still makes the files of the states so far.
+            RecordingError: the step cannot be written.
         """
         step = stepped.step
         reset = stepped.reset_mask.tolist()
@@ -190,7 +192,7 @@ class EpisodeGatherer:
                 self._append([e for e in going_on if e.state_names == names], names, stepped)
         for env in [env for env in self._episodes if reset[env]]:
             self.end(env)
-            # Not after a jump into the middle of an episode, which no seed can start.
+            # A jump into the middle of an episode begins none: no seed could start a replay there.
             if env in self._episodes and step.elapsed_steps[env] == 0:
                 self._begin(env, stepped)
 
@@ -241,7 +243,7 @@ class EpisodeGatherer:
         successes = step.evaluate.get("success")
         success: list[bool] | None = None
         if successes is not None:
-            # One value an env, or several.
+            # `success` may have several values for each env.
             success = np.any(successes.reshape(len(successes), -1), axis=1).tolist()
         captured, others, acted_by = stepped.captured, step.others, stepped.acted_by
         layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
@@ -261,16 +263,18 @@ class EpisodeGatherer:
                 self.end(env)
 
 
-def _lost_step(env: int, expected: int, came: int) -> ValueError:
+def _lost_step(env: int, expected: int, arrived: int) -> ValueError:
     return ValueError(
-        f"env {env}: step {expected} was expected, but step {came} arrived; a step was lost or the env was reset unseen"
+        f"env {env}: step {expected} was expected, but step {arrived} arrived; a step was lost, or a reset "
+        "bypassed the recorder"
     )
 
 
 def batch_columns(
     step: StepResult, columns: Mapping[str, NDArray], state_names: frozenset[str]
 ) -> list[tuple[str, NDArray]]:
-    """A control step of the batch as columns for `BatchPacker`."""
+    """A control step of the batch as columns for `BatchPacker`; of the env states only those in
+    `state_names`."""
     assert step.action is not None
     count = len(step.reward)
     rows = [
@@ -339,14 +343,15 @@ class Finished:
     bytes_written: int = 0
     last: EpisodeFiles | None = None
     problem: str | None = None
-    """Reason why the last failed episode failed."""
+    """Reason why the last episode could not be written; None if it was written."""
 
 
 class EpisodeFinisher:
     """Writes the files of finished episodes one by one on a thread. Thread-safe.
 
-    There is no second thread, since both would compete for the GIL: even at the end, when nothing else needs it, two take a
-    quarter longer (measured). A subprocess does not compete; with one, the closing thread makes files too.
+    There is only one thread, because two would compete for the GIL: even at the end, when nothing else needs
+    the GIL, two threads take a quarter longer (measured). A subprocess does not compete; with one, `close`
+    makes files on its own thread too.
     """
 
     def __init__(
@@ -360,7 +365,7 @@ class EpisodeFinisher:
         Args:
             on_change: called when an episode's files are written, or have failed: on the thread, or by `close`.
             first: called once at the start of the thread.
-            then: called with the files of each episode, which is finished only afterwards.
+            then: called with the files of each episode, before the episode counts as finished.
             in_process: make the files in a subprocess, for a caller that needs the GIL; its start takes a second of a core.
         """
         self._on_change, self._then = on_change, then
@@ -388,8 +393,8 @@ class EpisodeFinisher:
             return len(self._waiting) + self._at_work
 
     def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | str]:
-        """Write the files; the future's result is the reason as text if writing fails. `finished` also holds the
-        reason, until another episode succeeds."""
+        """Queue the episode; returns the future of its files. If they cannot be written, the result is the
+        reason as text, which `finished` also has until another episode is written."""
         made: Future[EpisodeFiles | str] = Future()
         with self._lock:
             self._waiting.append((episode, made))
@@ -408,7 +413,7 @@ class EpisodeFinisher:
         self._finish_one(self._process if self._process is not None and self._process.is_ready else None)
 
     def _finish_one(self, process: FilesProcess | None) -> bool:
-        """Write the files of one waiting episode; returns whether one waited."""
+        """Write the files of one waiting episode; returns False if none was waiting."""
         with self._lock:
             if not self._waiting:
                 return False
@@ -447,5 +452,5 @@ class EpisodeFinisher:
             # A panic of rerun's Rust code is not an Exception. The journal stays, and the next start tries again.
             if not isinstance(error, (RecordingError, OSError, ValueError)):
                 report_failure(f"An episode of env {episode.env} could not be written", error)
-            return f"an episode of env {episode.env} could not be written: {error}", 0
+            return f"An episode of env {episode.env} could not be written: {error}", 0
         return made, size

@@ -37,8 +37,8 @@ from workbench.task.open import describe
 
 logger = logging.getLogger(__name__)
 _MAX_PENDING_STEPS = 2048
-"""Maximum number of pending steps (times envs) for the gatherer: 3 MB. The queue is flushed earlier after half a second, or
-when an episode begins."""
+"""Maximum number of pending steps, summed over the envs: 3 MB. The queue is flushed earlier if half a second
+has passed or an episode begins."""
 _MAX_PENDING_PICTURE_BYTES = 1 << 25
 """Maximum size of the pictures that wait for the gatherer."""
 
@@ -65,19 +65,20 @@ class Recorder(gym.Wrapper):
 
         env = workbench.make("PickCube-v1", num_envs=16)
         env = workbench.Recorder(env, "recordings/")
-        env = ManiSkillVectorEnv(env, auto_reset=True)  # goes around it: training, evaluation, anything
+        env = ManiSkillVectorEnv(env, auto_reset=True)  # other wrappers go around the Recorder
         env.reset(seed=0)
         for _ in range(200):
             env.step(policy(obs))
         env.close()  # waits for the files
 
-    Writes the files of the page and of ``workbench record``, one set per episode: .rrd, .h5 and .json. An episode of an env
-    lasts from its reset to its next one, so partial resets, auto-resets and wrappers that continue after success work. The
-    env's own state, observation and reward are recorded, so it must wrap the env of `make` directly, inside all wrappers
-    that change actions. From four envs on, a subprocess makes the files.
+    Writes the same files as the page and ``workbench record``, one set per episode: .rrd, .h5 and .json. An
+    episode of an env lasts from one reset to the next, so partial resets, auto-resets and wrappers that
+    continue after success work. The Recorder records the env's own state, observation and reward, so it must
+    wrap the env of `make` directly, inside all wrappers that change actions. From four envs on, a subprocess
+    makes the files.
 
-    A full disk must not end a training loop: an error of the files gives one warning, ends the recording, and is kept in
-    `problem`.
+    A full disk must not end a training loop: if the files cannot be written, one warning is given, the
+    recording ends, and `problem` has the reason.
     """
 
     def __init__(
@@ -105,7 +106,8 @@ class Recorder(gym.Wrapper):
         """
         if not isinstance(env, gym.Env) or isinstance(env, gym.vector.VectorEnv):
             raise TypeError(
-                f"Recorder wraps the env of workbench.make directly, inside a vector env: not {type(env).__name__}"
+                "Recorder must wrap the env of workbench.make directly, inside a vector env: "
+                f"not a {type(env).__name__}"
             )
         super().__init__(env)
         base: BaseEnv = open_env(env)
@@ -158,8 +160,8 @@ class Recorder(gym.Wrapper):
             self._begin()
         if self._gatherer is not None:
             self._gather()  # before the options change
-            kept = {k: v for k, v in (options or {}).items() if k != "env_idx"}
-            self._gatherer.reset_options = kept
+            other_options = {k: v for k, v in (options or {}).items() if k != "env_idx"}
+            self._gatherer.reset_options = other_options
         self._add_step(step, mask)
         return obs, info
 
@@ -233,7 +235,7 @@ class Recorder(gym.Wrapper):
             len(self._pending) * len(reset_mask) > _MAX_PENDING_STEPS
             or self._waiting_pictures > _MAX_PENDING_PICTURE_BYTES
         )
-        # A step that does not continue its episode raises at once.
+        # Gather a step that does not continue its episode now: an error is then reported at this step.
         if full or not follows:
             self._gather()
         self._report_failures()
@@ -244,7 +246,7 @@ class Recorder(gym.Wrapper):
             try:
                 while self._pending and self._gatherer is not None:
                     self._gatherer.take(self._pending.popleft().stepped())
-            except Exception as error:  # kept for the next step, since this may be another thread
+            except Exception as error:  # for `_report_failures`: this may be another thread
                 self._pending.clear()
                 self._failure = error
 
@@ -259,7 +261,7 @@ class Recorder(gym.Wrapper):
     def _stop_recording(self, error: Exception) -> None:
         self._end()
         self.problem = str(error)
-        warnings.warn(f"the recording ended: {error}", stacklevel=4)
+        warnings.warn(f"The recording ended: {error}", stacklevel=4)
 
     def _on_episode_end(self, episode: GatheredEpisode) -> None:
         self._made.append(self._finisher.finish(episode))
@@ -284,4 +286,4 @@ class Recorder(gym.Wrapper):
         if problems and self.problem is None:
             self.problem = problems[0]
             self._gatherer = None
-            warnings.warn(f"the recording ended: {self.problem}", stacklevel=4)
+            warnings.warn(f"The recording ended: {self.problem}", stacklevel=4)

@@ -25,10 +25,10 @@ from workbench.record.job_worker import (
 )
 
 MAX_CHUNK_STARTS = 2
-"""Maximum number of times that a chunk of episodes is started when its workers die, before they are tried one by one."""
+"""Number of times that a chunk is started, if its workers die; then its episodes are tried one by one."""
 _LONG_JOB_BATCHES = 256
-"""Number of batches from which a chunk holds several (`_CHUNK_BATCHES`): the envs of a batch wait for each other only at
-the end of a chunk."""
+"""Length of a job, in batches, from which a chunk holds `_CHUNK_BATCHES` batches instead of one: envs that
+finish early idle only at the end of a chunk."""
 _CHUNK_BATCHES = 4
 
 
@@ -64,7 +64,7 @@ class Recorded:
     """The result of a recording."""
 
     written: tuple[Written, ...]
-    """Episodes by number."""
+    """The kept episodes, ordered by number."""
     tried: int
     """Number of episodes that were run."""
     stopped: bool
@@ -94,14 +94,15 @@ def record(
 ) -> Recorded:
     """Record into ``what.out``.
 
-    Each episode starts with a reset of its env alone with its own seed, and has its own actions (`RecordActionChooser`):
-    episode k is the episode that ``gym.make(...).reset(seed=seed + k)`` starts, for any number of envs and processes.
+    For each episode, one env is reset alone, with the seed of the episode. Random actions have a generator
+    for each episode (`RecordActionChooser`). So for any number of envs and processes, episode k is the
+    episode that ``gym.make(...).reset(seed=seed + k)`` starts.
 
     Args:
-        on_finding: called once for each place where the task breaks a rule without being stopped.
+        on_finding: called once for each place where the task breaks a rule that does not stop it.
         stop: called between steps; once it returns True, finished episodes are kept and the others dropped.
-        executor: None for this process, or for spawned processes with several workers.
-        run: as in `RecordSetup`, for a job that resumes.
+        executor: None to run in this process, or in spawned processes if ``what.workers`` is above 1.
+        run: as in `RecordSetup`; a resumed job passes the name that it began with.
         on_notice: called once with each notice about the task.
 
     Raises:
@@ -128,6 +129,7 @@ def collect(what: RecordOptions, known: Mapping[int, Written | None]) -> Recorde
 
     Args:
         what: options as completed by `with_given_actions`.
+        known: result of each episode by number; None if the episode was not kept.
     """
     recording = _Recording(
         what,

@@ -51,7 +51,7 @@ from workbench.task.load import undo_load
 from workbench.task.open import OpenedTask, open_task
 
 _TRIES_PER_SUCCESS = 100
-"""Number of episodes that are tried for each requested success, by default."""
+"""Maximum number of episodes that are tried for each requested success, by default."""
 _START_TOLERANCE = 1e-4
 """Maximum distance, in metres or radians, from the demonstration's start state that counts as the same start."""
 
@@ -133,11 +133,12 @@ class Written:
     success: bool | None
     """Success at its last state; None for a task without ``success``."""
     start_corrected: bool = False
-    """Whether its seed gave a different start than the demonstration's, so that the demonstration's first state was restored."""
+    """Whether the seed gave another start than the demonstration's, so that its first state was restored."""
     planned: PlannedEpisode | None = None
     """Data about the planning, if the actions were planned."""
     address: str = ""
-    """Address that its .rrd file was uploaded to; `path` then does not exist."""
+    """Address that its .rrd file was uploaded to, in which case `path` does not exist; empty if it was not
+    uploaded."""
     solved_at: int | None = None
     """Control steps until its first state with success; None without one."""
     means: dict[str, float] = field(default_factory=dict)
@@ -180,7 +181,9 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
     if what.successes is None:
         episodes = what.episodes or len(given) or 4
         if several and episodes > several:
-            raise ValueError(f"{what.actions} has {several} episodes, and --episodes asks for {episodes}")
+            raise ValueError(
+                f"--episodes asks for {episodes} episodes, but {what.actions} has only {several}"
+            )
         return replace(what, episodes=episodes), given
     most = what.tries or _TRIES_PER_SUCCESS * what.successes
     return replace(what, tries=min(most, several) if several else most), given
@@ -195,7 +198,8 @@ def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedR
     torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # the task may change it
     chunk = None
-    # A single recording is opened before its first chunk is requested, so that an error of opening is no chunk's failure.
+    # Open a single recording before its first chunk is requested: an error of opening must not count as a
+    # chunk's failure.
     at = 0 if len(setup.wanted) == 1 else _recording_of(chunk := queue.next(), setup)
     while at is not None:
         what = setup.wanted[at]
@@ -220,7 +224,7 @@ def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedR
 
 @contextmanager
 def _scratch(folder: Path, what: RecordOptions) -> Iterator[Path]:
-    """Folder for the files: the recording's folder, or one of this worker alone if the files are uploaded."""
+    """Folder for the files: the recording's folder, or a temporary one if the files are uploaded."""
     if not what.upload:
         yield folder
         return
@@ -262,7 +266,8 @@ def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> Opened
 
 
 class _Episodes:
-    """The episodes of one recording: a free env takes the next one of the chunk, and all step together."""
+    """Runs the episodes of one recording: a free env begins the next episode of the chunk, and all envs step
+    together."""
 
     def __init__(
         self,
@@ -349,7 +354,8 @@ class _Episodes:
         self._chunk = chunk
         self._waiting.extend(n for n in chunk.numbers if self._acts_on_batch or n in chunk.wanted)
         if self._acts_on_batch and (idle := self._envs[len(self._waiting) :]):
-            # A source that sees the whole batch sees these envs too: reset them, so that they are the same in every run.
+            # The action source also sees the idle envs: reset them, so that they are in the same state in
+            # every run.
             with blamed("reset", self._opened.loaded, self._opened.env):
                 self._opened.env.reset(self._seed_of(chunk.numbers[0]), idle)
         while self._begin_free():
@@ -358,7 +364,7 @@ class _Episodes:
         self._waiting.clear()
 
     def _begin_free(self) -> bool:
-        """Begin episodes in free envs. Returns whether any env has one."""
+        """Begin episodes in free envs. Returns whether any env runs an episode."""
         limit = self._queue.limit()
         self._drop_from(limit)
         begun = False
@@ -388,7 +394,7 @@ class _Episodes:
         """Report the episodes whose files are written.
 
         Raises:
-            RecordingError: the files of one cannot be written.
+            RecordingError: the files of an episode could not be written.
         """
         for number in [number for number, (_, future) in self._made.items() if future.done()]:
             episode, future = self._made.pop(number)

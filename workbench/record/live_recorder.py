@@ -25,10 +25,11 @@ from workbench.record.state import (
 
 
 class LiveRecorder:
-    """Records chosen envs. `close` waits until all files are written.
+    """Records the episodes of chosen envs. `close` waits until all files are written.
 
-    The loop only passes the steps on to the thread: encoding a row and writing it to the journal takes a millisecond or less,
-    but a disk may be slow, and the files of an episode take a fraction of a second or more.
+    The loop hands each step to a thread. Encoding a row and writing it to the journal takes a millisecond or
+    less, but a slow disk would block the loop, as would the files of an episode, which take a fraction of a
+    second or more.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class LiveRecorder:
             # Expected errors: a full disk, an entry of evaluate() that is not a number, a lost step. All others are bugs.
             if not isinstance(error, (RecordingError, ValueError)):
                 report_failure("A step could not be recorded", error)
-            problem = f"the recording ended: {error}"
+            problem = f"The recording ended: {error}"
         episodes = gatherer.under_way
         under_way = RunningEpisodes(
             len(episodes),
@@ -115,7 +116,7 @@ class LiveRecorder:
             recovered = tuple(str(file) for file in recover_confined(self._folder))
             message = recovered_text(recovered)
         except RecordingError as error:
-            message = problem = f"an earlier, unfinished recording could not be recovered: {error}"
+            message = problem = f"An earlier, unfinished recording could not be recovered: {error}"
         self._post(EpisodesRecovered(recovered, problem))
         if message:
             self._on_recovered(message)

@@ -23,8 +23,8 @@ from workbench.record.commands import (
 )
 from workbench.record.state import RecordingStatus
 
-RECORD_HINT = "Reset and record every episode until it is stopped"
-SAVE_HINT = "Record after the fact: the episode at the shown moment"
+RECORD_HINT = "Reset and record every episode until you stop it"
+SAVE_HINT = "Make a recording of the episode that contains the shown moment"
 RECORD, NEXT, SAVE = "Record", "Record the next episode", "Save what I just saw"
 SAVE_BEFORE = "Save the previous episode"
 REC = "REC"
@@ -40,10 +40,11 @@ def record_tool(view: SessionView) -> Tool:
 
 
 class RecordPanel(MomentPart):
-    """Three buttons, each of which also stops what it started, and a status text.
+    """The buttons that record and save episodes, and a status text.
 
-    *Record* begins a new episode, since an episode without its reset cannot be replayed; *Record the next episode* waits for
-    a reset; *Save what I just saw* makes a recording of the past.
+    *Record* begins a new episode, because an episode without its reset cannot be replayed. *Record the next
+    episode* waits for a reset. *Save what I just saw* makes a recording of the past. *Record* also stops a
+    recording, and *Save what I just saw* also stops a save.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -87,7 +88,7 @@ class RecordPanel(MomentPart):
 
 
 def runs_since(view: SessionView) -> int | None:
-    """Steps of the selected env's episode up to the shown moment, if it still runs there; else None."""
+    """Steps of the selected env's episode up to the shown moment; None if it has no step or has ended there."""
     step, env = view.step, view.selected_env
     if step is None or view.timeline.moments == 0 or env >= len(step.elapsed_steps):
         return None
@@ -97,13 +98,13 @@ def runs_since(view: SessionView) -> int | None:
 
 
 def has_one_before(view: SessionView) -> bool:
-    """Whether the history has steps before a running episode."""
+    """Whether the history has steps before the selected env's running episode."""
     steps, past = runs_since(view), view.timeline
     return steps is not None and past.tick - past.first_tick > steps
 
 
 def what_saving_means(view: SessionView, all_envs: bool) -> str:
-    """Text about the episode that *Save what I just saw* takes, if it is a running one; else empty."""
+    """Text on what *Save what I just saw* would save; empty if the shown episode has no step or has ended."""
     steps = runs_since(view)
     if steps is None or view.task is None:
         return ""
@@ -113,8 +114,8 @@ def what_saving_means(view: SessionView, all_envs: bool) -> str:
     if view.task.num_envs == 1:
         return f"{SAVE}: this episode, {count}."
     if all_envs:
-        return f"{SAVE}: all envs, their running episodes (env {view.selected_env}: {count})."
-    return f"{SAVE}: env {view.selected_env}, this episode, {count}."
+        return f"{SAVE}: the running episodes of all envs (env {view.selected_env}: {count})."
+    return f"{SAVE}: this episode of env {view.selected_env}, {count}."
 
 
 def recording_html(recording: RecordingStatus) -> str:
@@ -128,7 +129,7 @@ def recording_html(recording: RecordingStatus) -> str:
 
 
 def envs_in_words(env_idx: tuple[int, ...], most: int = 6) -> str:
-    """``envs 0, 3 and 5 more``."""
+    """Text with at most `most` numbers, such as ``envs 0, 3 and 5 more``."""
     numbers = ", ".join(str(env) for env in env_idx[:most])
     more = f" and {len(env_idx) - most} more" if len(env_idx) > most else ""
     return f"env{'s' if len(env_idx) != 1 else ''} {numbers}{more}"

@@ -1,4 +1,5 @@
-"""Question that captures the recorded data of a past moment. Only for a worker that does not play, because it moves envs."""
+"""The question that captures a past moment's data for a recording. It moves envs: only for a worker that does
+not play."""
 
 from __future__ import annotations
 
@@ -26,6 +27,6 @@ class CaptureMoment(Question[Captured]):
     snapshot: bytes
     """A pickled `envs.snapshots.snapshot.Snapshot` of the whole batch."""
     env_idx: tuple[int, ...]
-    """The envs to render."""
+    """The envs whose cameras are rendered."""
     pictures: bool
     """Whether to render pictures."""

@@ -50,10 +50,11 @@ _START_TOLERANCE = 1e-6
 class PastSaver:
     """Records past episodes, one job at a time, in the background process.
 
-    The history has the original poses, actions, rewards and results of ``evaluate``, and a snapshot of each moment. The
-    rest (env states, observations, pictures of all cameras) is read from envs that are restored from the snapshots. So the
-    file equals that of a live recording, except that after an edit of the task's file the rest comes from the new code. The
-    recorded source is that of the version that played.
+    The history has the original poses, actions, rewards and results of ``evaluate``, and a snapshot of each
+    moment. Env states, observations and pictures of all cameras are read from envs that are restored from the
+    snapshots. So the file equals a live recording, except after an edit of the task's file: then states,
+    observations and pictures come from the new code. The recorded source is the version that played the
+    episode.
     """
 
     def __init__(
@@ -107,15 +108,15 @@ class PastSaver:
         total = len(moments)
 
         async def redraw() -> None:
-            """Continue with the first moment that is not captured yet, since a job of higher rank may have interrupted this
-            one."""
+            """Capture the moments that are not captured yet. Runs again after a job of higher rank
+            interrupted this one."""
             await self._process.ensure(job, what.load, placed)
             for episode in what.episodes:
                 if episode.env not in seeds:
                     job.report(len(seeds), len(what.episodes), "trying the seeds")
                     seeds[episode.env] = await self._verified_seed(episode)
             while moments:
-                job.report(total - len(moments), total, "rendering it again")
+                job.report(total - len(moments), total, "rendering again")
                 moment, rows = moments[0]
                 question = CaptureMoment(pickle.dumps(moment.snapshot), tuple(rows), what.task.can_render)
                 captured = await self._process.ask(question)
@@ -148,7 +149,7 @@ class PastSaver:
         except BaseException as error:
             self._aside.begin(discard)
             if isinstance(error, RecordingError | ValueError):
-                raise JobFailed(f"it could not be saved: {error}") from error
+                raise JobFailed(f"Saving failed: {error}") from error
             raise
         job.report(1, 1, "writing the files")
         if problems := await self._aside.run(finish):
@@ -158,12 +159,12 @@ class PastSaver:
         lost = sum(seeds[episode.env] != episode.seed for episode in what.episodes)
         envs = what.episodes[0].env if len(what.episodes) == 1 else None
         which = f"{len(writers)} episodes" if envs is None else f"an episode of env {envs}"
-        kept = f"saved {which}, {steps} step{'' if steps == 1 else 's'}"
+        saved = f"Saved {which}, {steps} step{'' if steps == 1 else 's'}"
         earlier = sum(
             _as_played(what.task, episode).source_hash != what.task.source_hash for episode in what.episodes
         )
         message = (
-            kept
+            saved
             + _unfinished_text(unfinished, len(writers))
             + _lost_seed_text(lost, len(writers))
             + _earlier_text(earlier, len(writers))
@@ -173,7 +174,8 @@ class PastSaver:
     def _begun(
         self, what: SaveRequest, placed: tuple[PlaceCamera, ...], episode: PastEpisode, seed: int
     ) -> GatheredEpisode:
-        """Begin the episode's recording, including the camera placements that its source lacks. Raises RecordingError."""
+        """Begin the recording of an episode, with the camera placements that its source lacks. Raises
+        RecordingError."""
         task = _as_played(what.task, episode)
         observed_by = "" if task.source_hash == what.task.source_hash else what.task.source_hash
         writer = GatheredEpisode.of(self._folder, task, episode.env, seed, observed_by=observed_by)
@@ -185,7 +187,7 @@ class PastSaver:
     async def _verified_seed(self, episode: PastEpisode) -> int:
         """Seed of the episode, if a reset of its env alone with this seed gives the first state; else -1.
 
-        Random numbers of envs that were reset together depend on all of them, since they share torch's generator.
+        Envs that are reset together share torch's generator, so their random numbers depend on all of them.
         """
         if episode.seed < 0:
             return episode.seed
@@ -198,12 +200,13 @@ class PastSaver:
         why, problem = str(failure), failure.problem
         if problem is not None:
             where = "" if problem.line is None else f" (line {problem.line})"
-            why = f"it could not be rendered again: {problem.message}{where}"
+            why = f"The episode could not be rendered again: {problem.message}{where}"
         self._happen(SaveFailed(self._job, why))
 
 
 def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:
-    """The running version, whose scene and cameras are in the pictures, with the source that made the episode's rewards."""
+    """The running version, which makes the pictures, with the file and source of the version that played the
+    episode."""
     played = episode.played_by
     if played is None:
         return task
@@ -211,7 +214,8 @@ def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:
 
 
 def _cameras_in_source(task: TaskDescription, episode: PastEpisode) -> dict[CameraKey, CameraSettings]:
-    """Settings in the version that played, for the cameras that the running version places elsewhere."""
+    """Camera settings of the version that played, for the cameras whose settings differ in the running
+    version."""
     now = {camera.key: camera.settings for camera in task.cameras}
     played = () if episode.played_by is None else episode.played_by.cameras
     return {
@@ -223,26 +227,26 @@ def _cameras_in_source(task: TaskDescription, episode: PastEpisode) -> dict[Came
     }
 
 
-def _unfinished_text(count: int, kept: int) -> str:
+def _unfinished_text(count: int, episodes: int) -> str:
     if not count:
         return ""
-    if kept == 1:
+    if episodes == 1:
         return "; it had not ended"
-    return "; none of them had ended" if count == kept else f"; {count} of them had not ended"
+    return "; none of them had ended" if count == episodes else f"; {count} of them had not ended"
 
 
-def _lost_seed_text(count: int, kept: int) -> str:
+def _lost_seed_text(count: int, episodes: int) -> str:
     if not count:
         return ""
-    what = "" if count == kept else f"{count} "
-    return f"; {what}without a seed (the start came from a reset of many envs): replayed from the first state"
+    what = "" if count == episodes else f"{count} "
+    return f"; {what}without a seed (many envs were reset together): a replay restores the first state"
 
 
-def _earlier_text(count: int, kept: int) -> str:
+def _earlier_text(count: int, episodes: int) -> str:
     if not count:
         return ""
-    what = "it was" if kept == 1 else "they were" if count == kept else f"{count} were"
+    what = "it was" if episodes == 1 else "they were" if count == episodes else f"{count} were"
     return (
-        f"; {what} played by an earlier version of the file: that source and its rewards are recorded, observations and "
-        "pictures are the current version's"
+        f"; {what} played by an earlier version of the file: source and rewards are of that version, "
+        "observations and pictures of the current one"
     )

@@ -28,10 +28,10 @@ class SaveStatus:
     failed: bool = False
     """Whether `message` is an error."""
     refused_at: object = None
-    """The shown version, env and moment of which nothing could be recorded; the message is valid only for it. None for any
-    other message."""
+    """The version, env and moment that were shown when a save was refused; `message` is valid only while they
+    are shown. None if no save was refused."""
     progress: JobProgress | None = None
-    """Progress in moments; None while no job runs."""
+    """Progress of the running job; None while no job runs."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ class Saving:
 class PastEpisode:
     """The moments of one env's episode, oldest first; the first is its reset.
 
-    It includes the moments that the env was restored to, until it terminated, was truncated, was reset or was abandoned.
+    After a jump back, the moments up to the restored one are followed by the new ones. The last moment is the
+    one at which the env terminated or was truncated, or the last one before a reset or a jump.
     """
 
     env: int
@@ -61,7 +62,7 @@ class PastEpisode:
     seed: int
     """Seed of the episode; negative if unknown."""
     played_by: TaskDescription | None = None
-    """The version that made the last moment; None for the running one."""
+    """The version that made the last moment; None if unknown."""
 
     @property
     def steps(self) -> int:
@@ -69,7 +70,7 @@ class PastEpisode:
 
     @property
     def ended(self) -> bool:
-        """Whether the task ended the episode; False if it still runs or was reset early."""
+        """Whether the task ended the episode; False if the episode still runs or its env was reset early."""
         moment, env = self.moments[-1]
         step = moment.as_recorded
         return bool(step.terminated[env] or step.truncated[env])
@@ -77,11 +78,11 @@ class PastEpisode:
 
 @dataclass(frozen=True)
 class SaveRequest:
-    """Episodes to record, with everything that a worker needs. Independent of the history, which changes meanwhile."""
+    """Past episodes to record, with all that a worker needs: the history changes while the job runs."""
 
     task: TaskDescription
     load: Load
-    """The load of the running version, for another worker."""
+    """The load that gave the running version; the background worker repeats it."""
     episodes: tuple[PastEpisode, ...]
 
 
@@ -110,7 +111,7 @@ class SaveProgressed:
 class EpisodesSaved:
     job: int
     message: str
-    """Text about what was saved, for the page."""
+    """What was saved, for the page."""
 
 
 @dataclass(frozen=True)
@@ -154,14 +155,14 @@ def apply(
     runs = saving.status.progress is not None
     match event:
         case Asked(command=ToggleSavePast()) if runs:
-            return Saving(SaveStatus("stopped; nothing was saved"), saving.job), [EndSaving()]
+            return Saving(SaveStatus("Stopped; nothing was saved"), saving.job), [EndSaving()]
         case Asked(command=ToggleSavePast()):
             return _save(saving, run, chosen)
         case Asked(command=SavePreviousEpisode()):
             return _save(saving, run, chosen, before=True)
         case Asked(command=SaveSolved()):
             if runs:
-                raise Refused("An episode is being saved.")
+                raise Refused("An episode is already being saved: wait until it is saved.")
             if not solved:
                 raise Refused("No episode is solved.")
             return _save(saving, run, solved)
@@ -179,7 +180,7 @@ def apply(
 
 
 def without_message(saving: Saving) -> Saving:
-    """Drop the last result, because something else is recorded or another version runs."""
+    """Drop the message about the last result, because something else is recorded or another version runs."""
     if not saving.status.message:
         return saving
     return replace(saving, status=SaveStatus(progress=saving.status.progress))
@@ -214,7 +215,7 @@ def request_of(run: Run, env_idx: tuple[int, ...] | None, before: bool = False) 
     """
     load = run.running_load()
     if run.task is None or run.past is None or load is None:
-        return "no task is loaded"
+        return "No task is loaded yet"
     shown = run.past.shown
     serial = None if shown is None else shown.serial
     envs = range(run.num_envs) if env_idx is None else env_idx
@@ -226,7 +227,7 @@ def request_of(run: Run, env_idx: tuple[int, ...] | None, before: bool = False) 
     )
     if not episodes:
         env, why = next(iter(found.items()))
-        return f"nothing was saved of env {env}: {why}"
+        return f"Nothing of env {env} was saved: {why}"
     return SaveRequest(run.task, load, episodes)
 
 
@@ -246,14 +247,18 @@ def find_episode(history: History, env: int, serial: int | None, before: bool = 
         found = _episode_before(history, env, found)
         while isinstance(found, PastEpisode) and found.steps == 0:  # it was reset at once
             found = _episode_before(history, env, found)
-        found = found or "there is no episode before it in memory"
+        found = found or "there is no earlier episode in memory"
     if isinstance(found, PastEpisode) and found.steps == 0:
-        return "the previous episode has no step: it was reset at once" if before else "it has no step yet"
+        return (
+            "the previous episode has no step: it was reset at once"
+            if before
+            else "its episode has no step yet"
+        )
     return found
 
 
 def _episode_before(history: History, env: int, episode: PastEpisode) -> PastEpisode | str | None:
-    """The previous episode; None if it is no longer in memory."""
+    """The previous episode, or the reason why it cannot be recorded; None if it is not in memory."""
     begin = episode.moments[0][0].serial
     return _episode_at(history, env, begin - 1) if begin > history.first else None
 
@@ -264,9 +269,9 @@ def _episode_at(history: History, env: int, serial: int) -> PastEpisode | str:
         return "there is no step yet"
     first, of = moments[0]
     if not first.jumped[of] or first.step.elapsed_steps[of] != 0:
-        return "its beginning is no longer in memory"
+        return "the beginning of its episode is no longer in memory"
     if any(moment.snapshot is None for moment, _ in moments):
-        return "the state of this task cannot be kept, so it cannot be replayed"
+        return "some moments have no snapshot of the task's state, so they cannot be rendered again"
     for count, (moment, at) in enumerate(moments):
         step = moment.as_recorded
         if count > 0 and (step.terminated[at] or step.truncated[at]):

@@ -27,7 +27,7 @@ DOES: frozenset[type[Command]] = of_saving.DOES | {
 MAX_PENDING_BYTES = 256 * 1024**2
 """Maximum size of steps that may wait for the disk."""
 TOO_SLOW = (
-    "the recording ended: the disk is slower than the simulation. Record fewer envs, or choose another folder"
+    "The recording ended: the disk is slower than the simulation. Record fewer envs, or choose another folder"
 )
 ChosenEnvs = Literal["selected", "all"]
 
@@ -64,7 +64,7 @@ class RecordingStatus:
 
 @dataclass(frozen=True)
 class RunningEpisodes:
-    """The running episodes, as far as they are in their journals."""
+    """Counts over the running episodes, as far as their steps are in the journals."""
 
     episodes: int = 0
     steps: int = 0
@@ -126,7 +126,7 @@ class Continues:
     env_idx: tuple[int, ...]
     one_each: bool
     put_back: bool
-    """Whether the envs continue their running episodes: a reset would lose the current moment."""
+    """Whether the load left the envs within their episodes: a reset would lose the current moment."""
 
 
 # --- events and effects -----------------------------------------------------------------------------
@@ -160,7 +160,7 @@ class EpisodeEnded:
     """An episode has ended; its files are written next."""
 
     live: bool
-    """Whether it was recorded while the session ran."""
+    """True if the episode was recorded live, False if it was saved from the history."""
 
 
 @dataclass(frozen=True)
@@ -323,7 +323,7 @@ def _take(recording: LiveRecording, stepped: Stepped) -> Change:
 def _recorded(recording: LiveRecording, event: StepRecorded) -> Change:
     recording = replace(recording, waiting_bytes=recording.waiting_bytes - event.bytes)
     if event.number != recording.number or not recording.env_idx:
-        return recording, []  # another recording has begun, or none
+        return recording, []  # the step belongs to a recording that has ended
     if event.problem is not None:
         return _ended(recording, event.problem), [EndEpisodes(), Send(SetCapture(()))]
     left = tuple(env for env in recording.env_idx if env in event.env_idx)

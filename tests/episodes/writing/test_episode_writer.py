@@ -136,7 +136,7 @@ def test_invalid_rows_are_refused_and_the_episode_continues(make_episode: Maker,
     append(writer, first)
     given = Picture("eye", "sensor", 0, pose, depth=np.zeros((3, 4), np.float32))
     for row, why in (
-        (dataclasses.replace(second, action=np.zeros(3)), "3 numbers, but 1 action names"),
+        (dataclasses.replace(second, action=np.zeros(3)), "3 numbers; the number of action names is 1"),
         (dataclasses.replace(second, pictures=(given,)), "gave rgb first and now depth"),
     ):
         with pytest.raises(ValueError, match=why):

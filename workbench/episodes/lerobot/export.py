@@ -24,7 +24,7 @@ from workbench.episodes.lerobot.format import Choice, Frames, feature_name, fram
 from workbench.episodes.row import UnreadableRecording
 
 ENCODING = Encoding(crf=20, key_every=2, exact_size=True)
-"""Has a key frame every second frame, as lerobot's films: training reads frames in random order."""
+"""As in lerobot's films, every second frame is a key frame: training reads frames in random order."""
 ROBOT = "robot_uids"
 
 
@@ -34,7 +34,7 @@ class ExportOptions:
     only_successes: bool = False
     """Leave out episodes without success at any step."""
     only_fitting: bool = False
-    """Leave out, and report, episodes that cannot be read or lack a feature of the first one; else raise."""
+    """Leave out, and report, episodes that cannot be read or do not fit the first one; else raise."""
     instruction: str | None = None
     """The task's instruction for language-conditioned policies; None is the task's id."""
     fps: int | None = None
@@ -65,19 +65,20 @@ def export_lerobot(
 ) -> Exported:
     """Write a dataset of these episodes to a new folder.
 
-    Episodes are read and written one by one, so memory use does not grow with their number. A film holds successive
-    episodes. The folder gets its name when it is complete, so that a full disk leaves nothing behind.
+    Episodes are read and written one by one, so memory use does not grow with their number. A film contains
+    several episodes in a row. The folder gets its name when it is complete, so that a full disk leaves
+    nothing behind.
 
     Args:
-        sources: a name for messages and a function that reads the episode.
+        sources: for each episode a name for messages, and a function that reads it.
         folder: must be empty or not exist.
         on_progress: called with the number of finished episodes, and the name of the current one.
 
     Raises:
         UnreadableRecording: an episode cannot be read, or not all of it.
-        DoesNotFit: an episode lacks a chosen feature or one of the first episode.
+        DoesNotFit: an episode lacks a chosen part, or differs from the first one in features or frame rate.
         ValueError: there is no episode to write.
-        OSError: it cannot be written.
+        OSError: the dataset cannot be written.
     """
     folder = Path(folder).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -180,8 +181,8 @@ class _Writer:
         """The frames of an episode for `add`; None if it is left out because it never succeeds.
 
         Raises:
-            DoesNotFit: it cannot be added.
-            UnreadableRecording: it cannot be read, or not all of it.
+            DoesNotFit: the episode cannot be added.
+            UnreadableRecording: the episode cannot be read, or not all of it.
         """
         episode = read_whole(name, read)
         if self._options.only_successes and not _succeeds(episode):
@@ -198,7 +199,8 @@ class _Writer:
             self._robot = episode.info.env_kwargs.get(ROBOT)
         elif features != self._features or fps != self._fps:
             raise DoesNotFit(
-                f"{name} does not go into one dataset with {self._first}: {_difference(self._features, features)}."
+                f"{name} does not fit into a dataset with {self._first}: "
+                f"{_difference(self._features, features)}."
             )
         return frames
 
@@ -246,7 +248,7 @@ class _Writer:
             fps = max(1, round(rate))
             if abs(rate - fps) > 1e-3 and not self._made.notes:
                 self._made.notes.append(
-                    f"The format has integer frame rates only: {rate:.3f} is written as {fps}."
+                    f"The format has only integer frame rates: {rate:.3f} per second is written as {fps}."
                 )
             return fps, 1
         every = round(rate / self._options.fps)
@@ -366,11 +368,11 @@ def _difference(one: dict[str, dict], other: dict[str, dict]) -> str:
         if key not in other:
             return f"it has no {key}"
         if key not in one:
-            return f"only it has {key}"
+            return f"the first one has no {key}"
         if one[key] != other[key]:
             part = next(name for name in one[key] if one[key][name] != other[key].get(name))
-            return f"{key} has the {part} {other[key].get(part)} where the other has {one[key][part]}"
-    return "it has another rate"
+            return f"the {part} of {key} is {other[key].get(part)}, and {one[key][part]} in the first one"
+    return "it has another frame rate"
 
 
 def _write_json(path: Path, content: Any) -> None:

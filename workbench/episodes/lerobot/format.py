@@ -195,7 +195,7 @@ def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:
     if not episode.length:
         raise ValueError("has no step")
     states = np.arange(0, episode.length, choice.every)
-    # Rewards of skipped steps are added to the previous frame, and `done` is kept.
+    # A frame gets the rewards of the skipped steps after it, and is `done` if one of them is.
     rewards = np.add.reduceat(episode.reward.astype(np.float64), states).astype(np.float32)
     done = np.logical_or.reduceat(episode.terminated | episode.truncated, states)
     columns: dict[str, NDArray] = {}

@@ -25,7 +25,7 @@ from workbench.machine.files import open_regular_file
 from workbench.pictures.camera_conventions import intrinsic_from_fov
 
 DEFAULT_FOVY_RADIANS = math.radians(60)
-"""Placeholder: datasets have no camera parameters, and nothing is computed from this."""
+"""Placeholder for the vertical field of view: datasets have no camera parameters."""
 MAX_EPISODES = 100_000
 MAX_FRAMES = 20_000_000
 """Maximum number of frames of a dataset."""
@@ -36,7 +36,7 @@ _NUMBER = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
 def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
-    """The episodes of the dataset in this folder; success means success at some frame.
+    """The episodes of the dataset in this folder; `Facts.success` is success at any frame.
 
     Raises:
         UnreadableRecording: it has an unsupported version, or is broken.
@@ -216,8 +216,8 @@ def _info(folder: Path) -> dict[str, Any]:
         raise _broken(Path(folder), error) from error
     if not version.startswith("v3."):
         raise UnreadableRecording(
-            f"{Path(folder).name} is a LeRobot dataset of version {version}; version 3 can be read. lerobot converts older "
-            "ones: python -m lerobot.datasets.v30.convert_dataset_v21_to_v30."
+            f"{Path(folder).name} is a LeRobot dataset of version {version}; only version 3 can be read. "
+            "Convert an older one with lerobot: python -m lerobot.datasets.v30.convert_dataset_v21_to_v30."
         )
     return info
 

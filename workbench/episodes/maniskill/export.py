@@ -39,7 +39,8 @@ class Demonstrations:
     left_out: int = 0
     """Episodes without success."""
     not_fitting: list[str] = field(default_factory=list)
-    """A sentence for each episode that was left out because it does not fit."""
+    """A sentence for each episode that was left out because it cannot be read or does not fit the first
+    one."""
     lossy: bool = False
     """Whether colour pictures come from recordings, which keep them as JPEG."""
     incomplete: list[str] = field(default_factory=list)
@@ -60,7 +61,7 @@ def export_maniskill(
     when they are complete.
 
     Args:
-        sources: a name for messages and a function that reads the episode.
+        sources: for each episode a name for messages, and a function that reads it.
         file: ends in ``.h5``; neither it nor its ``.json`` may exist.
         only_successes: leave out episodes that never reach success.
         only_fitting: leave out episodes that cannot be read or do not fit the first one.
@@ -70,7 +71,7 @@ def export_maniskill(
         UnreadableRecording: an episode cannot be read, or not all of it.
         OtherDemonstration: an episode has no step, has another task, or was made with other options than the first one.
         ValueError: there is no episode to write, or `file` has another suffix.
-        OSError: it cannot be written.
+        OSError: the files cannot be written.
     """
     file = Path(file).absolute()
     if file.suffix != ".h5":
@@ -109,14 +110,12 @@ def export_maniskill(
                 trajectory = written.create_group(f"traj_{made.episodes}", track_order=True)
                 put_columns(_flat(episode), trajectory)
                 put_pictures(episode, trajectory)
-                # ManiSkill's own files, which have no scene, keep pictures to the bit.
+                # An episode without a scene is from a file of ManiSkill, which keeps pictures without loss.
                 made.lossy |= episode.geometry is not None and any(
                     "rgb" in m for m in shape["pictures"].values()
                 )
                 if missing := missing_pictures(episode):
-                    made.incomplete.append(
-                        f"{name}: its recording lacks some of its observations: {missing}."
-                    )
+                    made.incomplete.append(f"{name}: the recording lacks some observations: {missing}.")
                 document["episodes"].append(
                     {
                         **entry["episodes"][0],
@@ -161,7 +160,7 @@ def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
     for what, wanted in first.items():
         if other[what] != wanted:
             found, expected = short_line(repr(other[what]), 300), short_line(repr(wanted), 300)
-            return f"its {what}: {found}, that of the first recording: {expected}"
+            return f"its {what}: {found}; in the first recording: {expected}"
     return ""
 
 

@@ -138,7 +138,7 @@ def _written(path: Path) -> str:
 
 
 def _actions(node: H5Group | H5Dataset) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """(T, A) with the robots' actions concatenated, and a name for each of the A."""
+    """(T, A) actions of all robots, concatenated, and the names of the A dimensions."""
     parts = [(name, array.reshape(len(array), -1)) for name, array in leaves(node)]
     names = [f"{name or 'action'}[{i}]" for name, array in parts for i in range(array.shape[1])]
     return np.concatenate([array for _, array in parts], axis=1).astype(np.float32), tuple(names)

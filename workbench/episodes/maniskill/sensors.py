@@ -27,9 +27,9 @@ def observed_pictures(episode: Episode) -> dict[str, tuple[Modality, ...]]:
     _, wanted = _wanted(episode)
     found: dict[str, tuple[Modality, ...]] = {}
     for track in _sensors(episode):
-        kept: tuple[Modality, ...] = tuple(m for m in wanted if track.pictures.get(m) is not None)
-        if kept and _is_whole(track, episode):
-            found[track.info.name] = kept
+        modalities: tuple[Modality, ...] = tuple(m for m in wanted if track.pictures.get(m) is not None)
+        if modalities and _is_whole(track, episode):
+            found[track.info.name] = modalities
     return found
 
 
@@ -79,7 +79,8 @@ def put_pictures(episode: Episode, trajectory: h5py.Group) -> None:
 
 
 def _wanted(episode: Episode) -> tuple[list[str], tuple[Modality, ...]]:
-    """Pictures of the observations: (names of those that no recording keeps, modalities of the others)."""
+    """Kinds of pictures in the observations: (names of those that no recording keeps, modalities of the
+    others). All recorded modalities if the observation mode is unknown."""
     mode = episode.info.env_kwargs.get("obs_mode")
     if not isinstance(mode, str):
         held = {modality for track in _sensors(episode) for modality in track.pictures}

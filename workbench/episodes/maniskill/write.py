@@ -52,7 +52,7 @@ def write_h5(episode: Episode, path: Path) -> None:
 
 def put_columns(episode: Episode, trajectory: h5py.Group) -> None:
     """Write the columns of an episode into its group, in the format of `write_h5`."""
-    # Groups in the file by name: asking h5py is slow.
+    # Groups in the file by name: looking them up with h5py is slow.
     groups: dict[tuple[str, ...], h5py.h5g.GroupID] = {(): trajectory.id}
     taken: set[tuple[str, ...]] = set()
 
@@ -164,5 +164,5 @@ def maniskill_json(episode: Episode) -> dict[str, Any]:
 
 
 def _parts(name: str) -> list[str]:
-    """Names of nested groups; HDF5 reads a dot as "here"."""
+    """Names of the nested groups; ``.`` becomes ``_``, because HDF5 reads it as the current group."""
     return ["_" if part == "." else part for part in name.split("/") if part]

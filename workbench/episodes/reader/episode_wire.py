@@ -119,8 +119,8 @@ def unpack_episode(
     names.
 
     Args:
-        process: number of the process that read it.
-        known: shapes that were already received.
+        process: number of the process that read the episode.
+        known: shapes that were already received, by (process, number).
 
     Raises:
         InvalidEpisode: parts do not fit together.

@@ -54,9 +54,9 @@ MAX_MESSAGE_CHARACTERS = 600
 def main() -> None:
     """Run the fork server: ``python -m workbench.episodes.reader.fork_readers SOCKET``.
 
-    Forking takes milliseconds, while starting Python takes half a second. The fork server imports what readers need and
-    reads no recording itself. It has one thread, since a fork copies only one (its environment turns numpy's threads off),
-    and ends when its socket closes; its readers end with it.
+    Forking takes milliseconds, while starting Python takes half a second. The fork server imports what
+    readers need and reads no recording itself. It has only one thread, because a fork copies only one: its
+    environment turns numpy's threads off. When its socket closes, it ends, and its readers with it.
     """
     control = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -124,7 +124,7 @@ class _Reader:
             self._opened.pop(number, None)
 
     def answer(self, request: Request) -> bytes:
-        """The packed answer; packing may run out of memory too."""
+        """The packed answer. Packing is inside the `try`, because it may run out of memory too."""
         try:
             return pack_message(self._answer(request))
         except UnreadableRecording as error:

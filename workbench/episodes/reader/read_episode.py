@@ -46,7 +46,7 @@ from workbench.machine.files import NotARegularFile
 
 MAX_STATES = 10_000_000
 MAX_COLUMN_BYTES = 1 << 29
-"""Maximum described size of one column: the file leaves out repeated rows, so its own size is no bound."""
+"""Maximum described size of one column. The file's size is no bound: repeated rows are left out."""
 
 
 def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
@@ -58,7 +58,7 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     of this env alone, as env 0 of 1. Pictures stay in the file until they are accessed.
 
     Args:
-        path: its .rrd, .h5 or .json.
+        path: the .rrd, .h5 or .json of the recording.
         shapes: shapes to share with other recordings.
 
     Raises:
@@ -105,8 +105,8 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             broken_files.append(_broken_file(files[".h5"], error, "its env states are missing"))
     if table is None and states is None and broken_files:
-        told = " ".join(broken.sentence for broken in broken_files)
-        raise UnreadableRecording(f"{told} Copy it again from where it was recorded.")
+        problems = " ".join(broken.sentence for broken in broken_files)
+        raise UnreadableRecording(f"{problems} Copy the recording again from where it was recorded.")
     if not_json is not None and table is not None:
         broken_files.append(
             _broken_file(files[".json"], not_json, "its tags, its note and the path of its task are missing")
@@ -141,7 +141,7 @@ def _broken_file(file: Path, error: Exception, lost: str) -> BrokenFile:
 
 
 def _read_description(file: Path | None) -> tuple[Description | None, Exception | None]:
-    """The description in the .json (None if it is not ours), and the error if it is not JSON."""
+    """The description in the .json (None if the workbench did not write it), and the read error."""
     if file is None:
         return None, None
     try:
@@ -159,7 +159,8 @@ def _read_description(file: Path | None) -> tuple[Description | None, Exception 
 def _description(
     file: Path | None, not_json: Exception | None, table: RerunTable | None, path: Path
 ) -> Description:
-    """Description of a recording without a .json of ours."""
+    """The description in the .rrd, for a recording without a .json of the workbench. Raises
+    UnreadableRecording."""
     if file is not None and table is None:
         if not_json is not None:
             raise UnreadableRecording(f"{file.name} {not_json}.") from not_json
@@ -285,7 +286,8 @@ _FLAGS = ("success", "fail")
 
 
 def _read_states(path: Path) -> dict[str, Any]:
-    """Content of the .h5, which takes precedence over the same columns of the .rrd because ManiSkill reads it."""
+    """Content of the .h5. It takes precedence over the same columns of the .rrd, because ManiSkill reads the
+    .h5."""
     with open_h5(path) as file:
         group = file.group(TRAJECTORY)
         if group is None:

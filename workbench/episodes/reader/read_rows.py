@@ -52,9 +52,9 @@ _MAX_PICTURE_PIXELS = 4096
 def read_found(folder: Path, found: RecordingFiles, only_names: bool = False) -> list[LibraryEntry]:
     """The recordings in these files: none, one, or one per trajectory.
 
-    A broken file becomes a row that states the problem, so that it is noticed. A ``.json`` of any other kind gives no row.
-    The ``.json`` has everything but rewards and pictures of ManiSkill's trajectories, which are in the ``.h5``; a lone
-    ``.rrd`` must be read through, which takes a tenth of a second or more.
+    A broken file becomes a row that states the problem. A ``.json`` of any other kind gives no row. The
+    ``.json`` has everything but rewards and pictures of ManiSkill's trajectories, which are in the ``.h5``. A
+    lone ``.rrd`` must be read completely, which takes a tenth of a second or more.
 
     Args:
         only_names: skip what is slow: rewards and pictures of trajectories, and the content of a lone ``.rrd``.
@@ -62,7 +62,7 @@ def read_found(folder: Path, found: RecordingFiles, only_names: bool = False) ->
     try:
         entries = _read(folder, found, only_names)
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError) as error:
-        # Untrusted files can raise anything, and one must not hide the others.
+        # Untrusted files can raise anything, and one broken file must not hide the other recordings.
         entries = [_broken(found, f"cannot be read ({error})")]
     if NOTES in found.sizes:
         notes = read_notes(found.path(folder, NOTES))
@@ -115,7 +115,8 @@ def _workbench_entry(found: RecordingFiles, document: Document) -> LibraryEntry:
     except WrongDocument as error:
         written, problem = {}, problem or clean_text(f"{name}.json {error}.", 500)
     for suffix, size in found.sizes.items():
-        # Compares sizes only: checksums are compared at opening, because listing thousands must not read contents.
+        # Compares sizes only: a list of thousands must not read contents. Opening a recording compares
+        # checksums.
         if problem is None and (why := wrong_size(written, suffix, size)) is not None:
             problem = f"{name}{suffix} was cut short or changed: {why}."
     described = document.data["workbench"]
@@ -226,7 +227,7 @@ def _maniskill_entries(
         more = clean_text(f"{name}.json does not describe {listed(others)} of {name}.h5.", 500)
         entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
     if count > most:
-        more = f"{name}.json names {count - most:,} episodes more than the {most:,} that are listed per file."
+        more = f"{name}.json names {count - most:,} more episodes than the {most:,} that are listed per file."
         entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
     return entries
 

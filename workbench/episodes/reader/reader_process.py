@@ -113,7 +113,7 @@ class _ForkServer:
 
     @staticmethod
     def _answer(control: socket.socket) -> int:
-        """Raises Unreadable if the server has ended."""
+        """The number that the server answers. Raises Unreadable if the server has ended."""
         return Unpacker().unpack(control.recv(64), int)
 
     def _end(self) -> None:
@@ -139,16 +139,16 @@ class Reader:
     def __init__(self, folder: Path, writes: Path | None = None) -> None:
         """
         Args:
-            writes: folder that it may write to.
+            writes: folder that the process may write to; None for none.
         """
         self._folder, self._writes = Path(folder), writes
         self._allowed: set[Path] = set()
-        """Other files that it may read: targets of links in the folder."""
+        """Other files that the process may read: targets of links in the folder."""
         self._turns = _FairLock()
         self._pid = 0
         self._line: MessageSocket | None = None
         self._there: tuple[tuple[int, int] | None, ...] = ()
-        """Device and inode of the folder and these files when the current process started."""
+        """Device and inode of the folder and of `_allowed` when the current process started."""
         self._closed: deque[tuple[int, int]] = deque()
         self.process = 0
         """Number of the current process; 0 if there is none."""
@@ -165,7 +165,7 @@ class Reader:
 
         Args:
             seconds: timeout of the answer.
-            patience: timeout of waiting for other requests; None waits forever.
+            patience: timeout in seconds of waiting for other requests; None waits forever.
             process: number of the process that the request refers to, such as one with an open episode.
             stopped: polled a few times a second; once it returns True, the answer is no longer needed.
 
@@ -218,7 +218,8 @@ class Reader:
         return answers
 
     def allow(self, paths: Sequence[Path]) -> None:
-        """Allow it to read these files too. A new reader starts for new paths, without open episodes."""
+        """Allow the process to read these files too. For new paths the process is replaced, and its episodes
+        are closed."""
         with self._turns.hold(None):
             if not self._allowed.issuperset(paths):
                 self._allowed.update(paths)
@@ -270,7 +271,7 @@ class Reader:
             return None
         self._line.end.close()
         self._line, self.process = None, 0
-        # Kills its children too. The fork server reaps it in `exit_code`, so the id cannot have been reused.
+        # Kills the process's children too. Its id cannot have been reused, because only `exit_code` reaps it.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._pid, signal.SIGKILL)
         return fork_server.exit_code(self._pid)
@@ -300,7 +301,7 @@ class _FairLock:
             self._waiting.append(me)
             if not self._changed.wait_for(lambda: self._waiting[0] is me, patience):
                 self._waiting.remove(me)
-                raise ReaderBusy("the process that reads recordings is busy with another one")
+                raise ReaderBusy("the process that reads recordings is busy with another recording")
         try:
             yield
         finally:

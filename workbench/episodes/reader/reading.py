@@ -48,7 +48,7 @@ PICTURE_WAIT_SECONDS = 0.2
 MAX_READERS = 4
 MAX_THUMBNAIL_BYTES = 64 << 10
 _BATCH_ROWS = 8
-"""Number of rows per batch of requests: the reader continues while the last batch goes into the table."""
+"""Number of requests that are sent at once: the reader works on the next one while an answer is unpacked."""
 _JPEG = b"\xff\xd8\xff"
 T = TypeVar("T")
 
@@ -164,8 +164,8 @@ def read_sweep(path: Path) -> SweepResults:
 def recover_confined(folder: Path) -> tuple[Path, ...]:
     """Recover recordings from the journals that dead writers left in `folder`; returns the .rrd of each.
 
-    Foreign folders may contain journals, so a confined process reads them, which may write only below that folder and has
-    limits on memory and time. It starts only if there are journals.
+    A foreign folder may contain journals, so a confined process reads them. It may write only below `folder`,
+    has limits on memory and time, and starts only if there are journals.
 
     Raises:
         RecordingError: files cannot be written, the folder cannot be read, or the process failed; the journals stay.
@@ -245,7 +245,7 @@ def _entries(found: RecordingFiles, answered: Answered | ReaderEnded) -> list[Li
 
 
 def _thumbnail(jpeg: bytes | None) -> bytes | None:
-    """`jpeg` if it may be sent to the browser."""
+    """`jpeg` if it is a JPEG that is small enough for the browser; else None."""
     return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= MAX_THUMBNAIL_BYTES else None
 
 
@@ -269,7 +269,7 @@ def _request(
             answer.message if Path(name).stem in answer.message else f"{name}: {answer.message}"
         )
     if not isinstance(answer, kind):
-        raise UnreadableRecording(f"{name} gave {type(answer).__name__}.")
+        raise UnreadableRecording(f"{name} cannot be read: the reader returned {type(answer).__name__}.")
     return answer, answered.process
 
 
@@ -290,7 +290,7 @@ class _OpenEpisode:
             try:
                 answer = self._ask(camera, modality, index, encoded).answer
             except ReaderEnded as error:
-                # No retry: it would end every new reader too, thirty times a second.
+                # No retry: the picture would end each new reader too, thirty times a second.
                 self._failed = OSError(f"{self._name} {error}")
                 raise self._failed from error
         if isinstance(answer, PictureRead):
@@ -317,8 +317,8 @@ class _OpenEpisode:
 
 
 def find_sources(path: Path) -> list[Source]:
-    """The recordings in a file, or in a folder and the folders below it, by name, including damaged ones, as its library
-    lists them.
+    """The recordings in a file, or in a folder and the folders below it, ordered by name; damaged ones too,
+    as in the library.
 
     Raises:
         UnreadableRecording: a folder cannot be listed.
@@ -367,8 +367,8 @@ def find_all_sources(paths: Sequence[Path]) -> tuple[Source, ...]:
 
     Raises:
         FileNotFoundError: a path does not exist.
-        UnreadableRecording: a file is not a recording, the folders hold none, or one cannot be listed; the message gives the
-            reason.
+        UnreadableRecording: a file is not a recording, the folders have no recording, or a folder cannot be
+            listed; the message gives the reason.
     """
     found: dict[str, Source] = {}
     for path in paths:

@@ -21,7 +21,7 @@ class NewReader(msgspec.Struct, tag=True):
 
     paths: list[Path]
     writes: Path | None = None
-    """Folder that it may write to."""
+    """Folder that the reader may write to; None for none."""
 
 
 class GetExitCode(msgspec.Struct, tag=True):
@@ -60,7 +60,7 @@ class ReadPicture(msgspec.Struct, frozen=True):
     modality: Modality
     index: int
     encoded: bool
-    """Return it encoded."""
+    """Return the picture encoded, as `PictureRead.blob`; else decoded, as `PictureRead.array`."""
 
 
 class CloseEpisodes(msgspec.Struct, frozen=True):

@@ -17,8 +17,8 @@ recording."""
 DATASET_KEY = ["meta", "info"]
 """End of the key of a LeRobot dataset."""
 SETTLE_SECONDS = 3.0
-"""Time in which a folder may change again within one tick of its modification time, or a recording may get its other
-files."""
+"""Time after a change in which a folder may change again within one tick of its modification time, or a
+recording may get its other files."""
 MAX_ENTRIES = 500_000
 """Maximum number of names that are listed: the folder may be a home folder."""
 
@@ -72,9 +72,10 @@ def key_of(path: str) -> str:
 class Scan:
     """Result of `scan_folder`.
 
-    A folder's modification time changes when a name in it is added, removed or replaced, which is how recordings are
-    written. So `is_unchanged` only checks the times of folders. These advance in ticks, and a file within the tick of the
-    last scan would be missed, so a folder with a recent time counts as changed (`fresh`).
+    A folder's modification time changes when a name in it is added, removed or replaced, which is how
+    recordings are written. So `is_unchanged` only checks the times of folders. These advance in ticks, and a
+    file that is added within the tick of the last scan would be missed, so a folder with a recent time counts
+    as changed (`fresh`).
     """
 
     found: dict[str, RecordingFiles] = field(default_factory=dict)
@@ -89,7 +90,7 @@ class Scan:
     """A sentence, if the scan is incomplete."""
 
     def is_unchanged(self) -> bool:
-        """Whether no file was added or removed since; cheap."""
+        """Whether no file was added, removed or replaced since the scan. Checks only the folders' times."""
         if self.fresh or self.problem is not None:
             return False
         try:

@@ -21,7 +21,8 @@ from workbench.episodes.rerun.entities import (
 )
 
 MAX_SERIES = 32
-"""Maximum number of curves of an ``evaluate()`` entry; one with more is not drawn, because it would hide the others."""
+"""Maximum number of curves of an ``evaluate()`` entry; one with more is not drawn, or it would hide the
+rest."""
 MAX_STACKED = 3
 """Maximum number of stacked cameras; more are in tabs, because each would be a narrow strip."""
 EYE_DIRECTION = (0.75, 0.85, 0.6)
@@ -77,7 +78,7 @@ def blueprint_of(arranged: Arrangement) -> rrb.Blueprint:
     scene = rrb.Spatial3DView(
         name="Scene",
         origin=WORLD,
-        # In a 3-D view a depth picture is a point cloud over the meshes.
+        # Without depth and segmentation: in a 3-D view a depth picture is a point cloud over the meshes.
         contents=[
             "$origin/**",
             *(f"- {entity}/{m}" for _, entity, _ in arranged.cameras for m in ("depth", "segmentation")),

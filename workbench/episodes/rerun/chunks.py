@@ -119,7 +119,8 @@ def _text_columns() -> tuple[tuple[rr.ComponentDescriptor, pa.DataType], ...]:
 
 def _lists(numbers: NDArray, kind: pa.DataType, per_row: int) -> pa.Array:
     """`numbers` as rows of type `kind` with `per_row` elements each, which may be fixed-size lists."""
-    # Rows of a journal may be unaligned. Arrow would use them without a copy, on which rerun aborts the process (observed).
+    # Rows of a journal may be unaligned. Arrow would use them without a copy, and rerun would abort the
+    # process (observed).
     flat = pa.array(np.require(numbers.reshape(-1), requirements=["C", "A"]))
     if pa.types.is_fixed_size_list(kind.value_type):
         flat = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)

@@ -202,7 +202,7 @@ _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 """Cache of `_mesh_chunk` by the visual's id, for the life of the visual: the next episode of the scene avoids converting
 megabytes of textures."""
 _MAX_ENTITIES = 64
-"""Maximum number of cached entities per visual. A scene that names bodies by env has one, and a copy, for each env."""
+"""Maximum number of cached entities per visual. A visual has one for each env if body names differ."""
 _encoded: dict[bytes, bytes] = {}
 _MAX_ENCODED_TEXTURES = 256
 _making = threading.Lock()
@@ -234,7 +234,7 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
     look = [visual.name, *map(float, (*material.base_color, material.metallic, material.roughness))]
     extras: dict[str, Any] = {LOOK: json.dumps(look)}
     if material.texture is not None and visual.mesh.uvs is not None and _is_large(material.texture):
-        # Rerun's own texture is uncompressed: the table's of ManiSkill would be three quarters of most recordings.
+        # Rerun stores textures uncompressed: that of ManiSkill's table would be 3/4 of most recordings.
         extras["texture"] = pa.array(np.frombuffer(_webp(material.texture), np.uint8))
     return static_chunk(entity, mesh, rr.AnyValues(**extras))
 
@@ -374,7 +374,8 @@ def _series_names(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 def _series(numbers: Iterable[tuple[str, list[str], NDArray]]) -> Iterator[Chunk]:
     drawn: Counter[str] = Counter()
     for entity, series, _ in numbers:
-        # One view shows all entities of a folder, and those of the batch together with those of the env.
+        # One view draws all entities of a folder, and /batch together with /evaluate: no two should have one
+        # colour.
         folder = entity.split("/")[1].replace("batch", "evaluate")
         if series:
             yield series_chunk(

@@ -35,10 +35,10 @@ warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)
 class RerunTable:
     """The content of an ``.rrd`` by entity and component.
 
-    Rerun's query engine is an extra of 100 MB, but chunks are Arrow tables, so the columns that `layout` wrote can be read as
-    columns. The file is read once, in pieces; pictures are not kept, but read again on access (`pictures`). A mesh is in
-    every recording of its scene, often as the same chunk: a mesh that another recording has loaded is found by the chunk's
-    id, and not decoded again.
+    Rerun's query engine is an extra of 100 MB. But chunks are Arrow tables, so the columns that `write_rrd`
+    wrote can be read without it. The file is read once, in pieces; pictures are not kept, but read again on
+    access (`pictures`). Every recording of a scene has the scene's meshes, often as the same chunks: a mesh
+    that was loaded from another recording is found by the chunk's id, and not decoded again.
 
     The file stays open while its pictures may be read, also after it is deleted.
     """
@@ -159,7 +159,8 @@ class RerunTable:
         return pictures_in(self._file, entity, chunks, modality, info.height, info.width)
 
     def geometry(self, bare: SceneGeometry, entities: Sequence[str]) -> SceneGeometry:
-        """`bare` with the visuals of its bodies, shared with other recordings; `entities` are the bodies'."""
+        """`bare` with the visuals of its bodies, which have these `entities`; shapes are shared with other
+        recordings."""
         visuals: dict[str, tuple[Mesh, Material, list[int]]] = {}
         for body, entity in enumerate(entities):
             number = 0
@@ -210,14 +211,15 @@ class RerunTable:
         )
 
     def _look(self, entity: str, default: str) -> tuple[str, Material]:
-        """Name, and material. Raises ValueError or TypeError."""
+        """Name and material of a visual. Raises ValueError or TypeError."""
         texture = self._texture(entity)
         look = self._one(entity, LOOK, None)
         if look is not None:
             name, *numbers = json.loads(look)
             r, g, b, a, metallic, roughness = map(float, numbers)
             return str(name), Material((r, g, b, a), metallic, roughness, texture)
-        # Files of older versions have the name, and a component for all numbers or one for each.
+        # Files of older versions have a component for the name, and one for all numbers or one for each
+        # number.
         name = str(self._one(entity, "visual", default))
         surface = self._static.get((entity, "surface"))
         if surface is not None:
@@ -297,7 +299,7 @@ def read_properties(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def store_id(path: Path) -> str:
-    """Id of the recording in `path` in messages to rerun's viewer (``viewer_control.proto``).
+    """Id by which messages to rerun's viewer (``viewer_control.proto``) name the recording in `path`.
 
     Raises ValueError, OSError or RuntimeError if there is none.
     """
@@ -355,7 +357,7 @@ class OpenFile:
     def chunks(self, *content: str, is_static: bool | None = None) -> Iterator[Chunk]:
         """Read the chunks of these entities (in rerun's filter syntax), one after the other.
 
-        Raises ValueError or RuntimeError if it is not a complete ``.rrd``.
+        Raises ValueError or RuntimeError if the file is not a complete ``.rrd``.
         """
         yield from self._opened().stream().filter(content=content, is_static=is_static)
 
@@ -420,7 +422,7 @@ def _read_rows(file: OpenFile, entity: str, chunk: str, component: str) -> pa.Ar
                 return read.to_record_batch().column(component)
     except (ValueError, RuntimeError) as error:
         raise OSError(f"{file.name} is damaged: {error}") from error
-    raise OSError(f"{file.name} has changed")
+    raise OSError(f"{file.name} has changed since it was opened")
 
 
 def pictures_in(

@@ -41,7 +41,7 @@ def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: I
     ``LazyChunkStream.write_rrd`` is faster, but writes only one store, and a blueprint is a second one.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: `path` cannot be written.
         Exception: raised by `chunks`.
     """
     with _one_at_a_time, path.open("wb", buffering=0) as file, _copied_to(file) as copy:
@@ -109,7 +109,7 @@ class _Copy(threading.Thread):
         return f"/proc/self/fd/{self._write_end}"
 
     def check(self) -> None:
-        """Raise the error of the file, if there was one."""
+        """Raise the error that writing to the file gave, if any."""
         if self._error is not None:
             raise self._error
 

@@ -86,7 +86,7 @@ def await_port(process: subprocess.Popen[bytes], port: int) -> None:
     deadline = time.monotonic() + START_SECONDS
     while time.monotonic() < deadline:
         if process.poll() is not None:
-            raise RuntimeError(f"rerun ended with {process.returncode} before it was ready.")
+            raise RuntimeError(f"rerun ended with exit status {process.returncode} before it was ready.")
         try:
             socket.create_connection((LOOPBACK, port), timeout=1.0).close()
             return
@@ -126,7 +126,7 @@ class Viewer:
             time.sleep(0.1)
         if status:
             self._says.join(timeout=5.0)
-            raise RuntimeError(f"rerun's viewer ended with {status}; its output is above.")
+            raise RuntimeError(f"rerun's viewer ended with exit status {status}; its output is above.")
 
     def close(self) -> None:
         end(self._process)
@@ -202,12 +202,12 @@ def viewer_file(name: str) -> Path:
 def web_viewer_folder() -> Path:
     """Folder of the web viewer's files ``<name>.gz``; the first call creates them, in about ten seconds.
 
-    The files are embedded in rerun's command, which only serves them, uncompressed (43 MB). So it is started once per
-    version of rerun, on loopback (by default it binds to every address), and the files are stored as gzip (14 MB) in the
-    user's cache. `share.rerun_panel` serves them.
+    The files are embedded in rerun's command, which only serves them, uncompressed (43 MB). So the command is
+    started once per version of rerun, on loopback (by default it binds to every address), and the files are
+    stored as gzip (14 MB) in the user's cache. `share.rerun_panel` serves them.
 
     Raises:
-        RuntimeError: rerun did not serve them, or they cannot be stored.
+        RuntimeError: rerun did not serve the files, or they cannot be stored.
     """
     folder = _cache_path()
     # A page requests all files at once.
@@ -224,7 +224,7 @@ def web_viewer_folder() -> Path:
 
 
 def viewer_is_cached() -> bool:
-    """Whether `web_viewer_folder` has its files."""
+    """Whether the web viewer's files are stored already."""
     return _cache_path().is_dir()
 
 

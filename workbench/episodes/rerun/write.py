@@ -31,7 +31,7 @@ def write_rrd(episode: Episode, path: Path) -> None:
     Chunks are made while rerun writes them, so that the pictures are never all in memory at once.
 
     Raises:
-        OSError: it cannot be written, or a picture cannot be read.
+        OSError: `path` cannot be written, or a picture cannot be read.
         ValueError: rerun refuses a value.
     """
     application_id = _application_id(episode.info)
@@ -103,6 +103,3 @@ def properties(episode: Episode) -> dict[str, dict[str, Any]]:
     # Without the texts, which `source` holds.
     values["workbench"] = {"description": json_text({**described, "source": None})}
     return values
-
-
-# --- blueprint -------------------------------------------------------------------------------------

@@ -47,10 +47,12 @@ _PIXELS: dict[Modality, tuple[tuple[int, ...], str, str]] = {
 class EpisodeWriter:
     """Writes one episode: `append` rows, the state after the reset first, then call `finish` or `discard`.
 
-    The caller must not wait for the disk, memory must stay bounded, and the process may be killed at any moment. So a
-    step only checks and packs a row, which goes into a `Journal`; pictures go to `encode_async`. `finish` makes the files.
+    The caller must not wait for the disk, memory must stay bounded, and the process may be killed at any
+    moment. So `append` only checks a row and queues it in a `Journal`; pictures go to `encode_async`.
+    `finish` makes the files.
 
-    Only one thread at a time may use it; another thread may call `finish`. `len()` is the number of control steps.
+    Only one thread at a time may use a writer; another thread may call `finish`. `len()` is the number of
+    control steps.
     """
 
     def __init__(
@@ -123,7 +125,8 @@ class EpisodeWriter:
 
         Raises:
             ValueError: the row does not fit the episode, which is unchanged.
-            RecordingError: the journal cannot be written, possibly for an earlier row, since writing is delayed.
+            RecordingError: the journal could not be written. Writing is delayed, so an earlier row may have
+                failed.
         """
         number = self._layouts.get(layout)
         items: list[JournalItem] = []
@@ -187,7 +190,7 @@ class EpisodeWriter:
         if self._finished is not None:
             return self._finished
         try:
-            self._journal.finish()  # nothing left to write when an earlier `finish` failed
+            self._journal.finish()  # writes nothing if an earlier call has written all
         except OSError as error:
             raise self._failed(error) from error
         try:
@@ -242,7 +245,7 @@ class EpisodeWriter:
         index = self._cameras.get(picture.key)
         if index is None:
             raise ValueError(
-                f"a picture of {picture.kind} camera {picture.camera}, which the task does not have."
+                f"there is a picture of {picture.kind} camera {picture.camera}, which the task does not have."
             )
         if index in seen:
             raise ValueError(f"camera {picture.camera} gave two pictures of one state.")
@@ -261,7 +264,7 @@ class EpisodeWriter:
         if given != before or not given:
             raise ValueError(
                 f"camera {info.name} gave {', '.join(before) or 'nothing'} first and now "
-                f"{', '.join(given) or 'nothing'}; within a recording they must stay the same."
+                f"{', '.join(given) or 'nothing'}; within a recording its modalities must stay the same."
             )
         return index
 
@@ -330,8 +333,9 @@ class PendingEntries(Future[list[JournalEntry]]):
 class _EncoderPool:
     """Encodes pictures on a few threads: JPEG and zlib release the GIL.
 
-    Colour, depth and segmentation of 128 x 128 take 0.5 ms, of 512 x 512 8 ms: sixteen envs with a camera each would
-    wait for that at every step. The queue is bounded; beyond the limit the caller encodes its own pictures.
+    Colour, depth and segmentation take 0.5 ms for 128 x 128 and 8 ms for 512 x 512: without threads, each
+    step would wait that long for each camera of each env. The queue is bounded; beyond the limit the caller
+    encodes its own pictures.
     """
 
     def __init__(self) -> None:
@@ -381,8 +385,8 @@ _making = threading.Lock()
 
 
 def encode_async(pictures: _Pictures) -> PendingEntries:
-    """Encode `pictures` to journal entries: kind and number of the entry, modality, picture. Do not modify the pictures
-    afterwards."""
+    """Encode `pictures`, each (kind and number of its journal entry, modality, picture), on threads. Do not
+    modify the pictures afterwards."""
     global _pool
     with _making:
         if _pool is None:

@@ -53,9 +53,9 @@ class _NotMade:
 class FilesProcess:
     """Makes files from journals in a subprocess. One thread may call `make`, any thread `is_ready`.
 
-    A thread would compete for the GIL with the env, whose calls of PhysX hold it. Starting the process takes a second of a
-    core and 110 MB. It does not run at the lowest priority, which was no faster and would let journals pile up while all
-    cores are busy.
+    A thread would compete for the GIL with the env, whose calls of PhysX hold it. Starting the process takes
+    a second of a core and 110 MB. The process has normal priority: the lowest one was no faster, and with it
+    journals would pile up while all cores are busy.
     """
 
     def __init__(self) -> None:
@@ -74,7 +74,8 @@ class FilesProcess:
             return self._is_ready
 
     def make(self, journal: Journal, header: Header, states: int) -> EpisodeFiles | None:
-        """Run `make_files` in the subprocess, into the folder of the recordings; None if it failed, possibly halfway."""
+        """Run `make_files` in the subprocess, into the folder of the recordings. Returns None if it failed,
+        perhaps after some files were made."""
         path = journal.path.absolute()
         try:
             # The descriptor passes on the lock: no process recovers the journal meanwhile, even if this process is killed.
@@ -102,8 +103,8 @@ class FilesProcess:
     def _receive(self) -> _Ready | _Made | _NotMade | None:
         """The next message; None if the subprocess has ended."""
         try:
-            said = self._end.recv(_MAX_MESSAGE_BYTES)
-            return self._unpacker.message(said) if said else None
+            received = self._end.recv(_MAX_MESSAGE_BYTES)
+            return self._unpacker.message(received) if received else None
         except (OSError, Unreadable):
             return None
 
@@ -133,7 +134,8 @@ def main() -> None:
 
 def _make(what: _Make, scenes: dict[tuple[int, ...], tuple[Visual, ...]]) -> _Made | _NotMade:
     try:
-        # Episodes of a scene share one file by hard links, and the chunks that are made from its meshes.
+        # Episodes of a scene share one scene file by hard links: with the same visuals, cached mesh chunks
+        # are reused.
         path = what.journal.with_suffix(SCENE_SUFFIX)
         file = os.stat(path)
         key = (file.st_dev, file.st_ino, file.st_mtime_ns, file.st_size)

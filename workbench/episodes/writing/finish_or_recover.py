@@ -51,7 +51,8 @@ def make_files(
 
     Args:
         states: expected number of states, if given.
-        again: whether another process has begun this and ended at any moment; files that it has published are used.
+        again: whether another process may have begun to make the files, and died; files that it published are
+            used.
 
     Raises:
         RecordingError: the files cannot be written; none of them exists then.
@@ -64,7 +65,7 @@ def make_files(
             if episode is None:
                 raise ValueError("the episode has no state yet: its first row is the state after the reset.")
             if states is not None and episode.length + 1 != states:
-                there = f"{episode.length + 1} of {states} states"
+                there = f"only {episode.length + 1} of {states} states"
                 raise OSError(errno.EIO, f"{there} could be read back from {journal.name}")
             if again and (stem := _already_made(header.info, journal, folder)) is not None:
                 rrd, h5, json = (folder / f"{stem}{suffix}" for suffix in SUFFIXES)
@@ -85,7 +86,7 @@ def make_files(
         ) from error
     finally:
         for path in temporaries:
-            # `recover` deletes the rest; an error here must not hide the one above.
+            # Files that cannot be deleted are left to `recover`: an error here must not hide the one above.
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 
@@ -151,7 +152,7 @@ def recover(folder: Path) -> list[EpisodeFiles]:
             try:
                 made += _recover(journal, folder)
             except Exception as error:
-                # Catches every error: a broken journal must not prevent the recovery of the others.
+                # Catches every error: a broken journal must not prevent the recovery of other journals.
                 failed = error
         _remove_strays(folder)
         remove_empty_folder(folder)
@@ -195,7 +196,8 @@ def _recover(journal: Path, folder: Path) -> list[EpisodeFiles]:
 
 
 def _already_made(info: EpisodeInfo, journal: Path, folder: Path) -> str | None:
-    """The stem of its files if the writer had published all of them; deletes the files of an incomplete publication."""
+    """The stem of the episode's files, if the writer published all of them. Else deletes those that it
+    published, and returns None."""
     temporaries = dict(zip(SUFFIXES, temporary_files(journal)))
     for stem in _stems(folder, episode_stem(info)):
         if _id_of(folder / f"{stem}.json") == info.id:
@@ -227,6 +229,6 @@ def _id_of(path: Path) -> str | None:
 def _remove_strays(folder: Path) -> None:
     """Delete temporary files without a journal, left by a writer that died during its cleanup."""
     for path in (folder / FOLDER).glob("*"):
-        kept = (path.with_suffix(suffix) for suffix in (".arrow", DAMAGED_SUFFIX))
-        if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not any(one.exists() for one in kept):
+        journals = (path.with_suffix(suffix) for suffix in (".arrow", DAMAGED_SUFFIX))
+        if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not any(one.exists() for one in journals):
             path.unlink(missing_ok=True)

@@ -60,7 +60,7 @@ def header_from(text: str, visuals: tuple[Visual, ...]) -> Header:
     num_envs, names, kinds, hidden = data["bodies"]
     # Validates the kinds: a damaged journal may hold kinds that readers of the files would reject.
     scene = msgspec.convert({"body_names": names, "body_kinds": kinds, "body_hidden": hidden}, SceneJson)
-    # Journals of older versions hold an object, without a seal.
+    # In journals of older versions `info` is an object, and there is no seal.
     info = data["info"] if isinstance(data["info"], str) else json.dumps(data["info"])
     return Header(
         info=_info_from(json.loads(info)),

@@ -34,7 +34,7 @@ SYNC_SECONDS = 0.4
 _BATCH_BYTES = 2 << 20
 """Queued bytes from which `append` writes by itself, so that memory stays bounded if the disk is slower than the episode."""
 _MAX_CACHED_BATCHES = 4
-"""Maximum number of cached batches while reading: pictures of the same states are read camera by camera."""
+"""Maximum number of cached batches while reading: each batch is read again for every camera."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 _BEGIN = _SCHEMA.serialize().size
 """Offset of the first batch."""
@@ -123,7 +123,7 @@ class Journal:
             if not isinstance(item, JournalEntry):
                 item.add_done_callback(self._count_bytes)
         if full:
-            self.write()  # an error is raised by the next `append`: this state is queued
+            self.write()  # an error is raised by the next `append`, because this state is queued already
 
     def write(self) -> None:
         """Write what is queued, so that it survives the death of the process."""
@@ -153,9 +153,10 @@ class Journal:
                 self._waiting_bytes += sum(map(_size, made.result()))
 
     def sync(self) -> None:
-        """Write what is queued and sync it, so that it survives a power cut. The next `append` raises an error of this.
+        """Write what is queued and sync it, so that it survives a power cut. If this fails, the next `append`
+        raises.
 
-        Rows can be written meanwhile, since a sync may take long.
+        A sync may take long; other threads can write rows meanwhile.
         """
         self.write()
         with self._syncing:
@@ -204,7 +205,7 @@ class Journal:
 
 
 def _resolve(items: Sequence[JournalItem]) -> tuple[list[JournalEntry], int, OSError | None]:
-    """(entries, number of resolved items, error): on an error only the entries of complete states before it."""
+    """(entries, number of items that gave them, error). With an error, only the complete states before it."""
     entries: list[JournalEntry] = []
     whole, done = 0, 0
     for number, item in enumerate(items, 1):
@@ -254,8 +255,8 @@ def _create(path: Path) -> int:
 class _JournalThreads:
     """Threads that periodically write and sync all journals of this process, while there are any.
 
-    There are two, since a sync may hang with the disk: unsynced data are written anyway, and a killed process does not lose
-    them.
+    There are two threads, because a sync may hang with the disk. Rows are written meanwhile, so that they
+    survive if the process is killed.
     """
 
     def __init__(self) -> None:
@@ -313,7 +314,7 @@ _journal_threads = _JournalThreads()
 def before_writing(flush: Callable[[], None]) -> None:
     """Call the bound method `flush` before each write, while its object lives, for a caller that batches rows.
 
-    It runs on the journals' thread and must not raise.
+    `flush` runs on the journals' thread and must not raise.
     """
     _journal_threads.flush_first.append(weakref.WeakMethod(flush))
 
@@ -366,8 +367,9 @@ class JournalReader:
                 raise
 
     def lost_bytes(self) -> int:
-        """Number of bytes from the batch on at which the last iteration ended, if complete batches follow it: then the journal
-        was damaged, not cut short. 0 if only the batch that was being written is lost. Raises OSError."""
+        """Number of bytes from the batch that ended the last iteration, if a complete batch follows it: then
+        the journal is damaged, not cut short. 0 if only the batch that was being written is lost. Raises
+        OSError."""
         size, at = self._file.size, self._end
         while (at := self._find_batch(at + 1, size)) < size:
             try:
@@ -420,7 +422,7 @@ def claim(path: Path) -> int | None:
     """
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):
-            return None  # not written by a writer
+            return None  # not a journal
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
         return None

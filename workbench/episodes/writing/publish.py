@@ -15,7 +15,7 @@ from workbench.machine.files import give_name
 
 
 class RecordingError(OSError):
-    """An episode could not be written; the message gives advice. No file is left."""
+    """An episode could not be written; the message gives advice. None of its files is published."""
 
 
 def try_folder(folder: Path) -> None:
@@ -58,7 +58,8 @@ def sync_files(paths: Sequence[Path]) -> None:
 
 
 def publish(temporaries: Sequence[Path], folder: Path, stem: str) -> list[Path]:
-    """Link finished files (``<id>.rrd``, ``<id>.h5`` ...) to the first stem that is free for all of them, in order.
+    """Link finished files (``<id>.rrd``, ``<id>.h5`` ...), in order, to the first stem that is free for all
+    of them.
 
     The .json comes last: **a recording without a .json does not exist.** Racing processes get different names. The
     temporaries stay if the filesystem supports links.

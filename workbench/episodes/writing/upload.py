@@ -40,7 +40,7 @@ def upload_episode(files: EpisodeFiles, address: str) -> None:
     """Upload the files of an episode, and delete them here.
 
     Raises:
-        RecordingError: it failed; without a .json the episode does not exist at the address.
+        RecordingError: the upload failed; without its .json, the episode does not exist at the address.
     """
     system, path = _place(address)
     try:
