@@ -156,7 +156,7 @@ class GatedServer:
             ValueError: the server requires no token.
         """
         if not self.options.token:
-            raise ValueError("This page requires no token, so there is none to renew.")
+            raise ValueError("This page asks for no token; there is none to renew.")
         token = secrets.token_urlsafe(32)
         self._access_check.rules = replace(self._access_check.rules, token=token)
         self._gated.close_pages("the token was renewed")

@@ -227,14 +227,14 @@ def _scripts() -> str:
 # them one by one and finds the page broken.
 # - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not
 #   unsafe-inline: a script in a name, a note or a file that slipped past escaping still would not run.
-#   wasm-unsafe-eval is for the program that decodes the server's messages. eval stays forbidden: viser needs it for Gaussian splats and Plotly, which the workbench
-#   does not use (web_assets/browser.js).
+#   wasm-unsafe-eval is for the program that decodes the server's messages. eval stays forbidden: viser needs
+#   it for Gaussian splats and Plotly, which the workbench does not use (web_assets/browser.js).
 # - worker-src blob: viser's connection and its sorting run in workers made from strings.
 # - style-src 'unsafe-inline': viser's widgets and our HTML have inline styles; a style runs no code.
 # - img-src data: blob: pictures from the websocket, and viser's icons.
 # - connect-src: only this server. viser's page would connect to any server that its address names
-#   (?websocket=, ?playbackPath=).
-#   data: and blob: are textures and programs of the page. The websocket is listed for browsers where 'self' excludes ws:.
+#   (?websocket=, ?playbackPath=). data: and blob: are textures and programs of the page. The websocket is
+#   listed for browsers where 'self' excludes ws:.
 # - frame-src 'self': rerun's viewer.
 DIRECTIVES: dict[str, str] = {
     "default-src": "'none'",
