@@ -25,7 +25,7 @@ KEY_NAMES = {
     "delete": "Delete",
 }
 MODIFIERS = "ctrl", "alt", "shift"
-"""In the order in which a key lists them. On a Mac ``ctrl`` is also Cmd."""
+"""Modifiers, in the order in which the name of a key lists them. On a Mac ``ctrl`` is also Cmd."""
 
 
 class Refused(ValueError):
@@ -44,7 +44,7 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """
 
     key: ClassVar[str] = ""
-    """Key that triggers it with its default values: ``s``, ``shift+arrowleft``, ``ctrl+z``."""
+    """Key that sends the command with its default values: ``s``, ``shift+arrowleft``, ``ctrl+z``."""
     context: ClassVar[str] = "page"
     """Where the key works: ``page``, or while an element with this ``data-context`` is visible."""
     repeats: ClassVar[bool] = False
@@ -57,7 +57,8 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     @classmethod
     def is_in_palette(cls) -> bool:
-        """Whether the palette lists it: its name alone is enough, without field values."""
+        """Whether the palette lists the command: it needs no values, is not for a dialog, and is not a page's
+        report."""
         alone = not any(field.required for field in msgspec.structs.fields(cls))
         return alone and cls.context != "dialog" and not cls.__name__.startswith("Tell")
 
@@ -77,7 +78,7 @@ class Key:
 
 
 class CommandList:
-    """All commands, in groups with a heading each."""
+    """All commands, in groups with a heading each. Names are unique, and so are keys within a context."""
 
     def __init__(self, groups: Mapping[str, Iterable[type[Command]]]) -> None:
         self.groups = {heading: tuple(kinds) for heading, kinds in groups.items()}
@@ -114,6 +115,8 @@ class CommandList:
 
 
 def is_key(key: str) -> bool:
+    """Whether a key is in the normal form: modifiers in the order of `MODIFIERS`, then a lower-case character
+    or a name in `KEY_NAMES`, joined by ``+``."""
     *held, last = key.split("+")
     known = len(last) == 1 and last == last.lower() or last in KEY_NAMES
     return known and held == [name for name in MODIFIERS if name in held]

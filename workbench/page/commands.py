@@ -32,23 +32,23 @@ class ShowTab(Command, frozen=True):
 
 
 class TellOpenTab(Command, frozen=True):
-    """Report from the page: the open tab."""
+    """Report from the page which tab is open."""
 
     tab: str
 
 
 class TellUnfolded(Command, frozen=True):
-    """Report from the page: a panel was unfolded."""
+    """Report from the page that a panel was unfolded."""
 
     panel: str
 
 
 class TellDrawnInSoftware(Command, frozen=True):
-    """Report from the page: the browser renders the view in software."""
+    """Report from the page that the browser renders the view in software."""
 
 
 class ToggleTable(Command, frozen=True):
-    """Open or close the table: of envs, or the library."""
+    """Open or close the table of envs, or the library."""
 
     key = "b"
 

@@ -120,7 +120,10 @@ def test_a_failing_route_is_reported_and_its_error_logged(caplog: pytest.LogCapt
         raise ZeroDivisionError
 
     made = answer("/a/x", {"/a/": (fails, {})})
-    assert (made.status_code, bytes(made.body)) == (500, b"This went wrong; the terminal says how.")
+    assert (made.status_code, bytes(made.body)) == (
+        500,
+        b"This request failed; the terminal shows the error.",
+    )
     assert caplog.records[0].exc_info and caplog.records[0].exc_info[0] is ZeroDivisionError
 
 

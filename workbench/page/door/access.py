@@ -55,22 +55,23 @@ class Admitted:
 
 @dataclass(frozen=True)
 class Entered:
-    """The right token was in the address: set the cookie, then go to ``location``."""
+    """The right token was in the address: set the cookie, then redirect to ``location``."""
 
     location: str
     set_cookie: str
     by_page: bool
-    """Whether the browser followed a link on another site. A redirect would keep that site as its initiator, and the browser
-    would not send a Strict cookie with it; a small page that redirects by itself makes us the initiator."""
+    """Whether the browser followed a link on another site. An HTTP redirect would keep that site as the
+    initiator, and the browser would not send a SameSite=Strict cookie; if a page of ours redirects instead,
+    we are the initiator."""
 
 
 class Why(Enum):
     """Reason for refusing a request."""
 
     NAME = "name"
-    """Its Host is not a name of this server."""
+    """The Host header is not a name of this server."""
     SITE = "site"
-    """A page of another site made it."""
+    """A page of another site made the request."""
     NO_TOKEN = "no token"
     OTHER_TOKEN = "other token"
     """A wrong token, or one that was replaced by a new one."""
@@ -86,7 +87,7 @@ class RefusedRequest:
 Decision = Admitted | Entered | RefusedRequest
 
 _OTHER_TOKEN = (
-    "Its token is not valid for this workbench. Each start makes a new one, and so does renewing it."
+    "Its token is not valid. Each start of the workbench makes a new token, and so does renewing the token."
 )
 
 
@@ -126,9 +127,9 @@ def is_loopback(host: str) -> bool:
 def host_is_ours(rules: AccessRules, host: str) -> bool:
     """Whether ``host`` is a name of this server.
 
-    The port is not compared: with ``ssh -L 9000:localhost:8080`` or a container's port map the browser sends another one.
-    That is safe: rebinding makes a *foreign name* point here, and no attacker can re-point ``localhost`` or a bare IP
-    address.
+    The port is not compared: with ``ssh -L 9000:localhost:8080`` or a container's port map the browser sends
+    another port. That is safe: rebinding makes a *foreign name* point here, and no attacker can re-point
+    ``localhost`` or a bare IP address.
     """
     if is_loopback(host) or host in rules.names:
         return True
@@ -142,8 +143,8 @@ def cookie_name(port: int) -> str:
 
 
 def _cookies(headers: Sequence[str], name: str) -> list[str]:
-    """All values of the cookie ``name``. Another server on the host may set the same name for a narrower path, and
-    must not hide the right value."""
+    """All values of the cookie ``name``: another server on the host may set a cookie of this name for a
+    narrower path, which must not hide the right value."""
     pairs = (part.strip().partition("=") for header in headers for part in header.split(";"))
     return [value for key, _, value in pairs if key == name]
 
@@ -199,7 +200,7 @@ def decide(rules: AccessRules, asked: RequestParts) -> Decision:
     opened_by_link = list(asked.fetch_mode) == ["navigate"] and list(asked.fetch_dest) == ["document"]
     foreign = any(site not in ("same-origin", "none") for site in asked.fetch_site)
     if foreign and not opened_by_link and not asked.websocket:
-        return RefusedRequest(Why.SITE, "It was made by a page of another site.")
+        return RefusedRequest(Why.SITE, "It came from a page of another site.")
 
     if rules.token is None:
         return Admitted(asked.host[0])

@@ -20,8 +20,8 @@ REMOTE_TRIP_SECONDS = 0.003
 MAX_QUEUE_SECONDS = 0.05
 """Longest time that a message may wait behind others in the connection."""
 ANSWER_TIMEOUT_SECONDS = 0.25
-"""Timeout for an answer, in addition to the shortest round trip; after it no more messages are sent, since the
-connection has become slower."""
+"""Timeout for an answer, in addition to the shortest round trip. After this time the connection has become
+slower: no message is sent until the answer arrives."""
 SAMPLES = 20
 """Number of the last answers from which the connection's rate is computed."""
 
@@ -29,16 +29,20 @@ SAMPLES = 20
 @dataclass(frozen=True)
 class _Sent:
     at: float
+    """Seconds of the event loop's clock."""
     size: int
+    """Bytes."""
     answered_before: int
+    """Bytes that the page had acknowledged when this message was sent."""
 
 
 class PageConnection:
     """Sends viser's messages to one page as fast as it acknowledges them.
 
-    A socket buffers megabytes before a sender has to wait, and so does ``ssh -L``: seconds on a slow connection, and the
-    reply to a click waits behind them. So each message is followed by a ping, which a browser answers when it has read
-    everything before it. While `send` waits, viser collects changes and later sends only the newest.
+    A socket buffers megabytes before a sender has to wait, and so does ``ssh -L``. On a slow connection these
+    take seconds, and the reply to a click waits behind them. So each message is followed by a ping, which a
+    browser answers when it has read everything before the ping. While `send` waits, viser collects changes
+    and later sends only the newest.
 
     Used on the event loop of the connection.
     """
@@ -61,7 +65,7 @@ class PageConnection:
         """Send a message as soon as there is room; raises the error of `websockets` if the page has left."""
         async with self._turn:
             if math.isinf(self._trip):
-                # Measure before the first message, which may be the largest.
+                # Measure the round trip before the first message, which may be the largest.
                 await self._probe()
             while not self._has_room():
                 self._freed.clear()
@@ -83,7 +87,7 @@ class PageConnection:
             return True
         if self._loop.time() - self._sent[0].at > self._trip + ANSWER_TIMEOUT_SECONDS:
             return False
-        # Allow one message beyond the limit, or there would never be two large ones in transit.
+        # Allow one message beyond the limit, or two large messages would never be in transit at once.
         return self.unanswered <= max(self._rates, default=0.0) * (self._trip + MAX_QUEUE_SECONDS)
 
     def _on_answer(self, sent: _Sent, pong: asyncio.Future[float]) -> None:
@@ -106,7 +110,8 @@ class PageConnection:
 class WhenFar(PerMessageDeflate):
     """Compresses sent messages while `on`.
 
-    Unchanged poses are found in previous messages, up to 32 kB back. On the same machine compression gains nothing.
+    deflate finds unchanged poses in previous messages, up to 32 kB back. On the same machine compression
+    gains nothing.
     """
 
     on = False
@@ -119,7 +124,8 @@ class CompressWhenFar(ServerPerMessageDeflateFactory):
     """Negotiates `WhenFar`; for ``extensions`` of `websockets`."""
 
     def __init__(self) -> None:
-        # Level 3: level 6 saves one sixth more for twice the time. The page's own messages are short.
+        # Level 3: level 6 saves one sixth more for twice the time. A small window: messages from the page are
+        # short.
         super().__init__(client_max_window_bits=10, compress_settings={"level": 3})
 
     def process_request_params(

@@ -101,7 +101,7 @@ class ViewerCameraMessage(ClientMessage):
         _check_numbers(*self.position, *self.look_at, *self.up_direction, self.near, self.far)
         if not 0 < self.fov < math.pi:
             raise ImpossibleValue("a field of view that no camera has")
-        # 0 by 0 is the view of a page that has folded it.
+        # A page whose view is folded reports 0 by 0.
         if not (0 <= self.image_height <= MAX_SIDE_PIXELS and 0 <= self.image_width <= MAX_SIDE_PIXELS):
             raise ImpossibleValue("a size that no page has")
 

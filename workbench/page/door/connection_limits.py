@@ -30,8 +30,8 @@ MAX_WITHOUT_TOKEN = 64
 MAX_HEAD_BYTES = 64 * 1024
 """Maximum size of a request's head. The head carries cookies of other programs on the same host name, up to 4 kB each."""
 READ_BYTES = 16 * 1024
-"""Maximum size of one read. `websockets` parses everything that was read before anything else runs, and a quarter of a
-megabyte of frames of six bytes blocks the event loop for a third of a second."""
+"""Maximum size of one read. `websockets` parses all bytes of a read before anything else runs: 256 kB of
+six-byte frames block the event loop for a third of a second."""
 
 _TOO_LONG = Response(
     431,
@@ -44,10 +44,12 @@ _TOO_LONG = Response(
 class ConnectionLimits:
     """All connections that have not presented the token yet. Used on their event loop.
 
-    A connection costs a task and its buffers before anything is known about it, so its duration, the size of its head and
-    the number of such connections are limited. If there are too many, the oldest is closed, not the newest: a browser sends
-    its request with the first packet, and idle sockets of an attacker must not lock it out. (Chromium holds some idle
-    sockets itself, and opens new ones when they are closed.)
+    A connection costs a task and buffers before its client has presented the token, so until then its
+    duration and the size of its head are limited, and so is the number of such connections. If there are too
+    many, the oldest is closed, not the
+    newest: a browser sends its request with the first packet, and idle sockets of an attacker must not lock
+        the browser out.
+    (Chromium holds some idle sockets itself, and opens new ones when they are closed.)
     """
 
     def __init__(self, told: RateLimitedLog) -> None:
@@ -138,17 +140,17 @@ READ_TIMEOUT_SECONDS = 30.0
 """Timeout for a client to read something. A busy page (a large scene rendered in software) reads nothing for some
 seconds."""
 _CHECKS = 30
-"""Number of checks of the unsent bytes in that time."""
+"""Number of checks of the unsent bytes in `READ_TIMEOUT_SECONDS`."""
 
 
 def unsent(connection: ServerConnection) -> int:
-    """Bytes that were written for this client and not acknowledged by its machine."""
+    """Bytes that were written for this client and that the client's machine has not acknowledged."""
     waiting = connection.transport.get_write_buffer_size()
     sock = connection.transport.get_extra_info("socket")
     if sock is None or sock.fileno() < 0:
         return waiting
-    # For a socket this is SIOCOUTQ (tcp(7)). Without it a slow connection would look stalled: the kernel accepts some
-    # megabytes at once, and then nothing until a third of them has been sent.
+    # For a socket, TIOCOUTQ is SIOCOUTQ (tcp(7)). Without these bytes a slow connection would look stalled:
+    # the kernel accepts some megabytes at once, and then nothing until a third of them has been sent.
     (in_kernel,) = struct.unpack("i", fcntl.ioctl(sock.fileno(), termios.TIOCOUTQ, bytes(4)))
     return waiting + in_kernel
 
@@ -158,12 +160,13 @@ async def close_when_stalled(
 ) -> None:
     """Close the connection when its client has read nothing for `READ_TIMEOUT_SECONDS`. Run it as a task of the connection.
 
-    A suspended browser or a sleeping laptop behind ``ssh -L`` keeps its connection open for hours. The data queued for it
-    is bounded, but it counts as a viewer, for whom pictures are rendered, and viser stores every removal until each client
-    has read it. The ping of `websockets` would wait behind the unsent bytes.
+    A suspended browser or a sleeping laptop behind ``ssh -L`` keeps its connection open for hours. The data
+    queued for it is bounded, but pictures are rendered for it as for any open page, and viser stores every
+    removal until each client has read it. The ping of `websockets` would wait behind the unsent bytes.
 
-    The client is stalled if bytes are queued and no check finds fewer than the previous one; new bytes written meanwhile do
-    not matter. A slow connection accepts some from time to time. A page that wakes up reconnects and gets the present state.
+    The client is stalled if bytes are queued and no check finds fewer bytes than the previous check; new
+    bytes written meanwhile do not matter. A slow client reads some bytes from time to time. A page that wakes
+    up reconnects and gets the present state.
 
     Args:
         unanswered: Returns the bytes that the page has not acknowledged, see `PageConnection.unanswered`.
@@ -177,7 +180,8 @@ async def close_when_stalled(
         before = left
     told.happened(
         "stalled",
-        f"Closed a browser's connection: it has read nothing for {READ_TIMEOUT_SECONDS:.0f} s. It may reconnect at any time.",
+        f"Closed the connection of a browser that has read nothing for {READ_TIMEOUT_SECONDS:.0f} s. "
+        "The browser may reconnect.",
     )
     connection.transport.abort()
 
@@ -193,10 +197,12 @@ MAX_LINE_CHARACTERS = 300
 
 
 class RateLimitedLog:
-    """Logs each kind of event at once, then again after `pause` seconds, after twice that, and so on. Thread-safe.
+    """Logs each kind of event at once, then again after `pause` seconds, after twice that time, and so on.
+    Thread-safe.
 
     Args:
         say: Prints one line.
+        pause: Seconds of the first pause.
     """
 
     def __init__(self, say: Callable[[str], None] = log.warning, pause: float = PAUSE_SECONDS) -> None:
@@ -204,7 +210,7 @@ class RateLimitedLog:
         self._silent_until: dict[Hashable, float] = {}
         self._pauses: dict[Hashable, float] = {}
         self._untold: dict[Hashable, tuple[int, str]] = {}
-        """Number of lines held back, and the last of them."""
+        """Number of lines held back, and the last of these lines, by kind."""
         self._lock = threading.Lock()
 
     def happened(self, kind: Hashable, sentence: str, error: BaseException | None = None) -> None:
@@ -243,6 +249,7 @@ class RateLimitedLog:
             self._say(line)
 
     def _forget(self) -> tuple[str, ...]:
+        """Reset all kinds; returns the lines that were held back."""
         rest = tuple(_line(sentence, times) for times, sentence in self._untold.values())
         self._silent_until.clear()
         self._pauses.clear()

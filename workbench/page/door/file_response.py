@@ -37,8 +37,8 @@ class FileReply:
 
 
 Handler = Callable[[str, Mapping[str, str]], tuple[int, str, bytes] | FileReply]
-"""Gets the path after its prefix (decoded, no ``..``, no backslash, no NUL) and the fields of the query; returns status,
-content type and body, or a file. Runs in a thread, so it may read files."""
+"""Gets the path after the route's prefix (decoded, no ``..``, no backslash, no NUL) and the fields of the query;
+returns status, content type and body, or a file. Runs in a thread, so it may read files."""
 AddRoute = Callable[[str, Handler, Mapping[str, str]], object]
 """Adds a route: its prefix, its handler, and headers of every reply."""
 
@@ -162,12 +162,12 @@ class Downloads:
         """The address of a file, from the root of the server; the same for the same file.
 
         Args:
-            kind: Its content type.
+            kind: Content type of the file.
             download: Whether the browser saves it instead of showing it.
         """
         path = Path(path).absolute()
         reply = FileReply(path, kind, download_as=path.name if download else None)
-        # The same for the same file, and unknown to others.
+        # A keyed hash: equal replies get the same address, and nobody can guess it without the secret.
         key = hashlib.blake2b(repr(reply).encode(), key=self._secret, digest_size=16).hexdigest()
         self._files[key] = reply
         return f"{PREFIX}{key}/{_quoted(path.name)}"

@@ -58,7 +58,7 @@ class ServerOptions:
     """0 takes any free port. If 8080, the default, is taken, the next free one is used and printed."""
     socket: Path | None = None
     """Listen on a Unix socket at this path instead, to which only its owner can connect; `port` is then the port at the
-    other end of ``ssh -L``, and `host` is ignored."""
+    other end of ``ssh -L``, and `host` must be the default."""
     token: bool = True
     """Require the token of the printed address. False is allowed only on a loopback port."""
 
@@ -73,13 +73,13 @@ class ServerOptions:
             raise ValueError("Give a socket or a host to listen on, not both.")
         if self.socket is not None and not self.token:
             raise ValueError(
-                "The other end of ssh -L is a port of that machine, to which everyone there can connect. Leave the "
-                "token on."
+                "With a socket, ssh -L opens a port on your own machine, and all users of that machine can connect "
+                "to it. Leave the token on."
             )
         if not self.token and not access.is_loopback(self.host.lower()):
             raise ValueError(
                 f"Without a token everyone who can reach {self.host} could run code on this machine through the "
-                "page. Leave the token on, or listen on 127.0.0.1 and come in over ssh -L."
+                "page. Leave the token on, or listen on 127.0.0.1 and connect over ssh -L."
             )
 
 
@@ -114,12 +114,13 @@ class GatedServer:
         return self._access_check.turned_away
 
     def add_route(self, prefix: str, handler: Handler, headers: Mapping[str, str] | None = None) -> None:
-        """Add a route for GET requests below ``prefix`` (``/recordings/``), behind the same checks. The longest prefix wins.
+        """Add a route for GET requests below ``prefix`` (``/recordings/``), behind the checks. The longest
+        prefix wins.
 
         Args:
             prefix: begins and ends with a slash.
             handler: see `file_response.Handler`. If it raises, the browser gets a 500 and the log the traceback.
-            headers: added to every reply; they replace the server's own of the same name (such as the
+            headers: added to every reply; they replace the server's own headers of the same name (such as the
                 Content-Security-Policy).
         """
         if len(prefix) < 3 or not prefix.startswith("/") or not prefix.endswith("/"):
@@ -131,7 +132,7 @@ class GatedServer:
         self._routes[prefix] = (handler, dict(headers or {}))
 
     def add_channel(self, path: str, serve: viser_private.Serve) -> None:
-        """Serve WebSockets that pages open at this path, behind the same checks."""
+        """Serve WebSockets that pages open at this path, behind the checks."""
         self._gated.channels[path] = serve
 
     @property
@@ -179,6 +180,7 @@ class _AccessCheck:
         self.rules = rules
         self.turned_away = 0
         self.tells = False
+        """Whether refusals are counted and reported; not during the server's own test."""
         self._refuse = refusals(example)
         self._told = told
 
@@ -252,7 +254,7 @@ def open_server(options: ServerOptions = ServerOptions(), label: str | None = No
     wide = (
         f"Listening on {options.host}, port {listening.port}: everyone who can reach this machine can send requests, and "
         "the token and everything on the page travel unencrypted. Anyone with the address and its token can run code "
-        "here. On a network that you do not trust, listen on 127.0.0.1 and come in over ssh -L."
+        "here. On a network that you do not trust, listen on 127.0.0.1 and connect over ssh -L."
     )
     if listening.loopback:
         wide = ""
@@ -303,6 +305,6 @@ def _test_refusal(listening: Listening) -> None:
         knock.close()
     if status != 403:
         raise ServerError(
-            f"The page is not protected: a request that must be refused got {status}. "
+            f"The page is not protected: a request that must be refused got the status {status}. "
             f"viser {viser.__version__} is installed. The tested versions: {command_for_tested_versions()}"
         )

@@ -37,11 +37,13 @@ class Listening:
     port: int
     """Port in the address that a browser on this machine or behind `ssh_hint` opens."""
     bound_host: str
+    """Address that the socket is bound to."""
     loopback: bool
     """Whether only this machine can connect."""
     path: Path | None = None
     """Path of the Unix socket; None for a TCP port."""
     inode: int = 0
+    """Inode of the Unix socket's file, by which `remove` recognizes it."""
 
     @property
     def authority(self) -> str:
@@ -55,7 +57,7 @@ class Listening:
 
     def hosts_elsewhere(self) -> tuple[str, ...]:
         """This machine's name and addresses for browsers on other machines. When listening on every interface, loopback is
-        last: outside a container it is the address that works, through the published port."""
+        last: for a container's published port, loopback is the address that works on the host."""
         if self.loopback:
             return ()
         address = ipaddress.ip_address(self.bound_host.partition("%")[0])
@@ -186,6 +188,11 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def _make_room(place: Path) -> None:
+    """Remove the socket of a killed workbench.
+
+    Raises:
+        ServerError: Something else is at this path, or a program listens there.
+    """
     try:
         found = place.lstat()
     except FileNotFoundError:
@@ -207,8 +214,8 @@ def _make_room(place: Path) -> None:
 
 
 def _reach(host: str) -> str:
-    """``host`` for a URL: IPv6 in brackets; for "every interface", the address of the interface with the default route.
-    Connecting a datagram socket sends nothing."""
+    """``host`` for a URL: IPv6 in brackets; for "every interface", the address of the interface with the
+    default route, found by connecting a datagram socket, which sends nothing."""
     address = ipaddress.ip_address(host.partition("%")[0])
     if not address.is_unspecified:
         return _in_address(address)

@@ -18,8 +18,9 @@ from workbench.page.door.connection_limits import RateLimitedLog
 MESSAGES_PER_SECOND = 200.0
 """Maximum sustained rate of a page; a drag sends about twenty messages a second."""
 BURST_MESSAGES = 400.0
+"""Maximum number of messages at once before a page is slowed down."""
 MESSAGE_BYTES = 2048
-"""Block size: a message counts once for each block."""
+"""Block size: a message counts once, and once more for each full block."""
 MAX_SLOWED_SECONDS = 5.0
 """Maximum time that a page is slowed down without a pause; then its connection is closed."""
 MESSAGES_PER_TURN = 16
@@ -27,12 +28,13 @@ MESSAGES_PER_TURN = 16
 
 
 class PageGuard:
-    """The message filter of one connection. Used on its event loop.
+    """The message filter of one connection. Used on the connection's event loop.
 
-    Commands use another channel (`widgets/visitors.py`): this one carries the camera of the view, clicks in it, gizmos and
-    the palette. A message that no viser page sends closes the connection. A viser message that our pages do not use (values
-    of inputs, uploads, messages of the server) is dropped, and so is one with an impossible number. A page that sends faster
-    than possible is slowed down, so that the others keep their share of the event loop.
+    Commands use another channel (`widgets/visitors.py`): this one carries the view's camera, clicks in the
+    view, gizmos and the palette. A message that no viser page sends closes the connection. A viser message
+    that our pages do not use (values of inputs, uploads, messages of the server) is dropped, and so is a
+    message with an impossible number. A page that sends faster than a user can is slowed down, so that the
+    other pages keep their share of the event loop.
     """
 
     def __init__(self, is_of_viser: Callable[[str], bool], told: RateLimitedLog) -> None:
@@ -71,13 +73,15 @@ class PageGuard:
         """Whether to pass a frame on to viser; False drops it.
 
         Raises:
-            MalformedMessage: Close the connection.
+            MalformedMessage: No viser page sends this frame; close the connection.
         """
         kind = kind_of(raw)
         if kind not in KINDS:
             if not self._is_of_viser(kind):
-                raise MalformedMessage("an unknown type")
-            self._told.happened(kind, f"Dropped a message from a page: {kind} is not for pages to send.")
+                raise MalformedMessage("a message of an unknown type")
+            self._told.happened(
+                kind, f"Dropped a message from a page: the workbench takes no {kind} from pages."
+            )
             return False
         assert isinstance(raw, bytes)
         try:

@@ -29,8 +29,8 @@ SCRIPTS = (
 )
 """Scripts of ``web_assets/`` injected into viser's index.html, in load order."""
 STYLES = "panels/page.css"
-"""Style sheet of ``web_assets/``. It is in the page's head, since viser removes an HTML element while its panel is
-folded."""
+"""Style sheet of ``web_assets/``. It is in the page's head, because viser removes an HTML element from the
+page while the element's panel is folded."""
 
 MAX_NAME_BYTES = 255
 """Maximum length of a file name in all common file systems."""
@@ -90,6 +90,12 @@ async def admitted_reply(
     authority: str,
     told: RateLimitedLog,
 ) -> Response:
+    """The reply to an admitted request: that of the route with the longest matching prefix, else that of
+    viser.
+
+    Args:
+        authority: the checked Host header, see `access.Admitted`.
+    """
     page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
     # Decode once, like viser: anything still encoded is part of a file name.
     path = unquote(request.path.partition("?")[0]).replace("\\", "/")
@@ -117,7 +123,7 @@ async def admitted_reply(
             made = handler(path[len(prefix) :], dict(parse_qsl(request.path.partition("?")[2])))
         except Exception as error:
             told.happened(("route", prefix), f"The route {prefix} failed on {short_line(path, 200)}.", error)
-            made = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
+            made = 500, "text/plain; charset=utf-8", b"This request failed; the terminal shows the error."
         if isinstance(made, FileReply):
             return made
         status, kind, body = made
@@ -133,7 +139,8 @@ async def admitted_reply(
 
 
 def _is_path_of_files(path: str) -> bool:
-    """Whether a file could have this path: the system raises on a name that is too long or contains a NUL."""
+    """Whether a file below a folder could have this path. The system raises on a name that is too long or
+    contains a NUL."""
     parts = path.encode("utf-8", "surrogatepass").split(b"/")
     return (
         b".." not in parts
@@ -218,15 +225,16 @@ def _scripts() -> str:
 
 # Everything that is not listed is forbidden, and each exception is needed: `tests/page/door/test_page_policy.py` removes
 # them one by one and finds the page broken.
-# - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not unsafe-inline: HTML
-#   from a name, a note or a file that slipped past escaping still would not run. wasm-unsafe-eval is for the program that
-#   decodes the server's messages. eval stays forbidden: viser needs it for Gaussian splats and Plotly, which the workbench
-#   does not use (web_assets/browser.js).
+# - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not
+#   unsafe-inline: a script in a name, a note or a file that slipped past escaping still would not run.
+#   wasm-unsafe-eval is for the program that decodes the server's messages. eval stays forbidden: viser needs
+#   it for Gaussian splats and Plotly, which the workbench does not use (web_assets/browser.js).
 # - worker-src blob: viser's connection and its sorting run in workers made from strings.
 # - style-src 'unsafe-inline': viser's widgets and our HTML have inline styles; a style runs no code.
 # - img-src data: blob: pictures from the websocket, and viser's icons.
-# - connect-src: only this server. viser's page would use another one given in its address (?websocket=, ?playbackPath=).
-#   data: and blob: are textures and programs of the page. The websocket is listed for browsers where 'self' excludes ws:.
+# - connect-src: only this server. viser's page would connect to any server that its address names
+#   (?websocket=, ?playbackPath=). data: and blob: are textures and programs of the page. The websocket is
+#   listed for browsers where 'self' excludes ws:.
 # - frame-src 'self': rerun's viewer.
 DIRECTIVES: dict[str, str] = {
     "default-src": "'none'",

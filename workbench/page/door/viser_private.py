@@ -54,8 +54,9 @@ PAGES = {
 }
 """sha256 of the two scripts of viser's page, by viser's version: the one in the page, and the one that it decompresses.
 
-A browser that allows only these runs no script that slipped past escaping (`responses.page_policy`). If only the first is
-allowed, the browser prints the hash of the second in its console.
+A browser that allows only these scripts runs no other one that slipped past escaping
+(`responses.page_policy`). To find the second hash of a new version, allow only the first: the browser prints
+the second in its console.
 """
 
 REFUSED_FROM_CLIENTS = (
@@ -120,8 +121,8 @@ def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
 
 
 def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
-    """Tabs of a page's tab groups, and folds inside or outside tabs: labels of tab and fold, empty for none; in order of
-    creation."""
+    """Labels (tab, fold) of each tab in a page's tab groups and of each fold, in order of creation; the fold
+    of a tab is empty, and so is the tab of a fold outside tabs."""
     containers = server.gui._container_handle_from_uuid
     for handle in list(containers.values()):
         if isinstance(handle, viser.GuiTabHandle):
@@ -137,7 +138,7 @@ def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
 def wait_until_taken(server: viser.ViserServer, timeout: float) -> None:
     """Wait until all messages so far are in a batch that is being sent to each page, at most `timeout` seconds.
 
-    A page handles a batch as a whole: messages written after this do not delay earlier ones.
+    A page handles a batch as a whole: messages written after this call do not delay earlier ones.
     """
     buffer = server._websock_server._broadcast_buffer
     written, end = buffer.message_counter - 1, time.monotonic() + timeout
@@ -190,8 +191,9 @@ def unknown_page_text() -> str:
     if page_scripts() is not None:
         return ""
     return (
-        f"viser {viser.__version__} is not tested with the workbench: the browser is not told which scripts are the page's, "
-        f"so one that slipped past escaping would run. The tested versions: {command_for_tested_versions()}"
+        f"viser {viser.__version__} is not tested with the workbench: its scripts are unknown, so the browser "
+        "allows all scripts, and one that slipped past escaping would run. "
+        f"The tested versions: {command_for_tested_versions()}"
     )
 
 
@@ -266,8 +268,8 @@ class _Terminal(logging.Filter):
         print_rich = rich.print
 
         def print_unless_viser(*things: Any, **options: Any) -> None:
-            # ``verbose=False`` does not suppress viser's lines about start, stop and refused pages. Other code may print
-            # meanwhile.
+            # ``verbose=False`` does not suppress viser's lines about start, stop and refused pages. Lines of
+            # other code are printed.
             if not sys._getframe(1).f_globals.get("__name__", "").startswith("viser"):
                 print_rich(*things, **options)
 
@@ -411,7 +413,8 @@ def make_viser(
         real = infra.websockets
         infra.websockets = look_alike  # type: ignore[assignment]
         try:
-            # If viser ever stops calling our serve, it binds to loopback, on any port.
+            # If a viser does not call our `serve`, it listens on loopback only, on any port, until it is
+            # stopped below.
             server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
         finally:
             infra.websockets = real
@@ -420,7 +423,7 @@ def make_viser(
         server.stop()
         listening.close()
         raise _moved(
-            "viser did not start its server the known way" if not missing else f"viser has no {missing}"
+            "viser did not start its server as expected" if not missing else f"viser has no {missing}"
         )
     for name in REFUSED_FROM_CLIENTS:
         server._websock_server.unregister_handler(getattr(viser._messages, name))

@@ -22,8 +22,8 @@ from workbench.page.widgets.parts import Clock
 NAMES = ("/envs", "/floor")
 """Roots of the nodes in viser's tree."""
 REMOVAL_DELAY_SECONDS = 0.7
-"""Time for which old shapes stay when finer or coarser ones replace them: until the page has read the new ones, the
-view would be empty."""
+"""Time for which old shapes stay when finer or coarser ones replace them. Without it the view would be empty
+until the page has read the new shapes."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class DrawStyle:
 class SceneView:
     """The batched nodes of one scene under ``/envs``.
 
-    One viser node per body is too slow in a browser from a hundred bodies on (measured: 1 frame a second at 3,840); one
-    batched node per shape is not (30 a second). A frame is two arrays per node: world positions and quaternions, each env's
-    own pose plus its grid offset. World poses, not parent frames: viser's batches bypass its scene graph, and a parent that
-    moves in the same frame makes them shake.
+    One viser node per body is too slow in a browser from a hundred bodies on (measured: 1 frame a second at
+    3,840); one batched node per shape is not (30 a second). A frame is two arrays per node, world positions
+    and quaternions: poses in the envs' frames plus the envs' grid offsets. World poses, not parent frames:
+    viser's batches bypass its scene graph, and a parent that moves in the same frame makes them shake.
 
-    If one env is shown, only that env is sent: a batch's arrays may change their length. Bodies that an env lacks (NaN) are
-    left out the same way. Triangles limit a browser, so fewer envs are drawn with finer shapes. Motion below a pixel is not
-    sent (`visible_motion`).
+    If one env is shown, only that env is sent: a batch's arrays may change their length. Bodies that an env
+    lacks (NaN) are left out the same way. The number of triangles limits a browser, so the shapes are finer
+    when fewer envs are shown. Motion below a pixel is not sent (`visible_motion`).
     """
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
@@ -72,7 +72,7 @@ class SceneView:
         only_env: int | None = None,
         looks: DrawStyle = DrawStyle(),
     ) -> None:
-        """Show this scene instead of the last; groups that look the same stay and are not sent again.
+        """Show this scene instead of the previous one; groups that look the same stay and are not sent again.
 
         Args:
             geometry: Geometry of the scene.
@@ -167,7 +167,9 @@ class _DrawnAs:
     limit: int
     """Maximum number of triangles of a visual."""
     error: float
+    """Simplification tolerance in metres."""
     lighter: bool
+    """Whether dark materials are lightened (a floor in the light theme)."""
 
 
 class _DrawnGroup:
@@ -199,7 +201,7 @@ class _DrawnGroup:
         self._group, self._once = group, once
         corners = [np.abs(visual.mesh.vertices).max(axis=0) for visual in group.visuals]
         self.reach = float(max(np.linalg.norm(corner) for corner in corners))
-        """Radius in metres of a sphere around its frame that contains the group."""
+        """Radius in metres of a sphere around the body's frame that contains the group."""
 
     @property
     def is_plane(self) -> bool:

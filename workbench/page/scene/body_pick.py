@@ -88,11 +88,11 @@ class BodyMark:
     def draw(
         self, geometry: SceneGeometry, poses: NDArray[np.float32], env: int, name: str, offset: NDArray
     ) -> None:
-        """Mark the body with this name; none if the env lacks it.
+        """Mark the body with this name, or no body if the env lacks it.
 
         Args:
             poses: (N, B, 7) as in `SceneGeometry`.
-            offset: (3,) of the env in the view.
+            offset: (3,) position of the env in the view, metres.
         """
         body = geometry.body_names.index(name) if name in geometry.body_names else -1
         pose = poses[env, body].astype(np.float64)

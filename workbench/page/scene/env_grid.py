@@ -125,7 +125,8 @@ def acting_box(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Lowest and highest corner, in the env's frame, of robots and movable bodies.
 
-    Static and kinematic bodies are left out, and positions are clipped to the env. If nothing moves, the whole env.
+    Static and kinematic bodies are left out, and positions are clipped to the env's box. Without robots and
+    movable bodies, returns the env's box.
 
     Args:
         poses: (K, B, 7) of one env at K moments, or of K envs.

@@ -20,6 +20,7 @@ MAX_TEXTURE_PIXELS = 1024
 MIN_LIGHT_MEAN = 0.6
 """Minimum mean of the sRGB channels of a light floor."""
 DARKNESS_KEPT = 0.3
+"""Share of a dark floor's darkness that stays in the light theme."""
 
 LAYER_METRES = 4e-4
 """Distance between painted layers; two steps of a 24-bit depth buffer at ten metres."""

@@ -25,13 +25,13 @@ TOLERANCE_PIXELS = 0.75
 MIN_TRIANGLES = 25_000
 """Number of triangles in the view below which shapes are not simplified: then pixels, not triangles, take the time."""
 TOLERANCE_FACTOR = 1.6
-"""Factor by which a wanted tolerance must differ before the tolerance is changed, since each tolerance sends other meshes
-to the page."""
+"""Minimum ratio of the wanted tolerance to the present one, or the reverse, at which the tolerance changes:
+each change sends new meshes to the pages."""
 AT_REST_SECONDS = 0.4
 """Time without motion of any page's camera after which the view counts as still."""
 REPORT_TIMEOUT_SECONDS = 3.0
-"""Timeout for a page to report that it renders in software. Until then nothing changes, or a reloaded page would be sent
-fine shapes and then simple ones."""
+"""Timeout for a page to report that it renders in software. Until then the shapes do not change: a reloaded
+page would first be sent fine shapes and then simple ones."""
 Scene = tuple[SceneGeometry, EnvLayout, bool]
 """A drawn scene, the grid of its envs, and whether a single env is shown."""
 
@@ -95,7 +95,8 @@ class InSoftware:
             self._simplifying = begin(self._simplify())
 
     def looks(self, looks: DrawStyle, geometry: SceneGeometry, layout: EnvLayout, alone: bool) -> DrawStyle:
-        """This style, or a cheaper one that differs by about a pixel in the open pages.
+        """The style to draw with: `looks`, or a cheaper one whose shapes differ by about a pixel in the open
+        pages.
 
         Shapes are simplified in the background, and used when they are ready. They stay unchanged if the user chose a finer
         level of detail than the default, or if the view has few triangles.

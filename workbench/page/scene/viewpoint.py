@@ -76,7 +76,8 @@ def frame_one(
 ) -> Viewpoint:
     """The view of one env at the origin.
 
-    With a human camera: from its direction, at a distance at which its picture fits the view.
+    With a human camera, the view has the camera's direction, at a distance at which the camera's picture fits
+    the view.
 
     Args:
         picture: Picture of the human camera; only its pose is used.
@@ -108,8 +109,9 @@ MAX_SCENES = 8
 class Framing:
     """Points the open pages at the scene until the user has moved the view.
 
-    A page's panels take their places some time after it has connected (later on a busy machine), and the user opens more:
-    while the view is untouched, it is framed for its present shape.
+    A page's panels take their places some time after the page has connected (later on a busy machine), and
+    the user opens more panels. Each changes the shape of the view: while the view is untouched, the scene is
+    framed for the new shape.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -122,8 +124,9 @@ class Framing:
         """Pages that returned to the viewpoint that they had when they left the framed object."""
 
     def is_new(self, what: Hashable) -> bool:
-        """Whether `what` differs from that of the last call, so that it must be framed. If the user had already moved the
-        view of this object, the page returns to that viewpoint, and `frame` leaves it there."""
+        """Whether `what` differs from the object of the last call, so that it must be framed. Pages on which
+        the user had already moved the view of this object return to their earlier viewpoint, and `frame_new`
+        leaves them there."""
         if what == self._framed:
             return False
         clients = self._server.get_clients()
@@ -175,7 +178,7 @@ class Framing:
                 number, (self._server.initial_camera.position, DEFAULT_ASPECT)
             )
             as_framed = _is_at(client, position) and abs(aspect_of(client) / aspect - 1) <= 0.05
-            # Not at the framed viewpoint: the page reconnected, or the user moved the view first.
+            # An untouched page that is not as framed: it reconnected, or its view has another shape.
             if not as_framed and self._is_untouched(client):
                 self._point(client, frame)
 

@@ -67,9 +67,9 @@ def displacements(
 class SentPoses:
     """The poses of bodies that were last sent to the pages.
 
-    A pose is sent again only when it is a pixel off, rounded to a part of a pixel. Both make messages repeat previous
-    values, which compression exploits (`door.client_connection`): viser sends a whole batch when one pose of it changes.
-    Bodies at rest are sent exactly.
+    A pose is sent again only when it is more than a pixel off, and is rounded to a fraction of a pixel. viser
+    sends a whole batch when one pose of it changes; as most values then equal previous ones, compression
+    makes the message small (`door.client_connection`). Bodies at rest are sent exactly.
 
     Args:
         reach: (R,) radius of each body around its frame, metres.
@@ -113,7 +113,12 @@ class SentPoses:
 def rounded(
     poses: NDArray[np.float32], pixels: NDArray[np.float32], reach: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Poses (R, 7) rounded to steps of a part of a pixel (R,); unchanged where a pixel is 0."""
+    """Poses (R, 7) rounded to steps of a fraction of a pixel.
+
+    Args:
+        pixels: (R,) sizes of a pixel in metres; where it is 0, the pose is unchanged.
+        reach: (R,) radii of the bodies around their frames, metres.
+    """
     steps = np.empty((len(poses), 7), np.float32)
     steps[:, :3] = pixels[:, None] / 2
     steps[:, 3:] = np.minimum(pixels / (4 * np.maximum(reach, NEAR_METRES)), MAX_QUATERNION_STEP)[:, None]

@@ -16,7 +16,7 @@ class Dialog:
             server.gui.add_html(render("context", context="dialog"))
 
     def close(self) -> bool:
-        """Close it; returns False if it was already closed, since only the first answer counts."""
+        """Close the window. Returns False if it was already closed: only the first answer counts."""
         if self.modal.closed:
             return False
         self.modal.close()

@@ -20,10 +20,11 @@ Look = Literal["text", "choice", "tick", "slider"]
 class Field:
     """One input, or several in a row, in the present container.
 
-    The value goes into a field of a command. It is committed on Enter, Tab or blur, or when an option is chosen; a slider and
-    a `live` text send at once, and only the newest value while a reply is pending. Numbers have the bounds of the command's
-    field, and the browser refuses other values. An input is drawn once, since redrawing loses the cursor; the server's value
-    is sent separately (`show`) and copied into the input while it is not in use.
+    The value goes into a field of a command. It is committed on Enter, Tab or blur, or when an option is
+    chosen. A slider and a `live` text send every change at once; while a reply is pending, only the newest
+    value is kept. Numbers have the bounds of the command's field, and the browser refuses other values. An
+    input is drawn once, because redrawing loses the cursor; the server's value is sent separately (`show`)
+    and copied into the input while the input is not in use.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ class Field:
 
     @property
     def name(self) -> str:
-        """Name of its first input in the page."""
+        """Name of the first input in the page."""
         return self._names[0]
 
     @property
@@ -144,7 +145,7 @@ def choice(
     """A list from which one option is chosen.
 
     Args:
-        options: values of the command's field by their label, or texts that are both.
+        options: values of the command's field by their label, or texts that are both value and label.
     """
     return Field(
         server,
@@ -188,10 +189,10 @@ def slider(
     given: Mapping[str, Plain] | None = None,
     hint: str = "",
 ) -> Field:
-    """A slider with its number next to it, at its lower end until `Field.show` sets a value.
+    """A slider with a number next to it. It shows its lower end until `Field.show` sets a value.
 
     Args:
-        bounds: its ends; by default the bounds of the command's field.
+        bounds: ends of the slider; by default the bounds of the command's field.
     """
     low, high, _ = _number(kind, field, float) or (None, None, False)
     ends = bounds or (low or 0.0, high or 0.0)

@@ -24,6 +24,7 @@ VIRIDIS = np.array(
 )  # fmt: skip
 """Ten colours of matplotlib's viridis (CC0), reversed: bright is near, as in most depth viewers."""
 NOTHING = np.array((24, 24, 27), np.uint8)
+"""RGB of a pixel without a value, and of the background."""
 MAX_LEGEND_ENTRIES = 10
 
 
@@ -41,8 +42,8 @@ class DepthRange:
 def depth_range(depth: NDArray[np.float32]) -> DepthRange | None:
     """The range of most finite positive depths; None if there are none.
 
-    From the 1st to the 98th percentile, and at most three times the median: with a floor that extends to the horizon, the
-    whole table in front would have one colour.
+    From the 1st to the 98th percentile, and at most to three times the median: in a range up to a floor's
+    horizon, the whole table in front would have one colour.
     """
     met = depth[np.isfinite(depth) & (depth > 0)]
     if not met.size:

@@ -76,7 +76,7 @@ def add(
     """Add one command to the palette of every page.
 
     Args:
-        about: text below its label, which the palette searches too.
+        about: text below the label, which the palette searches too.
     """
     handle = server.gui.add_command(label, description=about or None)
     handle.on_trigger(visitors.on(command))

@@ -29,7 +29,7 @@ class ChartLine:
     """One curve of a chart."""
 
     name: str
-    """Its name in the legend; an empty one leaves it out there."""
+    """Name in the legend; a line with an empty name is not in the legend."""
     values: NDArray
     """(K,) values; a value that is not finite is a gap."""
     colour: str = SELECTED_COLOUR

@@ -16,7 +16,7 @@ def tell_all(
     color: Literal["orange", "red"] | None = "orange",
     seconds: float | None = None,
 ) -> None:
-    """Notify every open page, since a key event does not tell on which one it was pressed."""
+    """Notify every open page: a key event does not tell on which page the key was pressed."""
     for client in server.get_clients().values():
         client.add_notification(title, text, color=color, auto_close_seconds=seconds)
 

@@ -21,7 +21,7 @@ class OpenTabs:
         return frozenset(one.client.client_id for one in here if self._open.get(one.name) == name)
 
     def shows(self, where: ShownOn, name: str) -> bool:
-        """Whether something of this tab is drawn in the view."""
+        """Whether to draw in the view what belongs to this tab, if the user chose to show it `where`."""
         return where == "on all tabs" or (where == "on this tab" and bool(self.pages_at(name)))
 
     def open(self, visitor: Visitor, name: str, fold: str = "") -> None:

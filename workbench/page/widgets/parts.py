@@ -35,7 +35,7 @@ class PagePart(Generic[View]):
     page would show several moments at once while a task plays."""
 
     def key(self, view: View) -> object:
-        """Key of the content that it shows; equal keys mean equal drawings."""
+        """Key of the content that the part shows; equal keys mean equal drawings."""
         return object()
 
     def urgent(self, view: View) -> object:
@@ -51,7 +51,7 @@ class PagePart(Generic[View]):
 
 
 def name_fold(folder: viser.GuiFolderHandle, name: str, value: str) -> None:
-    """Show what a folder contains beside its name, so that it need not be unfolded to see it."""
+    """Show a value next to a folder's name, so that a user sees the value without unfolding the folder."""
     folder.label = f"{name}{BEFORE_FOLD_VALUE}{value}" if value else name
 
 
@@ -105,7 +105,8 @@ class Parts(Generic[View]):
         return frozenset(self._owners)
 
     def do(self, command: Command, visitor: Visitor) -> Done:
-        """Let the part that has the command in `does` carry it out. Raises `Refused`, also if no part has it."""
+        """Let the part that has the command in `does` carry it out. Raises `Refused`, also if no part has the
+        command."""
         owner = self._owners.get(type(command))
         if owner is None:
             raise Refused(f"Not on this page: {command.help()}.")

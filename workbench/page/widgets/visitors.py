@@ -54,7 +54,8 @@ class Visitor:
     _sent: viser.GuiHtmlHandle | None = None
 
     def send(self, html: str) -> None:
-        """Add an element to this page, which acts on it (``arrivals`` in ``input.js``); it replaces the one before."""
+        """Add an HTML element to this page, whose script acts on it (``arrivals`` in ``input.js``). It
+        replaces the element of the previous call."""
         if self._sent is not None:
             self._sent.remove()
         self._sent = self.client.gui.add_html(html)
@@ -80,7 +81,7 @@ class Visitors:
     def __init__(self, server: viser.ViserServer, commands: CommandList) -> None:
         self.commands = commands
         self.do: Do = _nothing
-        """Carries out a command; replaced with each shown page."""
+        """Carries out a command on the shown page; set by `app.server`, refuses until then."""
         self._told = RateLimitedLog()
         self._by_name: dict[str, Visitor] = {}
         self._by_client: dict[int, Visitor] = {}
@@ -121,7 +122,7 @@ class Visitors:
             return str(reason)
         except Exception:
             log.exception("Failed: %r", command)
-            visitor.tell("It failed; the reason is in the terminal.", "Failed")
+            visitor.tell("The command failed. The reason is in the terminal.", "Failed")
             return "it failed"
         return ""
 
@@ -153,7 +154,7 @@ class Visitors:
                     refused = await self.ask(command, visitor)
             except (msgspec.DecodeError, UnicodeDecodeError, KeyError) as fault:
                 self._told.happened(
-                    "malformed", f"Closed a page's connection: it sent no command of ours ({fault!r})."
+                    "malformed", f"Closed a page's connection: it sent no valid command ({fault!r})."
                 )
                 await connection.close(1008, "malformed message or unknown command")
                 return
