@@ -86,7 +86,7 @@ def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, brows
         desk.tab("Checks")
         leads_to_help("link", "Checks")
         leads_to_help("palette")
-        leads_to_help("palette", "Solve a task before training on it", "help: solve a task")
+        leads_to_help("palette", "Solve a task before training on it", "help: solve a task before")
         desk.leave_inputs()
         desk.press("v")
         expect(desk.page.get_by_role("tab", name="Library")).to_be_visible()

@@ -47,7 +47,6 @@ def opened(task_file: Path, browser: Browser) -> Iterator[Page]:
             "base_camera · sensor"
         )
         page.get_by_text("Handles and preview", exact=True).click()
-        page.locator("[data-fold='Rotation']").click()
         yield page
         assert not errors
 
@@ -60,6 +59,7 @@ def page(opened: Page) -> Page:
     if "wb-off" not in tool(opened, "Reset to file")["classes"]:
         press(opened, "Reset to file")
     expect(opened.get_by_text(re.compile("^As in push_cube.py"))).to_be_visible()
+    unfold(opened, "Rotation", opened.get_by_label("Written as"))
     return opened
 
 
