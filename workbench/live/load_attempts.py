@@ -14,7 +14,7 @@ Newest = Callable[[], bytes | None]
 since assembling one takes longer than a step."""
 _GOOD_VERSIONS = 2
 _PROVEN_SECONDS = 30.0
-"""Time after a load: a version whose process crashes later than this counts as one that works."""
+"""A version whose process crashes later than this after its load counts as one that works."""
 
 
 class LoadInputs(NamedTuple):
@@ -39,7 +39,7 @@ class GoodVersion:
     crashes: int = 0
     """Number of crashes of its process in a row, each soon after a load of the version."""
     idle_crashes: int = 0
-    """How many of `crashes` happened since its last step, in an idle worker."""
+    """How many of `crashes` happened in an idle worker, since the version's last step."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Recovery:
         return self.asked > self.begun
 
     def next_load(self, newest: Newest) -> tuple[Recovery, LoadInputs | None]:
-        """The load for a new worker; None for nothing."""
+        """The load for a new worker; None if it has to load nothing."""
         if self.attempt == "nothing":
             return self, None
         good = self.good_source if self.attempt != "file" else None
@@ -128,8 +128,8 @@ class Recovery:
         """Record that the worker has ended.
 
         Args:
-            crashed: it ended by itself; it was not ended and did not hand over.
-            idle: it had no request at the time.
+            crashed: the worker ended by itself: it was not killed by the supervisor, and did not hand over.
+            idle: the worker was handling no request.
         """
         after = self
         if self.file_waits:
@@ -141,8 +141,8 @@ class Recovery:
         return replace(after, loading=False, has_env=False)
 
     def restart_requested(self) -> Recovery:
-        """Record that the user restarts the worker, to load the file as it is now; if that is being loaded (and may hang), to
-        restore the last good version."""
+        """Record that the user restarts the worker. The next worker loads the file as it is now. If the file
+        is being loaded already (and may hang), the next worker restores the last good version."""
         good = tuple(replace(version, crashes=0, idle_crashes=0) for version in self.good)
         if self.loading and not self.restoring and not self.file_waits and good:
             return replace(self, good=good)  # `died` continues from there

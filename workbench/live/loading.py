@@ -59,8 +59,8 @@ def watched_files(run: Run, paths: Iterable[str] = (), at_fault: str | None = No
 
 
 def files_at_fault(run: Run, failed: TaskFailed) -> frozenset[Path]:
-    """Files with the problem, to be watched: a module that the task has never imported without an error is not in
-    `source_files`, and it may be in another folder, where the user fixes it."""
+    """The files to watch after a failure, including the file with the problem: a module that the task has
+    never imported without an error is not in `source_files`, and may be in another folder."""
     if failed.problem.file is None:
         return frozenset()
     return watched_files(run, () if run.task is None else run.task.source_files, failed.problem.file)
@@ -181,7 +181,7 @@ def _new_scene(run: Run, task: TaskDescription, first: StepResult, its_past_stay
         settings=replace(run.settings, selected_env=selected),
         inspection=None,
         told=None,
-        # Broken rules of the new scene are reported after it.
+        # The worker reports broken rules of the new scene after the load.
         rules=None,
         rules_serial=run.rules_serial + 1,
     )
@@ -242,7 +242,7 @@ def _refuse_options(run: Run, failed: TaskOptions | None) -> tuple[Run, bool]:
     tried = run.tried_options
     if tried is None or failed is None or changed_options(tried, failed):
         return run, False
-    # Without an env there is nothing to keep: the next load tries them again.
+    # Without an env there is nothing to keep: the next load tries these options again.
     options = replace(tried, seed=run.options.seed) if run.task is None else run.options
     return replace(run, tried_options=None, options=options, options_refused=tried), True
 
@@ -262,7 +262,7 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
         run = with_problem(run, problem, at_run=not while_loading)
     if death.doing == "drawing" and death.end is not End.ASKED:
         # The next worker would die of the same picture.
-        why = f"The worker process {death.why} while it drew. Untick it and tick it again to try once more."
+        why = f"The worker process {death.why} while it drew. To retry, untick the camera and tick it again."
         failed = {camera.key: why for camera in run.settings.cameras}
         run = replace(run, failed_cameras={**run.failed_cameras, **failed})
     if death.end not in (End.FILE_WAITS, End.HANDED_OVER):

@@ -188,7 +188,7 @@ class EnvTable:
         return tuple(self._found.values())
 
     def begin_version(self, rules: Mapping[str, Finding]) -> None:
-        """The code changes: drop the findings of the old code, and keep the rows."""
+        """Drop the findings of the old code and keep the rows, because the code has changed."""
         self._rules, self._found = rules, {}
 
     def rows(self) -> EnvRows:
@@ -306,7 +306,8 @@ def _flags(step: StepResult) -> Iterator[tuple[str, NDArray[np.bool_]]]:
 def _note_first(
     first: dict[Hashable, NDArray[np.int32]], what: Hashable, true: NDArray[np.bool_], step: StepResult
 ) -> NDArray[np.bool_]:
-    """Write the step into `first` in envs where it is true for the first time in the episode; returns these (N,)."""
+    """Write the step into `first` in envs where the entry is true for the first time in the episode; returns
+    the mask (N,) of these envs."""
     known = first.get(what)
     if known is None:
         known = first[what] = np.full(len(true), -1, np.int32)
