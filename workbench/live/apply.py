@@ -142,7 +142,7 @@ DOES: frozenset[type[Command]] = frozenset(
 )
 """Commands that `apply` handles."""
 PICTURES_DELAY_SECONDS = 0.35
-"""Debounce: pictures of a past moment are drawn after it was shown for this long, or every drag would draw."""
+"""Debounce: pictures of a past moment are drawn after it was shown this long, or every drag would draw."""
 
 
 def apply(run: Run, event: object, now: Now) -> Change:

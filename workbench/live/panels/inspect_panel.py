@@ -239,7 +239,7 @@ class InspectPanel(PagePart[SessionView]):
         return lived is not None and lived[0] == lived[1]
 
     def _choose(self) -> None:
-        """Tell the session which sections to read."""
+        """Choose the sections that the session reads."""
         needed = {
             CHOICES[self._chosen] if self._opened else None,
             "contacts" if self._shows_forces or (self.body and self._opened) else None,
@@ -265,12 +265,16 @@ def inspect_html(
     before: Inspection | None,
     no_step_yet: bool = False,
 ) -> str:
-    """The tab's content; without contacts if the env made no step since it was set or restored."""
+    """The tab's content.
+
+    Args:
+        no_step_yet: the env has made no step since it was reset or restored: leave out contacts.
+    """
     leaves, articulations, contacts, poses = [], [], (), []
     note = ""
     env, section = view.selected_env, CHOICES[choice]
     if view.task is None or view.step is None:
-        note = "There is something to inspect when the task has loaded."
+        note = "There is nothing to inspect until the task has loaded."
     elif choice == NOTHING:
         note = (
             "Choose what to read of the selected env: its joints, contacts, the poses of its bodies, the observation "
