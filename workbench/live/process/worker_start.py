@@ -18,8 +18,8 @@ from workbench.machine.processes.family import Keeper
 from workbench.machine.processes.wire import Unpacker, has_come, pack
 
 _GPUS = ("/dev/nvidiactl", "/dev/dxg")
-"""Device files of which one exists if CUDA may be available (the second in WSL). No worker is forked then: CUDA does not
-work in a fork of a process that has used it, and any import may use it."""
+"""Device files, one of which exists if CUDA may be available (the second in WSL). Then no worker is forked:
+CUDA does not work in a fork of a process that has used it, and any import may use it."""
 _MAX_MESSAGE_BYTES = 1 << 12
 _UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
@@ -71,16 +71,16 @@ class ForkedKeeper:
         with self._lock:
             while self._code is None and has_come(self._told):
                 try:
-                    said = self._told.recv(_MAX_MESSAGE_BYTES)
+                    data = self._told.recv(_MAX_MESSAGE_BYTES)
                 except ConnectionResetError:
-                    said = b""
-                news = Unpacker((Forked, ForkEnded)).message(said) if said else ForkEnded(-signal.SIGKILL)
-                if isinstance(news, Forked):
-                    self._pid = news.pid
+                    data = b""
+                message = Unpacker((Forked, ForkEnded)).message(data) if data else ForkEnded(-signal.SIGKILL)
+                if isinstance(message, Forked):
+                    self._pid = message.pid
                 else:
-                    self._code = news.code
+                    self._code = message.code
             if self._code is None and self._terminated and self._pid == 0:
-                # The worker will not be forked; the fork server reports that only after its imports.
+                # The worker will never be forked, but the fork server reports that only after its imports.
                 self._code = -signal.SIGTERM
             if self._code is not None:
                 self._told.close()
@@ -131,7 +131,7 @@ class WorkerForks:
             fds: socket, heartbeat and stacks, see `workbench.app.worker.start.run`.
 
         Raises:
-            OSError
+            OSError: the process cannot be started.
         """
         with self._lock:
             control = None if any(map(os.path.exists, _GPUS)) else self._fork_server()
