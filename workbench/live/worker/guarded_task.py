@@ -59,7 +59,8 @@ class GuardedTask:
         ends the process.
 
         Args:
-            doing: what the heartbeat shows. None: `work` runs no code of the author and cannot be interrupted.
+            doing: what the heartbeat shows. None: `work` runs no code of the author and cannot be
+                interrupted.
             loads: `work` loads a version, which is refused if it fails.
         """
         if doing is None:

@@ -71,7 +71,8 @@ def load_version(
     step, which are undone, if the code of resets or steps changed. No picture may be in progress.
 
     Raises:
-        TaskError: the version does not work. If its code ran, its effects are not undone: the process must end.
+        TaskError: the version does not work. If its code ran, its effects are not undone: the process must
+        end.
     """
     opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
