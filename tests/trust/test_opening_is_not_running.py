@@ -136,7 +136,7 @@ def test_no_notation_of_a_name_in_a_recording_opens_a_file(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
     wanted = MakeScene(named.format(file=tmp_path / "evil.py"), (), {}, 0, {}, {})
-    with pytest.raises(Exception, match="is not known here"):
+    with pytest.raises(Exception, match="There is no env"):
         make(wanted)
     assert not mark.exists()
 

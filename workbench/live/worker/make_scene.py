@@ -79,9 +79,9 @@ def make(request: MakeScene) -> TaskEnv:
             loaded = load_task(RecordedTask(request.task))  # a registered id, never a path
         except TaskError as error:
             raise CannotAnswer(
-                f"The task {request.task} is not known here, so there is no scene, only numbers and curves. "
-                "If the task is yours, name its file (workbench review --task FILE) or the package that "
-                "registers it (workbench review --import PACKAGE)."
+                f"There is no env {request.task} here, so there is no scene, only numbers and curves. If the "
+                "env is yours, name its file (workbench review --task FILE) or the package that registers it "
+                "(workbench review --import PACKAGE)."
             ) from error
     try:
         env = make_env(
