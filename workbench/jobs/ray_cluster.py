@@ -68,7 +68,7 @@ class Cluster:
 
         Raises:
             NoCluster: no cluster answers, Ray is not installed, or the cluster has no room for a worker.
-            PoolError: a machine has other versions of the packages, the cluster ended, or as in `Executor.run`.
+            PoolError: a machine has other versions of the packages, the cluster ended, or see `Executor.run`.
             TooMuch: the files for the workers are too large.
         """
         worker_files = pack_worker_files(work.folders, work.files)

@@ -37,7 +37,7 @@ class ClusterLost(OSError):
 class ClusterHealth:
     """Detects that the daemons of the connected cluster have ended.
 
-    Ray itself notices it only after seconds, and then ends this process from native code, without an exception.
+    Ray itself needs seconds to notice, and then ends this process from native code, without an exception.
     """
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class ClusterHealth:
         self._raylet.connect(_global_node.raylet_socket_name)
 
     def check(self) -> None:
-        """Raise ClusterLost if the daemons have ended. Takes microseconds; connects every `_PROBE_SECONDS`."""
+        """Raise ClusterLost if the daemons have ended. Cheap: connects only every `_PROBE_SECONDS`."""
         # The raylet sends nothing on an idle connection: readable means closed.
         if self._raylet is not None and select.select([self._raylet], (), (), 0)[0]:
             raise ClusterLost("Ray's daemon of this machine (raylet) has ended")

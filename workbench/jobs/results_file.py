@@ -257,8 +257,8 @@ def read_parts(files: Sequence[Path]) -> JobParts:
             rows = database.execute("SELECT number, value FROM result").fetchall()
         if (doubled := next((number for number, _ in rows if number in owners), None)) is not None:
             raise JobFileError(
-                f"{owners[doubled]} and {path} both have the result of item {doubled}: they are the same part "
-                "of the job, so leave one of them out"
+                f"{owners[doubled]} and {path} both have the result of item {doubled}: they are the same "
+                "part of the job, so leave one of them out"
             )
         owners.update((number, path) for number, _ in rows)
         values.update(rows)

@@ -154,9 +154,9 @@ class Scheduler(Generic[Result, Update]):
             on_failure: called with items in which the author's code failed, or whose workers died in every
                 try. The job continues unless too many chunks fail in the same way. If None, the first failure
                 ends the job.
-            group: number of items in a group: item k belongs to group ``k // group``. Each group begins with a
-                new chunk. If too many chunks of a group fail in the same way, or the task cannot be built for
-                the group, the rest of the group counts as failed, and the job continues.
+            group: number of items in a group: item k belongs to group ``k // group``. Each group begins with
+                a new chunk. If too many chunks of a group fail in the same way, or the task cannot be built
+                for the group, the rest of the group counts as failed, and the job continues.
         """
         self._numbers, self._size, self._tries = numbers, chunk, tries
         self._on_result, self._on_update, self._stop = on_result, on_update, stop

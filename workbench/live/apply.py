@@ -313,7 +313,7 @@ def _travel(run: Run, command: Command) -> Change:
     """Carry out a command of the timeline."""
     past, env = run.kept, run.env
     if past is None:
-        raise Refused("There is no step yet.")
+        raise Refused("There is no step to go to yet.")
     match command:
         case StepBack():
             return _show(run, past.seek_by(env, -1)), []
@@ -360,7 +360,7 @@ def _show_live(run: Run) -> Run:
 
 
 def _show(run: Run, past: Past | None) -> Run:
-    """The run with this past, and with new pictures; unchanged if it shows the same moment as before."""
+    """The run with `past` and new pictures; the same run if `past` shows the same moment as before."""
     if past is None or run.past is None or past.shown is run.past.shown:
         return run
     return new_pictures(replace(run, past=past))

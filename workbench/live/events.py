@@ -70,7 +70,7 @@ class WorkerDied:
 
     death: Death
     printed: str
-    """The last lines of its output."""
+    """The last lines of the worker's output."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class PolicySaved:
 
 @dataclass(frozen=True)
 class PagesCounted:
-    """The number of open pages changed. Without any, no picture is rendered."""
+    """The number of open pages changed. Without open pages, no picture is rendered."""
 
     count: int
 

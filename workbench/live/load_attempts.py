@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 from workbench.task.description import TaskDescription
 
 Attempt = Literal["file", "moment", "version", "nothing"]
+"""What to load: the file on disk, the last good version at its newest moment or from its start, nothing."""
 Newest = Callable[[], bytes | None]
 """Returns the newest state of the batch, a pickled `envs.snapshots.snapshot.Snapshot`, or None. Called only when needed,
 since assembling one takes longer than a step."""
@@ -23,7 +24,7 @@ class LoadInputs(NamedTuple):
     source: dict[str, str] | None
     """Texts to use in place of the files; None to read the files on disk."""
     snapshot: bytes | None
-    """The moment to restore."""
+    """Pickled snapshot to restore; None for none."""
     number: int
     """`Load.number`."""
 
@@ -37,7 +38,7 @@ class GoodVersion:
     since: float
     """Time of the version's last load, in seconds of the session's clock."""
     crashes: int = 0
-    """Number of crashes of its process in a row, each soon after a load of the version."""
+    """Number of crashes of the version's process in a row, each soon after a load of the version."""
     idle_crashes: int = 0
     """How many of `crashes` happened in an idle worker, since the version's last step."""
 
@@ -50,8 +51,8 @@ class Recovery:
     out. So the attempts are, in order: the file on disk if no worker has tried it yet, the last good version at its newest
     moment, the same version from its start, and finally nothing, until the file changes. No attempt is repeated, so that a
     file cannot kill one worker after another. A version that crashes twice, each time soon after its load, is not good: the
-    previous good version is restored. If there is none, the version itself is restored, unless it crashed twice without
-    making a step.
+    previous good version is restored. If there is none, the version itself is restored, unless it crashed
+    twice while idle, with no step in between.
     """
 
     good: tuple[GoodVersion, ...] = ()
@@ -145,7 +146,7 @@ class Recovery:
         is being loaded already (and may hang), the next worker restores the last good version."""
         good = tuple(replace(version, crashes=0, idle_crashes=0) for version in self.good)
         if self.loading and not self.restoring and not self.file_waits and good:
-            return replace(self, good=good)  # `died` continues from there
+            return replace(self, good=good)  # `died` then chooses the last good version
         return replace(self, good=good, attempt="file", loading=False, has_env=False, asked=self.asked + 1)
 
     def _after_running(self, crashed: bool, idle: bool, now: float) -> Recovery:

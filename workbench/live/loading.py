@@ -76,7 +76,7 @@ def follow(
 def reload_file(run: Run, level: LoadLevel = "auto", effects: Iterable[RunEffect] = ()) -> Change:
     """Reload the file. A level other than ``auto`` is forced, even if it keeps parts of the old version.
 
-    A worker that does not handle the request (an endless loop) is interrupted or replaced.
+    If the worker does not handle the request (an endless loop), the supervisor interrupts or replaces it.
     """
     recovery, inputs = run.recovery.file_requested(run.newest_moment)
     run = replace(run, recovery=recovery)
@@ -99,7 +99,7 @@ def apply_options(run: Run, options: TaskOptions) -> Change:
 
 
 def _past_after(before: TaskDescription | None, event: Loaded, restored: bool) -> PastAfterLoad:
-    """What happens to the history after a load.
+    """Effect of a load on the history.
 
     Args:
         before: the previous version.
@@ -262,7 +262,7 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
         run = with_problem(run, problem, at_run=not while_loading)
     if death.doing == "drawing" and death.end is not End.ASKED:
         # The next worker would die of the same picture.
-        why = f"The worker process {death.why} while it drew. To retry, untick the camera and tick it again."
+        why = f"The worker {death.why} while it rendered. To retry, untick the camera and tick it again."
         failed = {camera.key: why for camera in run.settings.cameras}
         run = replace(run, failed_cameras={**run.failed_cameras, **failed})
     if death.end not in (End.FILE_WAITS, End.HANDED_OVER):
@@ -279,14 +279,14 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
 
 
 def _texts(run: Run) -> Mapping[str, str]:
-    """Source by path of the version that is being loaded, if known, or of the running one."""
+    """Source by path of the version that is being loaded (empty if unknown), else of the running version."""
     recovery = run.recovery
     if not recovery.loading:
         return {} if run.task is None else run.task.source
     if recovery.restoring:
         return recovery.good_source or {}
     if recovery.file_waits:
-        # The file was saved again since: its lines on disk are not those that ran.
+        # Empty texts: the file was saved again, so the lines on disk are not those that ran.
         return dict.fromkeys(run.own_files, "")
     return {}
 

@@ -35,7 +35,7 @@ EpisodeEnd = Literal["reset", "continue", "pause"]
 
 @dataclass(frozen=True)
 class Load(Question["Loaded"]):
-    """Import and build the task; it replaces the running one only if all of it succeeds."""
+    """Import and build the task. It replaces the running version only if everything succeeds."""
 
     task: TaskName
     """A path, ``path:ClassName`` or a registered env id, as the user named it, or a task named by a recording."""
@@ -399,7 +399,7 @@ class Pictures:
 
     pictures: tuple[Picture, ...]
     milliseconds: float | None
-    """Render time; None if steps were made meanwhile, which took part of the time."""
+    """Render time; None if steps were made during the rendering, since they took part of the time."""
     number: int
     """`Stepped.number` of the moment that the pictures show."""
 
@@ -414,7 +414,7 @@ class CameraFailed:
 
 @dataclass(frozen=True)
 class Placed:
-    """The result of `PlaceCamera`. Later pictures of that camera show it as placed."""
+    """The result of `PlaceCamera`. Later pictures of the camera are taken with the new settings."""
 
     key: CameraKey
     settings: CameraSettings | None
@@ -468,11 +468,11 @@ class Status:
     """Whether and how fast the batch runs."""
 
     playing: bool
-    """Whether stepping goes on, after the last `Play` that the worker has handled."""
+    """Whether the batch is played, after the last `Play` that the worker has handled."""
     steps_per_second: float
     """Control steps of the whole batch per second of wall time."""
     real_time_factor: float
-    """Simulated seconds per wall second; below the chosen speed the machine is the limit."""
+    """Simulated seconds per wall second; if it is below the chosen speed, the machine is too slow."""
     activity: str = ""
     """Long work that delays requests, if any."""
     recorded_share: float = 0.0

@@ -46,7 +46,7 @@ class TimelineView:
     undo: str | None = None
     """Name of the change that `UndoReset` would undo; None if there is none."""
     not_carried: tuple[str, ...] = ()
-    """State that the last jump could not restore, each with its reason."""
+    """Parts of the state that the last jump could not restore, each with the reason."""
     arrived: str = ""
     """How the last jump reached its state: by a replay or from a recording; empty if it was restored."""
     entered: int = 0
@@ -80,7 +80,7 @@ def _ending(flags: Iterable[int]) -> Ending:
 
 @dataclass(frozen=True)
 class Strip:
-    """A part of one env's history, for the strip under the slider. All places are ticks (see `TimelineView`)."""
+    """A part of one env's history, for the strip under the slider. Positions are ticks (`TimelineView`)."""
 
     low: int
     high: int

@@ -35,8 +35,8 @@ from workbench.task.problem import Problem
 from workbench.task.reference import TaskName, followed_folder, named_file
 
 RunState = Literal["starting", "loading", "running", "paused", "error", "stopped"]
-"""``starting`` the worker process; ``loading``: a task is being imported or built; ``error``: no version is loaded,
-see `Run.problem`; ``stopped``: there is no worker."""
+"""``starting``: the worker process starts; ``loading``: a task is being imported or built; ``error``: no
+version is loaded, see `Run.problem`; ``stopped``: there is no worker."""
 
 
 PastAfterLoad = Literal["same", "patched", "gone"]
@@ -70,7 +70,7 @@ class Run:
     own_file: Path | None
     """The named file, even if it never loaded; None for an env id."""
     own_folder: Path | None
-    """Folder whose modules, and those below it, are watched with the file; None if nothing is watched."""
+    """Folder whose modules, also in subfolders, are watched with the file; None if nothing is watched."""
     running_reference: TaskName
     """The task of the running version; `reference` may already name another class of the file."""
     recovery: Recovery = Recovery()

@@ -26,7 +26,7 @@ from workbench.task.description import NO_MOMENT, Restored, Stepped
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 32
 """Event flags of an env at a moment. Success, fail and a NaN or infinite reward are flagged only once per episode."""
 _OVERHEAD_BYTES = 2500
-"""Memory of the objects around a moment's arrays; with it the total is within 2 % of what tracemalloc measures."""
+"""Memory of the objects around a moment's arrays; with it, tracemalloc measures the same total within 2 %."""
 _PICTURES_SHARE = 0.5
 """Share of the memory limit for pictures: they are by far the largest (a human camera's is 0.8 MB; a step of 16
 PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be rendered again."""
@@ -50,8 +50,8 @@ class SnapshotPartSet:
 class SnapshotParts:
     """Reference-counted store of snapshot parts.
 
-    A snapshot consists of a body and the keys of its parts (`envs.snapshots.packing`), most of which the previous moment
-    has too. So moments refer to a set of parts, sets count their moments, and parts count their sets.
+    A snapshot has a body and parts (`envs.snapshots.packing`), and shares most parts with the previous
+    moment. So moments refer to a set of parts, sets count their moments, and parts count their sets.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class SnapshotParts:
         """Bytes in use."""
 
     def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> SnapshotPartSet:
-        """Parts of the next moment; `keys` is None if they are those of the previous moment."""
+        """Parts of the next moment; `keys` is None if it has the same parts as the previous moment."""
         self._parts.update(new_parts)
         if keys is not None and keys != self._last.keys:
             known = self._parts.keys() >= {*keys}
@@ -85,7 +85,8 @@ class SnapshotParts:
                 if self._references[key] == 0:
                     self.used -= len(self._parts[key])
                     del self._references[key]
-                    # The worker sends a part again unless the newest moment has it, which is never dropped.
+                    # If a later moment has this part, the worker sends it again: the worker leaves out only
+                    # parts of the newest moment, which is never dropped.
                     del self._parts[key]
 
 

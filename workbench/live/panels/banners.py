@@ -78,8 +78,7 @@ class Banner(PagePart[SessionView]):
     Args:
         server: The page.
         link: Links the line in the file.
-        is_own: Returns whether a file may be written: it is the task's, and the user, not a recording, named
-            it.
+        is_own: Returns whether a file may be written: it is the task's, and the user (no recording) named it.
     """
 
     does = (FillEmptyFile,)
@@ -248,8 +247,8 @@ def busy_html(busy: Busy, view: SessionView, link: LinkTo = no_links) -> str:
         advice = "The renderer is working. The first picture may take a while; Restart ends the process."
     else:
         advice = (
-            "It may only be slow. Interrupt stops it there and shows the traceback; Restart ends the process and "
-            "loads the file as it is now. Saving a fixed file does the same."
+            "It may only be slow. Interrupt stops it there and shows the traceback. Saving a fixed file stops "
+            "it too, and loads the file. Restart ends the process and loads the file as it is now."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
     return render("busy", subject=subject, busy=busy, advice=advice, link=link)

@@ -45,7 +45,7 @@ _MIN_DECIMALS, _MAX_DECIMALS = 4, 9
 
 
 class EnvOptionsPanel(PagePart[SessionView]):
-    """A form that is applied as a whole: every change rebuilds the envs.
+    """A form that is applied as a whole, since every change rebuilds the envs.
 
     Entered values stay in the form until they are applied or discarded, also if the task fails with them; the running
     envs stay unchanged then. The form is rewritten when the envs were made with other options.

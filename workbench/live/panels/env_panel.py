@@ -481,8 +481,7 @@ class EnvPanel(MomentPart):
             self._chosen = {**self._chosen, name: name not in entry_names(rows, self._chosen)}
 
     def _select_first_flagged(self) -> None:
-        """Select the first flagged env of the shown moment, and go to the first outlier of its newest episode
-        with one."""
+        """Select the first flagged env of the shown moment, and go to the outlier."""
         rows = self._session.view().env_table
         env = None if rows is None else first_flagged(rows)
         if env is not None:
@@ -490,8 +489,7 @@ class EnvPanel(MomentPart):
 
     def _select_next(self, wanted: EnvEvent) -> None:
         """Select the next env (by number, wrapping around) whose present or previous episode failed or has an
-        outlier, and go to this event. Uses the newest moment, so that pressing again goes through all of
-        them."""
+        outlier, and go to this event. Uses the newest moment, so that pressing again visits all such envs."""
         rows = self._session.look(lambda run: run.newest_env_table())
         envs = np.zeros(0, int) if rows is None else np.flatnonzero(mask(rows, wanted))
         if not len(envs):

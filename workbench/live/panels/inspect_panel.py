@@ -29,7 +29,7 @@ from workbench.page.widgets.visitors import Visitor
 
 TAB = "Inspect"
 NEAR_LIMIT_SHARE = 0.02
-"""Share of a joint's range within which the joint counts as near its limit."""
+"""Share of a joint's range, at each end, in which the joint counts as near its limit."""
 
 Row = dict[str, Any]
 """A row of the template ``inspect``."""

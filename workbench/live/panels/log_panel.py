@@ -31,7 +31,7 @@ DARK_PAGE: Rgb = (66, 66, 66)
 MIN_CONTRAST = 4.5
 """Minimum contrast ratio of text in WCAG 2.1."""
 MAX_SPANS = 1500
-"""Maximum number of spans in all lines: a line may change its colour at every character. Older lines are
+"""Maximum number of spans in all lines, since each character may have another colour. Older lines are
 plain."""
 SIXTEEN = TerminalTheme(
     (255, 255, 255), (0, 0, 0),

@@ -226,7 +226,7 @@ class CurvesPanel(MomentPart):
 
 
 def _along(episode: EpisodeNumbers, column: Column, first: int, last: int) -> NDArray[np.float32]:
-    """(last - first + 1,) numbers of an episode by step; NaN where it has none."""
+    """(last - first + 1,) numbers of an episode by step; NaN at steps without a number."""
     line = np.full(last - first + 1, np.nan, np.float32)
     line[episode.steps - first] = episode.values[column]
     return line

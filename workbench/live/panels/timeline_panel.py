@@ -118,7 +118,8 @@ class TimeBar(PagePart[View]):
         return there
 
     def _show_slider(self, low: int, high: int, value: int) -> None:
-        # The range is never empty. Disabled, not hidden: the panel would grow at the first step.
+        # The range must not be empty. Without steps, the slider is disabled and not hidden: else the panel
+        # would grow at the first step.
         self._slider.show(value, bounds=(min(low, high - 1), high), off=low >= high)
 
 
@@ -211,7 +212,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             self._draw_empty()
 
     def _draw_empty(self) -> None:
-        """Draw that nothing is kept: no task, or its envs were just built."""
+        """Draw an empty timeline: there is no task, or its envs were just built."""
         self._range, self._newest, self._range_at, self._strip_of = (0, 0), 0, -math.inf, None
         self._show_slider(0, 0, 0)
         self._strip.content = self._legend.content = self._hint.content = self._walk.content = ""
