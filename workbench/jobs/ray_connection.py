@@ -20,8 +20,7 @@ BREAKPOINT = "PYTHONBREAKPOINT"
 _CONNECT_SECONDS = 5.0
 _PROBE_SECONDS = 2.0
 _HEAD_DOWN_SECONDS = 20.0
-"""Time for which the cluster's head may refuse connections, as during a restart. After 60 s Ray itself ends
-this process."""
+"""Time for which the head may refuse connections, as during its restart. After 60 s Ray ends this process."""
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
 _AUTH_MODE = "RAY_AUTH_MODE"
 
@@ -208,8 +207,7 @@ def _breakpoints_kept() -> Iterator[None]:
 
 @contextmanager
 def _only_for_this_user() -> Iterator[None]:
-    """Within this block, a started cluster listens on the loopback address, and requires a token that only
-    this user has.
+    """Within this block, let Ray start on the loopback address, with a token that only this user has.
 
     Anyone who can connect to a cluster can run code in it, and by default Ray listens on all addresses of the machine.
     """

@@ -1,5 +1,4 @@
-"""Messages of a pool's workers, and how the dealing process handles them. Messages are data, never a
-pickle."""
+"""Messages of a pool's workers, and their handling in the dealing process. A message is never a pickle."""
 
 from __future__ import annotations
 

@@ -357,10 +357,10 @@ class Past:
         found = {
             i: history.replay_path(of, origin, MAX_REPLAYED_STEPS) for i, of in zip(envs, source, strict=True)
         }
-        ways = {i: way for i, way in found.items() if way is not None}
-        beginnings = {way.start for way in ways.values()}
+        paths = {i: path for i, path in found.items() if path is not None}
+        beginnings = {path.start for path in paths.values()}
         starts = {at: taken for at in beginnings if (taken := history.snapshot_at(at)) is not None}
-        return Restore(snapshot, envs, source, origin, undoes, ways, starts)
+        return Restore(snapshot, envs, source, origin, undoes, paths, starts)
 
     def draw(
         self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "auto"

@@ -244,8 +244,7 @@ class EnvTable:
         return True
 
     def _begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
-        """Start new episodes in these envs (N,). A previous one that ended or had outliers becomes
-        `EnvRows.last`."""
+        """Start new episodes in these envs (N,); `EnvRows.last` keeps those that ended or had outliers."""
         now, from_start = self._now, step.elapsed_steps == 0
         worth_keeping = envs & ((now.end >= 0) | np.isin(np.arange(len(envs)), list(now.outliers)))
         until = np.where(now.end < 0, now.steps, now.end)

@@ -247,8 +247,8 @@ def busy_html(busy: Busy, view: SessionView, link: LinkTo = no_links) -> str:
         advice = "The renderer is working. The first picture may take a while; Restart ends the process."
     else:
         advice = (
-            "It may only be slow. Interrupt stops it there and shows the traceback. Saving a fixed file stops "
-            "it too, and loads the file. Restart ends the process and loads the file as it is now."
+            "It may only be slow. Interrupt stops it there and shows the traceback. Saving a fixed file also "
+            "stops it, and loads the file. Restart ends the process and loads the file as it is now."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
     return render("busy", subject=subject, busy=busy, advice=advice, link=link)

@@ -56,8 +56,7 @@ WORDS = {
 TABLE = "envs"
 """Name of the panel in the page's report that the panel was unfolded."""
 MAX_DEFAULT_ENTRIES = 6
-"""Number of bool entries with a column by default: with more, a row is wider than the view. The user can show
-the others."""
+"""Number of bool entries with a column by default; with more, a row is wider than the view."""
 CURVE_POINTS = 40
 """Number of points of a row's small curve."""
 STEP_CHARACTERS = 3

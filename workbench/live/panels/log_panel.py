@@ -31,8 +31,7 @@ DARK_PAGE: Rgb = (66, 66, 66)
 MIN_CONTRAST = 4.5
 """Minimum contrast ratio of text in WCAG 2.1."""
 MAX_SPANS = 1500
-"""Maximum number of spans in all lines, since each character may have another colour. Older lines are
-plain."""
+"""Maximum number of spans in all lines: each character may have another colour. Older lines are plain."""
 SIXTEEN = TerminalTheme(
     (255, 255, 255), (0, 0, 0),
     [(0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229)],

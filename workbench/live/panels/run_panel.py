@@ -87,8 +87,8 @@ class ActionSliders:
         self._which.show(self._moved)
         if not self._folder.visible or view.told is None:
             return
-        told = view.told[min(view.selected_env, len(view.told) - 1)]
-        for one, dimension, value in zip(self._sliders, self._dimensions, told, strict=False):
+        action = view.told[min(view.selected_env, len(view.told) - 1)]
+        for one, dimension, value in zip(self._sliders, self._dimensions, action, strict=False):
             low, high = slider_bounds(dimension)
             # A policy's action may lie outside the bounds.
             # Three digits: the field next to the slider has no room for more.

@@ -27,8 +27,7 @@ WAITING = "waiting for other work in the background"
 IDLE_SECONDS = 300.0
 """Time for which an idle process is kept."""
 _STDERR_BYTES = 4096
-"""Number of bytes kept from the end of a process's ``stderr``: if the process ends with an error, the message
-quotes the last line."""
+"""Bytes kept from the end of ``stderr``: the last line is quoted if the process ends with an error."""
 _CANCEL_TIMEOUT_SECONDS = 3.0
 _LOAD_CANCEL_TIMEOUT_SECONDS = 10.0
 """Timeout for the answer to a cancelled load; then the process is ended. For other questions it is
@@ -265,7 +264,7 @@ class Background(QuestionClient):
         Raises:
             JobFailed: there is no answer.
             ProcessDied: there is no answer because the process died.
-            Preempted: a job of higher priority waits. A load is finished first: that job most likely needs it too.
+            Preempted: a job of higher rank waits. A load is finished first: that job probably needs it too.
         """
         # Check before sending: the waiting job would have to wait for the answer.
         if self._is_waited_for() and not _is_load(question):

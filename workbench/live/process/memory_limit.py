@@ -67,8 +67,7 @@ class FamilyMemory:
 
     Pages that a forked child shares with its parent count once: summed resident memory (RSS) would count a worker of
     1 GB with seven children as 8 GB. Reading the proportional set size (PSS) takes milliseconds, so it is read every two
-    seconds, and at once if the memory seems above the limit. Until the next reading, new memory counts as
-    not shared.
+    seconds, and at once if the memory seems above the limit. Until then, new memory counts as not shared.
     """
 
     def __init__(self) -> None:

@@ -149,13 +149,11 @@ class WorkerForks:
 
     def _fork_server(self) -> socket.socket | None:
         """Socket of the fork server; None if the environment or the working directory has changed since it was started."""
-        come_from = (child_environment(**_UNBUFFERED), _current_folder())
+        present = (child_environment(**_UNBUFFERED), _current_folder())
         if self._control is None:
-            self._process, self._control = start_with_socket(
-                "workbench.app.worker.fork_workers", come_from[0]
-            )
-            self._from = come_from
-        return self._control if self._from == come_from else None
+            self._process, self._control = start_with_socket("workbench.app.worker.fork_workers", present[0])
+            self._from = present
+        return self._control if self._from == present else None
 
     def _end(self) -> None:
         if self._control is not None:
@@ -174,20 +172,20 @@ def _current_folder() -> str:
 
 
 def _forked(control: socket.socket, fds: Sequence[int], niceness: int) -> ForkedKeeper:
-    told, tells = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     out, err = os.pipe(), os.pipe()
     try:
-        socket.send_fds(control, [pack(NewWorker(niceness))], [tells.fileno(), *fds, out[1], err[1]])
+        socket.send_fds(control, [pack(NewWorker(niceness))], [theirs.fileno(), *fds, out[1], err[1]])
     except BaseException:
-        told.close()
+        ours.close()
         os.close(out[0])
         os.close(err[0])
         raise
     finally:
-        tells.close()
+        theirs.close()
         os.close(out[1])
         os.close(err[1])
-    return ForkedKeeper(told, out[0], err[0])
+    return ForkedKeeper(ours, out[0], err[0])
 
 
 def start_anew(fds: Sequence[int], niceness: int) -> Keeper:

@@ -59,8 +59,7 @@ def go_back(
         if put:
             report = restore_snapshot(env, snapshot, put, [source[i] for i in put])
         if replayed:
-            # All replayed envs in one call: the process's random generators are restored with a whole batch
-            # only.
+            # All replayed envs in one call: only a whole batch restores the process's random generators.
             every, own = list(source), all(i == of for i, of in source.items())
             positions = [snapshot.env_idx.index(of) for of in source.values()]
             whole = own and snapshot.num_envs == env.num_envs == len(every)

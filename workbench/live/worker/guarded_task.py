@@ -59,8 +59,7 @@ class GuardedTask:
         ends the process.
 
         Args:
-            doing: what the heartbeat shows. None: `work` runs no code of the author and cannot be
-                interrupted.
+            doing: what the heartbeat shows; None if `work` runs no code of the author: no interrupt then.
             loads: `work` loads a version, which is refused if it fails.
         """
         if doing is None:
@@ -146,6 +145,6 @@ class GuardedTask:
         try:
             # Not `TaskEnv.restore`: it calls `evaluate`, which may be the hook that hangs.
             restore_snapshot(self.opened.env.env, self.steps.moment)
-        except Exception as error:  # the failed code may have replaced the objects to restore by any others
+        except Exception as error:  # the failed code may have replaced the objects that are restored
             return problem_from_exception(error, "reset", self.opened.loaded.source_files)
         return None

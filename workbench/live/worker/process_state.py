@@ -56,8 +56,7 @@ def read_process_state() -> ProcessState:
 
 
 def changed_settings(before: ProcessState, now: ProcessState) -> list[str]:
-    """Names of the settings that were changed or removed, and of added environment variables. An added
-    function is no change."""
+    """Names of settings that were changed or removed, and of added environment variables (not functions)."""
     if may_be_debugged():
         # A debugger replaces functions of Python by its own, some when it attaches.
         before = {

@@ -71,8 +71,7 @@ def load_version(
     step, which are undone, if the code of resets or steps changed. No picture may be in progress.
 
     Raises:
-        TaskError: the version does not work. If its code ran, its effects are not undone: the process must
-        end.
+        TaskError: the version does not work. If its code ran, the process must end: effects are not undone.
     """
     opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
@@ -316,7 +315,7 @@ def _rescore(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change
     except TaskError as error:
         if change.hooks & RESET_HOOKS:
             raise _MustRebuild(
-                f"{change.reason}, and this moment lacks what a reset makes now ({error.problem.message})"
+                f"{change.reason}, and the state lacks what a reset makes now ({error.problem.message})"
             ) from error
         raise
     if last.action is None:

@@ -49,8 +49,7 @@ class StepEvents:
         self._undrawable.clear()
 
     def capture(self, env_idx: tuple[int, ...], from_reset: bool) -> None:
-        """Start or stop capturing, see `SetCapture`. With `from_reset`, envs that are captured now
-        continue."""
+        """Start or stop capturing, see `SetCapture`. Those of `env_idx` that are captured now continue."""
         begun = self._recording & set(env_idx) if from_reset else set(env_idx)
         self._recording, self._from_reset = begun, set(env_idx) - begun
 
