@@ -37,7 +37,7 @@ def test_a_task_is_solved_saved_and_exported_with_the_mouse_only(desk: Desk) -> 
     page = desk.page
     desk.tab("Run")
     choose(desk, "Source", "solve")
-    desk.button("Its options, and what it finds").click()
+    desk.button("Options and results of solve").click()
     expect(page.get_by_text(re.compile("actions are planned by rollouts"))).to_be_visible()
     desk.button("Play").click()
     save = desk.button("Save the solved episode")

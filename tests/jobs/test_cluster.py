@@ -209,7 +209,7 @@ def test_other_versions_are_refused_and_named(
 ) -> None:
     here = seam.versions_here()
     monkeypatch.setattr(seam, "versions_here", lambda: {**here, "torch": "1.0"})
-    with pytest.raises(PoolError, match=re.escape(f"has torch {here['torch']}, and the submitting side 1.0")):
+    with pytest.raises(PoolError, match=re.escape(f"has torch {here['torch']} (submitting side: 1.0)")):
         Run(Setup(folder=tmp_path), range(8)).run_with(Cluster(address, 1))
 
 

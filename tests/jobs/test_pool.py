@@ -295,7 +295,7 @@ def test_shards_cover_all_chunks_once_and_are_of_equal_size(total: int, count: i
 
 @pytest.mark.parametrize("text", ["0/4", "5/4", "1", "a/b", "-1/3", "1/0", " 1/2", "1/2/3", "١/٢"])
 def test_an_invalid_shard_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="--shard takes a part of a whole"):
+    with pytest.raises(ValueError, match="--shard takes a part of the job"):
         parse_shard(text)
     assert str(parse_shard("3/64")) == "3/64"
 

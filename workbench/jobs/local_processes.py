@@ -38,7 +38,7 @@ class Processes:
     def __init__(self, workers: int, on_death: Callable[[str], None] = lambda text: None) -> None:
         """
         Args:
-            workers: maximum number of processes; there are no more than chunks.
+            workers: maximum number of processes; there are never more processes than chunks.
             on_death: as in `Listener`.
         """
         self._workers, self._on_death = workers, on_death
@@ -53,7 +53,7 @@ class Processes:
 
 @dataclass(eq=False)
 class _Process:
-    """A process of the pool, in the process that started it."""
+    """A process of the pool, as seen by the process that started it."""
 
     line: MessageSocket
     keeper: subprocess.Popen[bytes]
@@ -64,7 +64,7 @@ class _Process:
 
 
 class _ProcessPool:
-    """Starts the processes of one run, deals to them, and replaces those that fail."""
+    """Starts the processes of one run, deals chunks to them, and replaces those that fail."""
 
     def __init__(
         self, work: Work, scheduler: Scheduler, workers: int, on_death: Callable[[str], None]
@@ -97,14 +97,14 @@ class _ProcessPool:
                     self._leave(process)
                     failure = failure or error
                     self._scheduler.lower(0)
-            # A chunk may have been given back after the other processes ended.
+            # A process that failed may have given back its chunk after all others had ended.
             if not self._busy() and self._scheduler.count_left(1):
                 self._start(0)
         if failure is not None:
             raise failure
 
     def end(self) -> None:
-        """Wait for finished processes, and kill the others, as after a second Ctrl-C: they may not respond."""
+        """Wait for finished processes, and kill the others at once: after a second Ctrl-C they may hang."""
         for process in self._processes:
             if not process.heard:
                 self._exit_code(process, _EXIT_SECONDS)
@@ -123,7 +123,7 @@ class _ProcessPool:
                 python_command("-m", "workbench.machine.processes.family", str(os.getpid()), *module),
                 stdin=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
-                start_new_session=True,  # Ctrl-C in the terminal reaches only this process, which stops them
+                start_new_session=True,  # Ctrl-C in the terminal reaches only this process, which ends them
                 env=child_environment(),
             )
         process = _Process(MessageSocket(ours, MESSAGES), keeper, place)
@@ -143,19 +143,20 @@ class _ProcessPool:
             self._start(process.place)
 
     def _receive(self, process: _Process) -> None:
-        """Handle its complete messages. They are untrusted: the author's code in the process may write to any descriptor.
+        """Handle the complete messages of a process. They are untrusted: the author's code in the process may
+        write to any descriptor.
 
         Raises:
             TaskError, PoolError: the process failed, and the job is over.
         """
         try:
             while process.heard and (message := process.line.receive(0)) is not None:
-                news = self._listener.take(process, message)
-                if news == "asks":
+                outcome = self._listener.take(process, message)
+                if outcome == "asks":
                     self._send(process, self._scheduler.next(process))
-                elif news == "failed":
+                elif outcome == "failed":
                     self._replace(process)
-                elif news == "done":
+                elif outcome == "done":
                     process.heard = False
         except Unreadable as error:
             raise PoolError(f"a process {self._work.name} sent an unreadable message ({error})") from error
@@ -211,7 +212,7 @@ def main(socket_fd: str) -> None:
     connection = Connection(int(socket_fd))
     queue = _SocketQueue(connection)
     try:
-        # Limit the cores: PhysX and the software renderer start a thread for each one that the process may use.
+        # Limit the cores: PhysX and the software renderer start a thread for each core of the process.
         os.sched_setaffinity(0, connection.recv())
         with quick_imports():
             run, setup = connection.recv()

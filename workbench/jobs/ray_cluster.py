@@ -1,8 +1,9 @@
 """Runs a job's work on a Ray cluster: a running one, or one that is started on this machine.
 
-A worker is a Ray actor that runs the same function as a local process. Its messages go as bytes of `wire` to one more actor,
-the broker, which the dealing process polls: so a worker never blocks, and a pickle that the author's code made is never
-loaded here. When Ray reports that an actor has ended, its chunk is dealt again.
+A worker is a Ray actor that runs the same function as a local process. It sends its messages, packed by
+`wire`, to another actor, the broker, which the dealing process polls. So a worker never blocks, and the
+dealing process never loads a pickle that the author's code may have made. When Ray reports that an actor has
+ended, its chunk is dealt again.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ class Cluster:
     """An executor whose workers are actors of a Ray cluster."""
 
     address: str = AUTO
-    """``local`` starts a cluster on this machine that only this user can connect to and that ends with the job;
-    ``auto`` takes a running cluster, or else starts one like ``local``."""
+    """``local`` starts a cluster on this machine, to which only this user can connect and which ends with the
+    job; ``auto`` uses a running cluster, or else starts one like ``local``."""
     workers: int | None = None
     """Number of workers; None for as many as the cluster has room for."""
     cpus_per_worker: float = 1
@@ -66,9 +67,9 @@ class Cluster:
         """Run the work on the cluster; see `Executor.run`.
 
         Raises:
-            NoCluster: as `connected` does; or the cluster has no room for a worker.
-            PoolError: a machine has other versions of the packages; the cluster ended; or as `Executor.run` does.
-            TooMuch: as `pack_worker_files` does.
+            NoCluster: no cluster answers, Ray is not installed, or the cluster has no room for a worker.
+            PoolError: a machine has other versions of the packages, the cluster ended, or see `Executor.run`.
+            TooMuch: the files for the workers are too large.
         """
         worker_files = pack_worker_files(work.folders, work.files)
         with connected(self.address) as ray:
@@ -110,7 +111,7 @@ class _Started:
 
 
 class _ActorPool:
-    """Starts the actors of one run, deals to them, and replaces those that fail."""
+    """Starts the actors of one run, deals chunks to them, and replaces those that fail."""
 
     def __init__(
         self,
@@ -162,7 +163,7 @@ class _ActorPool:
             raise failure
 
     def end(self) -> None:
-        """Wait for finished actors, and kill the others at once, as after a second Ctrl-C: they may not respond."""
+        """Wait for finished actors, and kill the others at once: after a second Ctrl-C they may hang."""
         if self._ending:
             ended = [actor.ended for actor in self._ending]
             self._ray.wait(ended, num_returns=len(ended), timeout=_EXIT_SECONDS)
@@ -172,10 +173,10 @@ class _ActorPool:
 
     def _messages(self, seconds: float) -> list[tuple[int, bytes]]:
         """Messages of the workers since the last call; see `MessageBroker.take`. Raises ClusterLost."""
-        said = self._broker.take.remote(seconds)
-        while not self._ray.wait([said], timeout=_ANSWER_SECONDS)[0]:
+        reply = self._broker.take.remote(seconds)
+        while not self._ray.wait([reply], timeout=_ANSWER_SECONDS)[0]:
             self._health.check()
-        return self._ray.get(said)
+        return self._ray.get(reply)
 
     def _reap(self) -> None:
         """End the actors that have removed their folders: an actor keeps its cores as long as it lives."""
@@ -188,7 +189,8 @@ class _ActorPool:
             self._ending.remove(actor)
 
     def _guarded(self, number: int, failure: Any, act: Any) -> Any:
-        """Call `act` for a worker; after an error that ends the job, the other workers finish their items."""
+        """Call `act` for a worker; returns the first failure so far. After an error that ends the job, the
+        other workers finish their items."""
         try:
             act()
         except (TaskError, PoolError) as error:
@@ -201,7 +203,7 @@ class _ActorPool:
         """Number of workers that the cluster has room for.
 
         Raises:
-            NoCluster: there is no room for any.
+            NoCluster: there is no room for a single worker.
         """
         asked = {"CPU": self._how.cpus_per_worker, "GPU": self._how.gpus_per_worker}
         rooms = [
@@ -210,8 +212,8 @@ class _ActorPool:
             if node["Alive"]
         ]
         if not sum(rooms):
-            told = ", ".join(f"{count:g} {name}" for name, count in asked.items() if count > 0)
-            raise NoCluster(f"no machine of the cluster has {told} for a worker")
+            needs = ", ".join(f"{count:g} {name}" for name, count in asked.items() if count > 0)
+            raise NoCluster(f"a worker needs {needs}, and no machine of the cluster has that")
         return sum(rooms)
 
     def _start(self) -> None:
@@ -227,16 +229,16 @@ class _ActorPool:
 
     def _take(self, number: int, raw: bytes) -> None:
         if number not in self._busy:
-            return  # late messages of a worker whose chunk was dealt again
+            return  # a late message of a worker whose chunk was dealt again
         try:
-            news = self._listener.take(number, self._read(raw))
+            outcome = self._listener.take(number, self._read(raw))
         except Unreadable as error:
             raise PoolError(f"a worker {self._work.name} sent an unreadable message ({error})") from error
-        if news == "asks":
+        if outcome == "asks":
             self._broker.answer.remote(number, self._scheduler.next(number))
-        elif news in ("failed", "done"):
+        elif outcome in ("failed", "done"):
             self._ending.append(self._busy.pop(number))
-            if news == "failed" and self._scheduler.count_left(1):
+            if outcome == "failed" and self._scheduler.count_left(1):
                 self._start()
 
     def _gone(self) -> list[int]:
@@ -305,9 +307,9 @@ class MessageBroker:
                 await asyncio.wait_for(self._came.wait(), seconds)
             except asyncio.TimeoutError:
                 return []
-        said = list(self._said)
+        messages = list(self._said)
         self._said.clear()
-        return said
+        return messages
 
     async def set_limit(self, limit: int) -> None:
         self._limit = limit
@@ -328,10 +330,10 @@ class RayWorker:
         """Do the work.
 
         Args:
-            work: the pickled function and its setup; unpickled after `quick_imports`, since its imports take seconds.
+            work: the pickled function and its setup; its imports take seconds, so `quick_imports` is active.
 
         Raises:
-            OtherVersions: this machine has other versions than the submitting side.
+            OtherVersions: this machine has other versions of the packages than the submitting side.
         """
         from workbench.machine.software_vulkan import use_private_driver
 
@@ -366,12 +368,14 @@ def _remove_left_folders() -> None:
 def _require_versions(versions: Mapping[str, str]) -> None:
     here = versions_here()
     if here != versions:
-        told = [
-            f"{name} {here.get(name, 'is not installed')}, and the submitting side {versions.get(name, 'none')}"
+        differences = [
+            f"{name} {here.get(name, 'not installed')} (submitting side: {versions.get(name, 'none')})"
             for name in dict.fromkeys((*versions, *here))
             if here.get(name) != versions.get(name)
         ]
-        raise OtherVersions(f"{platform.node()} has {'; '.join(told)}: install the same on all machines")
+        raise OtherVersions(
+            f"{platform.node()} has {'; '.join(differences)}: install the same versions on all machines"
+        )
 
 
 class _BrokerQueue(WorkerQueue):

@@ -20,13 +20,13 @@ BREAKPOINT = "PYTHONBREAKPOINT"
 _CONNECT_SECONDS = 5.0
 _PROBE_SECONDS = 2.0
 _HEAD_DOWN_SECONDS = 20.0
-"""Time for which the head may refuse connections, since it may be restarting. After 60 s Ray itself ends this process."""
+"""Time for which the head may refuse connections, as during its restart. After 60 s Ray ends this process."""
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
 _AUTH_MODE = "RAY_AUTH_MODE"
 
 
 class NoCluster(OSError):
-    """There is no such cluster, or it cannot run a worker; the message gives advice."""
+    """No cluster answers, or the cluster cannot run a worker; the message gives advice."""
 
 
 class ClusterLost(OSError):
@@ -36,7 +36,7 @@ class ClusterLost(OSError):
 class ClusterHealth:
     """Detects that the daemons of the connected cluster have ended.
 
-    Ray itself continues for seconds, then ends this process from native code, without an exception.
+    Ray itself needs seconds to notice, and then ends this process from native code, without an exception.
     """
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ class ClusterHealth:
         self._raylet.connect(_global_node.raylet_socket_name)
 
     def check(self) -> None:
-        """Raise ClusterLost if they have ended. Takes microseconds, and opens a connection every `_PROBE_SECONDS`."""
+        """Raise ClusterLost if the daemons have ended. Cheap: connects only every `_PROBE_SECONDS`."""
         # The raylet sends nothing on an idle connection: readable means closed.
         if self._raylet is not None and select.select([self._raylet], (), (), 0)[0]:
             raise ClusterLost("Ray's daemon of this machine (raylet) has ended")
@@ -73,7 +73,7 @@ class ClusterHealth:
 
 @contextmanager
 def connected(address: str = AUTO) -> Iterator[Any]:
-    """Yield the module ``ray``, connected. A cluster that is started here ends with this context.
+    """Yield the module ``ray``, connected to a cluster. A cluster that this context starts ends with it.
 
     Raises:
         NoCluster: Ray is not installed, or nothing answers at the address.
@@ -111,14 +111,15 @@ def connected(address: str = AUTO) -> Iterator[Any]:
 def _token_given(ray: Any, address: str) -> Iterator[None]:
     """Within this block, send this user's token if the cluster requires one and ``RAY_AUTH_MODE`` is not set.
 
-    ``ray start`` requires a token if this user has one, but Ray does not send it by default, and is refused after twenty
-    seconds. If it is sent to a cluster that requires none, no worker starts.
+    A cluster of ``ray start`` requires a token if this user has one, but by default Ray does not send the
+    token, and is refused after twenty seconds. If the token is sent to a cluster that requires none, no
+    worker starts.
     """
     if not _asks_for_token(ray, address):
         yield
         return
     os.environ[_AUTH_MODE] = "token"
-    ray._raylet.Config.initialize("")  # reread the mode, which Ray read when it was imported
+    ray._raylet.Config.initialize("")  # Ray has read the mode when it was imported: read it again
     try:
         yield
     finally:
@@ -137,7 +138,7 @@ def _asks_for_token(ray: Any, address: str) -> bool:
 
 
 def _why_deaf(address: str) -> str | None:
-    """Why there can be no cluster at the address; None if something listens there. Ray itself would retry for minutes."""
+    """Why no cluster can be at the address; None if something listens there. Ray would retry for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
         with socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS):
@@ -150,8 +151,8 @@ def _why_deaf(address: str) -> str | None:
 
 def _no_cluster_text(address: str, why: str) -> str:
     return (
-        f"no Ray cluster answers at {address} ({why}). Start one with `ray start --head`, or give --cluster auto; if it asks "
-        "for a token, give that in RAY_AUTH_TOKEN"
+        f"no Ray cluster answers at {address} ({why}). Start one with `ray start --head`, or use --cluster "
+        "auto. If the cluster requires a token, set RAY_AUTH_TOKEN"
     )
 
 
@@ -159,7 +160,7 @@ def _left_here() -> str | None:
     """Address of a cluster that was started on this machine and still answers; None if there is none."""
     from ray._private.services import find_bootstrap_address
 
-    # Ray keeps the address of a cluster that has ended, and would try it for minutes.
+    # Ray keeps the address of a cluster that has ended, and would try to connect for minutes.
     address = find_bootstrap_address(None)
     return address if address and _why_deaf(address) is None else None
 
@@ -174,8 +175,8 @@ def _connect(ray: Any, address: str, how: Mapping[str, Any]) -> None:
     if not ray.get_runtime_context().gcs_address.startswith("127.0.0.1:"):
         ray.shutdown()
         raise NoCluster(
-            f"Ray {ray.__version__} would let other machines connect to the cluster that it starts: start one "
-            "yourself with `ray start --head`, and give its address"
+            f"Ray {ray.__version__} would let other machines connect to the cluster that it starts. Start "
+            "one yourself with `ray start --head`, and give its address to --cluster"
         )
 
 
@@ -206,7 +207,7 @@ def _breakpoints_kept() -> Iterator[None]:
 
 @contextmanager
 def _only_for_this_user() -> Iterator[None]:
-    """Let Ray start on the loopback address, with a token that no other user can read.
+    """Within this block, let Ray start on the loopback address, with a token that only this user has.
 
     Anyone who can connect to a cluster can run code in it, and by default Ray listens on all addresses of the machine.
     """
@@ -214,11 +215,11 @@ def _only_for_this_user() -> Iterator[None]:
 
     before = ray_constants.ENABLE_RAY_CLUSTER
     ray_constants.ENABLE_RAY_CLUSTER = False
-    # The variable is for the daemons, which import the constant again.
+    # The environment variable is for the daemons, which import the constant again.
     os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"
-    # Same niceness as local processes; Ray's default of 15 is for shared machines.
+    # Workers get the niceness of local processes; Ray's default of 15 is for shared machines.
     os.environ.setdefault("RAY_worker_niceness", "0")
-    # Without this Ray writes a token into the home folder, where others may read it. Ray requires tokens by itself.
+    # Without this Ray, which requires a token, writes one into the home folder, where others may read it.
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
     try:
         yield

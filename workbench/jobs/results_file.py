@@ -39,7 +39,7 @@ Request = TypeVar("Request")
 
 
 class JobFileError(ValueError):
-    """The file belongs to another job, or is no job file."""
+    """The file belongs to another job, cannot be used, or is not a job file."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def job_of(
     """The key of a command's job.
 
     Args:
-        task: the task as the person named it.
+        task: the task as the user named it.
         request: a dataclass with all options.
         leaves_out: fields of `request` that the results do not depend on.
         files: other files that the results depend on, such as a policy's.
@@ -71,7 +71,7 @@ def job_of(
     """
     about = {"command": command, "python": ".".join(map(str, sys.version_info[:2])), **package_versions()}
     file = named_file(task)
-    # The task is identified by its text: its folder may differ between machines.
+    # The task is identified by its file's name and text: the folder may differ between machines.
     about["task"] = task if file is None else task.replace(str(file.parent) + "/", "").rpartition("/")[2]
     if file is not None and file.is_file():
         about["the task's text"] = read_content(file).hash[:12]
@@ -106,9 +106,9 @@ class JobFile:
         """Open or create the file.
 
         Raises:
-            JobFileError: it belongs to another job (the message lists the differences), another process has it open, or it
-                is no job file.
-            OSError: its folder cannot be created.
+            JobFileError: the file belongs to another job (the message lists the differences), is open in
+                another process, or is not a job file.
+            OSError: the folder of the file cannot be created.
         """
         path.absolute().parent.mkdir(parents=True, exist_ok=True)
         self.path = path
@@ -145,12 +145,12 @@ class JobFile:
         return _results(self.path, self._database, kind)
 
     def keep(self, number: int, result: object) -> None:
-        """Write a result; it is on disk afterwards. Raises JobFileError."""
+        """Write a result to the disk. Raises JobFileError."""
         with _named(self.path):
             self._database.execute("INSERT OR REPLACE INTO result VALUES (?, ?)", (number, pack(result)))
 
     def put(self, packed: Mapping[int, bytes]) -> None:
-        """Write packed results; replaces results that are in the file already. Raises JobFileError."""
+        """Write packed results, also in place of results in the file. Raises JobFileError."""
         with _named(self.path):
             self._database.execute("BEGIN")
             self._database.executemany("INSERT OR REPLACE INTO result VALUES (?, ?)", packed.items())
@@ -168,7 +168,7 @@ class Kept:
     file: JobFile | None = None
     shard: Shard = Shard()
     is_there: Callable[[Any], bool] = lambda result: True
-    """Returns whether the files that a result names still exist; if not, its item runs again."""
+    """Returns whether the files that a result names still exist. An item without its files runs again."""
 
     @property
     def elsewhere(self) -> bool:
@@ -216,11 +216,11 @@ class JobParts:
 
 
 def write_whole(path: Path, merged: JobParts) -> None:
-    """Write a job file with all results of the parts.
+    """Write the results of all parts to a job file, also in place of results that it has.
 
     Raises:
-        JobFileError: the file exists and belongs to another job, or is complete already.
-        OSError: its folder cannot be created.
+        JobFileError: the file exists and belongs to another job, or another process has it open.
+        OSError: the folder of the file cannot be created.
     """
     folder = next(iter(merged.folders.values()), "")
     file = JobFile(path, JobKey(merged.command, merged.about, merged.request, folder))
@@ -232,14 +232,15 @@ def read_parts(files: Sequence[Path]) -> JobParts:
     """The results of these job files.
 
     Raises:
-        JobFileError: they belong to different jobs (the message lists the differences), or two hold the same item.
-        FileNotFoundError: there is no such file.
+        JobFileError: the files belong to different jobs (the message lists the differences), or two have the
+            same item.
+        FileNotFoundError: a file does not exist.
     """
     about: Mapping[str, str] | None = None
     values: dict[int, bytes] = {}
     folders: dict[int, str] = {}
     owners: dict[int, Path] = {}
-    """The file that holds each item."""
+    """The file that each item comes from."""
     request = b""
     for path in files:
         if not path.is_file():
@@ -248,16 +249,16 @@ def read_parts(files: Sequence[Path]) -> JobParts:
             _named(path),
             closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database,
         ):
-            told = _about(path, database)
+            about_part = _about(path, database)
             if about is None:
-                about, request = told, _kept(database, "request")
-            _require_same(path, about, told)
+                about, request = about_part, _kept(database, "request")
+            _require_same(path, about, about_part)
             folder = os.fsdecode(_kept(database, "folder"))
             rows = database.execute("SELECT number, value FROM result").fetchall()
         if (doubled := next((number for number, _ in rows if number in owners), None)) is not None:
             raise JobFileError(
-                f"{owners[doubled]} and {path} hold the same results (such as number {doubled}): they are the same part, so "
-                "leave one of them out"
+                f"{owners[doubled]} and {path} both have the result of item {doubled}: they are the same "
+                "part of the job, so leave one of them out"
             )
         owners.update((number, path) for number, _ in rows)
         values.update(rows)
@@ -270,12 +271,12 @@ def read_parts(files: Sequence[Path]) -> JobParts:
 def _require_same(path: Path, mine: Mapping[str, str], there: Mapping[str, str]) -> None:
     names = [name for name in dict.fromkeys((*mine, *there)) if mine.get(name) != there.get(name)]
     if names:
-        told = "; ".join(
+        differences = "; ".join(
             f"{name} is {mine.get(name, 'not given')} here and {there.get(name, 'not given')} there"
             for name in names[:_MAX_DIFFERENCES]
         )
         more = f"; and {len(names) - _MAX_DIFFERENCES} more differ" if len(names) > _MAX_DIFFERENCES else ""
-        raise JobFileError(f"{path} belongs to another job: {told}{more}")
+        raise JobFileError(f"{path} belongs to another job: {differences}{more}")
 
 
 def _about(path: Path, database: sqlite3.Connection) -> dict[str, str]:
@@ -301,7 +302,7 @@ def _results(path: Path, database: sqlite3.Connection, kind: Any) -> dict[int, A
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Add the name of the file to an error of the database."""
+    """Raise errors of the database as JobFileError with the name of the file."""
     try:
         yield
     except sqlite3.OperationalError as error:

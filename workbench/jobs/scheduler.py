@@ -15,8 +15,8 @@ from workbench.task.problem import Problem, TaskError
 
 NO_LIMIT = sys.maxsize
 MAX_ALIKE_FIRST, MAX_ALIKE_LATER = 5, 20
-"""Maximum number of consecutive chunks with the same failure, before the first result and after it; beyond that the
-others would fail too."""
+"""Number of chunks that fail in the same way without a result in between, after which the others would fail
+too: before the first result, and later."""
 _MAX_EARLY_DEATHS = 3
 """Number of workers that may die before their first chunk."""
 _NO_GROUP = -1
@@ -35,8 +35,8 @@ class PoolError(RuntimeError):
 class Chunk:
     """Items that one worker runs together.
 
-    The division does not depend on the number of workers, so that the results cannot depend on it either: a policy's
-    results differ in the last bits with the size of its batch and the row in it.
+    The division into chunks does not depend on the number of workers, so that the results do not either: a
+    policy's results differ in the last bits with the batch size and with the row in the batch.
     """
 
     numbers: tuple[int, ...]
@@ -44,7 +44,7 @@ class Chunk:
     wanted: frozenset[int]
     """Items whose results are still missing."""
     again: bool = False
-    """Whether another worker, or an earlier run of the job, may have begun the chunk, so that files of it may exist."""
+    """Whether another worker, or an earlier run of the job, may have begun the chunk and left files of it."""
 
 
 class ItemQueue(Protocol):
@@ -52,7 +52,7 @@ class ItemQueue(Protocol):
 
     @property
     def origin(self) -> Mapping[str, str]:
-        """Maps a folder on this worker to the folder of the submitting side that its files came from."""
+        """Maps folders on this worker to the folders of the submitting side from which their files came."""
         ...
 
     def next(self) -> Chunk | None:
@@ -60,7 +60,7 @@ class ItemQueue(Protocol):
         ...
 
     def limit(self) -> int:
-        """First item number that is not needed, even if that item has begun. The limit never rises."""
+        """The first item number that is not needed, even if the item has begun. The limit never rises."""
         ...
 
     def send_result(self, number: int, result: Any) -> None:
@@ -81,7 +81,7 @@ class Failure:
 
 
 def kind_of(problem: Problem) -> object:
-    """Key that is equal for failures of the same kind (raised at the same place)."""
+    """Key that is equal for failures of the same kind: raised in the same stage, at the same line."""
     return problem.stage, problem.file, problem.line
 
 
@@ -102,8 +102,7 @@ class Shard:
     count: int = 1
 
     def part(self, total: int) -> range:
-        """Range of the chunks in this part, out of `total` chunks. Parts are consecutive, and their sizes differ by at most
-        one."""
+        """Range of the chunks in this part, out of `total` chunks. Sizes of parts differ by at most one."""
         return range(total * (self.index - 1) // self.count, total * self.index // self.count)
 
     def __str__(self) -> str:
@@ -114,7 +113,7 @@ def parse_shard(text: str) -> Shard:
     """The part that ``--shard`` names, as in ``3/64``. Raises ValueError for any other text."""
     match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise ValueError(f"--shard takes a part of a whole, as in 3/64 for the third of 64; got {text!r}")
+        raise ValueError(f"--shard takes a part of the job, as in 3/64 for the third of 64; got {text!r}")
     return Shard(int(match[1]), int(match[2]))
 
 
@@ -149,14 +148,15 @@ class Scheduler(Generic[Result, Update]):
         """
         Args:
             numbers: item numbers, ascending, from 0 on.
-            stop: called often; once it returns True, no more items are needed.
+            stop: called often; as soon as it returns True, no more items are needed.
             chunk: number of items in a chunk: item k belongs to chunk ``k // chunk``.
-            tries: maximum number of times that a chunk is started if its workers die.
-            on_failure: called with the items in which the author's code failed, and those whose workers died in each try; the
-                job continues unless too many fail in the same way. If None, the first failure ends the job.
-            group: number of items in a group, which begins with a new chunk: item k belongs to group ``k // group``. If the
-                chunks of a group fail in the same way, or the task cannot be built for it, the rest of the group fails too,
-                and the job continues.
+            tries: maximum number of times that a chunk is started, if its workers die.
+            on_failure: called with items in which the author's code failed, or whose workers died in every
+                try. The job continues unless too many chunks fail in the same way. If None, the first failure
+                ends the job.
+            group: number of items in a group: item k belongs to group ``k // group``. Each group begins with
+                a new chunk. If too many chunks of a group fail in the same way, or the task cannot be built
+                for the group, the rest of the group counts as failed, and the job continues.
         """
         self._numbers, self._size, self._tries = numbers, chunk, tries
         self._on_result, self._on_update, self._stop = on_result, on_update, stop
@@ -171,7 +171,7 @@ class Scheduler(Generic[Result, Update]):
         self._ahead: deque[Chunk] = deque()
         """Chunks that were already taken from `_left`."""
         self._alone: deque[Chunk] = deque()
-        """Items of failed chunks, as chunks of one item: dealt first, to find out which of them fail."""
+        """Items of failed chunks, as chunks of one item each: dealt first, to find out which items fail."""
         self._returned: deque[Chunk] = deque()
         self._held: dict[Hashable, list[_Held]] = {}
         self._deaths: dict[int, int] = {}
@@ -224,7 +224,7 @@ class Scheduler(Generic[Result, Update]):
         return None
 
     def count_left(self, most: int) -> int:
-        """Number of chunks that can be dealt, counted up to `most`."""
+        """Number of chunks that can still be dealt, at most `most`."""
         limit = self.limit()
         again = sum(min(chunk.wanted) < limit for chunk in (*self._alone, *self._returned))
         return min(self._look(most) + again, most)
@@ -257,17 +257,18 @@ class Scheduler(Generic[Result, Update]):
         self._on_update(update)
 
     def ended(self, worker: Hashable) -> None:
-        """Handle a worker's last message. Raises PoolError if it still has items."""
+        """Handle a worker's last message. Raises PoolError if the worker still has needed items."""
         held = self._held.pop(worker, [])
         if min((number for one in held for number in one.missing), default=NO_LIMIT) < self.limit():
             raise PoolError("ended before it was done")
 
     def failed(self, worker: Hashable, error: TaskError) -> None:
-        """Handle a failure of the author's code in the last chunk of this worker, which has ended. The items of that
-        chunk are then dealt one by one.
+        """Handle a failure of the author's code in the last chunk of this worker, which has ended. The items
+        of the failed chunk are then dealt one by one.
 
         Raises:
-            TaskError: the job is over: no item was begun, or there were too many failures of this kind.
+            TaskError: the job is over: the worker had no chunk, too many chunks failed in this way, or there
+                is no `on_failure`.
         """
         held = self._held.pop(worker, [])
         if not held or self._on_failure is None:
@@ -275,7 +276,7 @@ class Scheduler(Generic[Result, Update]):
         *others, last = held
         for one in others:
             self._give_back(one)
-        # A task that cannot be built fails for the next chunk of its group too.
+        # A task that cannot be built would also fail in the next chunk of its group.
         unbuilt = self._group != NO_LIMIT and error.problem.stage in ("syntax", "import", "build")
         if not unbuilt and self._divide(last):
             return
@@ -299,7 +300,7 @@ class Scheduler(Generic[Result, Update]):
         if self.limit() == 0:
             return
         if not held:
-            # It died before its first chunk: the machine or the import is at fault.
+            # The worker died before its first chunk: the machine or the import is at fault.
             before = self._failed_alike.setdefault(_NO_GROUP, [])
             before.append((code, -len(before) - 1))
             if len(before) >= _MAX_EARLY_DEATHS:
@@ -330,7 +331,7 @@ class Scheduler(Generic[Result, Update]):
             yield tuple(numbers)
 
     def _look(self, most: int) -> int:
-        """Fill `_ahead` with up to `most` chunks; returns the number of them that are needed."""
+        """Fill `_ahead` with up to `most` chunks; returns how many of these are needed."""
         while len(self._ahead) < most and (numbers := next(self._left, None)) is not None:
             if wanted := frozenset(numbers) - self._known.keys():
                 if (problem := self._given_up.get(numbers[0] // self._group)) is not None:
@@ -377,8 +378,8 @@ class Scheduler(Generic[Result, Update]):
             self._on_failure(failure)
 
     def _alike(self, key: object, held: _Held) -> bool:
-        """Record a failure of this kind; returns whether enough consecutive chunks of its group failed in the same way
-        to give it up."""
+        """Record a failure of this kind; returns whether enough chunks of the group have failed in this way
+        since its last result to give up the group."""
         first = held.chunk.numbers[0]
         group = first // self._group
         before = self._failed_alike.setdefault(group, [])
@@ -394,20 +395,21 @@ class Work(Generic[Setup, Result, Update]):
     run: Callable[[Setup, ItemQueue], None]
     """A function that can be imported by name. It returns when its queue has no next chunk and none is running.
 
-    A TaskError from it is the failure of its last chunk; an OSError, ValueError or RuntimeError ends the job.
+    If it raises a TaskError, its last chunk has failed; an OSError, ValueError or RuntimeError ends the job.
     """
     setup: Setup
     """The first argument of `run`; can be pickled."""
     result: Any
     update: Any
-    """Types of results and progress, against which `wire` checks the messages of other processes."""
+    """Types of results and updates; `wire` checks the messages of other processes against them."""
     name: str
-    """Clause that names the process in messages: "a process *that records* was killed by SIGKILL"."""
+    """Clause that describes a worker in messages: "a process *that records* was killed by SIGKILL"."""
     folders: Sequence[Path] = ()
     """Folders of the author that workers on other machines need, with everything below."""
     files: Sequence[Path] = ()
-    """Other files that workers on other machines need. Paths in `setup` that are in neither must exist on all machines; a path
-    below a copied folder that must not be relocated, such as the folder of the results, is stored as bytes."""
+    """Other files that workers on other machines need. Paths in `setup` outside `folders` and `files` must
+    exist on all machines. A path in a copied folder that must not be relocated (the results folder) is stored
+    as bytes."""
 
 
 class Executor(Protocol):
@@ -422,8 +424,8 @@ class Executor(Protocol):
         """Deal until no chunk is left or needed and all running items are finished.
 
         Raises:
-            TaskError, PoolError: as `Scheduler` decides; or a worker failed in our own code. The other workers were stopped
-                and dropped their running items.
+            TaskError, PoolError: too much failed (see `Scheduler`), or a worker failed in the workbench's own
+                code. The other workers were stopped and dropped their running items.
         """
         ...
 

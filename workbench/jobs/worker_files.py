@@ -22,7 +22,7 @@ Value = TypeVar("Value")
 
 
 class TooMuch(ValueError):
-    """The files of the task's folder exceed the maximum size; the message names the large ones."""
+    """The files exceed the maximum size; the message names the largest."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,15 @@ class WorkerFiles:
     current: str
     """Current folder on the submitting side."""
     data: bytes
-    """The zip. Names are the absolute paths without their first slash, so that relative paths between files stay valid."""
+    """The zip. Its names are absolute paths without the first slash, so that relative paths between files
+    stay valid."""
 
     def unpack(self, folder: Path) -> dict[str, str]:
-        """Write all files below `folder`, which is empty, and change to the counterpart of the submitting side's current
-        folder.
+        """Write all files below `folder`, which is empty, and make the copy of the submitting side's current
+        folder the current one.
 
         Returns:
-            path here by path on the submitting side, for each root.
+            for each root: its path on the submitting side, and its path here.
 
         Raises:
             OSError: a file cannot be written.
@@ -62,12 +63,12 @@ def pack_worker_files(folders: Iterable[Path], files: Iterable[Path] = ()) -> Wo
         files: other files, packed without their folders.
 
     Raises:
-        TooMuch: together they are larger than `MAX_BYTES`.
+        TooMuch: the files are together larger than `MAX_BYTES`.
         OSError: a file cannot be read.
     """
     roots = _outermost(folder.resolve() for folder in folders)
     found = [file for root in roots for file in files_below(root)]
-    # They may lie below a root whose packing leaves them out, such as recordings in the task's folder.
+    # Pack these files in any case: `files_below` leaves some out, such as recordings in the task's folder.
     alone = {file.resolve() for file in files}
     sizes = {file: file.stat().st_size for file in sorted({*found, *alone})}
     if sum(sizes.values()) > MAX_BYTES:
@@ -86,7 +87,7 @@ def pack_worker_files(folders: Iterable[Path], files: Iterable[Path] = ()) -> Wo
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:
-    """The folders that are not inside another one of them."""
+    """Those of the folders that are not inside another of them."""
     kept: list[Path] = []
     for folder in sorted(set(folders)):
         if not any(folder.is_relative_to(one) for one in kept):
@@ -112,8 +113,8 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def relocated(value: Value, places: Mapping[str, str]) -> Value:
-    """Copy of `value` with each of these paths replaced in every text and path, recursively through dataclasses, sequences
-    and mappings. Arrays and bytes stay unchanged.
+    """Copy of `value` in which each key of `places` is replaced by its value, in every text and path,
+    recursively through dataclasses, sequences, sets and mappings. Arrays and bytes stay unchanged.
     """
     return _relocated(value, sorted(places.items(), key=lambda pair: -len(pair[0]))) if places else value
 

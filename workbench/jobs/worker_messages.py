@@ -1,4 +1,4 @@
-"""Messages of a worker of a pool, and their handling in the dealing process. Messages are data, never a pickle."""
+"""Messages of a pool's workers, and their handling in the dealing process. A message is never a pickle."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ MESSAGES = get_args(Message)
 
 
 class WorkerQueue(ABC):
-    """The chunks of a worker in another process than the dealing one."""
+    """The chunks of a worker that runs in another process than the scheduler."""
 
     origin: Mapping[str, str] = {}
     """Maps folders on this worker to folders of the submitting side; see `ItemQueue.origin`."""
@@ -88,7 +88,7 @@ class Listener:
     """Handles the messages of workers for a scheduler."""
 
     kind: str
-    """Name of a worker in messages: "*a process* that records was killed"."""
+    """What messages call a worker: "*a process* that records was killed"."""
     work: Work[Any, Any, Any]
     scheduler: Scheduler[Any, Any]
     on_death: Callable[[str], None]
@@ -104,7 +104,7 @@ class Listener:
 
         Raises:
             TaskError, PoolError: the worker failed, and the job is over.
-            Unreadable: the message has other types than the work's.
+            Unreadable: a result or an update does not have the type that the work declares.
         """
         if isinstance(message, ChunkRequest):
             return "asks"

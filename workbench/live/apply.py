@@ -142,7 +142,7 @@ DOES: frozenset[type[Command]] = frozenset(
 )
 """Commands that `apply` handles."""
 PICTURES_DELAY_SECONDS = 0.35
-"""Debounce time at one moment of the past before its pictures are drawn; with less, every drag would draw some."""
+"""Debounce: pictures of a past moment are drawn after it was shown this long, or every drag would draw."""
 
 
 def apply(run: Run, event: object, now: Now) -> Change:
@@ -265,7 +265,7 @@ def _do_command(run: Run, command: Command) -> Change:
             return _reset(replace(run, seed=seed), None)
         case SelectEnv(env=env):
             if not 0 <= env < run.num_envs:
-                raise Refused(f"There is no env {env}: they are 0 to {run.num_envs - 1}.")
+                raise Refused(f"There is no env {env}: the envs are 0 to {run.num_envs - 1}.")
             return _change_settings(run, selected_env=env)
         case NextEnv():
             return _change_settings(run, selected_env=(run.env + 1) % run.num_envs)
@@ -282,7 +282,7 @@ def _do_command(run: Run, command: Command) -> Change:
         case SetPolicy(policy=policy):
             policy = policy.strip()
             if policy and ":" not in policy:
-                raise Refused("A policy is written module:function or file.py:function.")
+                raise Refused("Write the policy as module:function or file.py:function.")
             return _change_settings(run, action_source="policy", policy=policy or None)
         case ChoosePictures(pictures=pictures):
             return _change_settings(run, pictures=pictures)
@@ -313,7 +313,7 @@ def _travel(run: Run, command: Command) -> Change:
     """Carry out a command of the timeline."""
     past, env = run.kept, run.env
     if past is None:
-        raise Refused("There is no step yet.")
+        raise Refused("There is no step to go to yet.")
     match command:
         case StepBack():
             return _show(run, past.seek_by(env, -1)), []
@@ -360,7 +360,7 @@ def _show_live(run: Run) -> Run:
 
 
 def _show(run: Run, past: Past | None) -> Run:
-    """Take the shown moment from `past`."""
+    """The run with `past` and new pictures; the same run if `past` shows the same moment as before."""
     if past is None or run.past is None or past.shown is run.past.shown:
         return run
     return new_pictures(replace(run, past=past))
@@ -374,7 +374,7 @@ def _draw_past(run: Run) -> Change:
 
 
 def _change_settings(run: Run, **values: Any) -> Change:
-    """Change fields of `Settings`; the selected env is clipped to the batch, once there is one."""
+    """Change fields of `Settings`; once a task is loaded, the selected env is clipped to the batch."""
     before = run.settings
     new = replace(before, **values)
     selected = max(int(new.selected_env), 0)
@@ -392,7 +392,7 @@ def _change_settings(run: Run, **values: Any) -> Change:
             run, failed_cameras={key: why for key, why in run.failed_cameras.items() if key in kept}
         )
     if new.selected_env != before.selected_env:
-        # Without this the other env's picture would stay until a new one comes.
+        # Without this the pictures of the previous env would stay until new ones arrive.
         run = new_pictures(replace(run, pictures={}))
     effects: list[RunEffect] = [Send(run.for_worker())]
     if run.policy != policy:
@@ -402,7 +402,7 @@ def _change_settings(run: Run, **values: Any) -> Change:
 
 def _choose_class(run: Run, name: str) -> Change:
     if run.own_file is None or name not in run.choices:
-        raise Refused("The file has no such task.")
+        raise Refused(f"The file has no task {name}.")
     file = run.own_file if run.task is None or run.task.file is None else Path(run.task.file)
     choices = (name, *(other for other in run.choices if other != name))
     return reload_file(replace(run, reference=reference_to_class(run.reference, file, name), choices=choices))
@@ -468,13 +468,13 @@ def _placed(run: Run, event: Placed) -> Run:
     if event.info is None or run.task is None:
         return run
     infos = tuple(event.info if c.key == event.key else c for c in run.task.cameras)
-    reshaped = run.cameras_serial + event.reshaped  # its modalities may have changed
+    reshaped = run.cameras_serial + event.reshaped  # the camera's modalities may have changed
     past = None if run.past is None else run.past.camera_moved(*event.key)
     return replace(run, task=replace(run.task, cameras=infos), cameras_serial=reshaped, past=past)
 
 
 def _policy_saved(run: Run) -> Change:
-    """Clear a problem of the policy; playing resumes if one had stopped it."""
+    """Clear a problem of the policy and reload the policy; playing resumes if the problem had stopped it."""
     if run.problem is not None and run.problem.stage == "policy":
         run = at_rest(with_problem(run, None))
     return run, [Send(ReadPolicyAgain(play=run.policy_failed and run.wants_play))]

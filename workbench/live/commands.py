@@ -92,7 +92,7 @@ class ToggleCurve(Command, frozen=True):
 
 
 class ChooseBeside(Command, frozen=True):
-    """Draw the curves over this env's last episodes, or over those of the other envs."""
+    """Draw the curves over this env's last episodes, or over the episodes of the other envs."""
 
     beside: Literal["last", "batch"]
 
@@ -184,11 +184,11 @@ class RebuildScene(Command, frozen=True):
 
 
 class ReloadCode(Command, frozen=True):
-    """Only reload code, even if that was not found safe: old and new code may then be mixed."""
+    """Only reload code, even if the change needs more than that: old and new code may then be mixed."""
 
 
 class ReloadCameras(Command, frozen=True):
-    """Only reload cameras and code, even if that was not found safe: old and new code may then be mixed."""
+    """Only reload cameras and code, even if the change needs more: old and new code may then be mixed."""
 
 
 class ChooseClass(Command, frozen=True):

@@ -26,7 +26,7 @@ class Then:
 
 @dataclass(frozen=True)
 class Later:
-    """Effect: handle this event after some seconds. `apply` ignores the event if it no longer applies by then."""
+    """Effect: handle this event after `seconds`. `apply` ignores an event that no longer applies by then."""
 
     seconds: float
     event: Any

@@ -55,7 +55,7 @@ class ShowFirstFlagged(Command, frozen=True):
 
 
 class ShowEnvAtEvent(Command, frozen=True):
-    """Select this env, at the event that its row shows."""
+    """Select this env, at the first outlier of its episode, or else at the end of the episode."""
 
     env: int
 

@@ -18,7 +18,7 @@ from workbench.task.description import TaskOptions
 
 
 class Now(NamedTuple):
-    """When an event happens."""
+    """Time of an event."""
 
     monotonic: float
     """`time.monotonic()` in seconds."""
@@ -28,7 +28,8 @@ class Now(NamedTuple):
 
 @dataclass(frozen=True)
 class RunToEnter:
-    """Put the selected env, or all, into the last state of a recorded run, and pause; once a task is loaded."""
+    """Put the selected env, or all envs, into the last state of a recorded run, and pause. Without a task
+    this is done as soon as one is loaded."""
 
     run: RecordedRun
     number: int
@@ -48,7 +49,7 @@ class VersionLoaded:
 
     loaded: Loaded
     on_disk: bool
-    """Whether the files still have its texts."""
+    """Whether the files on disk still equal the loaded texts."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +70,12 @@ class WorkerDied:
 
     death: Death
     printed: str
-    """The last lines of its output."""
+    """The last lines of the worker's output."""
 
 
 @dataclass(frozen=True)
 class WorkerBusy:
-    """The worker is busy with one piece of work for long; None when that is done."""
+    """One piece of work keeps the worker busy for long; None when that work is done."""
 
     busy: Busy | None
 
@@ -91,7 +92,7 @@ class PolicySaved:
 
 @dataclass(frozen=True)
 class PagesCounted:
-    """The number of open pages changed. Without any, no picture is rendered."""
+    """The number of open pages changed. Without open pages, no picture is rendered."""
 
     count: int
 
@@ -112,7 +113,7 @@ class OptionsApplied:
 
 @dataclass(frozen=True)
 class FileOpened:
-    """Open a task class of another file instead."""
+    """Open a task class of another file in place of the present task."""
 
     file: Path
     class_name: str
@@ -144,7 +145,7 @@ class EnvEventShown:
 
 @dataclass(frozen=True)
 class PastPicturesWanted:
-    """Draw the missing pictures of the shown moment, if it is still the same."""
+    """Draw the missing pictures of the shown moment, unless another moment is shown by now."""
 
     at: object
     """`Run.stands_at` when this was requested."""
@@ -152,7 +153,8 @@ class PastPicturesWanted:
 
 @dataclass(frozen=True)
 class ActionTold:
-    """Set these numbers of the action of envs (all if None), while its source is ``sliders``; without any, hold still."""
+    """Set these dimensions of the action of some envs (None: all), while the source of actions is
+    ``sliders``. Without dimensions, the envs hold still."""
 
     dimensions: tuple[int, ...]
     values: tuple[float, ...]
@@ -161,7 +163,7 @@ class ActionTold:
 
 @dataclass(frozen=True)
 class ReadingChosen:
-    """Read these sections of the selected env from now on, while pages are open; without any, stop reading."""
+    """Read these sections of the selected env from now on, while pages are open; empty: stop reading."""
 
     sections: tuple[Section, ...]
 
@@ -173,7 +175,7 @@ class ReadingDue:
 
 @dataclass(frozen=True)
 class EnvsReset:
-    """Reset these envs with fresh seeds; all, with the session's seed, if None."""
+    """Reset these envs; the task's random numbers continue. None: reset all with the session's seed."""
 
     env_idx: tuple[int, ...] | None = None
 

@@ -9,12 +9,13 @@ from typing import Literal, NamedTuple
 from workbench.task.description import TaskDescription
 
 Attempt = Literal["file", "moment", "version", "nothing"]
+"""What to load: the file on disk, the last good version at its newest moment or from its start, nothing."""
 Newest = Callable[[], bytes | None]
 """Returns the newest state of the batch, a pickled `envs.snapshots.snapshot.Snapshot`, or None. Called only when needed,
 since assembling one takes longer than a step."""
 _GOOD_VERSIONS = 2
 _PROVEN_SECONDS = 30.0
-"""Time after a load: a version whose process crashes later than this counts as one that works."""
+"""A version whose process crashes later than this after its load counts as one that works."""
 
 
 class LoadInputs(NamedTuple):
@@ -23,7 +24,7 @@ class LoadInputs(NamedTuple):
     source: dict[str, str] | None
     """Texts to use in place of the files; None to read the files on disk."""
     snapshot: bytes | None
-    """The moment to restore."""
+    """Pickled snapshot to restore; None for none."""
     number: int
     """`Load.number`."""
 
@@ -37,9 +38,9 @@ class GoodVersion:
     since: float
     """Time of the version's last load, in seconds of the session's clock."""
     crashes: int = 0
-    """Number of crashes of its process in a row, each soon after a load of the version."""
+    """Number of crashes of the version's process in a row, each soon after a load of the version."""
     idle_crashes: int = 0
-    """How many of `crashes` happened since its last step, in an idle worker."""
+    """How many of `crashes` happened in an idle worker, since the version's last step."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ class Recovery:
     out. So the attempts are, in order: the file on disk if no worker has tried it yet, the last good version at its newest
     moment, the same version from its start, and finally nothing, until the file changes. No attempt is repeated, so that a
     file cannot kill one worker after another. A version that crashes twice, each time soon after its load, is not good: the
-    previous good version is restored. If there is none, the version itself is restored, unless it crashed twice without
-    making a step.
+    previous good version is restored. If there is none, the version itself is restored, unless it crashed
+    twice while idle, with no step in between.
     """
 
     good: tuple[GoodVersion, ...] = ()
@@ -80,7 +81,7 @@ class Recovery:
         return self.asked > self.begun
 
     def next_load(self, newest: Newest) -> tuple[Recovery, LoadInputs | None]:
-        """The load for a new worker; None for nothing."""
+        """The load for a new worker; None if it has to load nothing."""
         if self.attempt == "nothing":
             return self, None
         good = self.good_source if self.attempt != "file" else None
@@ -128,8 +129,8 @@ class Recovery:
         """Record that the worker has ended.
 
         Args:
-            crashed: it ended by itself; it was not ended and did not hand over.
-            idle: it had no request at the time.
+            crashed: the worker ended by itself: it was not killed by the supervisor, and did not hand over.
+            idle: the worker was handling no request.
         """
         after = self
         if self.file_waits:
@@ -141,11 +142,11 @@ class Recovery:
         return replace(after, loading=False, has_env=False)
 
     def restart_requested(self) -> Recovery:
-        """Record that the user restarts the worker, to load the file as it is now; if that is being loaded (and may hang), to
-        restore the last good version."""
+        """Record that the user restarts the worker. The next worker loads the file as it is now. If the file
+        is being loaded already (and may hang), the next worker restores the last good version."""
         good = tuple(replace(version, crashes=0, idle_crashes=0) for version in self.good)
         if self.loading and not self.restoring and not self.file_waits and good:
-            return replace(self, good=good)  # `died` continues from there
+            return replace(self, good=good)  # `died` then chooses the last good version
         return replace(self, good=good, attempt="file", loading=False, has_env=False, asked=self.asked + 1)
 
     def _after_running(self, crashed: bool, idle: bool, now: float) -> Recovery:

@@ -59,8 +59,8 @@ def watched_files(run: Run, paths: Iterable[str] = (), at_fault: str | None = No
 
 
 def files_at_fault(run: Run, failed: TaskFailed) -> frozenset[Path]:
-    """Files with the problem, to be watched: a module that the task has never imported without an error is not in
-    `source_files`, and it may be in another folder, where the user fixes it."""
+    """The files to watch after a failure, including the file with the problem: a module that the task has
+    never imported without an error is not in `source_files`, and may be in another folder."""
     if failed.problem.file is None:
         return frozenset()
     return watched_files(run, () if run.task is None else run.task.source_files, failed.problem.file)
@@ -76,7 +76,7 @@ def follow(
 def reload_file(run: Run, level: LoadLevel = "auto", effects: Iterable[RunEffect] = ()) -> Change:
     """Reload the file. A level other than ``auto`` is forced, even if it keeps parts of the old version.
 
-    A worker that does not handle the request (an endless loop) is interrupted or replaced.
+    If the worker does not handle the request (an endless loop), the supervisor interrupts or replaces it.
     """
     recovery, inputs = run.recovery.file_requested(run.newest_moment)
     run = replace(run, recovery=recovery)
@@ -99,7 +99,7 @@ def apply_options(run: Run, options: TaskOptions) -> Change:
 
 
 def _past_after(before: TaskDescription | None, event: Loaded, restored: bool) -> PastAfterLoad:
-    """What happens to the history after a load.
+    """Effect of a load on the history.
 
     Args:
         before: the previous version.
@@ -181,7 +181,7 @@ def _new_scene(run: Run, task: TaskDescription, first: StepResult, its_past_stay
         settings=replace(run.settings, selected_env=selected),
         inspection=None,
         told=None,
-        # Broken rules of the new scene are reported after it.
+        # The worker reports broken rules of the new scene after the load.
         rules=None,
         rules_serial=run.rules_serial + 1,
     )
@@ -242,7 +242,7 @@ def _refuse_options(run: Run, failed: TaskOptions | None) -> tuple[Run, bool]:
     tried = run.tried_options
     if tried is None or failed is None or changed_options(tried, failed):
         return run, False
-    # Without an env there is nothing to keep: the next load tries them again.
+    # Without an env there is nothing to keep: the next load tries these options again.
     options = replace(tried, seed=run.options.seed) if run.task is None else run.options
     return replace(run, tried_options=None, options=options, options_refused=tried), True
 
@@ -262,7 +262,7 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
         run = with_problem(run, problem, at_run=not while_loading)
     if death.doing == "drawing" and death.end is not End.ASKED:
         # The next worker would die of the same picture.
-        why = f"The worker process {death.why} while it drew. Untick it and tick it again to try once more."
+        why = f"The worker {death.why} while it rendered. To retry, untick the camera and tick it again."
         failed = {camera.key: why for camera in run.settings.cameras}
         run = replace(run, failed_cameras={**run.failed_cameras, **failed})
     if death.end not in (End.FILE_WAITS, End.HANDED_OVER):
@@ -279,14 +279,14 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
 
 
 def _texts(run: Run) -> Mapping[str, str]:
-    """Source by path of the version that is being loaded, if known, or of the running one."""
+    """Source by path of the version that is being loaded (empty if unknown), else of the running version."""
     recovery = run.recovery
     if not recovery.loading:
         return {} if run.task is None else run.task.source
     if recovery.restoring:
         return recovery.good_source or {}
     if recovery.file_waits:
-        # The file was saved again since: its lines on disk are not those that ran.
+        # Empty texts: the file was saved again, so the lines on disk are not those that ran.
         return dict.fromkeys(run.own_files, "")
     return {}
 

@@ -35,7 +35,7 @@ EpisodeEnd = Literal["reset", "continue", "pause"]
 
 @dataclass(frozen=True)
 class Load(Question["Loaded"]):
-    """Import and build the task; it replaces the running one only if all of it succeeds."""
+    """Import and build the task. It replaces the running version only if everything succeeds."""
 
     task: TaskName
     """A path, ``path:ClassName`` or a registered env id, as the user named it, or a task named by a recording."""
@@ -51,7 +51,7 @@ class Load(Question["Loaded"]):
     number: int = 0
     """Number of the load of the file on disk, counting up; 0 for a restored version."""
     because: str = ""
-    """Why a new process loads it, for the `ReloadReport`."""
+    """Why a new process loads the task, for the `ReloadReport`."""
     same_scene: bool = False
     """Whether a new process loads the version and its scene-building code is unchanged."""
 
@@ -62,7 +62,7 @@ class Play:
 
     playing: bool
     number: int = 0
-    """Number of the request of a person, counting up; 0 for one that nobody made."""
+    """Number of the user's request, counting up; 0 for a request that the workbench itself makes."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,8 @@ class Settings:
 
 @dataclass(frozen=True)
 class SetSliderAction:
-    """Set values of the action of envs, while `Settings.action_source` is ``sliders``; other dimensions keep their
-    value."""
+    """Set dimensions of the action of some envs, while `Settings.action_source` is ``sliders``; other
+    dimensions keep their value."""
 
     env_idx: tuple[int, ...]
     dimensions: tuple[int, ...]
@@ -139,7 +139,8 @@ class ReadPolicyAgain:
 
 @dataclass(frozen=True)
 class FollowPlan:
-    """The answer to a `PlanWanted`: actions to take from that moment on. Dropped if the envs moved in any other way since."""
+    """The answer to a `PlanWanted`: the actions to take from its moment on. The worker drops the answer if
+    anything else moved the envs since then."""
 
     number: int
     """Number of the `PlanWanted` that this answers."""
@@ -172,14 +173,14 @@ class SetCapture:
 
 @dataclass(frozen=True)
 class ReplayPath:
-    """How an env reached a moment: actions from the state at an exact point."""
+    """How an env reached a moment: the actions since an exact point (see `History.replay_path`)."""
 
     start: int
-    """The server's number of the exact point's moment; the snapshot of it is in `Restore.starts`."""
+    """The server's number of the moment at the exact point; `Restore.starts` has its snapshot."""
     source: int
     """The env's number at the exact point."""
     actions: NDArray[np.float32]
-    """(T, A) actions from there."""
+    """(T, A) actions since the exact point."""
 
 
 @dataclass(frozen=True)
@@ -314,8 +315,8 @@ class Loading:
 
 @dataclass(frozen=True)
 class NewProcessNeeded:
-    """The worker's answer to a `Load` that it must not do: the running version left something in this process that no
-    reload undoes. The worker ends; the next one loads the file at the newest moment."""
+    """The worker's answer to a `Load` that needs another process: the running version left something in this
+    process that no reload undoes. The worker ends; the next one loads the file at the newest moment."""
 
     reason: str
     same_scene: bool
@@ -398,7 +399,7 @@ class Pictures:
 
     pictures: tuple[Picture, ...]
     milliseconds: float | None
-    """Render time; None if steps were made meanwhile, which took part of the time."""
+    """Render time; None if steps were made during the rendering, since they took part of the time."""
     number: int
     """`Stepped.number` of the moment that the pictures show."""
 
@@ -413,7 +414,7 @@ class CameraFailed:
 
 @dataclass(frozen=True)
 class Placed:
-    """The result of `PlaceCamera`. Later pictures of that camera show it as placed."""
+    """The result of `PlaceCamera`. Later pictures of the camera are taken with the new settings."""
 
     key: CameraKey
     settings: CameraSettings | None
@@ -467,11 +468,11 @@ class Status:
     """Whether and how fast the batch runs."""
 
     playing: bool
-    """Whether stepping goes on, after the last `Play` that the worker has handled."""
+    """Whether the batch is played, after the last `Play` that the worker has handled."""
     steps_per_second: float
     """Control steps of the whole batch per second of wall time."""
     real_time_factor: float
-    """Simulated seconds per wall second; below the chosen speed the machine is the limit."""
+    """Simulated seconds per wall second; if it is below the chosen speed, the machine is too slow."""
     activity: str = ""
     """Long work that delays requests, if any."""
     recorded_share: float = 0.0

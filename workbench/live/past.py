@@ -25,8 +25,8 @@ MAX_REPLAYED_STEPS = 400
 
 @dataclass(frozen=True)
 class TimelineView:
-    """State of the time slider. Moments have serials, which count up and are never reused; resets are moments too. The page
-    shows ticks: a tick is the number of control steps since the envs were built, as on the curves."""
+    """State of the time slider. Moments have serials, which count up and are never reused; resets are moments
+    too. The page shows ticks: a tick is the number of control steps since the envs were built."""
 
     first: int = 0
     last: int = -1
@@ -44,11 +44,11 @@ class TimelineView:
     can_continue: bool = False
     """Whether envs can go back to the shown moment."""
     undo: str | None = None
-    """Text: the change that `UndoReset` would undo."""
+    """Name of the change that `UndoReset` would undo; None if there is none."""
     not_carried: tuple[str, ...] = ()
-    """State that the last jump could not restore, each with its reason."""
+    """Parts of the state that the last jump could not restore, each with the reason."""
     arrived: str = ""
-    """How the last jump entered a recording; empty if the jump entered none."""
+    """How the last jump reached its state: by a replay or from a recording; empty if it was restored."""
     entered: int = 0
     """Number of the last finished `EnterRecording`; 0 for none."""
     wants_pictures: bool = False
@@ -69,7 +69,7 @@ Ending = Literal["", "success", "fail", "limit"]
 
 
 def _ending(flags: Iterable[int]) -> Ending:
-    """How a segment with these events ended; empty for one that runs on, or was cut short by a reset."""
+    """How a segment with these events ended; empty if it still runs or was cut short by a reset."""
     all_flags = 0
     for one in flags:
         all_flags |= one
@@ -80,13 +80,13 @@ def _ending(flags: Iterable[int]) -> Ending:
 
 @dataclass(frozen=True)
 class Strip:
-    """A part of one env's history, for the strip under the slider. All places are ticks (see `TimelineView`)."""
+    """A part of one env's history, for the strip under the slider. Positions are ticks (`TimelineView`)."""
 
     low: int
     high: int
     """Lowest and highest tick, both included."""
     events: tuple[tuple[int, int], ...]
-    """Tick and event flags (`history.RESET` ... combined); everything at one tick is one event."""
+    """Tick and event flags (`moments.RESET` ...); the flags of all events at a tick are combined."""
     values: NDArray[np.float32]
     """(high - low + 1,) number after each control step, by default the reward; NaN where there is none."""
     branches: tuple[tuple[int, int], ...]
@@ -116,7 +116,7 @@ class Past:
     # --- events --------------------------------------------------------------------------------------
 
     def added(self, stepped: Stepped) -> tuple[Past, Moment]:
-        """The past with one more moment."""
+        """Add a moment. Returns the past with it, and the moment."""
         moment = self.history.add(stepped)
         past = self
         if stepped.restored is not None and stepped.restored.number:
@@ -143,14 +143,14 @@ class Past:
         return self.history.last if self.pinned is None else self.pinned
 
     def seek(self, serial: int | None) -> Past:
-        """Pin a moment, or the nearest kept one; the newest, or None, is live."""
+        """Pin the moment of this serial, or the nearest kept one; the newest serial, or None, goes live."""
         if serial is None or serial >= self.history.last:
             return replace(self, pinned=None)
         return replace(self, pinned=max(serial, self.history.first))
 
     def seek_by(self, env: int, steps: int) -> Past:
-        """Go some moments of this env (control steps, resets and jumps back) forward, or back if negative, from the shown
-        one. Moments of other envs are skipped."""
+        """Go forward (or back, if negative) from the shown moment by moments of this env: control steps,
+        resets and jumps back. Moments at which only other envs jumped are skipped."""
         history, at = self.history, self.at
         for _ in range(abs(steps)):
             at += 1 if steps > 0 else -1
@@ -209,9 +209,9 @@ class Past:
         at = moment if moment is not None else history.at(history.last)
         jump = history.last_jump(env)
         begin = history.at(history.segment_at(env, self.at)[0]) if at is not None else None
-        # Only for the shown env and moment: another env, or a later reset, lacks nothing.
-        came = begin.restored if begin is not None and begin.jumped[env] else None
-        missed, how = ({}, "") if came is None else (came.not_carried, came.how)
+        # Report only the jump that led this env to the shown moment: after a later reset, nothing is missing.
+        jumped_to = begin.restored if begin is not None and begin.jumped[env] else None
+        missed, how = ({}, "") if jumped_to is None else (jumped_to.not_carried, jumped_to.how)
         return TimelineView(
             first=history.first,
             last=history.last,
@@ -307,7 +307,7 @@ class Past:
     def episodes(
         self, env: int, last: int, columns: Sequence[Column], before: int
     ) -> tuple[EpisodeNumbers, ...]:
-        """Numbers of this env's episode at the shown moment, whole, and of the ones before; see `History.episodes`.
+        """Numbers of this env's whole shown episode, and of the episodes before it; see `History.episodes`.
 
         Args:
             last: serial of the live moment; the history may have newer ones by now.
@@ -316,8 +316,8 @@ class Past:
         return self.history.episodes(env, end, columns, before)
 
     def episode(self, env: int) -> tuple[int, int]:
-        """Serials of the first and the last moment of this env's episode that contains the shown moment. The moments in
-        between that it abandoned by going back are included."""
+        """Serials of the first and the last moment of this env's episode that contains the shown moment. The
+        range includes moments that the env left when it went back."""
         end = self.history.segment_at(env, self.at)[1]
         begin = min((moment.serial for moment, _ in self.history.episode_backwards(env, end)), default=end)
         return begin, end
@@ -335,7 +335,7 @@ class Past:
         return self._restore(snapshot, envs, source, moment.serial)
 
     def undo(self, env: int) -> Restore | None:
-        """Request to undo this env's last jump, in all envs that have not jumped since; None if there is none."""
+        """Request to undo this env's last jump in all envs that have not jumped since; None if impossible."""
         jump = self.history.last_jump(env)
         if jump is None:
             return None
@@ -357,10 +357,10 @@ class Past:
         found = {
             i: history.replay_path(of, origin, MAX_REPLAYED_STEPS) for i, of in zip(envs, source, strict=True)
         }
-        ways = {i: way for i, way in found.items() if way is not None}
-        beginnings = {way.start for way in ways.values()}
+        paths = {i: path for i, path in found.items() if path is not None}
+        beginnings = {path.start for path in paths.values()}
         starts = {at: taken for at in beginnings if (taken := history.snapshot_at(at)) is not None}
-        return Restore(snapshot, envs, source, origin, undoes, ways, starts)
+        return Restore(snapshot, envs, source, origin, undoes, paths, starts)
 
     def draw(
         self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "auto"

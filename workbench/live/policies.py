@@ -16,7 +16,7 @@ from workbench.machine.kept_choices import keep_policy, used_policies
 from workbench.machine.loop import BlockingPool, do
 
 LIST_SECONDS = 5.0
-"""Interval of searches for policies, which read many files."""
+"""Interval between searches for policies. A search reads many files."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class KnownPolicies:
     wanted: Wanted | None = None
     """None while nothing is listed."""
     found: tuple[str, ...] = ()
-    """Policies that were used in the folder where the command was started, and functions in its files and those of the
-    task's folder."""
+    """Policies that were used before in the folder where the command was started, and functions in the files
+    of this folder and of the task's folder."""
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ from workbench.task.problem import Problem
 from workbench.task.reference import TaskName, followed_folder, named_file
 
 RunState = Literal["starting", "loading", "running", "paused", "error", "stopped"]
-"""``starting`` the worker process; ``loading``: a task is being imported or built; ``error``: no version is loaded,
-see `Run.problem`; ``stopped``: there is no worker."""
+"""``starting``: the worker process starts; ``loading``: a task is being imported or built; ``error``: no
+version is loaded, see `Run.problem`; ``stopped``: there is no worker."""
 
 
 PastAfterLoad = Literal["same", "patched", "gone"]
@@ -70,16 +70,16 @@ class Run:
     own_file: Path | None
     """The named file, even if it never loaded; None for an env id."""
     own_folder: Path | None
-    """Folder whose modules, and those below it, are watched with the file; None if nothing is watched."""
+    """Folder whose modules, also in subfolders, are watched with the file; None if nothing is watched."""
     running_reference: TaskName
-    """The running task."""
+    """The task of the running version; `reference` may already name another class of the file."""
     recovery: Recovery = Recovery()
     past: Past | None = None
     """The history; None before a task is loaded."""
     versions: tuple[tuple[int, TaskDescription], ...] = ()
-    """The versions that made the moments of `past`, oldest first, each with the serial of its first one."""
+    """The versions that made the moments of `past`, oldest first, with the serials of their first moments."""
     needed: NewProcessNeeded = NewProcessNeeded("", False)
-    """Why the next worker must be a new process, as reported by the last one."""
+    """Why the next worker must be a new process, as reported by the last worker."""
     to_enter: RunToEnter | None = None
     """Recorded run to enter as soon as a task is loaded."""
     first_step_due: bool = False
@@ -154,12 +154,13 @@ class Run:
     inspection: Inspection | None = None
     """The newest reading, of the env that was selected then."""
     read_sections: tuple[Section, ...] = ()
-    """Sections of the selected env that are read while steps are made."""
+    """Sections of the selected env to read again after each step; see `inspect_polling`."""
     reading: Literal["none", "soon", "asked"] = "none"
+    """``soon``: a reading is scheduled; ``asked``: the worker has not answered the last request yet."""
     read_at: object = None
-    """What was shown when the last reading was requested."""
+    """Version, step, env and sections of the last requested reading."""
     read_when: float = -math.inf
-    """When it was requested, in seconds of `Now.monotonic`."""
+    """When the last reading was requested, in seconds of `Now.monotonic`."""
 
     # --- reading -----------------------------------------------------------------------------------
 
@@ -261,7 +262,7 @@ class Run:
         return self.past.history.episode(self.env, self.past.at, most)
 
     def version_of(self, serial: int) -> TaskDescription | None:
-        """The version that made this moment."""
+        """The version that made the moment of this serial; None if unknown."""
         return next((task for first, task in reversed(self.versions) if first <= serial), None)
 
 

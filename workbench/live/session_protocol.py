@@ -39,7 +39,7 @@ class LiveSession(Protocol):
         ...
 
     def look(self, read: Callable[[Run], Value]) -> Value:
-        """The value of `read` for the present run; it runs on the loop, since the history is written there."""
+        """The result of `read` for the present run. `read` runs on the loop, which writes the history."""
         ...
 
     def env_rows(self) -> EnvRows | None:

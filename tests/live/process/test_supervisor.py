@@ -303,7 +303,7 @@ def test_a_load_behind_uninterruptible_work_ends_the_worker() -> None:
         pytest.param("nonsense x", 0, "unreadable data", marks=pytest.mark.slow),
         ("say this", 1, "no such step"),
         pytest.param("without_a_main_thread 600", 0, "main thread", marks=pytest.mark.slow),
-        pytest.param("close_its_line 600", 0, "closed its line", marks=pytest.mark.slow),
+        pytest.param("close_its_line 600", 0, "closed its connection", marks=pytest.mark.slow),
     ],
 )
 def test_a_broken_worker_is_ended_with_a_reason_and_replaced(does: str, fails: int, says: str) -> None:

@@ -227,7 +227,7 @@ class Spans:
 
 
 def spans_of(values: NDArray[np.floating], most: int = _MAX_SPANS, first: int = 1) -> Spans:
-    """The spans of whole lines (L, T), at most `most` of them.
+    """Whole lines (L, T) cut into at most `most` spans.
 
     Args:
         first: the step of the first number.

@@ -60,8 +60,8 @@ class LastEpisode:
 
 @dataclass(frozen=True)
 class EnvRows:
-    """The whole table at one moment. Arrays are never written to, and unchanged ones are shared with the previous moment:
-    most steps add only an array of returns."""
+    """The whole table at one moment. Arrays are never changed in place, and unchanged arrays are shared with
+    the previous moment: most steps add only an array of returns."""
 
     steps: NDArray[np.int32]
     """(N,) control steps of the present episode."""
@@ -104,7 +104,7 @@ class EnvRows:
 
 
 def event_step(rows: EnvRows, env: int, event: EnvEvent) -> int | None:
-    """The step of the present episode of an env at which this happened; None if it has not."""
+    """The step of an env's present episode at which this event happened; None if it has not happened."""
     if event == "flagged":
         return rows.outliers[env][0].step if env in rows.outliers else None
     return int(rows.end[env]) if rows.outcome[env] in (Outcome.FAIL, Outcome.TRUNCATED) else None
@@ -113,8 +113,8 @@ def event_step(rows: EnvRows, env: int, event: EnvEvent) -> int | None:
 class EnvTable:
     """Updates the table with every reset and control step of the batch, by array operations; `add` all events in order.
 
-    An env that goes back to a moment gets the row, at that moment, of the env whose state it gets. Only the counts of
-    ended episodes continue.
+    If an env goes back to a moment, its row becomes the one that the source env had at that moment. Only the
+    counts of ended episodes continue.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class EnvTable:
 
         Args:
             then: the rows at the moment that some envs went back to. None without a jump back, or if that moment is
-                unknown: then the rows of these envs start with an empty history.
+                unknown: the rows of these envs begin without a past then.
             rewards_then: returns the rewards of an env's episode up to that moment, oldest first.
 
         Returns:
@@ -188,7 +188,7 @@ class EnvTable:
         return tuple(self._found.values())
 
     def begin_version(self, rules: Mapping[str, Finding]) -> None:
-        """The code changes: drop the findings of the old code, and keep the rows."""
+        """Drop the findings of the old code and keep the rows, because the code has changed."""
         self._rules, self._found = rules, {}
 
     def rows(self) -> EnvRows:
@@ -232,7 +232,7 @@ class EnvTable:
             )
 
     def _break(self, rule: str, sight: OutlierSighting, step: StepResult) -> bool:
-        """Count a violation; returns False if the rule is off."""
+        """Count a violation of this rule; returns False if the rule is off."""
         if (whole := self._rules.get(rule)) is None:
             return False
         known, count = self._found.get(rule), int(np.count_nonzero(sight.envs))
@@ -244,7 +244,7 @@ class EnvTable:
         return True
 
     def _begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
-        """Start a new episode in these envs (N,); the previous one becomes `EnvRows.last`."""
+        """Start new episodes in these envs (N,); `EnvRows.last` keeps those that ended or had outliers."""
         now, from_start = self._now, step.elapsed_steps == 0
         worth_keeping = envs & ((now.end >= 0) | np.isin(np.arange(len(envs)), list(now.outliers)))
         until = np.where(now.end < 0, now.steps, now.end)
@@ -306,7 +306,8 @@ def _flags(step: StepResult) -> Iterator[tuple[str, NDArray[np.bool_]]]:
 def _note_first(
     first: dict[Hashable, NDArray[np.int32]], what: Hashable, true: NDArray[np.bool_], step: StepResult
 ) -> NDArray[np.bool_]:
-    """Write the step into `first` in envs where it is true for the first time in the episode; returns these (N,)."""
+    """Write the step into `first` in envs where the entry is true for the first time in the episode; returns
+    the mask (N,) of these envs."""
     known = first.get(what)
     if known is None:
         known = first[what] = np.full(len(true), -1, np.int32)

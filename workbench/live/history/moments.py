@@ -26,14 +26,14 @@ from workbench.task.description import NO_MOMENT, Restored, Stepped
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 32
 """Event flags of an env at a moment. Success, fail and a NaN or infinite reward are flagged only once per episode."""
 _OVERHEAD_BYTES = 2500
-"""Memory of the objects around a moment's arrays; with it the total is within 2 % of what tracemalloc measures."""
+"""Memory of the objects around a moment's arrays; with it, tracemalloc measures the same total within 2 %."""
 _PICTURES_SHARE = 0.5
 """Share of the memory limit for pictures: they are by far the largest (a human camera's is 0.8 MB; a step of 16
 PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be rendered again."""
 _MAX_ENDED = 64
-"""Maximum number of ended episodes whose numbers are kept ready for curves."""
+"""Maximum number of ended episodes whose numbers are cached for curves."""
 _RECENT_MOMENTS = 200
-"""Number of newest moments in which a picture's moment is searched: pictures arrive some steps late."""
+"""Number of newest moments to search for the one that a picture shows: pictures arrive some steps late."""
 
 
 @dataclass
@@ -50,8 +50,8 @@ class SnapshotPartSet:
 class SnapshotParts:
     """Reference-counted store of snapshot parts.
 
-    A snapshot consists of a body and the keys of its parts (`envs.snapshots.packing`), most of which the previous moment
-    has too. So moments refer to a set of parts, sets count their moments, and parts count their sets.
+    A snapshot has a body and parts (`envs.snapshots.packing`), and shares most parts with the previous
+    moment. So moments refer to a set of parts, sets count their moments, and parts count their sets.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class SnapshotParts:
         """Bytes in use."""
 
     def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> SnapshotPartSet:
-        """Parts of the next moment; `keys` is None if they are those of the previous moment."""
+        """Parts of the next moment; `keys` is None if it has the same parts as the previous moment."""
         self._parts.update(new_parts)
         if keys is not None and keys != self._last.keys:
             known = self._parts.keys() >= {*keys}
@@ -85,7 +85,8 @@ class SnapshotParts:
                 if self._references[key] == 0:
                     self.used -= len(self._parts[key])
                     del self._references[key]
-                    # The worker sends a part again unless the newest moment has it, which is never dropped.
+                    # If a later moment has this part, the worker sends it again: the worker leaves out only
+                    # parts of the newest moment, which is never dropped.
                     del self._parts[key]
 
 
@@ -96,8 +97,8 @@ class Moment:
     serial: int
     """Number of the moment, counting up over the session."""
     step: StepResult
-    """Result of the step. Its reward is NaN in an env that was reset, and the recorded one in an env that was put
-    back here."""
+    """Result of the step. The reward is NaN in an env that was reset here. In an env that went back to a
+    moment, it is the reward of that moment."""
     jumped: NDArray[np.bool_]
     """(N,) mask as in `Stepped.reset_mask`."""
     seeds: NDArray[np.int64] | None
@@ -163,7 +164,7 @@ class ShownMoment:
 
 
 class History:
-    """The moments of one built task, oldest first, append-only. Not thread-safe: its owner locks.
+    """The moments of one built task, oldest first, append-only. Not thread-safe: used on the loop.
 
     A reset is a separate moment, and so is going back: the envs *jump*, and new moments follow the jump. The moments that
     they left are kept and can be returned to; undo goes back to the moment before a jump. A *segment* is a run of an env's
@@ -359,13 +360,13 @@ class History:
         self._table.begin_version(rules)
 
     def events(self, env: int, low: int, high: int) -> list[tuple[int, int]]:
-        """Events of this env between two moments, both included: serials and flags (`RESET` ... added up)."""
+        """Events of this env between two moments, both included: serials and combined flags (`RESET` ...)."""
         low = max(low, self.first)
         event_flags = self._columns.between("event_flags", low, min(high, self.last))[:, env]
         return [(low + int(k), int(event_flags[k])) for k in np.flatnonzero(event_flags)]
 
     def numbers(self, env: int, low: int, high: int, column: Column = REWARD) -> NDArray[np.float32]:
-        """(K,) numbers of this env between two moments, both included; the reward is NaN where it was reset."""
+        """(K,) numbers of this env between two moments, both included; at a reset, the reward is NaN."""
         low, high = max(low, self.first), min(high, self.last)
         if column == REWARD:
             return self._columns.between("reward", low, high)[:, env]
@@ -384,7 +385,7 @@ class History:
             known = self._ended.pop(key, None)
             if known is None or not known.values.keys() >= {*columns}:
                 known = self._episode_numbers(env, last, columns)
-            # The episodes that were asked for last stay.
+            # The episodes that were requested last stay in the cache.
             self._ended[key] = known
             if len(known.steps):
                 found.append(known)
@@ -444,7 +445,7 @@ class History:
     def episode_backwards(self, env: int, serial: int) -> Iterator[EnvMoment]:
         """The episode of this env up to a moment, newest first; a jump back continues at the moment that it led to.
 
-        Yields each control step and finally the first reset, as far as they are kept.
+        Yields each control step, and finally the reset that began the episode, as far as they are kept.
         """
         for moment, at in self._moments_back(env, serial):
             jumped = moment.jumped.any()
@@ -554,7 +555,7 @@ class History:
 
         kept = np.flatnonzero(~jumped | stepped.resumed)
         if self._moments:
-            # Also if every env was reset: an entry that disappears for one moment would move all below it on the page.
+            # Also if every env was reset: if an entry disappeared for a moment, the rows below would move.
             take(self._moments[-1].step, kept, kept)
         if restored is not None and origin is not None:
             take(origin.step, list(restored.env_idx), list(restored.source))

@@ -23,15 +23,15 @@ from workbench.task.new_task import CannotBegin, fill_blank_file, is_blank
 from workbench.task.problem import Problem
 
 WIDTH_PIXELS, BUSY_WIDTH_PIXELS = 520, 460
-"""Widths where the view is wide enough: the style sheet keeps a banner within it, or it would cover the controls, with
-which the last good version can still be used."""
+"""Widths if the view is wide enough. In a narrower view the style sheet narrows the banner, which would cover
+the controls: they still work, for the last good version."""
 
 FILL = "Write the minimal task into it"
 RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Restart the worker"
 REBUILD = "Rebuild the scene"
 REBUILD_HINT = (
     "A patch keeps the old scene. Rebuild if the new code needs something that _load_scene makes, such as a body or an "
-    "attribute. The moment is restored."
+    "attribute. The current state is restored."
 )
 _MAY_BE_OLD = ("reset", "step", "evaluate", "reward", "observation", "returns")
 """Stages that use objects made while the scene was built: a patch keeps those objects, and some that the new code
@@ -61,10 +61,11 @@ INTERRUPTED = {
 
 
 def is_busy_for_long(view: SessionView) -> bool:
-    """Whether to show the busy banner; it hides that of a problem.
+    """Whether to show the busy banner, which hides the problem banner.
 
-    It is hidden while a worker starts: none of the author's code runs then, and the reason why the last worker ended must
-    stay visible. It is also hidden while a debugger holds the worker, which the status line shows.
+    The busy banner is hidden while a worker starts: none of the author's code runs then, and the reason why
+    the last worker ended must stay visible. It is also hidden while a debugger holds the worker; the status
+    line shows that.
     """
     busy = view.busy
     return busy is not None and busy.seconds >= SHOWN_AFTER_SECONDS and not (busy.getting_ready or busy.held)
@@ -77,7 +78,7 @@ class Banner(PagePart[SessionView]):
     Args:
         server: The page.
         link: Links the line in the file.
-        is_own: Whether a file may be written: it is the task's, and the user named it, not a recording.
+        is_own: Returns whether a file may be written: it is the task's, and the user (no recording) named it.
     """
 
     does = (FillEmptyFile,)
@@ -95,7 +96,7 @@ class Banner(PagePart[SessionView]):
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
-            # A separate element: its text changes, and the other element must not be rewritten.
+            # A separate element: rewriting the first one when this text changes would close a traceback.
             self._kept = server.gui.add_html("")
             self._tools = server.gui.add_html("")
         self._panel.float(width=WIDTH_PIXELS)
@@ -158,7 +159,7 @@ def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) ->
 
 
 def kept_html(view: SessionView) -> str:
-    """HTML below the problem: which version runs now, and what to do."""
+    """HTML of the text below the problem, see `_kept`."""
     return render("banner_kept", kept=_kept(view))
 
 
@@ -182,11 +183,11 @@ def _kept(view: SessionView) -> str:
         return "The last good version is back where it was, and paused."
     if view.problem_at_run:
         if view.problem is not None and view.problem.stage == "policy":
-            return "The task is paused. Mend the policy and save it, or choose another source of actions (Run tab)."
-        process = f" Another process has loaded it: {view.spoiled}." if view.spoiled else ""
+            return "The task is paused. Save a fixed policy, or choose another source of actions (Run tab)."
+        process = f" Another process has loaded this version: {view.spoiled}." if view.spoiled else ""
         return (
-            f"It failed while it ran, and is paused at {step_in_words(view)}.{process} Save a mended file, or go on with this version: with a "
-            "reset (Shift+R), or with another step (S)."
+            f"The task failed while it ran, and is paused at {step_in_words(view)}.{process} Save a fixed "
+            "file, or continue with this version: reset (Shift+R) or step (S)."
         )
     if view.playing:
         return "The last good version is still running."
@@ -197,8 +198,8 @@ class BusyBanner(PagePart[SessionView]):
     """A floating panel that is shown while the worker is busy for long: hook, line and seconds.
 
     The code may only be slow, so nothing is done automatically. *Interrupt* raises in the author's code and keeps process
-    and envs. If that does not help (native code, a loop that catches everything), *Restart* ends the process, and a new
-    one restores the last good version where it was.
+    and envs. If that does not help (native code, a loop that catches everything), *Restart* ends the process.
+    A new one loads the file as it is now; if the file was being loaded, it restores the last good version.
 
     Args:
         server: The page.
@@ -239,14 +240,15 @@ def busy_html(busy: Busy, view: SessionView, link: LinkTo = no_links) -> str:
     if busy.ignores_interrupt:
         advice = (
             "It did not stop when it was interrupted: it is in native code, or it catches every exception. Restart "
-            "ends the process and loads the file as it is now; while it loads, the last good version comes back instead."
+            "ends the process and loads the file as it is now; if it is already being loaded, Restart brings "
+            "back the last good version instead."
         )
     elif busy.drawing:
         advice = "The renderer is working. The first picture may take a while; Restart ends the process."
     else:
         advice = (
-            "It may only be slow. Interrupt stops it there and shows the traceback; Restart ends the process and "
-            "loads the file as it is now. Saving a fixed file does the same."
+            "It may only be slow. Interrupt stops it there and shows the traceback. Saving a fixed file also "
+            "stops it, and loads the file. Restart ends the process and loads the file as it is now."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
     return render("busy", subject=subject, busy=busy, advice=advice, link=link)

@@ -20,7 +20,7 @@ class EnvColumn:
     Args:
         name: Its heading, which may break after each underscore.
         text: Length of its longest cell in characters.
-        word: Number of these characters that are left out first: a dot means the same.
+        word: Length of the word in this cell, which is left out first: the dot before it means the same.
         fixed: Further pixels of a cell.
         rank: Order in which columns are left out, 0 first; None: never.
     """

@@ -45,7 +45,7 @@ _MIN_DECIMALS, _MAX_DECIMALS = 4, 9
 
 
 class EnvOptionsPanel(PagePart[SessionView]):
-    """A form that is applied as a whole: every change rebuilds the envs.
+    """A form that is applied as a whole, since every change rebuilds the envs.
 
     Entered values stay in the form until they are applied or discarded, also if the task fails with them; the running
     envs stay unchanged then. The form is rewritten when the envs were made with other options.
@@ -110,9 +110,9 @@ class EnvOptionsPanel(PagePart[SessionView]):
                 self._num_envs = num_envs
             case SetKeyword(name=name, value=value):
                 if not any(keyword.name == name and not keyword.fixed for keyword in self._keywords):
-                    raise Refused(f"There is no {name} that can be changed here.")
+                    raise Refused(f"There is no option {name} that can be changed here.")
                 if isinstance(value, str) and not value.isprintable():
-                    raise Refused(f"The {name} has characters that cannot be shown.")
+                    raise Refused(f"The value of {name} has characters that cannot be shown. Remove them.")
                 self._values[name] = value
             case ApplyEnvOptions():
                 self._apply()
@@ -166,7 +166,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
 
 
 def merged(given: Mapping[str, Any], values: Mapping[Keyword, Any]) -> dict[str, Any]:
-    """The keyword arguments of a form merged over the given ones.
+    """The keyword arguments `given`, with the values of a form in place of theirs.
 
     Unchanged arguments are kept, and arguments equal to the class's default are omitted. A new robot has other control
     modes, so the old mode is dropped unless it was chosen together with the robot.
@@ -223,7 +223,7 @@ def _field_for(server: viser.ViserServer, keyword: Keyword) -> Field:
     label, value = LABELS.get(keyword.name, keyword.name), _in_effect(keyword)
     given = {"name": keyword.name}
     if keyword.fixed:
-        hint = f"Not changed here: {keyword.fixed}"
+        hint = f"Cannot be changed here: {keyword.fixed}"
         return Field(server, label, SetKeyword, "value", value, given=[given], hint=hint)
     if keyword.kind == "choice" or (keyword.kind == "bool" and keyword.optional):
         return choice(server, label, SetKeyword, "value", _options(keyword), value, given=given)
@@ -242,7 +242,7 @@ def _options(keyword: Keyword) -> dict[str, Plain]:
     """Values in JSON by label."""
     texts = keyword.choices or ("true", "false")
     names = [shown(text) for text in texts]
-    # 1 and "1" look the same.
+    # The labels of 1 and "1" are equal: then all options are labelled in JSON.
     options: dict[str, Plain] = dict(zip(names if len(set(names)) == len(names) else texts, texts))
     if keyword.optional and "null" not in texts:
         options[NONE] = "null"

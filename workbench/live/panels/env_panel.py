@@ -56,13 +56,13 @@ WORDS = {
 TABLE = "envs"
 """Name of the panel in the page's report that the panel was unfolded."""
 MAX_DEFAULT_ENTRIES = 6
-"""Number of bool entries with a column by default; with more a row is wider than the view. The others can be chosen."""
+"""Number of bool entries with a column by default; with more, a row is wider than the view."""
 CURVE_POINTS = 40
 """Number of points of a row's small curve."""
 STEP_CHARACTERS = 3
 """Minimum width of a step number in characters, so that the columns do not widen in the first steps."""
 REWARD_CURVE = "reward curve"
-"""Name of the column that cannot be sorted by."""
+"""Name of the only column by which the table cannot be sorted."""
 CURVE_WIDTH, CURVE_HEIGHT = 60, 14
 _GRAVITY = np.array([2, 3, 0, 1])
 """Sort key of each `Outcome`: failed, then truncated, then running, then solved."""
@@ -74,7 +74,11 @@ def bool_entries(rows: EnvRows) -> tuple[str, ...]:
 
 
 def entry_names(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[str, ...]:
-    """Bool entries that get a column: the chosen ones, and the first of those that the user did not switch."""
+    """Bool entries that get a column: as the user has switched them, else the first `MAX_DEFAULT_ENTRIES`.
+
+    Args:
+        chosen: True or False for each entry that the user has switched.
+    """
     chosen = chosen or {}
     every = bool_entries(rows)
     return tuple(name for place, name in enumerate(every) if chosen.get(name, place < MAX_DEFAULT_ENTRIES))
@@ -147,7 +151,8 @@ def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") 
 
 
 def moment_of(rows: EnvRows, env: int) -> int | None:
-    """The step of the present episode that a press on an env's row shows: its first outlier, if none its end, if none None."""
+    """The step of the present episode that a press on an env's row shows: the first outlier, else the
+    episode's end; None without either."""
     if env in rows.outliers:
         return rows.outliers[env][0].step
     return int(rows.end[env]) if rows.end[env] >= 0 else None
@@ -156,7 +161,7 @@ def moment_of(rows: EnvRows, env: int) -> int | None:
 def make_rows(
     rows: EnvRows, envs: NDArray[np.int64], chosen: Mapping[str, bool] | None = None
 ) -> list[dict[str, Any]]:
-    """The cells of these envs. A curve is ``points`` of SVG polylines; flags are oldest first."""
+    """The cells of these envs. A curve is ``points`` of SVG polylines; flags of this episode come first."""
     names = entry_names(rows, chosen)
     curves = _curves(rows.rewards, envs)
     made = []
@@ -192,7 +197,7 @@ def ended_text(rows: EnvRows, envs: Sequence[int] | slice = slice(None)) -> str:
 
 
 def ended_counts(rows: EnvRows, envs: Sequence[int] | slice = slice(None)) -> list[tuple[str, str, int]]:
-    """Name, word and number of the ended episodes of these envs for each way to end."""
+    """For each way to end: its name, its word on the page, and the number of ended episodes of these envs."""
     success, fail, all_of_them = (int(n[envs].sum()) for n in (rows.succeeded, rows.failed, rows.ended))
     counts = {
         Outcome.SUCCESS: success,
@@ -264,10 +269,10 @@ HINTS = {
 
 
 class EnvPanel(MomentPart):
-    """The table of envs in the present container. Sorting and filter are the same for all open pages.
+    """The table of envs. Sorting and filter are the same for all open pages.
 
-    While every page has it folded, it is redrawn only for a new task: drawing 64 rows takes half of the panels' time while a
-    task plays.
+    While it is folded in every page, it is redrawn only for a new task: drawing 64 rows takes half of the
+    panels' time while a task plays.
     """
 
     does = (
@@ -475,15 +480,15 @@ class EnvPanel(MomentPart):
             self._chosen = {**self._chosen, name: name not in entry_names(rows, self._chosen)}
 
     def _select_first_flagged(self) -> None:
-        """Select the first flagged env of the shown moment, at its newest outlier."""
+        """Select the first flagged env of the shown moment, and go to the outlier."""
         rows = self._session.view().env_table
         env = None if rows is None else first_flagged(rows)
         if env is not None:
             self._session.happen(EnvEventShown(env, "flagged"))
 
     def _select_next(self, wanted: EnvEvent) -> None:
-        """Select the next env, by number and wrapping around, whose present or previous episode failed or has an outlier, at
-        this event. The newest moment decides, so that pressing again goes through all of them."""
+        """Select the next env (by number, wrapping around) whose present or previous episode failed or has an
+        outlier, and go to this event. Uses the newest moment, so that pressing again visits all such envs."""
         rows = self._session.look(lambda run: run.newest_env_table())
         envs = np.zeros(0, int) if rows is None else np.flatnonzero(mask(rows, wanted))
         if not len(envs):

@@ -30,7 +30,7 @@ from workbench.page.widgets.visitors import Visitor
 
 TAB = "Inspect"
 NEAR_LIMIT_SHARE = 0.02
-"""Share of a joint's range within which the joint counts as near its limit."""
+"""Share of a joint's range, at each end, in which the joint counts as near its limit."""
 
 Row = dict[str, Any]
 """A row of the template ``inspect``."""
@@ -242,7 +242,7 @@ class InspectPanel(PagePart[SessionView]):
         return lived is not None and lived[0] == lived[1]
 
     def choose_sections(self) -> None:
-        """Tell the session which sections to read; call it when a page opens another tab."""
+        """Choose the sections that the session reads; call it also when a page opens another tab."""
         is_open = bool(self._tabs.pages_at(TAB))
         shows_contacts = self._tabs.shows(self._forces_on, TAB) or (self.body and is_open)
         needed = {CHOICES[self._chosen] if is_open else None, "contacts" if shows_contacts else None}
@@ -267,12 +267,16 @@ def inspect_html(
     before: Inspection | None,
     no_step_yet: bool = False,
 ) -> str:
-    """The tab's content; without contacts if the env made no step since it was set or restored."""
+    """The tab's content.
+
+    Args:
+        no_step_yet: the env has made no step since it was reset or restored: leave out contacts.
+    """
     leaves, articulations, contacts, poses = [], [], (), []
     note = ""
     env, section = view.selected_env, CHOICES[choice]
     if view.task is None or view.step is None:
-        note = "There is something to inspect when the task has loaded."
+        note = "There is nothing to inspect until the task has loaded."
     elif choice == NOTHING:
         note = (
             "Choose what to read of the selected env: its joints, contacts, the poses of its bodies, the observation "

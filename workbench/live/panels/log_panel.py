@@ -31,7 +31,7 @@ DARK_PAGE: Rgb = (66, 66, 66)
 MIN_CONTRAST = 4.5
 """Minimum contrast ratio of text in WCAG 2.1."""
 MAX_SPANS = 1500
-"""Maximum number of spans in all lines; older lines are shown plain. A line may change its colour at every character."""
+"""Maximum number of spans in all lines: each character may have another colour. Older lines are plain."""
 SIXTEEN = TerminalTheme(
     (255, 255, 255), (0, 0, 0),
     [(0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229)],
@@ -139,7 +139,7 @@ class LogPanel(PagePart[SessionView]):
             "Filter",
             FilterLog,
             "text",
-            hint="Only lines that contain this; stderr: or stdout: before it selects one stream.",
+            hint="Show only lines that contain this text. Begin with stderr: or stdout: for one stream.",
             live=True,
             longest=MAX_FILTER_CHARACTERS,
         )
@@ -182,7 +182,8 @@ def log_html(printed: Printed, wanted: str) -> str:
     """The last lines that pass the filter.
 
     Args:
-        wanted: text that a line must contain, case-insensitive; a prefix ``stderr:`` or ``stdout:`` takes one stream.
+        wanted: text that a line must contain, case-insensitive; ``stderr:`` or ``stdout:`` before it selects
+            one stream.
     """
     stream, colon, rest = wanted.partition(":")
     if not (colon and stream in ("stdout", "stderr")):

@@ -1,4 +1,4 @@
-"""The Reward tab: a table of the task's numbers, and curves of the episode in sight."""
+"""The Reward tab: a table of the task's numbers, and curves of the shown episode."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ class CurvesPanel(MomentPart):
             own, alone = together[:MAX_LINES], len(together) == 1
             chosen = [(column, episodes[0]) for column in own]
             chosen += [(own[0], one) for one in episodes[1:]] if alone else []
-            # The episode in sight first: its peaks are exact, also in a long one.
+            # The shown episode is the first line: in a long episode, only the first line's peaks are exact.
             x, values = spans_of(
                 np.stack([_along(one, column, first, last) for column, one in chosen]), first=first
             ).points()
@@ -175,7 +175,7 @@ class CurvesPanel(MomentPart):
         return drawn
 
     def _episodes(self, view: SessionView, columns: Sequence[Column]) -> list[EpisodeNumbers]:
-        """The selected env's episode, and then the ones that it is drawn over."""
+        """The selected env's episode, then the episodes that it is drawn over."""
         env, last = view.selected_env, view.timeline.last
         before = MAX_BESIDE if self._beside == "last" or view.task is None or view.task.num_envs == 1 else 0
         found = list(self._session.look(lambda run: run.episodes(env, last, columns, before)))
@@ -226,7 +226,7 @@ class CurvesPanel(MomentPart):
 
 
 def _along(episode: EpisodeNumbers, column: Column, first: int, last: int) -> NDArray[np.float32]:
-    """(last - first + 1,) numbers of an episode by step; NaN where it has none."""
+    """(last - first + 1,) numbers of an episode by step; NaN at steps without a number."""
     line = np.full(last - first + 1, np.nan, np.float32)
     line[episode.steps - first] = episode.values[column]
     return line

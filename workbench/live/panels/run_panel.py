@@ -37,7 +37,7 @@ from workbench.task.description import ActionDimension
 ENVS = {"the selected env": "selected", "all envs": "all"}
 """Choices of a field *Envs*, with their values in commands."""
 HOLD = "Hold still"
-MOVED_HINT = "Whose robot a slider moves. The sliders show the action of the selected env."
+MOVED_HINT = "The envs whose robot a slider moves. The sliders show the action of the selected env."
 DEFAULT_BOUND = 1.0
 """Bound of the slider of a dimension without bounds: from -1 to 1."""
 
@@ -87,8 +87,8 @@ class ActionSliders:
         self._which.show(self._moved)
         if not self._folder.visible or view.told is None:
             return
-        told = view.told[min(view.selected_env, len(view.told) - 1)]
-        for one, dimension, value in zip(self._sliders, self._dimensions, told, strict=False):
+        action = view.told[min(view.selected_env, len(view.told) - 1)]
+        for one, dimension, value in zip(self._sliders, self._dimensions, action, strict=False):
             low, high = slider_bounds(dimension)
             # A policy's action may lie outside the bounds.
             # Three digits: the field next to the slider has no room for more.
@@ -99,7 +99,7 @@ class ActionSliders:
         match command:
             case MoveSlider(dimension=dimension, value=value):
                 if dimension >= len(self._dimensions):
-                    raise Refused(f"The robot's action has {len(self._dimensions)} dimensions.")
+                    raise Refused(f"The robot's action has only {len(self._dimensions)} dimensions.")
                 low, high = slider_bounds(self._dimensions[dimension])
                 self._session.happen(ActionTold((dimension,), (min(max(value, low), high),), envs))
             case HoldStill():
@@ -121,7 +121,7 @@ EPISODE_ENDS: dict[str, EpisodeEnd] = {
 }
 SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
 RESET_ALL, RESET_THIS = "Reset all", "Reset this env"
-TO_TRY = "Its options, and what it finds"
+TO_TRY = "Options and results of solve"
 MODE_HINT = "Another control mode rebuilds the envs."
 CHOOSE = "choose one"
 KNOWN_HINT = (
@@ -152,7 +152,7 @@ class RunPanel(PagePart[SessionView]):
                 "Policy",
                 SetPolicy,
                 "policy",
-                hint="module:function or file.py:function, given obs, returns the action.",
+                hint="module:function or file.py:function. The function takes obs and returns the action.",
             )
             self._known = choice(server, "Known", SetPolicy, "policy", (CHOOSE,), CHOOSE, hint=KNOWN_HINT)
             self._policy_hint = gui.add_html(render("policy_hint"))

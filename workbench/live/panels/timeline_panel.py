@@ -68,7 +68,7 @@ class TimeBar(PagePart[View]):
     """The transport, a row of 60 px under the view, and the drawer that opens below it.
 
     The row has buttons, the speed and the strip. The drawer's first tab, *Timeline*, has a legend, a slider and further
-    buttons; whether the drawer is open is a matter of each page (`ToggleTimeline`).
+    buttons. Each page opens and closes the drawer on its own (`ToggleTimeline`).
 
     Args:
         name: Name of the slider.
@@ -97,7 +97,7 @@ class TimeBar(PagePart[View]):
         self._drawer.float(x=0, y=-1)
 
     def add_tab(self, name: str) -> viser.GuiTabHandle:
-        """Add a tab to the drawer, to be filled."""
+        """Add an empty tab to the drawer."""
         tab = self._drawer.add_tab(name)
         with tab:
             self._server.gui.add_html(render("drawer"))
@@ -118,7 +118,8 @@ class TimeBar(PagePart[View]):
         return there
 
     def _show_slider(self, low: int, high: int, value: int) -> None:
-        # The range is never empty. Disabled, not hidden: the panel would grow at the first step.
+        # The range must not be empty. Without steps, the slider is disabled and not hidden: else the panel
+        # would grow at the first step.
         self._slider.show(value, bounds=(min(low, high - 1), high), off=low >= high)
 
 
@@ -155,7 +156,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         """Key of the data that the strip was drawn for."""
 
     def _add_speed(self, server: viser.ViserServer) -> Field:
-        hint = "Simulated seconds in one second."
+        hint = "Simulated seconds per real second."
         return choice(server, "Speed", SetSpeed, "speed", SPEEDS, 1.0, hint=hint)
 
     def _add_entry(self, server: viser.ViserServer) -> None:
@@ -211,7 +212,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             self._draw_empty()
 
     def _draw_empty(self) -> None:
-        """Draw that nothing is kept: no task, or its envs were just built."""
+        """Draw an empty timeline: there is no task, or its envs were just built."""
         self._range, self._newest, self._range_at, self._strip_of = (0, 0), 0, -math.inf, None
         self._show_slider(0, 0, 0)
         self._strip.content = self._legend.content = self._hint.content = self._walk.content = ""
@@ -297,7 +298,7 @@ def play_tool(playing: bool, off: bool = False) -> tuple[str, Tool]:
 
 
 def event_tools() -> list[Tool]:
-    """Buttons that go to the event before or after."""
+    """Buttons that go to the previous and the next event."""
     return [tool(LAST_EVENT, PreviousEvent()), tool(NEXT_EVENT, NextEvent())]
 
 
@@ -352,7 +353,7 @@ def strip_values(
         low: First tick of the strip.
         high: Last tick.
         reward: (high - low + 1,), NaN where there is none.
-        styles: Styles of its marks.
+        styles: Styles of the strip's marks.
     """
 
     def place(at: float) -> float:

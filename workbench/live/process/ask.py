@@ -27,7 +27,7 @@ WAITING = "waiting for other work in the background"
 IDLE_SECONDS = 300.0
 """Time for which an idle process is kept."""
 _STDERR_BYTES = 4096
-"""How much of the end of a process's ``stderr`` is kept: its last line is quoted if the process ends with an error."""
+"""Bytes kept from the end of ``stderr``: the last line is quoted if the process ends with an error."""
 _CANCEL_TIMEOUT_SECONDS = 3.0
 _LOAD_CANCEL_TIMEOUT_SECONDS = 10.0
 """Timeout for the answer to a cancelled load; then the process is ended. For other questions it is
@@ -96,7 +96,7 @@ class QuestionClient:
 
 
 class Preempted(Exception):
-    """A job of higher priority needs the process; the question must be asked again in another turn."""
+    """A job of higher rank needs the process; the caller must ask the question again in its next turn."""
 
 
 Priority = Literal["person", "low", "lowest"]
@@ -110,12 +110,13 @@ class Background(QuestionClient):
     """Asks questions of a background process, one at a time. Jobs use it in turns. Used on the loop.
 
     Rescoring the past, rendering it and searching for cameras take seconds to minutes and move the envs, so they cannot
-    run in the worker that plays. This process has a lower priority; it takes some seconds to start and 0.75 GB. It ends
-    after `IDLE_SECONDS` without a job.
+    run in the worker that plays. The background process has a higher niceness, takes some seconds to start,
+    uses 0.75 GB, and ends after `IDLE_SECONDS` without a job.
 
-    The newest job runs first, since the user waits for it: the others are preempted and continue later. A worker answers in
-    order, so a job that stops or is preempted leaves one pending answer; the next turn starts when that has arrived, or
-    the process is ended. If the process dies, its job fails; the next job starts another process.
+    Of the jobs with the highest priority the newest runs first, since the user waits for it; the others are
+    preempted and continue later. A worker answers in order, so a job that stops or is preempted leaves one
+    pending answer. The next turn starts when this answer has arrived; if it does not arrive in time, the
+    process is ended. If the process dies, its job fails, and the next job starts another process.
     """
 
     def __init__(self, niceness: int = _NICENESS) -> None:
@@ -152,8 +153,9 @@ class Background(QuestionClient):
     async def in_turns(
         self, job: Job, work: Callable[[], Awaitable[Value]], priority: Priority = "person"
     ) -> Value:
-        """Run `work` while no other job has the process and none of higher priority waits. `work` is started again each time
-        it was preempted; the envs are in another state then."""
+        """Run `work` when it is this job's turn. If a job of higher rank preempts `work`, it is called again
+        in the next turn; the envs are in another state then.
+        """
         rank = _ORDER[priority], job.number
         while True:
             await self._begin_turn(rank)
@@ -183,7 +185,7 @@ class Background(QuestionClient):
             return
         if self._idle is not None:
             self._idle.cancel()
-        # If two jobs are stopped at once, one may still be in the list.
+        # If two jobs are stopped at once, one of them may still be in the list.
         waiting = [rank for rank, granted in self._waiting.items() if not granted.done()]
         if not waiting:
             self._idle = loop.later(IDLE_SECONDS, self.end)
@@ -200,7 +202,7 @@ class Background(QuestionClient):
         self._grant()
 
     def _is_waited_for(self) -> bool:
-        """Whether a job waits that has a higher priority than the job that has the process."""
+        """Whether a job waits whose rank is higher than that of the job that has the process."""
         return self._turn is not None and max(self._waiting, default=self._turn) > self._turn
 
     @property
@@ -216,17 +218,17 @@ class Background(QuestionClient):
     async def ensure(
         self, job: Job, load: Load, placed: tuple[PlaceCamera, ...] = (), or_else: Load | None = None
     ) -> int:
-        """Start the process, load this version and place the cameras, as far as that is not done.
+        """Start the process, load this version and place the cameras, unless that was done before.
 
         Args:
-            load: with a level other than ``auto`` it is always loaded.
-            or_else: loaded if `load` fails.
+            load: the version; with a level other than ``auto`` it is loaded in any case.
+            or_else: loaded if the author's code raises in `load`.
 
         Returns:
             the number of envs.
 
         Raises:
-            JobFailed: one of the steps failed; with the problem, if the author's code raised.
+            JobFailed: one of the steps failed; has the problem, if the author's code raised.
         """
         if self._process is None:
             job.report(0, 0, "starting a process in the background")
@@ -246,7 +248,7 @@ class Background(QuestionClient):
             if loaded.reload is None or loaded.reload.level not in ("same", "patched"):
                 self._placed = {}
         wanted = {request.key: request for request in placed}
-        # A camera that is no longer placed goes back to the file's pose.
+        # Cameras that are not in `placed` any more go back to the file's pose.
         for key in [key for key in self._placed if key not in wanted]:
             await self.ask(PlaceCamera(key, None))
             del self._placed[key]
@@ -262,13 +264,13 @@ class Background(QuestionClient):
         Raises:
             JobFailed: there is no answer.
             ProcessDied: there is no answer because the process died.
-            Preempted: a job of higher priority waits. A load is finished first: that job most likely needs it too.
+            Preempted: a job of higher rank waits. A load is finished first: that job probably needs it too.
         """
-        # Before the question: the waiting job would wait for it too.
+        # Check before sending: the waiting job would have to wait for the answer.
         if self._is_waited_for() and not _is_load(question):
             raise Preempted
         if self._idle is not None:
-            self._idle.cancel()  # also outside a turn: a question may take hours
+            self._idle.cancel()  # or the process would be ended during a long question outside a turn
         if self._process is None:
             self._process = _Process(self, self._niceness)
         return await super().ask(question, on_progress)
@@ -333,7 +335,7 @@ class _Process:
         self._stderr = b""
         """The last bytes of the process's ``stderr``."""
         self._lock = threading.Lock()
-        """Lock for the start: requests made before it are queued and sent then."""
+        """Lock for the start: requests made before the start are queued, and sent at the start."""
         self._thread = threading.Thread(target=self._run, name="background", daemon=True)
         self._thread.start()
 
@@ -371,7 +373,8 @@ class _Process:
 
     def _serve(self) -> str:
         """Start the process and read its events until it ends; returns why it ended."""
-        # The author's output is not shown: the worker that plays already shows it. The last lines explain a death.
+        # The author's output is not shown, since the worker that plays shows the same. Only the end of
+        # stderr is kept, to explain a death.
         worker = WorkerProcess(self._hear, self._niceness)
         code: int | None = None
         with self._lock:

@@ -23,7 +23,7 @@ class JobProgress:
 
 
 class JobFailed(Exception):
-    """The job failed. The text is for the page; `problem` is that of the author's code, if it raised."""
+    """The job failed. The text is for the page; `problem` is set if the author's code raised."""
 
     def __init__(self, why: str, problem: Problem | None = None) -> None:
         super().__init__(why)
@@ -42,7 +42,7 @@ class Job:
     def __init__(self, what: str, on_change: Callable[[], None] = lambda: None) -> None:
         self._what, self._on_change = what, on_change
         self.number = next(self._numbers)
-        """Number of the job; a job of any kind that begins later has a higher number."""
+        """Number of the job, counting up over jobs of all kinds."""
         self.progress = JobProgress(what, 0, 0)
         self.stopped = False
         """Whether the job was stopped; work on another thread checks this."""

@@ -25,7 +25,7 @@ _LINES_PER_SECOND = 400
 _BAR_PERIOD_SECONDS = 0.1
 """Minimum interval of reports of an unfinished line that is overwritten."""
 _FLOOD_BYTES = 16_384
-"""How much of the end of a piece is split into lines during a flood."""
+"""During a flood, only this many bytes at the end of each piece are split into lines."""
 
 
 class StyledText(NamedTuple):
@@ -67,15 +67,15 @@ class PrintedLog:
     """The last lines of a worker's output. Thread-safe: reader threads feed it, the page reads it.
 
     A print in a loop writes a gigabyte per minute. Splitting and decoding a line takes microseconds in the server process,
-    so a flood of millions would freeze the page: at most `_LINES_PER_SECOND` lines are split, the others are only counted.
-    For a line that overwrites itself, such as a progress bar, the last version is kept.
+    so millions of lines would freeze the page: at most `_LINES_PER_SECOND` are decoded, the others are only
+    counted. Of a line that overwrites itself, such as a progress bar, the last version is kept.
     """
 
     def __init__(self, on_lines: Callable[[list[PrintedLine], int], None]) -> None:
         """
         Args:
-            on_lines: called on the feeding threads with the new lines and the number of lines dropped before them; without
-                lines if an unfinished line was overwritten.
+            on_lines: called on the feeding threads with the new lines and the number of lines dropped before
+                them. If only an unfinished line was overwritten, it is called without lines.
         """
         self._on_lines = on_lines
         self._lock = threading.Lock()
@@ -91,11 +91,12 @@ class PrintedLog:
         self._view = NOTHING_PRINTED
 
     def feed(self, stream: str, piece: bytes) -> bool:
-        """Add the next bytes of a stream, split anywhere; empty at its end. Returns True during a flood."""
+        """Add the next bytes of a stream, which may end within a line; empty bytes mean that the stream has
+        ended. Returns True during a flood."""
         ended = not piece
         with self._lock:
             if ended:
-                # Remaining text without a newline is the last line.
+                # The rest, which has no newline, becomes the last line.
                 piece = b"\n" if self._rest.get(stream) else b""
             now = time.monotonic()
             earned = (now - self._refilled) * _LINES_PER_SECOND
@@ -146,10 +147,10 @@ class PrintedLog:
             if cut:
                 piece, self._rest[stream] = piece[cut:], b""
         *whole, rest = (self._rest.get(stream, b"") + piece).split(b"\n")
-        # Only the last version of a progress bar and the one being written are needed.
+        # Of a progress bar keep only the last whole version, and the one that is being written.
         if rest.count(b"\r") > 1:
             rest = b"\r".join(rest.rsplit(b"\r", 2)[1:])
-        # Cut a line that does not end, or a gigabyte of it would fill this process.
+        # Cut an endless line, or it would fill this process's memory.
         if len(rest) > _MAX_LINE_BYTES:
             whole.append(rest)
             rest = b""
@@ -183,7 +184,7 @@ def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[StyledText], St
     """One line as runs, and the style at the start of the next line.
 
     Args:
-        style: at the end of the previous line.
+        style: style at the end of the previous line.
     """
     runs: list[StyledText] = []
     end = 0

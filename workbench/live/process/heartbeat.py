@@ -29,11 +29,11 @@ _OURS = ("/workbench/app/", "/workbench/live/", "/workbench/envs/", "/workbench/
 
 @dataclass(frozen=True)
 class Busy:
-    """A piece of work that takes long, and its position in the code at the last check."""
+    """A piece of work that takes long, and the line of code that was being executed at the last check."""
 
     seconds: float
     doing: str
-    """Text for the page: ``in evaluate``, ``loading``."""
+    """What the worker does, as text for the page: ``in evaluate``, ``loading``."""
     file: str | None = None
     """The author's file, if one of its lines is being executed."""
     line: int | None = None
@@ -46,7 +46,7 @@ class Busy:
     ignores_interrupt: bool = False
     """Whether the worker continued after an interrupt."""
     held: bool = False
-    """Whether a debugger has suspended the worker, or the worker waits for one; it does not hang then."""
+    """Whether a debugger has suspended the worker, or the worker waits for one: it is not hanging then."""
     awaited: bool = False
     """Whether the worker waits until a debugger attaches."""
 
@@ -158,8 +158,8 @@ def death_problem(
     Args:
         why: for example ``was killed by SIGSEGV``.
         doing: for example ``stepping``; None for an idle worker.
-        dump: its last stack, or empty.
-        printed: the last lines of its output.
+        dump: the worker's last stack; may be empty.
+        printed: the last lines of the worker's output.
         texts: source by path of the version that ran.
     """
     frames = parse_stack(dump)
@@ -192,9 +192,9 @@ def own_files_of(source_files: Iterable[str], own_file: Path | None) -> list[str
 
 
 # --- the heartbeat in shared memory ------------------------------------------------------------------
-# A hanging worker and a paused one both send nothing, and a question would not distinguish them. So the worker writes
-# the start and end of each piece of work into shared memory: two small writes per control step, no message. The clock is
-# CLOCK_MONOTONIC, which is the same in all processes of the machine.
+# A hanging worker and a paused worker both send nothing. To tell them apart, the worker writes the start and
+# end of each piece of work into shared memory: two small writes per control step, and no message. The clock
+# is CLOCK_MONOTONIC, which is the same in all processes of the machine.
 
 
 Doing = Literal[
@@ -237,7 +237,8 @@ class Beat:
 
 
 def make_heartbeat() -> int:
-    """Shared memory as a file descriptor for the child; the caller closes it. Until the child writes, it is starting."""
+    """File descriptor of the shared memory, for the child; the caller closes it. Until the child writes,
+    `read` gives ``starting``."""
     fd = os.memfd_create("workbench-heartbeat")
     os.ftruncate(fd, mmap.PAGESIZE)
     os.pwrite(fd, _LAYOUT.pack(0, time.monotonic(), _DOINGS.index("starting"), 0), 0)
@@ -254,7 +255,8 @@ class HeartbeatWriter:
 
     def begin(self, doing: Doing) -> None:
         self._number += 1
-        # Not `pack_into`, which clears the memory first: the server would read a start at second 0, and report the worker as busy.
+        # Not `pack_into`, which clears the memory first: the server might read a start at second 0, and
+        # report the worker as busy.
         written = _LAYOUT.pack(self._number, time.monotonic(), _DOINGS.index(doing), self._number)
         self._memory[: _LAYOUT.size] = written
 
@@ -295,16 +297,17 @@ STACK_SIGNAL = signal.SIGUSR2
 class Interrupts:
     """Lets the server stop the author's code in the worker's main thread, but never the workbench's own code.
 
-    A signal handler runs in the main thread between two bytecodes and may raise there, so an endless Python loop is left
-    with a traceback at the author's line. In other code it must not raise: half a message in the pipe would end the
-    session. So a signal counts only while `allowed`, and not within `shielded`. It cannot stop native code that does not
-    return or a loop that catches everything; the supervisor reports that.
+    A signal handler runs in the main thread between two bytecodes and may raise there: this ends an endless
+    Python loop, with a traceback at the author's line. In the workbench's code it must not raise: half a
+    message in the pipe would end the session. So the handler raises only while `allowed`, and not within
+    `shielded`. It cannot stop native code that does not return or a loop that catches everything; the
+    supervisor reports that.
     """
 
     def __init__(self) -> None:
         self.allowed = False
-        """Set this after `begin`, and clear it in a ``finally``, by plain assignments: a signal can raise at the start of
-        any call, which would leave it set for ever."""
+        """Set this after `begin`, and clear it in a ``finally``, by plain assignments: a signal can raise at
+        the start of any call, so a method that clears `allowed` might never run."""
         self._waiting = False
         self._began = 0.0
 
@@ -330,7 +333,7 @@ class Interrupts:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.allowed:
             self._raise()
-        # Between two pieces of work there is nothing to stop; within `shielded` the signal is raised at its end.
+        # Between two pieces of work there is nothing to stop; `shielded` raises at its end.
         self._waiting = True
 
     def _raise(self) -> None:

@@ -22,10 +22,10 @@ _PSS_PERIOD_SECONDS = 2.0
 
 
 def parse_memory(text: str) -> int | None:
-    """Bytes of ``8GB``, ``800 MiB`` (both count by 1024), ``auto``; None for ``none``.
+    """Bytes of ``8GB``, ``800 MiB`` (units are powers of 1024) or ``auto``; None for ``none``.
 
     Raises:
-        ValueError: the text is none of these, or the limit is too small for any worker.
+        ValueError: the text has another form, or the limit is too small for any worker.
     """
     word = text.strip().lower()
     if word == "none":
@@ -37,13 +37,13 @@ def parse_memory(text: str) -> int | None:
         raise ValueError(f"--memory-limit takes a size such as 8GB, auto, or none; got {text!r}")
     if size < _MIN_BYTES:
         raise ValueError(
-            f"--memory-limit must be at least 1GB: a worker that has built nothing uses half of it, not {text}"
+            f"--memory-limit must be at least 1GB, not {text}: a worker that has built nothing uses half a GB"
         )
     return int(size)
 
 
 def size_in_bytes(text: str) -> float | None:
-    """Bytes of ``8GB``, ``1.5 GiB``, ``800m`` (all by 1024) or a plain number; None for other text."""
+    """Bytes of ``8GB``, ``1.5 GiB``, ``800m`` (in powers of 1024) or a plain number; None for other text."""
     found = _SIZE.fullmatch(text.strip())
     return None if found is None else float(found["number"]) * _UNITS[found["unit"].lower()]
 
@@ -67,7 +67,7 @@ class FamilyMemory:
 
     Pages that a forked child shares with its parent count once: summed resident memory (RSS) would count a worker of
     1 GB with seven children as 8 GB. Reading the proportional set size (PSS) takes milliseconds, so it is read every two
-    seconds, and at once if the memory seems above the limit. In between, new memory counts as not shared.
+    seconds, and at once if the memory seems above the limit. Until then, new memory counts as not shared.
     """
 
     def __init__(self) -> None:
@@ -95,5 +95,5 @@ class FamilyMemory:
 
 
 def format_size(size: int) -> str:
-    """``8.0 GB``, ``310 MB``; by 1024."""
+    """``8.0 GB``, ``310 MB``; units are powers of 1024."""
     return f"{size / 2**30:.1f} GB" if size >= 2**30 else f"{size / 2**20:.0f} MB"

@@ -36,18 +36,18 @@ _POLL_SECONDS = 0.1
 """Interval at which the worker is checked."""
 _BUSY_SECONDS = 2.0
 _SLOW_WORK_SECONDS: dict[Doing, float] = {"starting": 20.0, "warming up": 20.0, "drawing": 20.0}
-"""Time after which slow kinds of work (imports, shaders) are reported as busy; other work is after `_BUSY_SECONDS`."""
+"""Time after which slow work (imports, shaders) is reported as busy; for other work it is `_BUSY_SECONDS`."""
 _STACK_PERIOD_SECONDS = 1.0
 """Interval at which the worker's stack is read."""
 _INTERRUPT_TIMEOUT_SECONDS = 1.5
 """Timeout for the author's code to end after an interrupt."""
 _LOAD_WAIT_SECONDS = 2.0
-"""Time that a load may wait behind other work; then that work is interrupted."""
+"""Time that a load may wait behind other work before this work is interrupted."""
 _SILENCE_TIMEOUT_SECONDS = 4.0
-"""Time after the interrupt at which the worker is ended if the load still waits."""
+"""Time after this interrupt at which the worker is ended if the load still waits."""
 _RESTART_DELAY_SECONDS = 0.5
 _HEADLESS_SECONDS = 1.0
-"""Time without a main thread after which a worker is ended; a process that exits has none for a moment."""
+"""Time without a main thread after which a worker is ended; an exiting process has none for a moment."""
 _MAX_DEATHS = 3
 """Maximum number of workers that may die in a row without a load in between."""
 _SPARE_DELAY_SECONDS = 5.0
@@ -94,7 +94,7 @@ class Death:
     stack: str
     """The worker's last stack, as faulthandler writes it; may be empty."""
     gives_up: bool
-    """Whether too many workers died: the next is started only when `Supervisor.replace` is called."""
+    """Whether too many workers died in a row: only `Supervisor.replace` starts the next one."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class SpareWorker:
 
     A new worker makes a render system and compiles its shaders; if it is not forked (`worker_start`), it also imports
     torch, SAPIEN and ManiSkill, which takes 4 s or more. The spare does this in the background once a task runs, then
-    sleeps; it takes memory (`memory`). Some time after it is taken, the next one is started.
+    sleeps; it takes memory (`memory`). After it is taken, the next load starts another one (`begin_soon`).
     """
 
     def __init__(self, warm_up: WarmUp) -> None:
@@ -134,7 +134,7 @@ class SpareWorker:
         if self._process is None:
             if self._due is not None and time.monotonic() >= self._due:
                 self._due = None
-                # Its output is dropped: ManiSkill and the renderer print what the first worker has already shown.
+                # The spare's output is dropped: the first worker has already shown the same lines.
                 self._process = WorkerProcess(lambda stream, piece: False)
                 self._process.send(Call(0, self._warm_up))
             return
@@ -147,7 +147,7 @@ class SpareWorker:
             self.begin_soon()
 
     def take(self) -> WorkerProcess | None:
-        """Hand over the spare, which may not be ready yet; None if there is none."""
+        """Return the spare, which may not be ready yet, and forget it; None if there is none."""
         self.poll()
         taken, self._process, self._ready, self._due = self._process, None, False, None
         return taken
@@ -179,10 +179,11 @@ class Supervisor:
 
     The author's code may crash its process, exit it, loop for ever or fill the memory; the page must survive that. One
     thread starts a worker, sends the requests of `first_requests`, forwards its events and checks it ten times a second.
-    When the worker ends, the thread reports why and continues with the next, from the spare if there is one.
+    When the worker ends, the thread reports why and continues with the next one: the spare, if there is one.
 
-    It ends a worker on its own only in two cases: memory above the limit, and a load that waits behind work that cannot
-    be interrupted, since a corrected file must not wait for a worker that hangs. A busy worker may just be slow: it is
+    The supervisor ends a worker whose main thread has ended or whose data is unusable. It ends a working one
+    only in two cases: memory above the limit, and a load that waits behind work that cannot be interrupted,
+    since a corrected file must not wait for a worker that hangs. A busy worker may just be slow: it is
     reported with its line and left alone. Time during which a debugger holds the worker does not count.
     """
 
@@ -201,9 +202,9 @@ class Supervisor:
         """The callbacks are called on this object's threads, and may call `send`, `replace` and `interrupt`.
 
         Args:
-            first_requests: returns the requests for each new worker, which restore the previous one's state.
-            on_busy: called about once a second during a long piece of work, and with None when it is done.
-            own_files: returns the author's files, to find the author's line on a stack.
+            first_requests: returns the requests that restore the previous worker's state in a new one.
+            on_busy: called about once a second during a long piece of work, and with None at its end.
+            own_files: returns the author's files, to find the author's line in a stack.
             output: as for `WorkerProcess`.
         """
         self._options, self._warm_up = options, warm_up
@@ -255,9 +256,9 @@ class Supervisor:
         return self._load_sent is not None
 
     def send(self, request: Request) -> None:
-        """Send a request to the current worker. While one worker hands over to the next, the user's commands are queued, and so
-        is a load that came too late for the next worker's `first_requests`. All other requests sent between two workers are
-        lost; `first_requests` must include their effect."""
+        """Send a request to the current worker. While one worker hands over to the next, commands of the user
+        are queued for the next worker; so is a load that came too late for its `first_requests`. Other
+        requests that are sent between two workers are lost: `first_requests` must include their effect."""
         with self._condition:
             worker = self._worker
             if isinstance(request, Load) and not self._begun:
@@ -273,7 +274,7 @@ class Supervisor:
             worker.send(request)
 
     def interrupt(self) -> None:
-        """Raise Interrupted in the author's code, if Python runs it and no debugger holds it."""
+        """Raise Interrupted in the author's code, if it is running in Python and not held by a debugger."""
         with self._condition:
             worker = self._worker
         if worker is not None:
@@ -314,7 +315,7 @@ class Supervisor:
             return self._run_worker()
         except Exception as error:
             # Do not start a new thread: the kernel ends a worker with the thread that started it.
-            report_failure("The thread that supervises the worker failed and is started again", error)
+            report_failure("The supervision of the worker failed and is started again", error)
             with self._condition:
                 worker, self._worker, self._begun = self._worker, None, False
                 self._deaths += 1
@@ -325,16 +326,16 @@ class Supervisor:
         try:
             self._on_death(Death(why, End.DIED, None, "", gives_up))
         except Exception as failure:
-            report_failure("The page cannot be told that the worker was lost", failure)
+            report_failure("The loss of the worker could not be reported to the page", failure)
         with self._condition:
-            # A delay, or an immediate failure would use up all attempts.
+            # Without a delay, a failure that repeats at once would use up all attempts.
             self._condition.wait_for(
                 lambda: self._replace_asked or self._closing, None if gives_up else _RESTART_DELAY_SECONDS
             )
             return not self._closing
 
     def _run_worker(self) -> bool:
-        """Run one worker from start to end. Returns False if no other must follow."""
+        """Run one worker from start to end. Returns False if this object closes: no worker must follow."""
         worker = self._spare.take() if self._spare is not None else None
         if worker is None:
             worker = WorkerProcess(self._output)
@@ -372,19 +373,19 @@ class Supervisor:
             except Exception as error:
                 report_failure("The last events of a worker could not be handled", error)
         except Exception as error:
-            # An event that does not fit the state is treated like an unreadable one.
+            # An event that cannot be handled is treated like unreadable data.
             report_failure("An event of the worker could not be handled, so the worker is ended", error)
             state.why = f"sent unusable data ({type(error).__name__}: {shorten(str(error))}) and was ended"
             worker.kill()
         self._on_busy(None)
         if self._closing:
             if self._spare is not None:
-                self._spare.kill()  # before the worker: freeing a gigabyte takes a while, so both do it at once
-            worker.stop(grace=0.3)  # nothing is lost: the server has all data worth keeping
+                self._spare.kill()  # before the worker, so that both free their gigabyte at the same time
+            worker.stop(grace=0.3)  # a short grace loses nothing: the server has all data worth keeping
             return False
         code = worker.exit_code()
         if code is None and state.why is None:
-            state.why = "closed its line to the server and was ended"
+            state.why = "closed its connection to the server and was ended"
         report, beat = worker.crash_report(), worker.beat()  # both files outlive the process
         worker.stop(grace=0.0)
         with self._condition:
@@ -395,7 +396,8 @@ class Supervisor:
             gives_up = self._deaths >= _MAX_DEATHS
         seen = state.stack if state.stack_of == beat.number else ""
         stack = report if fatal_error(report) is not None else seen
-        # A crash may take a while; before the exit code is known it shows as an ended main thread or half a message.
+        # A crash may take a while, and first show as an ended main thread or half a message: so its exit code
+        # counts more than `state.why`.
         crashed = code is not None and code < 0 and code != -signal.SIGKILL
         why = describe_exit(code) if crashed or state.why is None else state.why
         self._on_death(Death(why, state.end, _doing(beat), stack, gives_up))
@@ -419,7 +421,7 @@ class Supervisor:
             if event is not None:
                 self._on_event(event)
             if hands_over(event):
-                state.end, state.why = End.HANDED_OVER, "was ended for another to go on"
+                state.end, state.why = End.HANDED_OVER, "was ended so that another process continues"
                 worker.kill()
                 raise EOFError
             if time.monotonic() - looked >= _POLL_SECONDS:
@@ -451,7 +453,7 @@ class Supervisor:
             self._end(worker, state)
         self._check_memory(worker, state)
         if beat.held != state.held:
-            # Report at once, and count time from here: the debugger's time is not the task's.
+            # Report at once, and count the time from now: time in the debugger is not the task's.
             state.held, state.held_changed, state.reported = beat.held, now, 0.0
         load_sent = self._load_sent
         if (
@@ -461,7 +463,7 @@ class Supervisor:
             and beat.since < load_sent
         ):
             waited = now - max(load_sent, state.held_changed)
-            # Count from the interrupt: an interrupted load must close what it built.
+            # Count from the interrupt: an interrupted load needs time to close what it built.
             ignored = self._since_interrupt(beat)
             if waited > _LOAD_WAIT_SECONDS and ignored is None:
                 self.interrupt()
@@ -490,13 +492,13 @@ class Supervisor:
         self._vitals = ProcessMemory(used, limit, spare or None, ready)
         if limit is not None and used > limit:
             state.why = (
-                f"was ended because it and what it started had {format_size(used)} in memory, more than the {format_size(limit)} that "
-                "--memory-limit allows,"
+                f"was ended because it and its child processes used {format_size(used)} of memory, more than "
+                f"the {format_size(limit)} that --memory-limit allows,"
             )
             self._end(worker, state)
 
     def _since_interrupt(self, beat: Beat) -> float | None:
-        """Seconds since this piece of work was interrupted; None if not interrupted."""
+        """Seconds since this piece of work was interrupted; None if it was not."""
         number, moment = self._interrupted or (0, 0.0)
         return time.monotonic() - moment if number == beat.number else None
 
@@ -522,13 +524,13 @@ class _WorkerState:
     end: End = End.DIED
     stack: str = ""
     stack_of: int = 0
-    """Number of the piece of work that `stack` was read in."""
+    """Number of the piece of work during which `stack` was read."""
     headless_since: float | None = None
     """When the worker was first seen without its main thread."""
     reported: float | None = None
     """When the worker was last reported as busy."""
     held: bool = False
-    """Whether a debugger held it at the last check."""
+    """Whether a debugger held the worker at the last check."""
     held_changed: float = 0.0
     """When `held` last changed."""
 

@@ -47,26 +47,28 @@ _MAX_REQUESTS = 1000
 """Maximum queue length while the worker reads nothing; above it steps and resets are dropped (a key is held down)."""
 _PIECE_BYTES = 1 << 20
 _FLOOD_PAUSE_SECONDS = 0.005
-"""Pause between two reads during a flood: with pieces of a megabyte that drains 200 MB a second."""
+"""Pause between two reads during a flood: with pieces of a megabyte, 200 MB are read in a second."""
 _F_SETPIPE_SZ = 1031
 _START_TIMEOUT_SECONDS = 60.0
 """Start-up timeout of a worker; generous for a cold first start on a loaded machine."""
 
 Output = Callable[[str, bytes], bool]
-"""Output callback: gets ``stdout`` or ``stderr`` and new bytes (empty at its end); returns True to request a pause."""
+"""Output callback: gets ``stdout`` or ``stderr`` and new bytes (empty at the end of the stream). Returns True
+to request a pause before the next read."""
 
 
 class WorkerProcess:
     """One worker process. `receive` is called on one thread; all other methods are thread-safe.
 
-    Start it on a thread that outlives the worker: if it is not forked (`worker_start`), the kernel ends it with the thread
-    that started it, so that no worker is left behind when the server is killed.
+    Start a worker on a thread that outlives it: a worker that is not forked (`worker_start`) is ended by the
+    kernel with the thread that started it, so that no worker is left behind when the server is killed.
 
-    It has no standard input, so that a task that reads it gets EOF instead of hanging, and its own process group, so that
-    Ctrl-C in the terminal reaches only the server. The author's code may prevent it from reading, writing and ending, so
-    nothing here waits for it: requests go through a queue and a thread (an unread socket is full after some hundred
-    messages, and the page would block), its activity is in shared memory (`heartbeat`), and faulthandler writes its stack
-    in a signal handler into a memory file.
+    A worker has no standard input, so that a task that reads it gets EOF instead of hanging, and its own
+    process group, so that Ctrl-C in the terminal reaches only the server. The author's code may keep the
+    worker from reading, writing and ending, so nothing here waits for the worker: requests go through a queue
+    and a thread (an unread socket is full after some hundred messages, and the page would block), the
+    activity is in shared memory (`heartbeat`), and faulthandler writes the stack into a memory file, in a
+    signal handler.
     """
 
     def __init__(self, output: Output, niceness: int = 0) -> None:
@@ -78,7 +80,7 @@ class WorkerProcess:
         ours, theirs = socket.socketpair()
         heartbeat = make_heartbeat()
         self._stacks = os.memfd_create("workbench-stacks")
-        # O_APPEND: the file position is shared; the worker appends, we read and truncate.
+        # O_APPEND: the file position is shared; the worker appends, the server reads and truncates.
         fcntl.fcntl(self._stacks, fcntl.F_SETFL, os.O_APPEND)
         fds = [theirs.fileno(), heartbeat, self._stacks]
         try:
@@ -133,7 +135,8 @@ class WorkerProcess:
             if self._waiting and _replaces(request, self._waiting[-1]):
                 self._waiting.pop()
             if len(self._waiting) >= _MAX_REQUESTS:
-                # Do not drop the newest request: a load or Pause would be lost. A step pauses first.
+                # Drop steps and resets, never the newest request, which may be a load or Pause. A step pauses
+                # first, so a pause takes the place of the dropped ones.
                 self._waiting = deque(r for r in self._waiting if not isinstance(r, (SingleStep, Reset)))
                 self._waiting.append(Play(False))
             self._waiting.append(request)
@@ -176,7 +179,7 @@ class WorkerProcess:
     def stack(self, timeout: float = 0.3) -> str:
         """The worker's current stack, as faulthandler writes it; empty if it does not arrive within `timeout` seconds."""
         if self.beat().number == 0 or self._process.poll() is not None:
-            return ""  # before its handlers are installed the signal would end the worker
+            return ""  # the signal would end a worker that has not installed its handlers yet
         with self._look_lock:
             start = size = os.fstat(self._stacks).st_size
             try:
@@ -206,7 +209,7 @@ class WorkerProcess:
         if self.beat().number > 0 and self._process.poll() is None:
             signal_main_thread(self.pid, INTERRUPT_SIGNAL)
 
-    # --- its end -----------------------------------------------------------------------------------
+    # --- the end -----------------------------------------------------------------------------------
 
     def exit_code(self) -> int | None:
         """Exit code as in ``subprocess``: negative for the signal that ended the worker. Blocks up to 2 s; None if
@@ -232,7 +235,7 @@ class WorkerProcess:
         with self._wake:
             self._ending = True
             self._wake.notify()
-        # Without this the writer would block for ever if a process that left the group holds the other end.
+        # A process that left the group may hold the other end: without this the writer would block for ever.
         self._line.end.shutdown(socket.SHUT_RDWR)
         self._writer.join()
         # A worker that is not forked yet has no output, and the fork server holds its pipes while it imports.
@@ -243,7 +246,7 @@ class WorkerProcess:
         self._line.end.close()
         os.close(self._stacks)
 
-    # --- its threads -------------------------------------------------------------------------------
+    # --- threads -----------------------------------------------------------------------------------
 
     def _write_all(self) -> None:
         while True:
@@ -265,7 +268,7 @@ class WorkerProcess:
             try:
                 fcntl.fcntl(fd, _F_SETPIPE_SZ, _PIECE_BYTES)
             except OSError:
-                pass  # the user's limit for pipe memory is reached: pieces are smaller then
+                pass  # the user's limit for pipe memory is reached: the pieces will be smaller
             failed = False
             while True:
                 piece = os.read(fd, _PIECE_BYTES)
@@ -298,8 +301,8 @@ def signal_main_thread(pid: int, number: signal.Signals) -> None:
     """Send a signal to the main thread of a process, where Python's handlers run.
 
     The kernel delivers a signal for the whole process to any thread, on a busy machine also to a thread of torch or the
-    renderer. CPython 3.11 then records the signal without waking the main thread. An endless loop there continues until
-    another Python thread wants to run, which may be never.
+    renderer. CPython 3.11 then records the signal without waking the main thread: an endless loop in the main
+    thread continues until another Python thread wants to run, which may never happen.
     """
     if _libc.tgkill(pid, pid, int(number)) != 0:
         error = ctypes.get_errno()

@@ -18,8 +18,8 @@ from workbench.machine.processes.family import Keeper
 from workbench.machine.processes.wire import Unpacker, has_come, pack
 
 _GPUS = ("/dev/nvidiactl", "/dev/dxg")
-"""Device files of which one exists if CUDA may be available (the second in WSL). No worker is forked then: CUDA does not
-work in a fork of a process that has used it, and any import may use it."""
+"""Device files, one of which exists if CUDA may be available (the second in WSL). Then no worker is forked:
+CUDA does not work in a fork of a process that has used it, and any import may use it."""
 _MAX_MESSAGE_BYTES = 1 << 12
 _UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
@@ -71,16 +71,16 @@ class ForkedKeeper:
         with self._lock:
             while self._code is None and has_come(self._told):
                 try:
-                    said = self._told.recv(_MAX_MESSAGE_BYTES)
+                    data = self._told.recv(_MAX_MESSAGE_BYTES)
                 except ConnectionResetError:
-                    said = b""
-                news = Unpacker((Forked, ForkEnded)).message(said) if said else ForkEnded(-signal.SIGKILL)
-                if isinstance(news, Forked):
-                    self._pid = news.pid
+                    data = b""
+                message = Unpacker((Forked, ForkEnded)).message(data) if data else ForkEnded(-signal.SIGKILL)
+                if isinstance(message, Forked):
+                    self._pid = message.pid
                 else:
-                    self._code = news.code
+                    self._code = message.code
             if self._code is None and self._terminated and self._pid == 0:
-                # The worker will not be forked; the fork server reports that only after its imports.
+                # The worker will never be forked, but the fork server reports that only after its imports.
                 self._code = -signal.SIGTERM
             if self._code is not None:
                 self._told.close()
@@ -131,7 +131,7 @@ class WorkerForks:
             fds: socket, heartbeat and stacks, see `workbench.app.worker.start.run`.
 
         Raises:
-            OSError
+            OSError: the process cannot be started.
         """
         with self._lock:
             control = None if any(map(os.path.exists, _GPUS)) else self._fork_server()
@@ -149,13 +149,11 @@ class WorkerForks:
 
     def _fork_server(self) -> socket.socket | None:
         """Socket of the fork server; None if the environment or the working directory has changed since it was started."""
-        come_from = (child_environment(**_UNBUFFERED), _current_folder())
+        present = (child_environment(**_UNBUFFERED), _current_folder())
         if self._control is None:
-            self._process, self._control = start_with_socket(
-                "workbench.app.worker.fork_workers", come_from[0]
-            )
-            self._from = come_from
-        return self._control if self._from == come_from else None
+            self._process, self._control = start_with_socket("workbench.app.worker.fork_workers", present[0])
+            self._from = present
+        return self._control if self._from == present else None
 
     def _end(self) -> None:
         if self._control is not None:
@@ -174,20 +172,20 @@ def _current_folder() -> str:
 
 
 def _forked(control: socket.socket, fds: Sequence[int], niceness: int) -> ForkedKeeper:
-    told, tells = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     out, err = os.pipe(), os.pipe()
     try:
-        socket.send_fds(control, [pack(NewWorker(niceness))], [tells.fileno(), *fds, out[1], err[1]])
+        socket.send_fds(control, [pack(NewWorker(niceness))], [theirs.fileno(), *fds, out[1], err[1]])
     except BaseException:
-        told.close()
+        ours.close()
         os.close(out[0])
         os.close(err[0])
         raise
     finally:
-        tells.close()
+        theirs.close()
         os.close(out[1])
         os.close(err[1])
-    return ForkedKeeper(told, out[0], err[0])
+    return ForkedKeeper(ours, out[0], err[0])
 
 
 def start_anew(fds: Sequence[int], niceness: int) -> Keeper:

@@ -13,8 +13,8 @@ from workbench.machine.processes.wire import MessageSocket, Unreadable
 
 
 class ServerConnection:
-    """The connection to the server: receives requests in order and sends events. No method raises if the server has ended;
-    `closed` is True then. An interrupt never cuts a message in two."""
+    """The connection to the server: receives requests in order and sends events. If the server has ended, no
+    method raises, and `closed` becomes True. An interrupt never cuts a message in two."""
 
     def __init__(self, connection: int, interrupts: Interrupts, questions: Sequence[type]) -> None:
         """
@@ -49,8 +49,9 @@ class ServerConnection:
             self.closed = True
 
     def drop_steps(self) -> None:
-        """Drop waiting control steps, which were requested while a hook hung and would make it hang again. Call this before
-        the interrupt is reported to the page: steps that the user requests after that must be kept."""
+        """Drop waiting control steps: they were requested while a hook hung, and would make it hang again.
+        Call this before the interrupt is reported to the page: steps that the user requests after the report
+        must be kept."""
         with self._interrupts.shielded():
             waiting = [*self._queue, *self._requests(0.0)]
             self._queue = deque(without_steps(waiting))

@@ -27,7 +27,7 @@ from workbench.task.open import OpenedTask
 from workbench.task.problem import Interrupted, TaskError
 
 MAX_REPLAY_SECONDS = 8.0
-"""Timeout of a replay; after it the state of the moment is restored instead."""
+"""Timeout of a replay; then the state of the moment is restored instead."""
 
 
 def go_back(
@@ -36,10 +36,11 @@ def go_back(
     """Put the envs of `request` back to its moment: by a replay if possible, else by restoring its state.
 
     A restored state lacks the internal state of PhysX, above all contacts, so a run continues differently if bodies press
-    on each other (`envs.snapshots.snapshot`; ``tests/benchmarks/restore_distance.py`` measures it). But an episode begins
-    without internal state (`envs.snapshots.snapshot.begin_anew`), and so does a run from a restored moment. From such an
-    exact point the same actions lead to the same moment, contacts included. The result is compared byte by byte; if it
-    differs (edited code, a task that draws numbers for the whole batch), the state is restored. State outside PhysX comes
+    on each other (`envs.snapshots.snapshot`; ``tests/benchmarks/restore_distance.py`` measures the
+    difference). But an episode begins without internal state (`envs.snapshots.snapshot.begin_anew`), and so
+    does a run from a restored moment. From such an exact point the same actions lead to the same moment,
+    contacts included. The replayed state is compared with the moment byte by byte; if they differ (edited
+    code, a task that draws numbers for the whole batch), the state is restored. State outside PhysX comes
     from the moment's snapshot in both cases.
 
     Args:
@@ -58,7 +59,7 @@ def go_back(
         if put:
             report = restore_snapshot(env, snapshot, put, [source[i] for i in put])
         if replayed:
-            # All replayed envs together: state that the task keeps for the whole batch belongs to the moment of all envs.
+            # All replayed envs in one call: only a whole batch restores the process's random generators.
             every, own = list(source), all(i == of for i, of in source.items())
             positions = [snapshot.env_idx.index(of) for of in source.values()]
             whole = own and snapshot.num_envs == env.num_envs == len(every)
@@ -84,7 +85,7 @@ def _replay_steps(
     source: Mapping[int, int],
     on_step: Callable[[int, int], None],
 ) -> list[int]:
-    """Replay all paths; returns the envs that then equal the moment byte by byte."""
+    """Replay all paths; returns the envs whose state then equals that of the moment byte by byte."""
     task, env = opened.env, opened.env.env
     width = actions.width(task.parts)
     ways = {i: way for i, way in request.ways.items() if way.actions.shape[1:] == (width,)}
@@ -120,11 +121,11 @@ def _replay_steps(
     except TaskError as error:
         if isinstance(error.__cause__, Interrupted):
             raise
-        return []  # an edited hook fails during the replay: only an error at the moment itself is reported
+        return []  # an edited hook failed during the replay; only an error at the moment itself is reported
 
 
 def _of_simulation(report: RestoreReport) -> dict[str, str]:
-    """The part of `not_carried` about physics; the task's own state has a separate report."""
+    """The entries of `not_carried` about physics; `restore_memory` reports the task's own state."""
     return {what: why for what, why in report.not_carried.items() if what.startswith("fresh physics")}
 
 
@@ -134,7 +135,10 @@ def _how(request: Restore, replayed: int, put: int, steps: int) -> str:
     again = f"{steps} steps were replayed, and " if steps > 1 else "one step was replayed, and "
     if not put:
         return f"{again}every body is where it was, to the last bit."
-    return f"{again}in {replayed} of {replayed + put} envs every body is where it was, to the last bit; the others were placed there."
+    return (
+        f"{again}in {replayed} of {replayed + put} envs every body is where it was, to the last bit; "
+        "the other envs were restored from the snapshot."
+    )
 
 
 def going_back_text(done: int, total: int) -> str:
@@ -151,7 +155,7 @@ def enter_recording(
     """Put the envs of `request` into the last state of its run.
 
     Raises:
-        TaskError: the task's code raised during the replay; the envs are left there.
+        TaskError: the task's code raised during the replay; the envs stay in the state at the error.
     """
     run = request.run
     step, replay_result = replay_to(opened, run, run.length, request.env_idx, on_step)

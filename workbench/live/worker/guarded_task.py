@@ -22,9 +22,9 @@ _STAGE: dict[Doing, str] = {"loading": "build", "stepping": "step", "resetting":
 
 
 class GuardedTask:
-    """The open task. All parts of the worker call the author's code through this object, so that each failure is handled the
-    same way: an interrupt drops the waiting steps, the server gets the problem with the author's line, and the batch is
-    restored to the end of the last step."""
+    """The open task. All parts of the worker call the author's code through this object, so that every
+    failure is handled in the same way: the server gets the problem with the author's line, and the batch is
+    restored to the end of the last step. If the failure is an interrupt, waiting steps are dropped."""
 
     def __init__(
         self,
@@ -49,17 +49,18 @@ class GuardedTask:
         self.when_loaded: ProcessState | None = None
         """Process settings at the end of the load of `opened`."""
         self.spoiled = False
-        """Whether the author's code left something in this process that cannot be undone: the process has to end."""
+        """Whether the author's code left something in this process that cannot be undone: it must end."""
 
     def run(self, doing: Doing | None, work: Callable[[], object], loads: bool = False) -> Problem | None:
-        """Run `work`; if `doing` is not None, it may run the author's code and can be interrupted. Returns the failure after
-        sending it, or None.
+        """Run `work`. Returns the failure, which was sent to the server, or None.
+
+        A BaseException that is not an Exception (KeyboardInterrupt, which only the author's code raises here,
+        or an author's class) is a failure. An Exception is a bug of the workbench: it passes through, and
+        ends the process.
 
         Args:
+            doing: what the heartbeat shows; None if `work` runs no code of the author: no interrupt then.
             loads: `work` loads a version, which is refused if it fails.
-
-        A BaseException that is not an Exception (KeyboardInterrupt, which only the author's code raises here, or an author's
-        class) is a failure; an Exception is a bug of the workbench, and ends the process.
         """
         if doing is None:
             work()
@@ -75,7 +76,7 @@ class GuardedTask:
         except Exception:
             raise
         except BaseException as error:
-            # Raised outside `blamed`: between two hooks, or in the workbench's own code.
+            # The error was raised outside `blamed`: between two hooks, or in the workbench's own code.
             if isinstance(error, Interrupted):
                 self.line.drop_steps()
             problem = problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error))
@@ -89,7 +90,8 @@ class GuardedTask:
         return None
 
     def _own_files(self, error: BaseException) -> list[Path]:
-        """The author's files, plus files of the traceback in the task's folder, whose import may not have finished."""
+        """The author's files, and the files in the task's folder on the traceback: their import may not have
+        finished."""
         known = [] if self.opened is None else list(self.opened.loaded.source_files)
         if self.requested_file is not None:
             folder, frames = self.requested_file.parent, traceback.extract_tb(error.__traceback__)
@@ -107,15 +109,15 @@ class GuardedTask:
             self.fail(error.problem)
 
     def drop_steps_if_interrupted(self, error: TaskError) -> bool:
-        """Drop the waiting steps if the user interrupted the author's code; returns whether that was so."""
+        """Drop the waiting steps if the user interrupted the author's code; returns whether the user did."""
         interrupted = isinstance(error.__cause__, Interrupted)
         if interrupted:
             self.line.drop_steps()
         return interrupted
 
     def fail(self, problem: Problem) -> None:
-        """Send a failure of the running task, and stop playing. The batch is restored to the end of the last step, in another
-        process if this one cannot be trusted with it."""
+        """Send a failure of the running task, and stop playing. The batch is restored to the end of the last
+        step; if this process is spoiled, another process restores it."""
         self.failed = self.failed or problem.stage != "policy"
         spoiled = self._settings_changed()
         if not spoiled and problem.stage != "policy" and self.restore_last_step() is not None:
@@ -136,12 +138,13 @@ class GuardedTask:
         self.line.send(failed)
 
     def restore_last_step(self) -> Problem | None:
-        """Restore the batch to the end of the last step after a step was cut short. Returns the problem if that failed."""
+        """Restore the batch to the end of the last step after a step was cut short. Returns the problem if
+        the restore failed, else None."""
         if self.opened is None or self.steps.moment is None:
             return None
         try:
-            # Not `TaskEnv.restore`: that calls `evaluate`, which may be the hook that did not end.
+            # Not `TaskEnv.restore`: it calls `evaluate`, which may be the hook that hangs.
             restore_snapshot(self.opened.env.env, self.steps.moment)
-        except Exception as error:  # the failed code may have replaced the objects to restore by anything
+        except Exception as error:  # the failed code may have replaced the objects that are restored
             return problem_from_exception(error, "reset", self.opened.loaded.source_files)
         return None

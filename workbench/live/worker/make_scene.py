@@ -21,13 +21,14 @@ _PROGRESS_PERIOD_SECONDS = 0.2
 
 
 class SceneEnv:
-    """Builds scenes of recordings; keeps the env for the next episode with the same task and options."""
+    """Builds scenes of recordings. Keeps the env: the next episode may have the same task and options."""
 
     def __init__(self) -> None:
         self._made: tuple[object, TaskEnv] | None = None
 
     def scene(self, request: MakeScene, on_progress: Callable[[int, int, str], None]) -> SceneMade:
-        """
+        """The scene of a recording.
+
         Args:
             on_progress: called with done, total and the activity.
 
@@ -78,8 +79,8 @@ def make(request: MakeScene) -> TaskEnv:
             loaded = load_task(RecordedTask(request.task))  # a registered id, never a path
         except TaskError as error:
             raise CannotAnswer(
-                f"There is no env {request.task} here to make the scene with, so there are only numbers and curves. If it "
-                "is yours, say which file it is in (workbench review --task FILE), or which package registers it "
+                f"There is no env {request.task} here, so there is no scene, only numbers and curves. If the "
+                "env is yours, name its file (workbench review --task FILE) or the package that registers it "
                 "(workbench review --import PACKAGE)."
             ) from error
     try:
@@ -116,7 +117,7 @@ def scene_of(env: TaskEnv, request: MakeScene, on_progress: Callable[[int, int, 
         state_mismatches(env.env, 0, {name: values[0] for name, values in states.items()}) if count else {}
     )
     for row in range(count):
-        report(row, count, f"putting it into state {row} of {count - 1}")
+        report(row, count, f"setting state {row} of {count - 1}")
         write_states(env.env, {0: {name: values[row] for name, values in states.items()}})
         poses.append(read_poses(env.env)[0])
     return SceneMade(geometry, np.stack(poses), tuple(f"{name}: {why}" for name, why in missed.items()))
@@ -148,9 +149,9 @@ def draw_task(env_id: str) -> TaskPicture:
         cameras = sorted(list_cameras(env.env), key=lambda camera: camera.kind != "human")
         seen = [camera for camera in cameras if "rgb" in camera.modalities]
         if not seen:
-            return TaskPicture(why_not="It has no camera, or nothing here can render.")
+            return TaskPicture(why_not="The task has no camera, or there is no renderer.")
         (picture,) = take_pictures(env.env, 0, [(seen[0].name, seen[0].kind, ("rgb",))])
-        return TaskPicture(picture.rgb, "" if picture.rgb is not None else "Its camera gives no colours.")
+        return TaskPicture(picture.rgb, "" if picture.rgb is not None else "The camera renders no colours.")
     except MissingAssets as error:
         return TaskPicture(why_not=" ".join(str(error).split()), needs_download=True)
     except BaseException as error:  # a constructor may end the program (SystemExit)

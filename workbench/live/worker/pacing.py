@@ -10,16 +10,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 _MAX_DEBT_SECONDS = 0.1
-"""Maximum wall time of simulation that is caught up with."""
+"""Maximum lag, in wall time, that is caught up."""
 
 
 @dataclass
 class Pacer:
     """A budget of simulated time, as in mjlab's base viewer.
 
-    Wall time adds simulated time (times the speed), a step subtracts ``control_dt``, and a step is due when there is enough.
-    So the speed is right for steps of any cost, even if the loop is uneven. Debt beyond `_MAX_DEBT_SECONDS` is dropped, or
-    one slow picture would be followed by a burst of steps.
+    Wall time, multiplied by the speed, adds to the budget; a step subtracts ``control_dt``, and is due when
+    the budget is large enough. So the speed is right for steps of any cost, even if the loop is uneven. Lag
+    beyond `_MAX_DEBT_SECONDS` is dropped, or a burst of steps would follow each slow picture.
     """
 
     control_dt: float
@@ -59,7 +59,7 @@ class Pacer:
 
 @dataclass
 class Rate:
-    """Events per second over a window; for events slower than that, over the last two."""
+    """Events per second over a window of `window` seconds; if they are rarer, over the last two events."""
 
     window: float = 1.0
     _times: deque[float] = field(default_factory=deque)
@@ -75,7 +75,7 @@ class Rate:
         if len(self._times) < 2:
             return 0.0
         first, last = self._times[0], self._times[-1]
-        # The pending step may take longer than the previous ones.
+        # The pending step lowers the rate if it takes longer than all counted steps together.
         return (len(self._times) - 1) / max(last - first, now - last, 1e-9)
 
     def clear(self) -> None:

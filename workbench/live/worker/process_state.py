@@ -56,8 +56,7 @@ def read_process_state() -> ProcessState:
 
 
 def changed_settings(before: ProcessState, now: ProcessState) -> list[str]:
-    """Names of settings that have another value or were removed. An added environment variable is a change, an added
-    function is not."""
+    """Names of settings that were changed or removed, and of added environment variables (not functions)."""
     if may_be_debugged():
         # A debugger replaces functions of Python by its own, some when it attaches.
         before = {
@@ -70,7 +69,7 @@ def changed_settings(before: ProcessState, now: ProcessState) -> list[str]:
 
 
 def some_of(names: list[str]) -> str:
-    """The first names, as part of a sentence."""
+    """The first two names and the number of the others, as part of a sentence."""
     more = f" and {len(names) - 2} more" if len(names) > 2 else ""
     return ", ".join(names[:2]) + more
 

@@ -65,13 +65,13 @@ def load_version(
     """Load the requested version of the task, and keep as much state of `running` as possible.
 
     The env stays and gets the new class (``same``, ``patched``; ``cameras`` rebuilds the cameras); or another env is built
-    and takes over the state by name (``rebuilt``), and the caller closes the old one; or a new worker's env takes over a
-    snapshot that the server kept (``restarted``). In each case the new version is tried first: on a copy of the current
-    moment if only reward, evaluate or observation changed, and with a reset and a step, which are undone, if those
-    changed. No picture may be in progress.
+    and takes over the state by name (``rebuilt``), and the caller closes the old env; or a new worker's env
+    takes over a snapshot that the server kept (``restarted``). In each case the new version is tried first:
+    on a copy of the current moment if only reward, evaluate or observation changed; also with a reset and a
+    step, which are undone, if the code of resets or steps changed. No picture may be in progress.
 
     Raises:
-        TaskError: the version does not work. If its code ran, its effects are not undone: the process has to end.
+        TaskError: the version does not work. If its code ran, the process must end: effects are not undone.
     """
     opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
@@ -79,7 +79,7 @@ def load_version(
     try:
         return _bring_in(request, running, before, loaded, opening)
     except TaskError as error:
-        # No advice about other tasks of the file if the user runs one of them or has chosen one.
+        # The user who has chosen a task of the file, or runs it, needs no advice about the other tasks.
         knows_others = False
         if running is None:
             found = _open_another(request, loaded, error, opening)
@@ -133,7 +133,7 @@ def _bring_in(
                 change = replace(change, level="rebuilt", reason=str(why))
         return _build(request, running, loaded, change, opening)
     except BaseException:
-        # The running version must not use the failed one's helper modules and registrations.
+        # Or the running version would use helper modules and registrations of the failed one.
         undo_load(loaded)
         raise
 
@@ -144,8 +144,8 @@ def _bring_in(
 def why_new_process(
     request: Load, running: Running, failed: bool, at_start: ProcessState, when_loaded: ProcessState
 ) -> NewProcessNeeded | None:
-    """What the running version left in this process that no reload undoes; None if nothing, or if the new version leaves
-    it too.
+    """What the running version left in this process that no reload undoes. None if there is nothing, or if
+    the new version will leave the same.
 
     Args:
         failed: whether the running version raised while it ran.
@@ -156,7 +156,7 @@ def why_new_process(
     same_file = named_file(request.task) == named_file(running.request.task)
     texts = _earlier_modules(before, request) if same_file else {}
     if same_file and before.file is not None and not _is_python(texts.get(str(before.file))):
-        return None  # the new version is refused before any of it runs
+        return None  # the new version will be refused before any of its code runs
     while_running = changed_settings(when_loaded, read_process_state()) + threads_of(before.source)
     at_load = changed_settings(at_start, when_loaded)
     gone = removed_effects(before.source, texts) if before.followed else ""
@@ -170,11 +170,11 @@ def why_new_process(
     elif while_running:
         reason = f"the version before has changed {some_of(while_running)}"
     elif same_scene or not before.followed:
-        return None  # imports and scene stay unchanged
+        return None  # imports and scene do not change
     elif at_load:
         reason = f"the version before has changed {some_of(at_load)}"
     else:
-        reason = f"what {gone} did when it was imported cannot be taken back"
+        reason = f"what {gone} did when it was imported cannot be undone"
     return NewProcessNeeded(reason, same_scene)
 
 
@@ -218,13 +218,13 @@ def _what_changed(
     reason = f"{request.level} was requested"
     if request.level != "rebuilt":
         reason += f" ({change.level} would have been chosen: {change.reason})"
-    # A level that was not found safe is tried as if every hook had changed.
+    # Rehearse a level that may be unsafe as if every hook had changed.
     hooks = change.hooks if change.level in ("patched", "cameras") else RESET_HOOKS
     return Change(request.level, reason, hooks)
 
 
 def _registration_text(before: LoadedTask, loaded: LoadedTask) -> str:
-    """Text: how the class's registered id changed; the id of an unregistered class is its name."""
+    """How the class's registered id changed, as a text. The id of an unregistered class is its name."""
     if loaded.env_id == loaded.class_name:
         lost = "" if before.max_episode_steps is None else ", and so has no time limit"
         return f"{loaded.chosen} is no longer registered as {before.env_id}{lost}"
@@ -234,7 +234,7 @@ def _registration_text(before: LoadedTask, loaded: LoadedTask) -> str:
 
 
 def _earlier_modules(before: LoadedTask, request: Load) -> dict[str, str]:
-    """Present texts of the previous version's modules: hooks of the old and the new version may import them late."""
+    """Present texts of the previous version's modules, which the hooks of both versions may import late."""
     texts: dict[str, str] = {}
     for path in before.source:
         given = (request.source or {}).get(path)
@@ -255,7 +255,7 @@ def _exchange(
     if change.level == "cameras" and not can_exchange_cameras(env):
         raise _MustRebuild(f"{change.reason}, and cameras cannot be exchanged here")
     rules = opened.env.broken_rules or BrokenRules({})
-    # Nothing of this is undone on failure: the process ends then.
+    # Nothing from here on is undone on failure: the process ends then.
     put_class(env, loaded.cls)
     left: dict[str, str] = {}
     if change.level != "same":
@@ -307,7 +307,7 @@ def _find_place(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[st
 
 
 def _rescore(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) -> StepResult:
-    # Compute the reward even without an action, to find its errors now.
+    # Compute the reward also after a reset, with a hold action, to find errors of the reward now.
     action = last.action if last.action is not None else actions.hold_action(task.parts, task.num_envs)
     try:
         with blamed("step", loaded, task):
@@ -315,7 +315,7 @@ def _rescore(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change
     except TaskError as error:
         if change.hooks & RESET_HOOKS:
             raise _MustRebuild(
-                f"{change.reason}, and this moment lacks what a reset makes now ({error.problem.message})"
+                f"{change.reason}, and the state lacks what a reset makes now ({error.problem.message})"
             ) from error
         raise
     if last.action is None:
@@ -338,7 +338,7 @@ def _build(
     try:
         first, restored = _restore(opened, snapshot, action)
     except TaskError as error:
-        # The new version works, as its rehearsal has shown, but not from this moment.
+        # The new version works, as the rehearsal has shown, but not from this moment.
         with blamed("reset", opened.loaded, opened.env):
             first = opened.env.reset(request.options.seed)
         restored = RestoreReport((), {"the moment": f"the new version fails in it: {error.problem.message}"})
@@ -360,7 +360,7 @@ def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snaps
     if running is None or running.opened.loaded.chosen != loaded.chosen:
         return None
     if changed_options(running.request.options, request.options):
-        return None  # envs built with other options must start from a reset
+        return None  # envs with other options must start from a reset
     return running.opened.env.snapshot()
 
 

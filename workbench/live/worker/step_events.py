@@ -23,8 +23,9 @@ from workbench.task.open import OpenedTask
 class StepEvents:
     """Makes and counts `Stepped` events.
 
-    The server never requests the past: each event has a snapshot of the batch, packed so that unchanged parts are sent
-    once (`envs.snapshots.packing`), and during a recording the state columns and pictures of exactly this step.
+    The server never asks the worker for past states: each event has a snapshot of the batch, packed so that
+    unchanged parts are sent once (`envs.snapshots.packing`), and during a recording the state columns and
+    pictures of exactly this step.
     """
 
     def __init__(self) -> None:
@@ -41,14 +42,14 @@ class StepEvents:
         self._packer: SnapshotPacker | None = SnapshotPacker()
 
     def new_scene(self) -> None:
-        """Start again for another env: parts that were already sent do not belong to it."""
+        """Start again for another env, which does not share the snapshot parts that were sent."""
         self.capture((), from_reset=False)
         self._packer = SnapshotPacker()
         self._columns_fail = False
         self._undrawable.clear()
 
     def capture(self, env_idx: tuple[int, ...], from_reset: bool) -> None:
-        """Start or stop capturing, see `SetCapture`; an env that is already captured continues, also with `from_reset`."""
+        """Start or stop capturing, see `SetCapture`. Those of `env_idx` that are captured now continue."""
         begun = self._recording & set(env_idx) if from_reset else set(env_idx)
         self._recording, self._from_reset = begun, set(env_idx) - begun
 
@@ -58,7 +59,8 @@ class StepEvents:
         return frozenset(self._recording | self._from_reset)
 
     def pictures_due(self, step: StepResult, reset_mask: NDArray[np.bool_]) -> bool:
-        """Whether the event of this step draws; no other picture may be in progress then."""
+        """Whether `event` renders pictures for this step: no other picture may be in progress then. Begins to
+        record envs that waited for this reset."""
         begun = {env for env in self._from_reset if reset_mask[env] and step.elapsed_steps[env] == 0}
         self._recording |= begun
         self._from_reset -= begun
@@ -136,7 +138,7 @@ class StepEvents:
             self.moment = opened.env.snapshot()
             return self._packer.pack(self.moment)
         except Exception as error:
-            # A task may hold any object: one that cannot be pickled must not stop a working task.
+            # A task may have any attribute: one that cannot be pickled must not stop a working task.
             self._packer = self.moment = None
             print(
                 f"The history of this task can be viewed, but not restored: {type(error).__name__}: {error}",
