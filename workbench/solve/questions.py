@@ -39,7 +39,7 @@ class PlannedEnv:
 
 @dataclass(frozen=True)
 class Planned:
-    """Plans for the envs that were asked for, in their order."""
+    """Plans for the envs of the request, in its order."""
 
     envs: tuple[PlannedEnv, ...]
 

@@ -61,7 +61,7 @@ class SolveView:
     why: str = ""
     """Why there is no plan, as text."""
     problem: Problem | None = None
-    """Problem of the author's code in a rollout."""
+    """The error that the author's code raised in a rollout."""
     plan: PlannedEnv | None = None
     """The last plan of the env."""
     plan_step: int = 0
@@ -162,7 +162,7 @@ class PlanFailed:
 
 @dataclass(frozen=True)
 class BeginPlan:
-    """Plan in place of the wish before."""
+    """Plan for this request; a running job is stopped."""
 
     wanted: PlanWanted
     load: Load
@@ -207,7 +207,7 @@ def apply(solving: Solving, event: object, run: Run) -> Change:
             return solving, [_set(solve_all=chosen == "all")]
         case Asked(command=FollowBody(body=body)):
             if body and body not in movable_bodies(run.task):
-                raise Refused("There is no such body that moves.")
+                raise Refused("There is no movable body of this name.")
             return solving, [_set(traced=body)]
         case Asked(command=command) if isinstance(command, _NEW_PLAN):
             plan = replace(run.settings.plan, **msgspec.structs.asdict(command))
