@@ -137,8 +137,8 @@ def summary(checks: ChecksView, shown: list[Card]) -> str:
 
 
 def times(count: int) -> str:
-    """``once``, ``7 times``, ``300 times and more``: only the first digit of large counts, or the list would change at
-    each step."""
+    """``once``, ``7 times``, ``300 times and more``. Of large counts only the first digit is shown, or the
+    list would change at each step."""
     if count < 10:
         return "once" if count == 1 else f"{count} times"
     scale = 10 ** (len(str(count)) - 1)

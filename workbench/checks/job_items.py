@@ -47,7 +47,7 @@ class CheckedTask:
     """Further tasks of the file, which were not checked."""
     notices: tuple[str, ...] = ()
     source: Mapping[str, str] = field(default_factory=dict)
-    """Path to text of the author's files."""
+    """Texts of the author's files by path."""
 
 
 @dataclass(frozen=True)

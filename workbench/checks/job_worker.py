@@ -30,7 +30,7 @@ from workbench.task.problem import Problem, TaskError
 
 
 def check_items(what: CheckOptions, queue: ItemQueue) -> None:
-    """Check the chunks that one process gets. Raises as `checks.job.check`."""
+    """Check the chunks that one process gets. Raises the errors of `checks.job.check`."""
     torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # the task may change it
     with here.again(), ExitStack() as stack:

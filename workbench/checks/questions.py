@@ -1,5 +1,5 @@
-"""Questions to a worker that does not play: check rules, and time a step. The worker makes separate envs for
-them."""
+"""Questions about rules and the time of a step. Only a worker that does not play answers them, on separate
+envs."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Finds silencing comments without a reason, with an unknown rule, or without a finding. Imports no
-simulator."""
+"""Finds silencing comments without effect. Imports no simulator."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ def comments_without_effect(
     """The silencing comments that lack a reason, name an unknown rule, or silence no finding.
 
     Args:
-        sources: path to text of the author's files.
+        sources: texts of the author's files by path.
         results: results of all checked rules, once the check is done. Comments on rules without a decided result are left out.
         class_name: the class that was checked. Comments in other tasks are left out: those were not checked.
         others: class names of other tasks in the file.

@@ -29,8 +29,8 @@ class Planner:
             obs, reward, terminated, truncated, info = env.step(planner.actions())
         planner.close()
 
-    The same seeds, options and actions in between give the same actions to the last bit. The env itself is only read, and
-    the state of the process's random generators is preserved.
+    The same seeds, options and earlier actions of the env give the same actions to the last bit. The env
+    itself is only read, and the state of the process's random generators is preserved.
     """
 
     def __init__(

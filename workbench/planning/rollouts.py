@@ -81,7 +81,8 @@ def control_mode_to_plan(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, st
     """Keyword argument of the control mode in which plans are found fastest; empty if `env` uses it already,
     if `given` names a mode, or if the robot lacks it.
 
-    For a task about bodies, each of the six dimensions of a hand motion has a direct effect; single joints have not.
+    In a task about bodies, each of the six dimensions of a hand motion has a direct effect; a single joint
+    has none.
     """
     modes = getattr(env.agent, "supported_control_modes", ())
     if (

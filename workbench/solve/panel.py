@@ -60,7 +60,7 @@ PREDICTED, ACHIEVED = "#228be6", "#f08c00"
 
 
 class SolvePanel(PagePart[SessionView]):
-    """The folder; while the source of actions is another one, a button that chooses *solve*.
+    """The folder, shown while the source of actions is *solve*; else a button that chooses this source.
 
     Args:
         server: The page.

@@ -22,7 +22,8 @@ LINE_PIXELS = 2.5
 
 
 class RolloutTraces:
-    """The paths of all rollouts as one node of line segments, so that a plan is one message of some kilobytes."""
+    """The paths of all rollouts as one node of line segments, so that a plan is one message of a few
+    kilobytes."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         more = {"thickness": LINE_PIXELS, "thickness_units": "screen"}

@@ -69,7 +69,8 @@ class SolveView:
     predicted: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
     """(T,) predicted reward per step of the best rollout, from each step of the episode on; NaN where nothing was planned."""
     achieved: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
-    """(T,) achieved reward per step over the horizon from each step on, if that horizon has passed."""
+    """(T,) mean achieved reward per step over the horizon from each step on, or over the steps so far; NaN
+    for steps to come."""
     begins: int = 0
     """Control step of the episode at which `predicted` and `achieved` begin."""
     solved_at: int = 0

@@ -146,7 +146,7 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
         try:
             text = TaskText(file, read_source(file), _class_name(what.task))
         except SyntaxError as error:
-            raise SettingError(f"{file} is not text: {error}") from error
+            raise SettingError(f"{file} cannot be read as text: {error}") from error
     elif (spec := registry.environment(what.task)) is not None:
         arguments = class_arguments(spec.cls)
     found = {one.name: _found(text, arguments, what.task, one.name) for one in what.settings}

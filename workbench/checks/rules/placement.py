@@ -262,9 +262,10 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _whole_batches_at(function: ast.FunctionDef, lines: Collection[int | None]) -> Iterator[ast.AST]:
-    """The calls that make a tensor of self.num_envs rows of which these lines use more than the rows of ``env_idx``."""
+    """Calls that make a tensor of self.num_envs rows, if these lines use more of it than the rows of
+    ``env_idx``."""
     made: dict[str, ast.AST] = {}
-    """Local name or attribute of self to the call that made its tensor."""
+    """The call that made the tensor of a local variable or attribute of self, by its name."""
     for statement in _statements(function):
         value = getattr(statement, "value", None)
         source = None if value is None else next(_uses(value, made), None)
@@ -293,8 +294,8 @@ def _name_of(node: ast.AST) -> str:
 
 
 def _uses(node: ast.AST, made: Mapping[str, ast.AST]) -> Iterator[ast.AST]:
-    """The calls that make the whole batches which a part of the source makes or names, except where it takes only some
-    rows."""
+    """Calls that make a whole batch (`_whole_batches`), if this part of the source contains the call or names
+    its result, and does not take only some rows of it."""
     batches = {id(batch): batch for batch in _whole_batches(node)}
     waiting: list[ast.AST] = [node]
     while waiting:
@@ -595,7 +596,7 @@ def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         if 0 < len(row.seeds) < row.tried:
             yield Found(
                 f"{row.names[0]} is up to {row.size:.2f} m from the robot's base, and the tcp reaches {row.numbers[0]:.2f} m: "
-                f"it is out of reach in {of(len(row.seeds), row.tried, 'seed')} (seed {listed(row.seeds)}). Narrow the "
+                f"the body is out of reach in {of(len(row.seeds), row.tried, 'seed')} (seed {listed(row.seeds)}). Narrow the "
                 "range in which it is placed.",
                 row.place,
                 len(row.seeds),

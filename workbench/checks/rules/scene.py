@@ -118,7 +118,7 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
 def _is_unposed(checkup: Checkup, each: Built) -> bool:
     """Whether a body should have an initial pose and has none. A body that stays at the origin needs none, and a kinematic body
-    harms only a body that it is inside of."""
+    does harm only if it is built inside another body."""
     if each.quaternion is not None or each.kind == "static":
         return False
     if each.kind == "kinematic" and each.name not in _inside_others(checkup):
@@ -413,8 +413,8 @@ def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
                     and value.value != "none"
                 ):
                     yield Found(
-                        f"This line decomposes a mesh with {value.value} in each build. Decompose the mesh once, ship the "
-                        "file that is written next to it (.coacd.ply), and load that file with decomposition='none'.",
+                        f"This line decomposes a mesh with {value.value} while the task is built. Decompose it once, ship "
+                        "the file that is written next to it (.coacd.ply), and load that file with decomposition='none'.",
                         module.place(value, function.name),
                     )
 

@@ -81,7 +81,7 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
 
 def _require_all_moved(checkup: Checkup) -> None:
     if (count := len(scene_index(checkup.pictured.env).states)) > MAX_BODIES:
-        raise NotKnown(f"only {MAX_BODIES} of {count} bodies were moved")
+        raise NotKnown(f"only {MAX_BODIES} of {count} bodies were looked at")
 
 
 @rule("hidden-goal", "warn", "_get_obs_extra")
