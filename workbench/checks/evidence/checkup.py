@@ -358,8 +358,8 @@ class Checkup:
                 default_kwargs=self.loaded.default_kwargs,
             )
             if isinstance(env, BatchedCpuMixin):
-                # Otherwise earlier episodes change the last bits of the physics, and a touch sensor reads the contacts of the
-                # last episode.
+                # Without this, earlier episodes change the last bits of the physics, and a touch sensor reads
+                # the contacts of the last episode.
                 env.begins_anew = True
             return TaskEnv(env, self.loaded.max_episode_steps, check=returns_check(self.loaded, num_envs))
 

@@ -26,7 +26,7 @@ from workbench.task.blame import blamed, returns_check
 BATCHES = 2
 """Number of batches of seeds whose states are changed."""
 MARGIN_METRES = 0.15
-"""Bodies are placed within this margin in metres around their start positions, in x and y."""
+"""Bodies are placed within this margin in metres, in x and y, around the box of their start positions."""
 HEIGHT_METRES = 0.3
 """Metres above the start of a body within which it is placed."""
 KINDS = ("right after the reset", "with joints and bodies at random places", "with joints at their limits")

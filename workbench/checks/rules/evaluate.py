@@ -105,7 +105,7 @@ def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     The rule reads the entries of `evaluate()` after a reset. A task without either breaks the rule if its
     reward is ManiSkill's sparse one. With a dense reward, no reward or its own `compute_sparse_reward` the
     result is *not applicable*: tasks of walking and balancing have no success. The rule notes how many random
-    episodes succeed, and how many of those with the actions of `--actions`. It does not find out by itself
+    episodes and how many episodes with the actions of `--actions` succeed. It does not find out by itself
     whether success can be reached. The result is *not known* if `entry-name` finds a misspelt entry.
     """
     for row in rows[:1]:

@@ -41,7 +41,8 @@ _WRITES_OR_ASKS = {
     "savez_compressed", "savetxt", "dump", "export", "imwrite", "to_csv", "glob", "listdir", "iterdir",
 }  # fmt: skip
 _DATASET_IDS = {"ycb:": "ycb"}
-"""Prefix of a model's id, as in ``get_actor_builder(scene, id="ycb:...")``, to the download that has the model."""
+"""The download that has a model, by the prefix of the model's id: ``get_actor_builder(scene,
+id="ycb:...")``."""
 
 
 @dataclass(frozen=True)

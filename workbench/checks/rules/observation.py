@@ -22,7 +22,8 @@ HUGE_NUMBER = 1000.0
 
 
 def see_observation_finite(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each leaf in random rollouts; if all are finite, one for the first leaf that is not in odd states."""
+    """A row for each leaf in random rollouts; if all are finite, one for the first leaf that is not finite in
+    odd states."""
     finite = True
     for name, rows in _leaves(checkup).items():
         bad = np.logical_or.reduce(~np.isfinite(rows), axis=2)

@@ -27,7 +27,8 @@ MAX_NORMALIZED = 1.0 + 1e-4
 FULL_REWARD = 0.999
 """Minimum normalized reward that counts as the largest."""
 RATIO_TOLERANCE = 1e-3
-"""Maximum difference from the dense reward over a constant, as a share of the largest normalized reward."""
+"""Maximum difference of the normalized reward from the dense one times a constant, as a share of the largest
+normalized reward."""
 RATIO_SHARE = 0.05
 """Minimum dense reward for the ratio, as a share of the largest one: near 0, rounding decides the ratio."""
 CLEARLY_LOWER_SHARE = 0.05

@@ -25,7 +25,7 @@ from workbench.envs.simulation.hiding import why_not_hidden
 from workbench.machine.text import listed
 
 OVERLAP_METRES = 0.005
-"""Depth in metres from which on an overlap counts."""
+"""Minimum depth in metres of an overlap that counts."""
 MAX_LINKS = 64
 """Maximum number of links of an articulation in PhysX on the GPU."""
 MAX_TRIANGLES = 100_000
@@ -462,7 +462,7 @@ def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
 
 def _require_read(unknown: list[str]) -> None:
     if unknown:
-        raise NotKnown(f"cannot be read, or has too many triangles to look at: {listed(unknown)}")
+        raise NotKnown(f"mesh files that cannot be read or have too many triangles: {listed(unknown)}")
 
 
 @rule("merged-actors", "warn", "_load_scene")
@@ -529,7 +529,7 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
 
 @rule("hidden-objects", "warn", "_load_scene")
 def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
-    """_hidden_objects has actors without collision shapes, and the merged actor instead of its parts.
+    """_hidden_objects has only actors without collision shapes, and a merged actor instead of its parts.
 
     Poses are wrong and sensors see what should be hidden, or every picture fails.
 
@@ -734,7 +734,8 @@ def _merges(checkup: Checkup) -> list:
 
 
 def _own(checkup: Checkup) -> Iterator[Built]:
-    """Bodies that the author's files build, without robots; of a body that is built for each env only the first."""
+    """Bodies that the author's files build, without robots; a body that is built once for each env is given
+    once."""
     lines = set()
     for each in _builds(checkup):
         if each.place is not None and not each.of_robot and (each.place, each.name) not in lines:

@@ -43,7 +43,7 @@ def reward_exploited(checkup: Checkup) -> Iterator[Found | Note]:
     training ends there: the curve of the return looks perfect, and the success rate stays at 0.
 
     ## Mend
-    Look at the episodes that are named, and ask in the reward for what `evaluate` asks for. A cube that is
+    Look at the episodes that are named, and let the reward pay for what `evaluate` checks. A cube that is
     held above the target is near it in x and y only.
 
     ```python fragment

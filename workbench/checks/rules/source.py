@@ -144,8 +144,8 @@ def time_limit(checkup: Checkup) -> Iterator[Found | Note]:
     _needs_id(checkup)
     if checkup.loaded.max_episode_steps is None:
         yield Found(
-            f"{checkup.loaded.env_id} has no time limit: write @register_env(..., max_episode_steps=100), as many "
-            "control steps as a slow success needs.",
+            f"{checkup.loaded.env_id} has no time limit: write @register_env(..., max_episode_steps=100), one and "
+            "a half times the control steps of a slow success.",
             _decorator(checkup),
         )
 

@@ -58,9 +58,9 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
     Two envs observe pictures. The rule moves each dynamic body and each articulation that is no robot (40 at
     most) by some centimetres without a step, and calls `_get_obs_extra` again: a number that changes follows
     the body. Goals (kinematic and hidden bodies) may be in the observation. Contacts and forces do not change
-    without a step, so `is_grasping` is no finding. The result is *not known* if there is nothing to render
-    with, and *not applicable* for a task without observations with pictures, or in which nothing but the
-    robot moves freely.
+    without a step, so `is_grasping` is no finding. The result is *not known* if there is no renderer, and
+    *not applicable* for a task that has no observation mode with pictures, or in which nothing but the robot
+    moves freely.
     """
     told: dict[str, list[str]] = {}
     seen = {body: moved for body, moved in checkup.look(followers).items() if not moved.hidden}
