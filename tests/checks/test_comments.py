@@ -46,7 +46,7 @@ def test_a_comment_without_a_reason_or_a_rule_is_reported() -> None:
     assert [(one.line, one.message) for one in found] == [
         (1, "off[reward-rows] silences nothing until a reason follows it"),
         (2, "no rule is called reward-row (did you mean reward-rows?)"),
-        (3, "the comment names no rule, as in off[reward-rows]"),
+        (3, "the comment names no rule: write an id in the brackets, such as off[reward-rows]"),
         (5, "no rule is called nothing_like_it"),
     ]
 

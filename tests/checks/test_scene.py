@@ -210,4 +210,4 @@ def test_one_env_that_always_has_the_same_objects(checked: Checked) -> None:
 def test_a_body_in_the_env_of_a_neighbour(checked: Checked) -> None:
     far = "cube[:, 2] = CUBE_HALF_SIZE\n", "cube[:, 2] = CUBE_HALF_SIZE\n            cube[:, 0] += 3\n"
     finding = the_finding(checked("env-spacing", far, seeds=4))
-    assert "cube comes" in finding.message and "SimConfig(spacing=" in finding.message
+    assert "cube is up to" in finding.message and "SimConfig(spacing=" in finding.message

@@ -212,7 +212,7 @@ def test_a_task_that_needs_a_renderer_but_has_none_is_reported(
     ended = run(capsys, "drawn.py", "--select", "runs,camera-size", "--json", *FEW)
     (finding,) = json.loads(ended.out)["findings"]
     assert ended.code == 1 and finding["line"] == line_of(file, "self.shape")
-    assert "built with render_backend=none: leave that out" in finding["message"]
+    assert "built with render_backend=none: leave this argument out" in finding["message"]
 
 
 @pytest.mark.slow

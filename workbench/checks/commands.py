@@ -1,4 +1,4 @@
-"""Checks of the task's rules, and solving it."""
+"""Commands of the Checks tab: check rules, time a step, solve seeds."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class CheckAfterSave(Command, frozen=True):
 
 
 class TimeStep(Command, frozen=True):
-    """Time each hook and line over some hundred control steps, in a separate process."""
+    """Time each hook and line over a few hundred control steps, in a separate process."""
 
 
 class StopProfile(Command, frozen=True):
@@ -60,7 +60,7 @@ MOST_SEEDS = 256
 
 
 class ChooseSeeds(Command, frozen=True):
-    """Choose how many seeds to solve, from 0 on."""
+    """Choose how many seeds to solve; seeds are counted from 0."""
 
     seeds: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEEDS)]
 

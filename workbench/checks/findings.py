@@ -24,9 +24,9 @@ class Row:
 
     finding: Finding
     played: str = ""
-    """Count of the times that it was seen while playing, as text; empty for a finding of the checks alone."""
+    """Text: how often the finding was seen while playing; empty if only the checks found it."""
     old: bool = False
-    """Whether the finding is of an earlier version and its rule is not checked again yet."""
+    """Whether the finding is from an earlier version and its rule has not been checked again."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Card:
 
     rule: Rule
     degree: Degree
-    """The worst of its findings."""
+    """The worst degree of the findings."""
     rows: tuple[Row, ...]
 
     @property
@@ -56,7 +56,7 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
     """Cards by degree, ``stop`` first, then ``warn``, then the findings of an earlier version.
 
     Args:
-        played: what was found while playing.
+        played: findings seen while playing.
     """
     rows = [Row(finding) for finding in checks.findings]
     for finding in played:
@@ -67,7 +67,8 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
         known = rows[place].finding
         same = known.key == finding.key
         rows[place] = Row(known, _played(finding) if same else f"{_played(finding)}: {finding.message}")
-    # Rules of GPU simulation are checked last, and seen while playing at once.
+    # The checks reach the rules of GPU simulation last, but playing shows a breach at once: then the old
+    # finding is left out.
     rows += [Row(finding, old=True) for finding in checks.before if _same(finding, rows) is None]
     together: dict[str, list[Row]] = {}
     for row in rows:
@@ -78,8 +79,8 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
 
 
 def _same(finding: Finding, rows: Sequence[Row]) -> int | None:
-    """Index of the row with the same finding: an outlier is seen at its hook while playing, and at its line by the
-    checks."""
+    """Index of the row with the same finding; None without one. For an outlier any row of its rule matches:
+    playing reports an outlier at its hook, the checks report it at its line."""
     of_rule = [place for place, row in enumerate(rows) if row.finding.rule == finding.rule]
     alike = [place for place in of_rule if rows[place].finding.key == finding.key]
     if not alike and finding.rule in OUTLIER_RULES:
@@ -93,7 +94,8 @@ def count(shown: Iterable[Card]) -> int:
 
 
 def without_finding(checks: ChecksView, shown: list[Card]) -> list[RuleResult]:
-    """Results of the rules that have no finding: a rule that the checks kept may be broken while playing."""
+    """Results of the rules without a finding. A rule that is kept in the checks may have a finding from
+    playing."""
     broken = {card.rule.id for card in shown if not card.old}
     return [result for result in checks.results if result.rule not in broken]
 
@@ -135,8 +137,8 @@ def summary(checks: ChecksView, shown: list[Card]) -> str:
 
 
 def times(count: int) -> str:
-    """``once``, ``7 times``, ``300 times and more``: only the first digit of large counts, or the list would change at
-    each step."""
+    """``once``, ``7 times``, ``300 times and more``. Of large counts only the first digit is shown, or the
+    list would change at each step."""
     if count < 10:
         return "once" if count == 1 else f"{count} times"
     scale = 10 ** (len(str(count)) - 1)

@@ -61,7 +61,7 @@ class CheckReport:
 
     def fails(self, fail_on: FailOn) -> bool:
         """Whether a finding has this degree or a higher one, the check of a rule failed, or a rule is not known because the
-        author's code raised. Never for ``never``."""
+        author's code raised. False if `fail_on` is ``never``."""
         if fail_on == "never":
             return False
         if self.of_state("failed") or any(fails(finding.degree, fail_on) for finding in self.findings):
@@ -82,17 +82,18 @@ def check(
     """Check a task.
 
     Args:
-        on_activity: gets what is being looked at, for a status line.
-        on_result: gets the result of each rule as it comes; of a rule that several report, several. Of several parts of the
-            seeds, only those that no further part changes.
+        on_activity: gets the name of the current work, for a status line.
+        on_result: gets each result as it comes; a rule may get several results from several checks. With
+            several parts of the seeds, it gets only the results that no further part changes.
         stop: called between steps; after True the rules that are not done are missing in the report.
-        executor: None for this process, or for spawned processes with several workers.
+        executor: None to run in this process, or in spawned processes if there are several workers.
         began: when the work began, by ``time.monotonic()``; None for now.
-        on_progress: where there are several parts of the seeds, gets how many rules are done, counted for each part.
+        on_progress: with several parts of the seeds, gets the number of rules that are done, counted for each
+            part.
 
     Raises:
         TaskError: the task or the policy cannot be imported, or the task lacks assets.
-        PoolError: a process that checks failed, or processes die again and again.
+        PoolError: a checking process failed, or processes die again and again.
         FileNotFoundError, ValueError: the request is invalid.
     """
     began = time.monotonic() if began is None else began
@@ -179,7 +180,7 @@ class _Results:
             self._task, self._started = task, time.monotonic()
 
     def report(self, began: float | None, stopped: bool) -> CheckReport:
-        # Stopped before the task was imported: nothing is known of it.
+        # The check was stopped before the task was imported: nothing is known of the task.
         task = self._task or CheckedTask("", "", None)
         by_part: dict[int, list[ItemOutcome]] = {}
         for number in sorted(self._outcomes):
@@ -218,7 +219,7 @@ class _Results:
         earliest: dict[object, Finding] = {}
         for finding in (finding for outcome in outcomes for finding in outcome.findings):
             known = earliest.setdefault(finding.key, finding)
-            # Which one each process meets first depends on what it does.
+            # Which breach a process meets first depends on its rules: report the earliest of all processes.
             if (finding.first_step, finding.message) < (known.first_step, known.message):
                 earliest[finding.key] = finding
         found = sorted(earliest.values(), key=lambda one: (one.file or "", one.line or 0, one.message))

@@ -1,4 +1,4 @@
-"""Options of a check, and how it is cut into items: rules on parts of the seeds."""
+"""Options of a check, and how it is divided into items: a rule on a part of the seeds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class CheckOptions:
     seeds: int = 32
     """Number of seeds that are checked, from ``options.seed`` on."""
     select: tuple[str, ...] = ()
-    """Only these rules; empty for all."""
+    """Ids of the rules to check; empty for all."""
     ignore: tuple[str, ...] = ()
     actions: str = "random"
     """Source of the actions of further episodes, which run in addition to the random ones; see
@@ -47,7 +47,7 @@ class CheckedTask:
     """Further tasks of the file, which were not checked."""
     notices: tuple[str, ...] = ()
     source: Mapping[str, str] = field(default_factory=dict)
-    """Path to text of the author's files."""
+    """Texts of the author's files by path."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class ItemOutcome:
 
 
 def groups_of(degrees: Mapping[str, Degree]) -> list[RuleGroup]:
-    """The groups with a rule that is not off, without the rules that are; `GPU_SIMULATION` last."""
+    """The groups without the rules that are off; empty groups are left out, `GPU_SIMULATION` comes last."""
     groups = [
         RuleGroup(group.name, {rule: check for rule, check in group.checks.items() if degrees[rule] != "off"})
         for group in GROUPS
@@ -97,7 +97,9 @@ def degrees_of_request(what: CheckOptions) -> dict[str, Degree]:
         if number is not None and number < 1:
             raise ValueError(f"--{name} must be at least 1, not {number}")
     if what.actions == SOLVE:
-        raise ValueError("--actions solve is for workbench record: --solve checks rules on planned episodes")
+        raise ValueError(
+            "--actions solve is for workbench record; to check rules on planned episodes, use --solve"
+        )
     degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
     if not groups_of(degrees):
         raise ValueError("no rule is left to check")
@@ -116,13 +118,13 @@ class Item:
 
 @dataclass(frozen=True)
 class CheckPlan:
-    """The items of a check, by number. A chunk holds the rules of one group, which use the same evidence; with
-    several parts of the seeds, all rules of one part, which use the same episodes. Rules that do not depend on the
-    seeds are checked in the first part only."""
+    """The items of a check, by number. With one part of the seeds, a chunk is the rules of one group, which
+    use the same evidence. With several parts, a chunk is all rules of one part, which use the same episodes.
+    Rules that do not depend on the seeds are checked in the first part only."""
 
     items: Mapping[int, Item]
     chunk: int
-    """Count of numbers in a chunk; not every number stands for an item."""
+    """Number of item numbers in a chunk; some numbers have no item."""
     part: int
     """Number of seeds of a part. A rule that compares whole batches uses one seed for each env."""
     parts: int
@@ -154,11 +156,11 @@ def plan_of(what: CheckOptions, degrees: Mapping[str, Degree]) -> CheckPlan:
 
 
 def count_chunks(what: CheckOptions) -> int:
-    """Chunks of the job. Raises ValueError for a request that is invalid."""
+    """Number of chunks of the job. Raises ValueError for a request that is invalid."""
     return plan_of(what, degrees_of_request(what)).chunks
 
 
 def count_items(what: CheckOptions, chunks: range) -> int:
-    """Items in these chunks."""
+    """Number of items in these chunks."""
     plan = plan_of(what, degrees_of_request(what))
     return sum(number // plan.chunk in chunks for number in plan.items)

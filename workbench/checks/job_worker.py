@@ -30,7 +30,7 @@ from workbench.task.problem import Problem, TaskError
 
 
 def check_items(what: CheckOptions, queue: ItemQueue) -> None:
-    """Check the chunks that one process gets. Raises as `checks.job.check`."""
+    """Check the chunks that one process gets. Raises the errors of `checks.job.check`."""
     torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # the task may change it
     with here.again(), ExitStack() as stack:
@@ -60,8 +60,8 @@ class _Worker:
     ) -> None:
         """
         Args:
-            runs: as `find_actions` gives them.
-            here: where a policy is found.
+            runs: recorded runs to replay, from `find_actions`.
+            here: folder in which a policy is found.
         """
         self._what, self._loaded, self._runs, self._here, self._queue = what, loaded, runs, here, queue
         self._degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
@@ -133,7 +133,7 @@ class _Worker:
 
 
 def _require_assets(loaded: LoadedTask, what: CheckOptions) -> None:
-    """Raise TaskError for a download that is missing: no line of the task is at fault."""
+    """Raise TaskError if a download is missing, which is no fault of a line of the task."""
     given = given_arguments(loaded.cls, what.options.env_kwargs, loaded.default_kwargs)
     with blamed("build", loaded):
         require_assets(loaded.cls.__name__, loaded.asset_ids, robots_of(loaded.cls, given))
@@ -161,7 +161,7 @@ class _Given:
     ) -> None:
         """
         Args:
-            runs: the runs of the file, as `find_actions` gives them.
+            runs: recorded runs to replay, from `find_actions`; empty for a policy.
             here: folder in which a policy is found.
             episodes: indices of the episodes, counted over the whole check.
 

@@ -25,9 +25,7 @@ from workbench.page.widgets.visitors import Visitor
 TAB = "Checks"
 CHECK_NOW, STOP_CHECKS = "Check now", "Stop checking"
 AFTER_SAVE = "After each save"
-AFTER_SAVE_HINT = (
-    "Check each version that loads. In a process of its own at low priority: playing goes first."
-)
+AFTER_SAVE_HINT = "Check each version that loads, in a separate process at low priority: playing goes first."
 REST = "rest"
 """Key of the fold of rules without a finding."""
 
@@ -37,7 +35,7 @@ class ChecksPanel(PagePart[SessionView]):
 
     Args:
         server: The page.
-        tab: The tab that it is in: its label has the number of findings.
+        tab: The tab that contains the panel; its label shows the number of findings.
         link: Links the lines of the author's files.
     """
 
@@ -88,14 +86,14 @@ class FindingsMark:
 
     count: int
     newest: str
-    """Place of the worst finding, with the number of the others."""
+    """Place of the worst finding that has a line, with the number of other findings."""
     stops: bool
     old: bool
-    """Whether all were found before the last change, and that change is not checked yet."""
+    """Whether all findings are from an earlier version, and their rules have not been checked again."""
 
 
 def findings_mark(view: SessionView) -> FindingsMark | None:
-    """The mark of findings; None without any."""
+    """The mark of findings; None if there are no findings."""
     found = cards(view.of(ChecksView), view.played)
     if not found:
         return None
@@ -113,7 +111,7 @@ def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) 
 
 
 def _comments(view: SessionView) -> list[Comment]:
-    """Comments that silence nothing; known when all rules are checked."""
+    """Silencing comments without effect; those without a finding are known once all rules are checked."""
     task, checks = view.task, view.of(ChecksView)
     if task is None:
         return []
@@ -130,13 +128,13 @@ def list_html(
     link: LinkTo = no_links,
     comments: Sequence[Comment] = (),
 ) -> str:
-    """HTML of the findings, and of the rules without one if that part is unfolded.
+    """HTML of the findings and, if that part is unfolded, of the rules without a finding.
 
     Args:
         more: breaches seen while playing at lines that are not listed.
-        opened: what is folded out.
-        toggle: the command that folds a part out and in.
-        comments: those that were to silence a rule and silence none.
+        opened: ids of the unfolded rules, and `REST`.
+        toggle: gives the command that unfolds or folds a part.
+        comments: silencing comments without effect.
     """
     known = {
         "found": found,

@@ -21,7 +21,7 @@ from workbench.page.command import Command, Refused
 from workbench.task.problem import Problem
 
 DOES: frozenset[type[Command]] = frozenset({TimeStep, StopProfile})
-"""Commands that `apply` takes."""
+"""Commands that `apply` handles."""
 ProfileState = Literal["none", "running", "done", "stopped", "failed"]
 
 
@@ -35,11 +35,11 @@ class ProfileView:
     profile: StepProfile | None = None
     """The last profile; of an earlier version if `stale`."""
     stale: bool = False
-    """Whether another version runs since."""
+    """Whether another version has been loaded since."""
     why: str = ""
     """Why the profile failed, as text."""
     problem: Problem | None = None
-    """The error that the code raised."""
+    """The error that the author's code raised."""
 
 
 # --- events and effects -----------------------------------------------------------------------------
@@ -62,7 +62,7 @@ class ProfileFailed:
 
 @dataclass(frozen=True)
 class BeginProfile:
-    """Time a step of this version in place of the one before."""
+    """Time a step of this version; a running job is stopped."""
 
     load: Load
 
@@ -77,7 +77,7 @@ ProfileEffect = BeginProfile | EndProfile
 
 
 def apply(view: ProfileView, event: object, run: Run) -> tuple[ProfileView, list[ProfileEffect]]:
-    """The profile after an event, and what has to be done.
+    """The profile after an event, and the effects to perform.
 
     Args:
         run: the run after the event.
@@ -109,12 +109,13 @@ def _changed(view: ProfileView, **values: Any) -> ProfileView:
 
 
 class ProfileJobs:
-    """Performs the effects: one job at a time, for which a person waits. Used on the loop, but for `close`."""
+    """Performs the effects: one job at a time, at the priority of jobs that a person waits for. Used on the
+    loop, except `close`."""
 
     def __init__(self, process: Background, happen: Callable[[ProfileEvent], object]) -> None:
         """
         Args:
-            process: where a job runs.
+            process: the background process in which a job runs.
             happen: handles the events of a job.
         """
         self._process, self._happen = process, happen

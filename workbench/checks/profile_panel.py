@@ -16,7 +16,7 @@ TITLE = "Where does a step go"
 PROFILE, STOP_PROFILE = "Time a step", "Stop timing"
 MOST_HOOKS, MOST_LINES = 12, 12
 FEWEST_LINES, SMALL = 5, 0.01
-"""Number of lines that are always shown, and minimum share of the lines after these."""
+"""Number of lines that are always shown, and minimum share of a step for further lines to be shown."""
 
 
 class StepProfilePanel(PagePart[SessionView]):
@@ -49,7 +49,7 @@ class StepProfilePanel(PagePart[SessionView]):
 
 
 def profile_html(shown: ProfileView, link: LinkTo = no_links) -> str:
-    """HTML of the tables, or of what to do for them."""
+    """HTML of the tables; without a profile, of what they show."""
     lines = () if shown.profile is None else shown.profile.lines[:MOST_LINES]
     lines = [line for place, line in enumerate(lines) if place < FEWEST_LINES or line.share >= SMALL]
     known = {"lines": lines, "most_hooks": MOST_HOOKS, "ms": milliseconds, "part": share_text}

@@ -1,4 +1,5 @@
-"""Questions to a worker about rules and the time of a step. Only for a worker that does not play: they make separate envs."""
+"""Questions about rules and the time of a step. Only a worker that does not play answers them, on separate
+envs."""
 
 from __future__ import annotations
 
@@ -39,7 +40,7 @@ class CheckGroup(Question[CheckedGroup]):
 
     part: ClassVar[Any] = RuleProgress
     group: int
-    """Index of the group, from 0 on, in the order of what people meet most."""
+    """Index of the group, from 0; groups with common mistakes come first."""
     degrees: Mapping[str, Degree]
     """Degree of each rule."""
     known: tuple[str, ...] = ()
@@ -48,4 +49,4 @@ class CheckGroup(Question[CheckedGroup]):
 
 @dataclass(frozen=True)
 class ProfileStep(Question[StepProfile]):
-    """Time the hooks and lines of a control step, on separate envs. A later request ends it."""
+    """Time the hooks and lines of a control step, on separate envs. A later request ends the timing."""

@@ -18,21 +18,22 @@ See = Callable[[Checkup], Iterator[Seen]]
 
 @dataclass(frozen=True)
 class RuleCheck:
-    """A rule and the check that looks whether a task keeps it."""
+    """A rule, and the check that decides whether a task keeps it."""
 
     rule: DeclaredRule
     check: Check
 
 
 Declare = Callable[[Callable[[Any], Iterator[Found | Note]]], RuleCheck]
-"""A decorator of a `Check`, or of the function that judges what another one saw (`OverSeeds.judge`)."""
+"""A decorator for a `Check`, or for the `judge` function of an `OverSeeds` check."""
 
 
 def rule(id: str, degree: Degree, hook: str, *, see: See | None = None, solve: bool = False) -> Declare:
     """Declare the decorated function as the check of a rule, and its docstring as the rule's page (`declared_rule`).
 
     Args:
-        see: for a rule over all seeds: looks at some of them. The decorated function then judges what this saw.
+        see: only for a rule over all seeds: gives rows about a part of the seeds, which the decorated
+            function judges.
         solve: as `Rule.solve`.
     """
 
@@ -44,7 +45,7 @@ def rule(id: str, degree: Degree, hook: str, *, see: See | None = None, solve: b
 
 
 def outlier_check(id: str, *, see: See) -> Declare:
-    """Declare the decorated function as the check of a rule of `OUTLIER_RULES`, which has the page.
+    """Declare the decorated function as the check of a rule of `OUTLIER_RULES`, where the rule's page is.
 
     Args:
         see: as in `rule`.

@@ -11,7 +11,7 @@ from workbench.envs.gpu_rules import Finding
 from workbench.task.problem import Problem
 
 State = Literal["broken", "failed", "silenced", "not_known", "kept", "not_applicable"]
-"""Result of a rule; of several results in one check, the first in this order counts.
+"""Result of a rule. If one check gives a rule several results, the first in this order counts.
 
 - ``broken``: it has findings. ``silenced``: comments in the source silence all of them.
 - ``kept``: the rule was tried and has no finding.
@@ -39,15 +39,15 @@ class Silenced:
 
 @dataclass(frozen=True)
 class Seen:
-    """A row of what a check saw of one thing in some episodes. `evidence.over_seeds` puts the rows of several parts of the seeds
-    together."""
+    """What a check saw of one thing, such as a body, in some episodes. `evidence.over_seeds` joins the rows
+    of several parts of the seeds."""
 
     names: tuple[str, ...] = ()
     """Names of the thing, such as a body; empty for the episodes as a whole."""
     place: tuple[str, int, str] | None = None
     """File, line and function at which a breach is reported."""
     tried: int = 0
-    """Number of episodes, or of other things that the rule counts, that were looked at."""
+    """Number of episodes, or of other things that the rule counts, that the check looked at."""
     seeds: tuple[int, ...] = ()
     """Seeds of the episodes that break the rule."""
     count: int = 0
@@ -75,16 +75,17 @@ class RuleResult:
     notes: tuple[str, ...] = ()
     """Notes that are no breach."""
     why: str = ""
-    """The reason why the rule is not known, not applicable or failed; for a broken rule, why the check did not end."""
+    """The reason why the rule is not known, not applicable or failed; for a broken rule, why its check
+    was not completed."""
     seconds: float = 0.0
     seen: tuple[Seen, ...] = ()
-    """Rows of a check over all seeds, by which results of further seeds are put together with this one."""
+    """Rows of an `OverSeeds` check, from which this result and those of further seeds are judged together."""
     problem: Problem | None = None
-    """The error that the author's code raised, or the check if it failed."""
+    """The error that the author's code raised; in a failed check, the error of the check."""
 
     @property
     def is_crash(self) -> bool:
-        """Whether the check itself raised; false if its process died, whose cause is not known."""
+        """Whether the check itself raised. False if its process died: then the cause is not known."""
         return self.state == "failed" and self.problem is not None and bool(self.problem.traceback)
 
 
@@ -106,8 +107,8 @@ def merged(results: Iterable[RuleResult], other_seeds: bool = False) -> RuleResu
     """One result from several results of one rule.
 
     Args:
-        other_seeds: whether each result has other seeds; then the breaches of all are counted. Else the results come from
-            the checks of several rules, which look at the same seeds, and the same breach counts once.
+        other_seeds: True if the results are of different seeds: their breaches are added up. False if they
+            come from the checks of several rules on the same seeds: the same breach counts once.
     """
     results = sorted(results, key=lambda result: STATES.index(result.state))
     findings: dict[object, Finding] = {}
@@ -153,7 +154,8 @@ class HookTime:
 
 @dataclass(frozen=True)
 class LineTime:
-    """Time of one of the author's lines in a control step, with what it calls outside the author's files."""
+    """Time of one of the author's lines in a control step, including the code that it calls outside the
+    author's files."""
 
     hook: str
     """The hook that ran the line."""

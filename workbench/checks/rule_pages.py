@@ -47,7 +47,7 @@ def sections(text: str) -> dict[str, str]:
 
 def as_html(markdown: str) -> str:
     """Markdown as HTML; HTML in it is shown as text. Links to other documents lead to their pages."""
-    from markdown_it import MarkdownIt  # late: a page that shows no finding needs none
+    from markdown_it import MarkdownIt  # late: a page that shows no finding needs no parser
 
     parser = MarkdownIt("commonmark", {"html": False})
     tokens = parser.parse(markdown)

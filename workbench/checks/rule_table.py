@@ -11,7 +11,8 @@ import msgspec
 from workbench.envs.gpu_rules import GPU_RULES, Degree, Rule
 
 RULES_FILE = Path(__file__).with_name("rules.json")
-"""Every rule without its page, written by ``python -m tests.docs.generate`` from where each rule is declared."""
+"""All rules without their pages. ``python -m tests.docs.generate`` writes the file from the rules'
+declarations."""
 
 
 def _read() -> dict[str, Rule]:
@@ -40,10 +41,10 @@ def degree_of_each(
     """The degree of each rule.
 
     Args:
-        select: only these rules; all others are off. Empty for all.
+        select: the rules to check; all others are off. Empty for all.
         ignore: rules that are off.
-        choice: the degree of all others; None for each rule's own.
-        solve: whether `SOLVE_RULES` are among all; else they are off unless `select` names them.
+        choice: the degree of the rules that are not off; None for the default degree of each.
+        solve: whether an empty `select` includes `SOLVE_RULES`.
 
     Raises:
         ValueError: an id that no rule has.

@@ -82,7 +82,8 @@ RULES_OVER_SEEDS: Mapping[str, OverSeeds] = {
 }
 """The rules whose results depend on the seeds. All others look at the source, at what is built, or at the first batch."""
 GPU_SIMULATION = RuleGroup("GPU simulation", {})
-"""The group of all rules of GPU simulation: the envs under check report breaches of them, whichever check runs."""
+"""The group of all rules of GPU simulation. It has no checks: the envs report breaches while any check
+runs."""
 _OF_RETURNS = ("evaluate-rows", "reward-rows")
 """Rules of GPU simulation about the values that hooks return."""
 _OF_SEVERAL = frozenset(
@@ -94,11 +95,11 @@ _OF_SEVERAL = frozenset(
 """Rules of GPU simulation about the other envs: one env alone cannot break them."""
 GPU_RESETS = 6
 """Number of resets of random envs, with steps between them."""
-ONE_ENV = "With one env it runs: --num-envs 1."
+ONE_ENV = "The task runs with one env: --num-envs 1."
 
 
 def check_rule(rule: str, check: Check, checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
-    """The result of a rule; if the task raises, that of the rule `runs` too. Raises CheckEnded."""
+    """The result of a rule, then one of the rule `runs` if the task raised. Raises CheckEnded."""
     began = time.perf_counter()
     rows: list[Seen] = []
     further: list[RuleResult] = []
@@ -129,11 +130,11 @@ def _checked(rule: str, check: Check, checkup: Checkup, degree: Degree, rows: li
             for row in check.see(checkup):
                 rows.append(_with_code(rule, row))
         for found in check.judge(rows) if isinstance(check, OverSeeds) else check(checkup):
-            seen.append(found)  # one by one: the next may raise
+            seen.append(found)  # one by one: breaches before an error are kept
 
     ended = ended_as(lambda: _of_task(look, checkup))
     if ended.problem is not None and isinstance(check, OverSeeds):
-        # Breaches that were found before the error are true all the same.
+        # Breaches that were found before the error still count.
         seen.extend(check.so_far(rows))
     return _ended(result_of(rule, degree, seen), ended)
 
@@ -148,7 +149,8 @@ class LookEnd:
 
 
 def ended_as(look: Callable[[], None]) -> LookEnd:
-    """Run a check, and say how it ended. Other exceptions pass."""
+    """Run a check and return how it ended. Exceptions other than NotApplicable, NotKnown and TaskError are
+    not caught."""
     try:
         look()
     except NotApplicable as reason:
@@ -161,8 +163,9 @@ def ended_as(look: Callable[[], None]) -> LookEnd:
 
 
 def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
-    """Run a check; again with one env if the task uses something that exists for one env only, as opening a task does. Errors of
-    the author's code, such as a robot's property, become TaskErrors."""
+    """Run a check. If the task uses something that exists for one env only, run it again with one env, as
+    opening a task does. An exception in the author's code, such as a robot's property, becomes a
+    TaskError."""
     try:
         look()
     except TaskError as error:
@@ -180,7 +183,7 @@ def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
 
 
 def _is_of_task(error: Exception, checkup: Checkup) -> bool:
-    """Whether the innermost line of the traceback, without those of libraries, is the author's and not the workbench's."""
+    """Whether the innermost traceback line outside libraries is the author's, not the workbench's."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if frame.filename in checkup.files:
             return True
@@ -190,7 +193,7 @@ def _is_of_task(error: Exception, checkup: Checkup) -> bool:
 
 
 def _ended(result: RuleResult, ended: LookEnd) -> RuleResult:
-    """The result of a check that ended so; findings count most."""
+    """The result, with how its check ended; a result with findings keeps its state."""
     if result.state != "kept":
         # The error is reported too: the check did not see everything.
         return replace(result, why=ended.why, problem=ended.problem) if ended.problem is not None else result
@@ -198,7 +201,7 @@ def _ended(result: RuleResult, ended: LookEnd) -> RuleResult:
 
 
 def problem_of_crash(error: Exception) -> Problem:
-    """The error of a check, at the innermost line of the workbench, with the whole traceback."""
+    """The exception that a check raised, at the innermost line of the workbench, with the whole traceback."""
     frames = traceback.extract_tb(error.__traceback__)
     at = next((frame for frame in reversed(frames) if Path(frame.filename).is_relative_to(_PACKAGE)), None)
     file = None if at is None else str(Path(at.filename).relative_to(_PACKAGE.parent))
@@ -208,8 +211,8 @@ def problem_of_crash(error: Exception) -> Problem:
 
 
 def as_sent(result: RuleResult) -> RuleResult:
-    """The result as another process reads it. Raises TypeError or Unreadable for a value of a wrong type, so that only this rule
-    fails; in the other process the error would end the whole check."""
+    """The result, packed and unpacked. A value of a wrong type raises TypeError or Unreadable here, so that
+    only this rule fails; in the process that reads the result, the error would end the whole check."""
     return Unpacker().unpack(pack(result), RuleResult)
 
 
@@ -252,7 +255,7 @@ def _with_code(rule: str, row: Seen) -> Seen:
 
 
 def _is_known(error: Problem, checkup: Checkup, degrees: Mapping[str, Degree]) -> bool:
-    """Whether another rule reports the error with its line: the type or shape of a value that a hook returned."""
+    """Whether a rule about returned values (`_OF_RETURNS`) reports this error already."""
     returned = (each.rule for each in checkup.findings if each.rule in _OF_RETURNS)
     return error.stage == "returns" and any(degrees[rule] != "off" for rule in returned)
 
@@ -274,8 +277,9 @@ def raised(error: Problem, checkup: Checkup) -> Found:
 
 
 def check_gpu_rules(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
-    """Step, and reset random envs, under the rules of GPU simulation. Gives the result of each without breaches: `gpu_results`
-    makes results from the breaches in `Checkup.findings`, which all checks add to. Raises CheckEnded."""
+    """Step and reset random envs under the rules of GPU simulation. Returns a result without breaches for
+    each rule: `gpu_results` makes those with breaches from `Checkup.findings`, to which all checks add.
+    Raises CheckEnded."""
     further: list[RuleResult] = []
     not_applicable: dict[str, str] = {}
     try:
@@ -312,12 +316,14 @@ def _run_gpu_rules(checkup: Checkup) -> None:
 
 
 def _nothing_there(task: TaskEnv) -> dict[str, str]:
-    """Reason by rule of GPU simulation that says nothing about this task."""
+    """The rules of GPU simulation that do not apply to this task, with the reason."""
     found: dict[str, str] = {}
     if task.env.reward_mode == "none":
-        found["reward-rows"] = "it has no reward"
+        found["reward-rows"] = "the task has no reward"
     if not KeptRows(task.env, [0]).before:
-        found |= dict.fromkeys(("rows-lost", "rows-rewritten"), "it keeps nothing with a row for each env")
+        found |= dict.fromkeys(
+            ("rows-lost", "rows-rewritten"), "the task keeps nothing with a row for each env"
+        )
     return found
 
 
@@ -339,8 +345,8 @@ def gpu_results(
 
 
 def findings_of(checkup: Checkup, first: int = 0) -> tuple[Finding, ...]:
-    """Breaches of the rules of GPU simulation so far, from index `first` on; their messages say so if the task is written for one
-    env."""
+    """Breaches of the rules of GPU simulation so far, from index `first` on. If the task runs with one env
+    only, messages about returned values end with `ONE_ENV`."""
     return tuple(
         replace(each, message=f"{each.message} {ONE_ENV}")
         if each.rule in _OF_RETURNS and checkup.fails_with_several is not None

@@ -1,4 +1,4 @@
-"""Finds silencing comments without effect: no reason, no such rule, or no finding. Imports no simulator."""
+"""Finds silencing comments without effect. Imports no simulator."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def comments_without_effect(
     """The silencing comments that lack a reason, name an unknown rule, or silence no finding.
 
     Args:
-        sources: path to text of the author's files.
+        sources: texts of the author's files by path.
         results: results of all checked rules, once the check is done. Comments on rules without a decided result are left out.
         class_name: the class that was checked. Comments in other tasks are left out: those were not checked.
-        others: further tasks of the file.
+        others: class names of other tasks in the file.
     """
     found: list[Comment] = []
     by_rule = {result.rule: result for result in results if result.state in _DECIDED}
@@ -63,7 +63,7 @@ def _mistakes(comment: Silence) -> Iterator[str]:
     for rule in sorted(comment.rules - RULES.keys()):
         yield f"no rule is called {rule}{did_you_mean(rule)}"
     if not comment.rules:
-        yield "the comment names no rule, as in off[reward-rows]"
+        yield "the comment names no rule: write an id in the brackets, such as off[reward-rows]"
     elif not comment.reason:
         named = ", ".join(sorted(comment.rules))
         yield f"off[{named}] silences nothing until a reason follows it"
@@ -76,7 +76,7 @@ def _silences(result: RuleResult, file: str, line: int) -> bool:
 def _lines_of_other_tasks(
     sources: Mapping[str, str], file: str, class_name: str, others: Collection[str]
 ) -> frozenset[int]:
-    """Lines of a file in the classes of further tasks."""
+    """Lines of a file that belong to the classes of other tasks."""
     classes = {path: _classes(text) for path, text in sources.items()}
     family, waiting = {class_name}, [class_name]
     while waiting:
@@ -97,7 +97,7 @@ def _classes(text: str) -> list[ast.ClassDef]:
     try:
         return [node for node in ast.walk(parse_python(text)) if isinstance(node, ast.ClassDef)]
     except (SyntaxError, ValueError, RecursionError):
-        return []  # the page has it from a file that is being edited
+        return []  # the page reads files that are being edited
 
 
 def _bases(node: ast.ClassDef) -> set[str]:

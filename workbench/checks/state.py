@@ -24,14 +24,15 @@ from workbench.page.command import Command, Refused
 from workbench.task.problem import Problem
 
 AHEAD_SECONDS = 2.0
-"""Seconds of checking at low priority; then at the lowest, since a person waits more for the rescored history than
-for the last rule."""
+"""Seconds of checking at low priority. After that, the priority is the lowest: a person waits more for the
+rescored history than for the last rule."""
 MAX_DEATHS = 5
-"""Maximum number of processes that may die in one check; the running rule fails, and the next process checks the others."""
+"""Maximum number of processes that may die in one check. If one dies, the running rule fails and a new
+process checks the others."""
 ChecksState = Literal["none", "off", "loading", "checking", "done", "stopped", "failed"]
 RUNNING: tuple[ChecksState, ...] = ("loading", "checking")
 DOES: frozenset[type[Command]] = frozenset({CheckNow, StopChecks, CheckAfterSave})
-"""Commands that `apply` takes."""
+"""Commands that `apply` handles."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +52,12 @@ class ChecksView:
     looks_at: str = ""
     """What the running group looks at."""
     waits: bool = False
-    """Whether another job has the background process."""
+    """Whether another job is using the background process."""
     stopped_by: StoppedBy | None = None
     why: str = ""
     """Why the check stopped or failed, as text."""
     problem: Problem | None = None
-    """The error that the code raised when it was loaded."""
+    """The error that the author's code raised when it was loaded."""
     seconds: float = 0.0
     """Seconds since the version was loaded in the background process."""
     after_each_save: bool = True
@@ -69,7 +70,7 @@ class ChecksView:
 
 @dataclass(frozen=True)
 class Checks:
-    """What is known of the checks."""
+    """State of the checks."""
 
     view: ChecksView = ChecksView()
     version: object = None
@@ -81,14 +82,14 @@ class Checks:
 
 @dataclass(frozen=True)
 class CheckWaits:
-    """Another job has the background process, or no longer."""
+    """Another job began or stopped using the background process."""
 
     waits: bool
 
 
 @dataclass(frozen=True)
 class GroupBegan:
-    """The version is loaded in the background process; a group of rules is checked."""
+    """The version is loaded in the background process; the check of a group of rules begins."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ class RuleChecked:
     seconds: float
     """Seconds since the version was loaded in the background process."""
     total: int | None = None
-    """Number of rules to check; None if a process that died has not told it."""
+    """Number of rules to check; None for a rule that failed because its process died."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class CheckFailed:
 
 @dataclass(frozen=True)
 class BeginCheck:
-    """Check this version in place of the one before."""
+    """Check this version; a running check is cancelled."""
 
     load: Load
 
@@ -139,7 +140,7 @@ class EndCheck:
 
 @dataclass(frozen=True)
 class KeepCheckAfterSave:
-    """Keep for the next run whether each version that loads is checked."""
+    """Store for the next run of the workbench whether each version that loads is checked."""
 
     wanted: bool
 
@@ -147,12 +148,12 @@ class KeepCheckAfterSave:
 CheckEvent = CheckWaits | GroupBegan | RuleChecked | GroupChecked | CheckDone | CheckFailed
 CheckEffect = BeginCheck | EndCheck
 Change = tuple[Checks, list[CheckEffect | KeepCheckAfterSave]]
-"""The checks after an event, and what has to be done."""
+"""The checks after an event, and the effects to perform."""
 
 
 def apply(checks: Checks, event: object, before: Run, run: Run) -> Change:
-    """The checks after an event, and what has to be done. Findings of the version before are kept until each rule has
-    been checked again.
+    """The checks after an event, and the effects to perform. A finding of an earlier version is kept until
+    its rule has been checked again.
 
     Args:
         before: the run before the event.
@@ -179,7 +180,8 @@ def apply(checks: Checks, event: object, before: Run, run: Run) -> Change:
             return checks, effects
         case VersionLoaded() if _task_id(before) != _task_id(run):
             return _changed(checks, before=(), results=()), []
-        # Not with `VersionLoaded`: the later of two jobs of one priority comes first, and rescoring begins with that.
+        # Not at `VersionLoaded`, at which rescoring begins: of two jobs of one priority, the later one comes
+        # first.
         case LoadDone() if (load := run.running_load()) is not None:
             return _check_loaded(checks, load)
         case _ if checks.view.state in RUNNING:
@@ -188,7 +190,7 @@ def apply(checks: Checks, event: object, before: Run, run: Run) -> Change:
 
 
 def _check_loaded(checks: Checks, load: Load) -> Change:
-    """A version runs in the worker that plays."""
+    """Handle a version that now runs in the worker that plays: check it, or show that it is not checked."""
     if checks.version == _version(load) and checks.view.state in ("done", "off"):
         return checks, []
     if checks.view.after_each_save:
@@ -231,7 +233,7 @@ def _stop(checks: Checks, why: StoppedBy) -> Change:
 
 
 def _take(checks: Checks, event: object) -> Checks:
-    """Take what a running check tells."""
+    """Apply an event of the running check."""
     view = checks.view
     match event:
         case CheckWaits(waits=waits) if waits != view.waits:
@@ -257,7 +259,7 @@ def _changed(checks: Checks, **values: Any) -> Checks:
 
 
 class CheckJobs:
-    """Performs the effects: one check at a time. Used on the loop, but for `close`.
+    """Performs the effects: one check at a time. Used on the loop, except `close`.
 
     The checks run in `process`, never in the worker that plays. They yield to jobs that a person waits for; a group that
     was interrupted is requested again without the rules that already have a result.
@@ -323,7 +325,7 @@ class CheckJobs:
                 rules = gpu_rules_of(degrees) if under_way == "" else filter(None, [under_way])
                 for rule in rules:
                     checked(failed(rule, problem))
-                group += under_way == ""  # that is the last one
+                group += under_way == ""  # GPU simulation is the last group
                 under_way = None
                 continue
             group, groups = group + 1, answer.groups
@@ -339,22 +341,24 @@ class CheckJobs:
 
 
 async def load_version(process: Background, job: Job, load: Load) -> None:
-    """Load a version in the background process, if it is not loaded.
+    """Load a version in the background process, unless it is loaded already.
 
     Raises:
-        JobFailed: it cannot be loaded there.
+        JobFailed: the version cannot be loaded there.
     """
     try:
-        # The new code may raise at the moment where an earlier job has left the process: then the env is rebuilt.
+        # The new code may raise in the state in which an earlier job left the env: then the env is rebuilt.
         await process.ensure(job, load, or_else=replace(load, level="rebuilt"))
     except JobFailed as failure:
         if failure.problem is None:
             raise
-        raise JobFailed("the version could not be loaded to be checked", failure.problem) from failure
+        raise JobFailed(
+            "the version could not be loaded in the background process", failure.problem
+        ) from failure
 
 
 def _still_there(finding: Finding, source: Mapping[str, str] | None) -> bool:
-    """Whether the line of the finding still stands in this version; true for a finding without a line."""
+    """Whether this version still contains the finding's line of code; True for a finding without a line."""
     if source is None or finding.file is None or not finding.code:
         return True
     text = source.get(finding.file)

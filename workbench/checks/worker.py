@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from workbench.task.load import LoadedTask
 
 OnProgress = Callable[[int, int, RuleProgress], None]
-"""Callback for progress: gets the number of results so far in this group, the number of rules in all, and what is
-begun or done."""
+"""Progress callback (done, total, progress): results of this group so far, rules in all groups that are not
+off, and the rule that began or has its result."""
 NUM_ENVS, SEEDS = 8, 32
-"""Number of envs of a check (one if the page has one), and number of seeds."""
+"""Number of envs of a check (1 if the opened task has one env), and number of seeds."""
 
 
 class WorkerChecks:
-    """Checks groups of rules, and keeps what it saw of the loaded version from one group to the next."""
+    """Checks groups of rules. Evidence about the loaded version is kept from one group to the next."""
 
     def __init__(self, waits: Callable[[], bool]) -> None:
         """
         Args:
-            waits: whether a request waits, which ends the check.
+            waits: returns whether a request is waiting, which ends the check.
         """
         self._waits = waits
         self._checkup: Checkup | None = None
@@ -45,11 +45,11 @@ class WorkerChecks:
     ) -> CheckedGroup | StepProfile:
         """
         Args:
-            options: with which the task was loaded.
+            options: the options with which the task was loaded.
 
         Raises:
-            CannotAnswer: a request came, or a step of this task cannot be timed.
-            TaskError: it raised while a step was timed.
+            CannotAnswer: another request came.
+            TaskError: the task raised while a step was timed.
         """
         from workbench.checks.evidence.checkup import CheckEnded
         from workbench.checks.evidence.time_step import profile_step
@@ -101,7 +101,7 @@ class WorkerChecks:
             begin("")
             tell("", check_gpu_rules(checkup, degrees))
             tell("", gpu_results(findings_of(checkup), checkup.silenced, degrees))
-            self.close()  # the memory is wanted elsewhere
+            self.close()  # the last group: free the envs' memory
         following = question.group + 1
         return CheckedGroup(len(groups), total, groups[following].name if following < len(groups) else "")
 

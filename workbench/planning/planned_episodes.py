@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PlannedEpisode:
-    """T control steps of one env, from a reset on. A plan that is used for several steps counts at each of them."""
+    """T control steps of one env, from a reset on. The values of a plan that is used for several steps are
+    repeated at each of them."""
 
     seed: int
     horizon: int

@@ -29,8 +29,8 @@ class Planner:
             obs, reward, terminated, truncated, info = env.step(planner.actions())
         planner.close()
 
-    The same seeds, options and actions in between give the same actions to the last bit. The env itself is only read, and
-    the state of the process's random generators is preserved.
+    The same seeds, options and earlier actions of the env give the same actions to the last bit. The env
+    itself is only read, and the state of the process's random generators is preserved.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Planner:
         """Number of actions of each plan that were returned already."""
 
     def reset(self, env_idx: Sequence[int] | int | None = None, seed: int | None = None) -> None:
-        """Begin an episode of these envs, or of all: forget their plans.
+        """Begin an episode in these envs (None for all): their old plans are dropped.
 
         Args:
             seed: seed of the candidates in each of these envs; None for the seed of each env's episode.

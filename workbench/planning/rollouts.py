@@ -25,7 +25,7 @@ from workbench.planning.options import PlanOptions
 from workbench.planning.sampling import Sampler
 
 _ABSOLUTE_NOISE_FACTOR = 0.2
-"""Factor on the noise for absolute joint positions: they range over the whole joint, which no plan crosses."""
+"""Factor on the noise for absolute joint positions: no plan crosses the whole range of a joint."""
 _PLANNED_MODE = "pd_ee_delta_pose"
 _NOT_FOR_ROLLOUTS = ("num_envs", "obs_mode", "render_mode", "render_backend", "sim_backend")
 """Arguments of the live env that its rollouts replace: rollouts need no pictures and no observations."""
@@ -36,14 +36,14 @@ class NotAlike(ValueError):
 
 
 class NothingToPlan(ValueError):
-    """The task has no actions, or no reward by which one is better than another."""
+    """The task has no actions, or no reward by which one action is better than another."""
 
 
 def require_plannable(env: BaseEnv) -> None:
     """Raise NothingToPlan if the task cannot be planned; builds nothing."""
     if env.reward_mode == "none":
         raise NothingToPlan(
-            "the task has no reward, and actions are planned by the reward: there is nothing to plan"
+            "there is nothing to plan: the task has no reward, and actions are planned by the reward"
         )
     if not actions.action_parts(env):
         raise NothingToPlan("there is nothing to plan: the task has no robot with a controller")
@@ -60,14 +60,14 @@ class Plan:
     terms: Mapping[str, NDArray[np.float32]]
     """(K,) sums of ``info["reward_terms"]`` over each rollout, by name; empty if the task has none."""
     success_at: NDArray[np.int32]
-    """(K,) step at which each rollout succeeded, counted from 1; 0 if it did not."""
+    """(K,) step at which each rollout succeeded, counted from 1; 0 without success."""
     seconds: float
     paths: NDArray[np.float32] | None = None
     """(K, H + 1, 3) path of the traced body in each rollout, metres in the env's frame."""
 
     @property
     def returns(self) -> NDArray[np.float32]:
-        """(K,) return of each rollout; NaN or infinite if one of its rewards was."""
+        """(K,) return of each rollout; NaN or infinite if one of its rewards is."""
         return self.rewards.sum(1)
 
     @property
@@ -78,10 +78,11 @@ class Plan:
 
 
 def control_mode_to_plan(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, str]:
-    """Keyword argument of the control mode that is planned fastest; empty if `env` has it, if a mode is `given`, or if there
-    is no choice.
+    """Keyword argument of the control mode in which plans are found fastest; empty if `env` uses it already,
+    if `given` names a mode, or if the robot lacks it.
 
-    For a task about bodies, each of the six dimensions of a hand motion has a direct effect; single joints have not.
+    In a task about bodies, each of the six dimensions of a hand motion has a direct effect; a single joint
+    has none.
     """
     modes = getattr(env.agent, "supported_control_modes", ())
     if (
@@ -178,7 +179,7 @@ class RolloutPlanner:
         """Check that the rollouts' envs have the same bodies as this env of the live batch. The result is cached.
 
         Raises:
-            NotAlike: they have not, such as in a randomly built scene; the message names a body.
+            NotAlike: the bodies differ, as in a randomly built scene; the message names them.
         """
         scene, known = self._alike
         if scene is not live.scene:

@@ -25,9 +25,9 @@ class SolvedSeed:
     seconds: float
     """Wall time of all plans of the seed."""
     in_the_way: str
-    """Why it was not solved; empty if it was."""
+    """Why the seed was not solved; empty if it was solved."""
     path: Path
-    """Path of its recording."""
+    """Path of the recording."""
     cut_off: bool = False
     """Whether the seed ended at its wall time limit."""
 
@@ -42,7 +42,7 @@ class SolveReport:
     seconds: float
     """Wall time, including the opening of the task."""
     stopped: bool
-    """Whether it was stopped before all seeds were tried."""
+    """Whether the job was stopped before all seeds were tried."""
     wanted: int
     """Number of requested seeds."""
 
@@ -68,7 +68,8 @@ class SolveReport:
 
     @property
     def summary(self) -> str:
-        """``Solved 14 of 16 seeds, in 9 control steps (median). 61 s.``; ``3 of 16 seeds are done, 2 of them solved ...``."""
+        """``Solved 14 of 16 seeds, in 9 control steps (median). 61 s.``; ``3 of 16 seeds are done, 2 solved
+        ...``."""
         done, solved = len(self.seeds), len(self.solved)
         steps = "" if self.median_steps is None else f", in {self.median_steps:g} control steps (median)"
         what = f"Solved {solved} of {_seeds(done)}"
@@ -86,7 +87,7 @@ class SolveReport:
             found.append(few_seeds_text(self.wanted))
         if cut := sum(one.cut_off and not one.solved_at for one in self.seeds):
             found.append(
-                f"{_seeds(cut)} reached the wall time limit: on another machine, or in another run, others "
+                f"{_seeds(cut)} reached the wall time limit: on another machine, or in another run, other seeds "
                 "may be solved."
             )
         return tuple(found)

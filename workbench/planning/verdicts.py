@@ -53,7 +53,7 @@ class PlannedEpisodes:
 
     @property
     def at_success(self) -> float | None:
-        """Median reward of the step that succeeds; None if no episode does."""
+        """Median reward of the steps at which the episodes succeed; None if none succeeds."""
         rewards = [one.reward[one.solved_at - 1] for one in self.solved]
         return float(np.median(rewards)) if rewards else None
 
@@ -73,13 +73,13 @@ class PlannedEpisodes:
 
 
 def of_episodes(episodes: Sequence[PlannedEpisode]) -> list[RewardVerdict]:
-    """The verdicts on a task's reward, each at most once."""
+    """The verdicts on a task's reward, at most one for each rule."""
     every = PlannedEpisodes(tuple(episodes))
     return [verdict for find in RULES.values() if (verdict := find(every)) is not None]
 
 
 def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> str:
-    """Why an episode was not solved, in a few words; empty if it was."""
+    """Why an episode was not solved, in a few words; empty if it was solved."""
     if episode.solved_at:
         return ""
     if episode.failed_at:
@@ -107,13 +107,13 @@ def exploited(episodes: PlannedEpisodes) -> RewardVerdict | None:
     found = [one for one in episodes.unsolved if _earns_like_success(episodes, one)]
     if not found:
         return None
-    told = ", ".join(f"{name} {value:.4g}" for name, value in found[0].evaluate.items())
-    said = f"; evaluate at the end of seed {found[0].seed}: {told}" if told else ""
+    entries = ", ".join(f"{name} {value:.4g}" for name, value in found[0].evaluate.items())
+    at_end = f"; evaluate at the end of seed {found[0].seed}: {entries}" if entries else ""
     rate = float(np.median([_end(one).mean() for one in found]))
     return RewardVerdict(
         "reward-exploited",
         f"{len(found)} of {len(episodes.all)} episodes earned {rate:.3f} a step at their end without success, and successful "
-        f"ones {episodes.at_success:.3f} at success{said}",
+        f"ones {episodes.at_success:.3f} at success{at_end}",
         _seeds(found),
     )
 
@@ -152,7 +152,7 @@ def stuck(episodes: PlannedEpisodes) -> RewardVerdict | None:
         one
         for one in episodes.unsolved
         if not _ended_early(one)
-        and "success" in one.evaluate  # without success, the best episode stays where it is
+        and "success" in one.evaluate  # in a task without success, the best episode stays where it is
         and not _earns_like_success(episodes, one)
         and not _is_flat(episodes, one)
         and _is_stuck(episodes, one)
@@ -200,8 +200,8 @@ def lost(episodes: PlannedEpisodes) -> RewardVerdict | None:
     again = int(first.success[first.solved_at - 1 :].argmin())
     return RewardVerdict(
         "success-lost",
-        f"success comes and goes in {len(found)} of {len(episodes.solved)} solved episodes: seed {first.seed} had it at step "
-        f"{first.solved_at} and not {again} {'step' if again == 1 else 'steps'} later, while maximizing the reward",
+        f"success is lost in {len(found)} of {len(episodes.solved)} solved episodes: seed {first.seed} succeeded at step "
+        f"{first.solved_at} and lost success {again} {'step' if again == 1 else 'steps'} later, while maximizing the reward",
         _seeds(found),
     )
 
@@ -215,7 +215,7 @@ def failing_pays(episodes: PlannedEpisodes) -> RewardVerdict | None:
     return RewardVerdict(
         "failing-pays",
         f"{len(found)} of {len(episodes.all)} episodes end by failing, and rewards are below 0: seed {first.seed} failed at "
-        f"step {first.failed_at}, with {first.reward.mean():.3f} a step until then. Steps after a fail earn nothing, so that the "
+        f"step {first.failed_at}, with {first.reward.mean():.3f} a step until then. Steps after a fail earn nothing, so the "
         "earliest fail earns most",
         _seeds(found),
     )

@@ -67,6 +67,6 @@ class FollowBody(Command, frozen=True):
 
 
 class LookAtRollout(Command, frozen=True):
-    """Show a rollout of the last plan: 1 is the best drawn one, the last number the worst."""
+    """Show a rollout of the last plan: 1 is the best of those drawn, the last number the worst."""
 
     number: Annotated[int, msgspec.Meta(ge=1)]

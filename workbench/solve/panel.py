@@ -51,12 +51,12 @@ THIS_ENV, ALL_ENVS = "the selected env", "all envs, in turn"
 PLANNED_ENVS = {THIS_ENV: "selected", ALL_ENVS: "all"}
 METHODS = {"MPPI": "mppi", "predictive sampling": "predictive", "CEM": "cem"}
 SOLVE_NOW = "Solve the selected env"
-SOLVE_HINT = "Choose the source of actions solve: planned by rollouts of the task with its own reward"
+SOLVE_HINT = "Choose solve as the source of actions: they are planned by rollouts with the task's own reward"
 SAVE_SOLVED = "Save the solved episode"
 TOOL = "the robot's tool"
 BETTER_MODE = "pd_ee_delta_pose"
 USE_MODE = "Plan in end-effector control (resets the envs)"
-USE_MODE_HINT = "Rebuilds the envs with this control mode, in which plans are found soonest"
+USE_MODE_HINT = "Rebuilds the envs with the control mode pd_ee_delta_pose, in which plans are found fastest"
 MAX_NAMED_ENVS = 4
 """Maximum number of newly solved envs that are named."""
 CHART_HEIGHT_PIXELS = 150
@@ -64,7 +64,7 @@ PREDICTED, ACHIEVED = "#228be6", "#f08c00"
 
 
 class SolvePanel(PagePart[SessionView]):
-    """The folder; while the source of actions is another one, a button that chooses *solve*.
+    """The folder, shown while the source of actions is *solve*; else a button that chooses this source.
 
     Args:
         server: The page.
@@ -105,7 +105,7 @@ class SolvePanel(PagePart[SessionView]):
             "envs",
             PLANNED_ENVS,
             "selected",
-            hint="The others hold still.",
+            hint="Envs that are not planned for hold still.",
         )
         self._method = choice(
             server,
@@ -114,7 +114,7 @@ class SolvePanel(PagePart[SessionView]):
             "method",
             METHODS,
             "mppi",
-            hint="What becomes the plan. MPPI: the mean of all rollouts, weighted by what they earned. Predictive "
+            hint="How rollouts become the plan. MPPI: the mean of all, weighted by what they earned. Predictive "
             "sampling: the best one. CEM: the mean of the best tenth.",
         )
         self._rollouts = slider(
@@ -123,7 +123,7 @@ class SolvePanel(PagePart[SessionView]):
             SetRollouts,
             "rollouts",
             step=8,
-            hint="Candidates that are tried at a time, each in its env.",
+            hint="Candidates that are tried at a time, each in its own env.",
         )
         self._horizon = slider(
             server,
@@ -281,9 +281,9 @@ class SolvePanel(PagePart[SessionView]):
         steps = np.arange(len(solve.predicted))[there] + solve.begins
         lines = (
             ChartLine("best rollout", solve.predicted[there], PREDICTED),
-            ChartLine("what came", solve.achieved[there], ACHIEVED),
+            ChartLine("achieved", solve.achieved[there], ACHIEVED),
         )
-        self._chart.draw("Reward a step, of the steps that a plan looks ahead", steps, lines)
+        self._chart.draw("Mean reward per step over the horizon of the plan", steps, lines)
 
     def _tell(self, view: SessionView) -> None:
         """Notify every page of newly solved envs, on any tab: this tab may not be open while it plans."""
@@ -292,7 +292,7 @@ class SolvePanel(PagePart[SessionView]):
         self._told = solved
         for env, step in new[:MAX_NAMED_ENVS]:
             several = view.task is not None and view.task.num_envs > 1
-            what = f"Env {env} is solved" if several else "It is solved"
+            what = f"Env {env} is solved" if several else "The episode is solved"
             tell_all(self._server, "Solved", f"{what} at step {step}.", color=None, seconds=8.0)
 
 
@@ -302,7 +302,7 @@ def horizon_seconds(plan: PlanOptions, control_dt: float, has_success: bool = Tr
 
 
 def offers_better_mode(view: SessionView) -> bool:
-    """Whether the robot has the control mode in which plans are found fastest, but another one is in effect."""
+    """Whether the robot has the control mode in which plans are found fastest, but uses another one."""
     if view.task is None or view.task.control_mode == BETTER_MODE:
         return False
     modes = {keyword.name: keyword for keyword in view.task.made.modes}
@@ -317,14 +317,15 @@ def in_words(plan: PlannedEnv, place: int) -> str:
     """
     number = plan.drawn[place]
     which = "The best rollout" if number == 0 else f"Rollout {number + 1} of {len(plan.returns)}"
-    told = f"{which}: return {plan.returns[number]:.4g}"
+    text = f"{which}: return {plan.returns[number]:.4g}"
     if number in (plan.plan, plan.hold):
-        told += ", the last plan carried on" if number == plan.plan else ", which holds still"
-    return told + (f", success at step {plan.success_at[number]}" if plan.success_at[number] else "")
+        text += ", the last plan carried on" if number == plan.plan else ", holding still"
+    return text + (f", success at step {plan.success_at[number]}" if plan.success_at[number] else "")
 
 
 def earned(rows: EnvRows, env: int) -> tuple[str, int] | None:
-    """Return and steps of the env's episode so far, or until its end; None if it was not followed from its start."""
+    """Return and steps of the env's episode so far, or until its end; None if the table lacks the start of
+    the episode."""
     if not rows.followed[env]:
         return None
     steps = rows.steps if rows.end[env] < 0 else rows.end

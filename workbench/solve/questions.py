@@ -1,4 +1,4 @@
-"""Questions to a worker for plans. Only for a worker that does not play: its envs run the rollouts."""
+"""Questions for plans. Only a worker that does not play answers them: its envs run the rollouts."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class PlannedEnv:
     drawn: tuple[int, ...]
     """(P,) indices of the rollouts in `paths`."""
     traced: str
-    """Name of the traced body; empty if the task has none to trace."""
+    """Name of the traced body; empty if the task has no body to trace."""
     seconds: float
 
 
 @dataclass(frozen=True)
 class Planned:
-    """Plans for the envs that were asked for, in their order."""
+    """Plans for the envs of the request, in its order."""
 
     envs: tuple[PlannedEnv, ...]
 

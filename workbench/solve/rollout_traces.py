@@ -22,7 +22,8 @@ LINE_PIXELS = 2.5
 
 
 class RolloutTraces:
-    """The paths of all rollouts as one node of line segments, so that a plan is one message of some kilobytes."""
+    """The paths of all rollouts as one node of line segments, so that a plan is one message of a few
+    kilobytes."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         more = {"thickness": LINE_PIXELS, "thickness_units": "screen"}
@@ -58,15 +59,15 @@ class RolloutTraces:
 def segments(paths: NDArray[np.float32], chosen: int = 0) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Points and colours (S, 2, 3) of the segments, the bright ones last; segments that are not finite are left out."""
     kept = np.unique(np.linspace(0, paths.shape[1] - 1, min(MAX_SEGMENTS + 1, paths.shape[1])).astype(int))
-    ways = paths[:, kept]
-    share = np.linspace(0, 1, len(ways))[:, None]
+    sampled = paths[:, kept]
+    share = np.linspace(0, 1, len(sampled))[:, None]
     colours = np.array(GOOD) * (1 - share) + np.array(BAD) * share
     colours[0] = BEST
-    if 0 < chosen < len(ways):
+    if 0 < chosen < len(sampled):
         colours[chosen] = CHOSEN
-    lines = np.stack([ways[:, :-1], ways[:, 1:]], axis=2)
+    lines = np.stack([sampled[:, :-1], sampled[:, 1:]], axis=2)
     each = np.broadcast_to(colours[:, None, None, :], lines.shape)
-    order = np.argsort([place not in (0, chosen) for place in range(len(ways))], kind="stable")[::-1]
+    order = np.argsort([place not in (0, chosen) for place in range(len(sampled))], kind="stable")[::-1]
     points, shades = lines[order].reshape(-1, 2, 3), each[order].reshape(-1, 2, 3)
     there = np.isfinite(points).all(axis=(1, 2))
     return points[there].astype(np.float32), shades[there].astype(np.uint8)

@@ -51,7 +51,7 @@ class SeedsView:
     why: str = ""
     """Why solving failed, as text."""
     problem: Problem | None = None
-    """Problem of the author's code."""
+    """The error that the author's code raised."""
     chosen: int = MIN_SEEDS
     """Number of seeds that the user chose to solve next."""
 
@@ -85,7 +85,7 @@ class SeedsFailed:
 
 @dataclass(frozen=True)
 class BeginSeeds:
-    """Solve seeds 0 to `seeds` - 1; a running job ends and keeps its results."""
+    """Solve seeds 0 to `seeds` - 1; a running job is stopped."""
 
     task: str
     options: TaskOptions
@@ -136,8 +136,8 @@ def _solve(view: SeedsView, run: Run) -> Change:
     if (load := run.running_load()) is None:
         raise Refused("No task is loaded yet.")
     if not isinstance(load.task, str):
-        # Only the recorded texts of this task were cleared, not the file with its name.
-        why = "this task comes from a recording: open its file to solve it"
+        # Only the recorded texts of this task were allowed to run, not the file that has its name.
+        why = "This task comes from a recording. To solve seeds, open the task's file."
         return _changed(view, state="failed", why=why), [EndSeeds()] if view.state in RUNNING else []
     begun = SeedsView("starting", view.serial + 1, total=view.chosen, chosen=view.chosen)
     return begun, [BeginSeeds(load.task, load.options, view.chosen, run.settings.plan)]
@@ -204,8 +204,8 @@ class SeedsJobs:
             return
         work = Work(_run, setup, SolveReport, SeedsTold, "that solves")
 
-        def tell(news: SeedsTold) -> None:
-            post(lambda: job.stopped or self._happen(news))
+        def tell(update: SeedsTold) -> None:
+            post(lambda: job.stopped or self._happen(update))
 
         deal: Scheduler[SolveReport, SeedsTold] = Scheduler(
             range(1), lambda number, report: tell(SeedsTold(report=report)), tell, lambda: job.stopped

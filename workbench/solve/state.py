@@ -61,7 +61,7 @@ class SolveView:
     why: str = ""
     """Why there is no plan, as text."""
     problem: Problem | None = None
-    """Problem of the author's code in a rollout."""
+    """The error that the author's code raised in a rollout."""
     plan: PlannedEnv | None = None
     """The last plan of the env."""
     plan_step: int = 0
@@ -69,7 +69,8 @@ class SolveView:
     predicted: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
     """(T,) predicted reward per step of the best rollout, from each step of the episode on; NaN where nothing was planned."""
     achieved: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
-    """(T,) achieved reward per step over the horizon from each step on, if that horizon has passed."""
+    """(T,) mean achieved reward per step over the horizon from each step on, or over the steps so far; NaN
+    for steps to come."""
     begins: int = 0
     """Control step of the episode at which `predicted` and `achieved` begin."""
     solved_at: int = 0
@@ -162,7 +163,7 @@ class PlanFailed:
 
 @dataclass(frozen=True)
 class BeginPlan:
-    """Plan in place of the wish before."""
+    """Plan for this request; a running job is stopped."""
 
     wanted: PlanWanted
     load: Load
@@ -207,7 +208,7 @@ def apply(solving: Solving, event: object, run: Run) -> Change:
             return solving, [_set(solve_all=chosen == "all")]
         case Asked(command=FollowBody(body=body)):
             if body and body not in movable_bodies(run.task):
-                raise Refused("There is no such body that moves.")
+                raise Refused("There is no movable body of this name.")
             return solving, [_set(traced=body)]
         case Asked(command=command) if isinstance(command, _NEW_PLAN):
             plan = replace(run.settings.plan, **msgspec.structs.asdict(command))

@@ -44,7 +44,7 @@ MAX_PATHS = 24
 
 
 class FollowedPlan:
-    """Planned actions in the worker that plays. The worker continues its loop until a plan comes."""
+    """Planned actions in the worker that plays. While it waits for a plan, the worker continues its loop."""
 
     def __init__(self, send: Callable[[PlanWanted | PlanDropped], None]) -> None:
         """
@@ -56,7 +56,7 @@ class FollowedPlan:
         self._told = False
         """Whether the server has a request for a plan that was not dropped."""
         self._at = -1
-        """Number of the moment for which the next of `_actions` is."""
+        """`Stepped.number` of the moment for which the first of `_actions` is."""
         self._actions: deque[NDArray[np.float32]] = deque()
         self._env_idx: tuple[int, ...] = ()
 
@@ -81,7 +81,7 @@ class FollowedPlan:
         return False
 
     def take(self, plan: FollowPlan) -> None:
-        """Take a plan that arrived."""
+        """Use a plan that arrived, unless another one has been requested since."""
         if plan.number == self._asked:
             self._at, self._env_idx, self._actions = plan.number, plan.env_idx, deque(plan.actions)
 
@@ -90,23 +90,25 @@ class FollowedPlan:
         action = actions.hold_action(task.parts, task.num_envs)
         planned = self._actions.popleft()
         self._at, self._asked = moment + 1, None
-        # Between two versions a plan of the old one may arrive for a robot with other joints.
+        # Just after a reload, a plan of the old version may arrive, for a robot with other joints.
         if planned.shape[1] == action.shape[1] and max(self._env_idx, default=-1) < len(action):
             action[list(self._env_idx)] = planned
         return action
 
     def forget(self) -> None:
-        """Drop plans, also a pending one, because something else moves the envs now."""
+        """Drop plans, also a requested one, because something else moves the envs now."""
         self._asked = None
         self._actions.clear()
         if self._told:
-            # Tell the server: it may get the request after it has sent the pause, and would plan in vain.
+            # Tell the server: it may get the request for a plan after it has sent the pause, and would plan
+            # in vain.
             self._told = False
             self._send(PlanDropped())
 
 
 def envs_to_plan(settings: Settings, task: TaskEnv, last: StepResult) -> list[int]:
-    """Envs to plan for: those that have not succeeded, or all if every one has."""
+    """Envs to plan for: the selected one, or with `solve_all` those that have not succeeded (all if every one
+    has)."""
     if not settings.solve_all:
         return [min(settings.selected_env, task.num_envs - 1)]
     done = succeeded(last)
@@ -124,9 +126,10 @@ def _wanted(opened: OpenedTask, moment: int, envs: tuple[int, ...]) -> PlanWante
     try:
         snapshot = pickle.dumps(opened.env.snapshot(list(envs)))
     except Exception as error:
-        # A task may hold any object: as for the history (`step_events`), that must not stop it.
+        # A task may keep an object that cannot be copied. As for the history (`step_events`), that must not
+        # stop it.
         return PlanWanted(
-            moment, envs, why_not=f"its state cannot be copied: {type(error).__name__}: {error}"
+            moment, envs, why_not=f"the task's state cannot be copied: {type(error).__name__}: {error}"
         )
     bodies = bodies_of(opened.env.env)
     return PlanWanted(moment, envs, snapshot, tuple(bodies[env] for env in envs))
@@ -135,8 +138,8 @@ def _wanted(opened: OpenedTask, moment: int, envs: tuple[int, ...]) -> PlanWante
 class WorkerPlans:
     """Makes plans with its own rollout envs, which are built at the first request.
 
-    An env's plan continues the last one while its episode continues; for a snapshot that does not follow from the last
-    plan, a new plan begins.
+    A plan continues the env's last plan if the snapshot is of the same episode, at the step where that plan
+    ended; else a new plan begins.
     """
 
     def __init__(self, waits: Callable[[], bool]) -> None:
@@ -192,7 +195,7 @@ class WorkerPlans:
         return Planned(tuple(planned))
 
     def loaded(self, opened: OpenedTask, level: ReloadLevel | None) -> None:
-        """Handle that another version of the task runs in this process."""
+        """Handle a load in this process: keep the rollouts' envs if the scene is kept, else close them."""
         if self._rolled is not None and level in SCENE_KEPT:
             put_class(self._rolled.env, opened.loaded.cls)
         else:

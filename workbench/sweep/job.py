@@ -132,8 +132,8 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
     """The recording of each point, with the modified text of the task's file. Does not run the file.
 
     Raises:
-        SettingError: a name is neither a constant of the file nor an argument of the constructor, or a value has another
-            type.
+        SettingError: a name is neither a constant of the file nor an argument of the constructor, or a value
+            has the wrong type.
         FileNotFoundError, ValueError: the request is invalid for another reason.
         OSError: the file cannot be read.
     """
@@ -146,7 +146,7 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
         try:
             text = TaskText(file, read_source(file), _class_name(what.task))
         except SyntaxError as error:
-            raise SettingError(f"{file} is not text: {error}") from error
+            raise SettingError(f"{file} cannot be read as text: {error}") from error
     elif (spec := registry.environment(what.task)) is not None:
         arguments = class_arguments(spec.cls)
     found = {one.name: _found(text, arguments, what.task, one.name) for one in what.settings}
@@ -183,7 +183,7 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
 
 
 def _own_file(task: str) -> Path | None:
-    """The task's file, if it is the author's."""
+    """The task's file; None if it is not the author's own."""
     if registry.environment(task) is not None:
         return None
     if (named := split_reference(task)) is not None:
@@ -206,7 +206,7 @@ def _found(
         # An id that a module of --import registers: its arguments are known only after running the module.
         return Argument(name)
     close = difflib.get_close_matches(name, arguments, n=3)
-    hint = f"did you mean {' or '.join(close)}?" if close else f"it has {', '.join(arguments)}"
+    hint = f"did you mean {' or '.join(close)}?" if close else f"it has {', '.join(arguments)}."
     raise SettingError(
         f"{task} has no constructor argument {name}; {hint} Its constants can be set in a copy of its file: "
         f"workbench new NAME --from {task}"
@@ -242,7 +242,7 @@ def sweep(
 
 
 def collect_sweep(what: SweepOptions, known: Mapping[int, Written | None]) -> SweepReport:
-    """Combine the results of these episodes to the report of a sweep. Runs nothing."""
+    """Combine the results of these episodes into the report of a sweep. Runs nothing."""
     collected = _Sweep(what, lambda _: None, lambda _: None, lambda: False, lambda _: None, lambda _: None)
     collected.scheduler.go_on(known, lambda number, written: None)
     return collected.report(stopped=False)

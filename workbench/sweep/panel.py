@@ -55,11 +55,12 @@ class Axis:
     heights: tuple[float | None, ...]
     """Height of each point in pixels; None for a point without a value."""
     ticks: tuple[tuple[str, float, str], ...]
-    """Label and height of each tick, and the JSON of a set value."""
+    """Label and height in pixels of each tick, and the JSON of the setting's value; empty JSON on other
+    axes."""
 
 
 def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Axis]:
-    """The set values, the success rate, the return and as many terms as there is room for."""
+    """One axis for each setting, then the success rate, the return and as many terms as there is room for."""
     places: list[tuple[str, Any]] = []
     for name in results.names:
         texts = sorted({one.values[name] for one in summaries}, key=_in_order)
@@ -141,7 +142,8 @@ def _short_number(value: float) -> str:
 
 
 def best_first(rows: Sequence[SweepEpisode]) -> list[SweepEpisode]:
-    """Sort episodes: successes first, then by earlier success, then by higher return."""
+    """Episodes in order: successes first, then by earlier success, then by higher return. Failed ones are
+    left out."""
 
     def goodness(row: SweepEpisode) -> tuple[bool, float, float]:
         solved = math.inf if row.solved_at is None else row.solved_at
@@ -158,7 +160,8 @@ class Shown:
     column: str = "success"
     descending: bool = True
     chosen: int | None = None
-    """Index of the chosen point. While it is None, the point of the open episode is shown, else the best one."""
+    """Index of the chosen point. If None, the point of the open episode is shown; without one, the best
+    point."""
     only: frozenset[tuple[str, str]] = frozenset()
     """Shown values by setting; a setting that is missing here shows all values."""
     pages: Paged = field(default_factory=lambda: Paged(PAGE_ROWS))
@@ -340,8 +343,8 @@ def _note_html(read: LoadedSweep) -> str:
 def _shown_point(
     read: LoadedSweep, shown: Shown, view: ReviewView, library: Sequence[LibraryRow]
 ) -> PointSummary | None:
-    """The point whose episodes are listed: the chosen one, else that of the open episode, else the best one. If that is
-    filtered out, the best remaining one."""
+    """The point whose episodes are listed: the chosen one, else that of the open episode, else the best one.
+    If that one is filtered out, the best remaining one."""
     by_index: dict[int | None, PointSummary] = {one.index: one for one in read.summaries}
     opened = {one.id for one in view.opened}
     paths = (str(path) for row in library if row.id in opened for path in row.paths)

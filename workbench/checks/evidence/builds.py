@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from workbench.envs.broken_rule import Place
 
 _BUILDERS = ("mani_skill.utils.building", "sapien.", "workbench.")
-"""Modules whose lines build for their caller."""
+"""Modules that build on behalf of their caller."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Built:
     kind: str
     """``dynamic``, ``kinematic``, ``static`` or ``articulation``"""
     of_robot: bool
-    """Made by an agent class."""
+    """Whether an agent class built it."""
     quaternion: NDArray[np.float32] | None
     """(M, 4) of the initial pose, wxyz; None if the builder was given none."""
     envs: tuple[int, ...]
@@ -144,7 +144,8 @@ def _replaced(owner: type, name: str, by: Callable[[Any], Any]) -> Iterator[None
 
 
 def author_place(files: Collection[str]) -> Place | None:
-    """The author's line that runs now; None if other code, such as a scene builder or a robot, builds."""
+    """The author's line that called the builder or setter; None if other code did, such as a scene builder or
+    a robot."""
     frame = sys._getframe(1)
     while frame is not None:
         code = frame.f_code

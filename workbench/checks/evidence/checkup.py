@@ -52,11 +52,11 @@ ROLLOUT_STEPS = 50
 STILL_SECONDS = 1.0
 """Simulated seconds for which the robot holds still."""
 PICTURED_ENVS = 2
-"""Number of envs that observe pictures: a reset renders all of their cameras."""
+"""Number of envs that observe pictures; small because a reset renders all of their cameras."""
 FIRST_BUILT_SEED = 2022
 """Seed with which BaseEnv's constructor builds env 0; env i has this seed plus i."""
 SEEDS_ALONE = 2
-"""Number of seeds for which one env is built."""
+"""Number of seeds for which a single env is built."""
 MAX_LEAF_NUMBERS = 4096
 """Maximum numbers per env of a leaf of the observation; larger leaves are pictures."""
 
@@ -81,13 +81,13 @@ class Note:
 
 
 Check = Callable[["Checkup"], Iterator[Found | Note]]
-"""Gives the breaches of one rule. Without one the rule is kept, unless the check raises NotApplicable or NotKnown, which it may
-do at the end too."""
+"""Yields the breaches of one rule. If there are none, the rule is kept, unless the check raises NotApplicable
+or NotKnown, at its start or at its end."""
 _Value = TypeVar("_Value")
 
 
 class NotApplicable(Exception):
-    """The rule says nothing about this task. The text is the reason, such as "it has no reward"."""
+    """The rule says nothing about this task. The text is the reason, such as "the task has no reward"."""
 
 
 class NotKnown(Exception):
@@ -135,8 +135,8 @@ class Alone:
 class Checkup:
     """One version of a task under check. The caller closes it.
 
-    Every method that calls the author's code raises `TaskError` with the author's line. If `num_envs` is 1, all envs of the
-    checkup are single.
+    Every method that calls the author's code raises `TaskError` with the author's line. If `num_envs` is 1,
+    the checkup makes no batch of several envs.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class Checkup:
 
     def close(self) -> None:
         while self._open:
-            # What closing raises is no result: all results are known.
+            # An error while closing changes no result: all results are known.
             with suppress(TaskError):
                 self._close(self._open.pop())
         self._looked.clear()
@@ -190,7 +190,8 @@ class Checkup:
                 self.__dict__.pop(name, None)
 
     def go_on_with_one_env(self) -> None:
-        """Forget all evidence from several envs except breaches: the task uses something that exists for one env only."""
+        """Continue with one env, for a task that uses something that exists for one env only. All evidence
+        from several envs is forgotten, except breaches of the rules of GPU simulation."""
         self._silenced_before = self.silenced
         self.close()
         self.num_envs, self._rules = 1, None
@@ -214,20 +215,20 @@ class Checkup:
     def require_several(self) -> None:
         """Raise NotKnown if there is one env only."""
         if self.num_envs == 1:
-            raise NotKnown("it needs several envs, and one was looked at")
+            raise NotKnown("the rule needs several envs, and one was checked")
 
     def require_source(self) -> None:
         """Raise NotKnown for a class without a file: from a notebook, or shipped as bytecode."""
         if not self.places.modules:
-            raise NotKnown("its source is not known")
+            raise NotKnown("the source of the task is not known")
 
     def require_task(self) -> None:
         """Raise NotApplicable for a robot that is shown in a scene of ManiSkill: the author wrote no task."""
         if self.loaded.robot is not None:
-            raise NotApplicable("it is a robot in a scene of ManiSkill's")
+            raise NotApplicable("the class is a robot in one of ManiSkill's scenes, not a task")
 
     def at_most(self, wanted: int) -> int:
-        """Number of envs to make if `wanted` are wanted: 1 if the checkup has one env."""
+        """Number of envs to make: `wanted`, or 1 if the checkup has one env."""
         return wanted if self.num_envs > 1 else 1
 
     @contextmanager
@@ -237,7 +238,8 @@ class Checkup:
         """Context with another env of the task.
 
         Args:
-            render: whether to make a renderer; one is made anyway if the task needs it to be built.
+            render: whether to make a renderer. It is made in any case if the task cannot be built without
+                one.
             kwargs: keyword arguments of the task class, which replace those of `env_kwargs`.
         """
         task = self._made(num_envs or self.num_envs, render or self._needs_renderer, rules, kwargs)
@@ -255,11 +257,12 @@ class Checkup:
 
     @evidence
     def task(self) -> TaskEnv:
-        """`num_envs` envs, which check the rules of GPU simulation, without a renderer unless the task needs one to be
-        built. Reset it before use."""
+        """`num_envs` envs that check the rules of GPU simulation. They have a renderer only if the task
+        cannot be built without one. Reset them before use."""
         with noting_builds(self.builds, self.merges, self.files):
             made = self._without_renderer()
-            # Outside of any `except`: an error without a renderer is no cause of an error with one.
+            # Outside of any `except`, or a traceback would name the error without a renderer as the cause of
+            # one with it.
             if made is None:
                 for noted in (self.findings, self.builds, self.merges):
                     noted.clear()
@@ -296,14 +299,15 @@ class Checkup:
 
     @property
     def _may_render(self) -> bool:
-        """Whether a failed build can be tried again with a renderer: an argument may name a renderer, or none."""
+        """Whether a failed build can be tried again with a renderer: one is found, and no argument chooses
+        it."""
         return self._render_backend == "found" and find_renderer() is not None
 
     @property
     def _why_no_renderer(self) -> str:
         if self._render_backend == "none":
-            return "built with render_backend=none: leave that out if the task needs a renderer"
-        return "built without a renderer: there is nothing to render with here, see `workbench doctor`"
+            return "built with render_backend=none: leave this argument out if the task needs a renderer"
+        return "built without a renderer: none was found on this machine, see `workbench doctor`"
 
     @property
     def _render_backend(self) -> Any:
@@ -317,17 +321,17 @@ class Checkup:
         """`PICTURED_ENVS` envs that observe pictures. Reset them before use.
 
         Raises:
-            NotApplicable: the task has no such observations.
-            NotKnown: there is nothing to render with.
+            NotApplicable: the task has no observation mode with pictures.
+            NotKnown: there is no renderer.
         """
         modes = self.loaded.cls.SUPPORTED_OBS_MODES
         wanted = [m for m in ("rgb", "rgbd", "depth") if m in modes or "any_textures" in modes]
         if not wanted:
-            raise NotApplicable("it has no observations with pictures")
+            raise NotApplicable("the task has no observation mode with pictures")
         if self._render_backend == "none":
-            raise NotKnown("it is made without a renderer (render_backend=none)")
+            raise NotKnown("the task is made without a renderer (render_backend=none)")
         if find_renderer() is None:
-            raise NotKnown("there is nothing to render with here, see `workbench doctor`")
+            raise NotKnown("no renderer was found on this machine, see `workbench doctor`")
         began = time.monotonic()
         made = self._made(self.at_most(PICTURED_ENVS), True, "off", {"obs_mode": wanted[0]})
         self._open.append(made)
@@ -335,7 +339,8 @@ class Checkup:
         return made
 
     def look(self, see: Callable[[Checkup], _Value]) -> _Value:
-        """The value of `see`, computed once: evidence that a module of rules defines. If it raises, it raises the same error again."""
+        """The value of `see`, which is evidence that a module of rules defines. It is computed once; if `see`
+        raised, the same error is raised again."""
         if see not in self._looked:
             self._looked[see] = self._once(see)
         return self._looked[see]
@@ -353,8 +358,8 @@ class Checkup:
                 default_kwargs=self.loaded.default_kwargs,
             )
             if isinstance(env, BatchedCpuMixin):
-                # Otherwise earlier episodes change the last bits of the physics, and a touch sensor reads the contacts of the
-                # last episode.
+                # Without this, earlier episodes change the last bits of the physics, and a touch sensor reads
+                # the contacts of the last episode.
                 env.begins_anew = True
             return TaskEnv(env, self.loaded.max_episode_steps, check=returns_check(self.loaded, num_envs))
 
@@ -397,7 +402,8 @@ class Checkup:
         held: dict[int, NDArray[np.float32]] = {}
 
         def hold(task: TaskEnv, step: int) -> NDArray[np.float32]:
-            # The action that holds the pose of the reset: one for the present pose would follow a robot that sags.
+            # Computed once, for the pose of the reset: an action for the current pose would follow a robot
+            # that sags.
             if step == 0:
                 held[0] = actions.hold_action(task.parts, task.num_envs)
             return held[0]
@@ -569,7 +575,8 @@ class _FromSeeds:
 
 
 def put_where_built(task: TaskEnv) -> None:
-    """Put all bodies where their builders put them, with joints at zero, as the GPU simulation begins."""
+    """Put all bodies where their builders put them, with joints at zero, as at the start of a GPU
+    simulation."""
     scene: Any = task.env.scene
     for actor in scene.actors.values():
         if actor.px_body_type != "static":
@@ -586,7 +593,7 @@ def read_obs(task: TaskEnv) -> dict[str, NDArray[np.float64]]:
 
 
 def leaf_rows(value: Any, num_envs: int) -> dict[str, NDArray[np.float64]]:
-    """(N, D) of each leaf that has a row for each env and is no picture."""
+    """(N, D) values by name, of each leaf that has a row for each env and is not a picture."""
     read: dict[str, NDArray[np.float64]] = {}
     for name, leaf in flat_entries(value):
         if not isinstance(leaf, torch.Tensor) or leaf.ndim == 0 or len(leaf) != num_envs:

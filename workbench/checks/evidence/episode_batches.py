@@ -60,7 +60,7 @@ class SeenOutlier:
     reason: str
     """Text as in `Outlier.reason`."""
     body: str
-    """Name of the body, as in `SceneIndex.names`; empty for an outlier that is no body."""
+    """Name of the body, as in `SceneIndex.names`; empty if the outlier is not of a body."""
 
 
 @dataclass

@@ -15,7 +15,7 @@ _RAYS = 162
 """Number of directions in which walls are looked for."""
 _MAX_TRIANGLES = 50_000
 _MIN_WALL_SHARE, _MIN_OPEN_SHARE = 0.6, 0.03
-"""Minimum shares of the directions from within a hollow mesh with a wall, and without one."""
+"""In a hollow mesh, minimum shares of the rays from inside that meet a wall, and that meet nothing."""
 
 
 def triangles_in(file: str, more_than: int) -> int | None:
@@ -37,7 +37,7 @@ def is_hollow(file: str) -> bool | None:
         return False
     try:
         hull = mesh.convex_hull
-    except Exception:  # qhull: all in one plane
+    except Exception:  # qhull raises if all vertices are in one plane
         return False
     directions = trimesh.creation.icosphere(subdivisions=2).vertices[:_RAYS]
     hits = _crossings(np.asarray(mesh.triangles), np.asarray(hull.center_mass), np.asarray(directions))
@@ -73,6 +73,6 @@ def _crossings(
 def _read(file: str) -> trimesh.Trimesh | None:
     try:
         mesh = trimesh.load(file, force="mesh")
-    except Exception:  # any of a dozen readers; the rule missing-file reports a missing file
+    except Exception:  # from any of a dozen readers; the rule missing-file reports a missing file
         return None
     return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None

@@ -26,7 +26,7 @@ from workbench.task.blame import blamed, returns_check
 BATCHES = 2
 """Number of batches of seeds whose states are changed."""
 MARGIN_METRES = 0.15
-"""Metres around the start of bodies in x and y within which they are placed."""
+"""Bodies are placed within this margin in metres, in x and y, around the box of their start positions."""
 HEIGHT_METRES = 0.3
 """Metres above the start of a body within which it is placed."""
 KINDS = ("right after the reset", "with joints and bodies at random places", "with joints at their limits")
@@ -36,7 +36,8 @@ MAX_GOALS = 4
 AT_GOAL = "with bodies at the place of {}"
 SHORT = "between the reset and a success"
 HALVINGS = 6
-"""Halvings of the way back: the last states are within 1/64 of the way from where success ends."""
+"""Halvings of the way back to the reset. The last states are at most 1/64 of the way from the point where
+success ends."""
 DENSE_HOOKS = {"dense": "compute_dense_reward", "normalized_dense": "compute_normalized_dense_reward"}
 """Hook of each dense reward mode."""
 
@@ -64,7 +65,8 @@ class OddStates:
 
 
 def odd_states(checkup: Checkup) -> OddStates:
-    """Evidence for `Checkup.look`: the first seeds, in each of the `KINDS` and with the bodies at each goal."""
+    """Evidence for `Checkup.look`: results for the first seeds, in each of the `KINDS` of states and with the
+    bodies at each goal."""
     task, rng, seen = checkup.task, np.random.default_rng(0), OddStates()
     for seeds in [*checkup.batches()][:BATCHES]:
         checkup.reset(task, seeds)

@@ -46,10 +46,10 @@ def together(seen: Iterable[Seen], worst: bool = False) -> list[Seen]:
             found[row.names] = row
             continue
         later = row.size > known.size if worst else bool(row.texts) and not known.texts
-        told, other = (row, known) if later else (known, row)
+        main, other = (row, known) if later else (known, row)
         found[row.names] = replace(
-            told,
-            place=told.place or other.place,
+            main,
+            place=main.place or other.place,
             tried=known.tried + row.tried,
             seeds=known.seeds + row.seeds,
             count=known.count + row.count,

@@ -48,7 +48,8 @@ class Module:
 
     @cached_property
     def imports(self) -> dict[str, str]:
-        """Imported names, such as ``np`` to ``numpy`` and ``uniform`` to ``random.uniform``."""
+        """Full name of each imported name, such as ``numpy`` for ``np``, and ``random.uniform`` for
+        ``uniform``."""
         found: dict[str, str] = {}
         for node in ast.walk(self.tree):
             if isinstance(node, ast.Import):
@@ -83,7 +84,8 @@ class Places:
         return self._loaded.source.get(file) or "".join(linecache.getlines(file))
 
     def hook(self, *names: str) -> Place | None:
-        """The ``def`` line of the first of these hooks that the author's files have; else the class."""
+        """The ``def`` line of the first of these hooks that the author's files have; else the
+        ``class`` line."""
         found = hook_definition(self._loaded.cls, names, self._loaded.source_files)
         return self.task if found is None else (*found[1], found[0])
 
@@ -170,8 +172,9 @@ class Places:
 
         Args:
             name: as in `SceneIndex.names`.
-            hooks: the functions that are searched for a line that places the attribute which holds the body. Without one,
-                the line of any function that names the body is taken; else the ``def`` line of a hook.
+            hooks: functions that are searched for a line that sets the pose of the attribute that holds the
+                body. If there is none, the result is the line of any function that names the body; else the
+                ``def`` line of a hook.
         """
         owner = name.split("/", 1)[0]
         attributes = set(self._attributes_of(owner))
@@ -187,7 +190,8 @@ class Places:
         return self.hook(*hooks)
 
     def _attributes_of(self, owner: str) -> Iterator[str]:
-        """Names of ``self.x`` that are assigned in a statement which has the body's name in it, and the name itself."""
+        """The body's name, and the names of attributes that a statement with this name in its value
+        assigns."""
         yield owner
         if any(robot in owner for robot in ("panda", "robot", "agent")):
             yield from ("agent", "robot")

@@ -65,7 +65,8 @@ Draws = Callable[[ast.AST, Module], str | None]
 
 
 def first_draw(places: Places, draws: Draws, *hooks: str) -> tuple[Place, str] | None:
-    """Place and text of the first such call in these hooks and the author's functions that they name."""
+    """Place and text of the first call that `draws` finds in these hooks and in the author's functions that
+    they name."""
     for module, function in places.reached_from(*hooks):
         for node in ast.walk(function):
             if (written := draws(node, module)) is not None:

@@ -43,13 +43,13 @@ _OWN = "own"
 """State of a tensor on the env's device. The state of a tensor that would stay on the host is the `Place` that made it. A
 tensor of unknown origin (``torch.Tensor([1])``) has no state."""
 _HOST = torch.device("cpu", 0)
-"""Value of ``tensor.device`` for a host tensor, so that a tensor made on it is a host tensor too. The env's device has no
-index."""
+"""Value of ``tensor.device`` for a host tensor: a tensor that is made on this device counts as a host tensor
+too. It differs from the env's device by its index, which the env's device lacks."""
 
 
 @dataclass(frozen=True)
 class Mix:
-    """A host tensor and one of the env's device in one operation."""
+    """A host tensor and a tensor on the env's device in one operation."""
 
     made: Place
     """Line that made the host tensor."""
@@ -102,7 +102,7 @@ class TensorWatch(TorchFunctionMode):
             self.uses.steps += 1
 
     def __enter__(self) -> Any:
-        # The only way to make a tensor that passes no TorchFunctionMode.
+        # The only function that makes a tensor without calling a TorchFunctionMode.
         self._from_numpy = torch.from_numpy
         torch.from_numpy = self._made_from_numpy
         return super().__enter__()

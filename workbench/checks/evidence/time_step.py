@@ -31,7 +31,7 @@ NUM_ENVS = 64
 """Number of envs whose steps are timed."""
 _WARM_UP_STEPS = 5
 _REST = "the rest of step"
-"""Name of what `step` takes without hooks and `_PARTS`."""
+"""Name for the time of `step` outside hooks and `_PARTS`."""
 _PARTS = (
     ("scene", "step", "physics"),
     ("agent", "set_action", "controller"),
@@ -44,8 +44,9 @@ _PARTS = (
 def profile_step(checkup: Checkup, num_envs: int | None = None, steps: int = STEPS) -> StepProfile:
     """Time steps with random actions, on separate envs (`NUM_ENVS` by default).
 
-    Hooks are timed in every second step and lines in the others, which a tracer slows: the times of a hook's lines are
-    scaled so that their sum is the time of the hook. Raises TaskError as the steps of a checkup do.
+    Hooks are timed in every second step. Lines are timed in the other steps, which the tracer slows down: so
+    the times of a hook's lines are scaled to add up to the time of the hook. Raises TaskError if the task
+    raises.
     """
     num_envs = num_envs or checkup.at_most(NUM_ENVS)
     with checkup.env(num_envs) as task:
@@ -122,7 +123,7 @@ class _Clock:
         """The function, timed under a name.
 
         Args:
-            traces: whether its lines are timed too: it is the author's.
+            traces: whether the function's lines are timed too; only for the author's functions.
         """
 
         def timed(*args: Any, **kwargs: Any) -> Any:
@@ -139,7 +140,7 @@ class _Clock:
         return timed
 
     def _switch(self, name: str | None) -> None:
-        """Begin a function, or end the one that runs."""
+        """Begin to time a function; None ends the one that runs."""
         now = time.perf_counter()
         if self._running and self._measured and not self._traced:
             self.hooks[self._running[-1]] += now - self._since

@@ -37,9 +37,9 @@ RESETS = 4
 MAX_OBJECTS = 30
 """Maximum number of objects that are looked for: each takes an extra picture."""
 MISSED_SHARE = 0.25
-"""Share of the pictures in which an object may be out of view."""
+"""Maximum share of the pictures in which an object may be out of view."""
 BACKGROUND_SHARE = 0.5
-"""Share of the pixels that may be empty background."""
+"""Maximum share of the pixels that may be empty background."""
 MAX_PIXELS = 512 * 512
 """Maximum number of pixels of a sensor camera."""
 HOOKS: Mapping[CameraKind, str] = {
@@ -82,7 +82,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
             in_view.setdefault(thing.name, []).append(np.where(thing.present, thing.alone > 0, True))
             uncovered.setdefault(thing.name, []).append(np.where(thing.present, thing.pixels > 0, True))
     if not in_view:
-        raise NotApplicable("it has no objects besides the robot and the scenery")
+        raise NotApplicable("the task has no objects besides the robot and the scenery")
     covered: list[str] = []
     found = False
     for name, of_cameras in in_view.items():
@@ -101,12 +101,12 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     env = checkup.pictured.env
     for key, report in reports.items():
         things = report.wanted_objects(None)
-        # With one camera, each object that it misses is a finding already.
+        # A single camera needs no finding of its own: each object that it misses is a finding already.
         one_of_several = len(reports) > 1 and mount_of(env, cameras_of(env)[key]) is None
         if one_of_several and not any((thing.alone > 0).any() for thing in things):
             found = True
             yield Found(
-                f"sensor camera {key[1]!r} has none of the task's objects in any picture after a reset "
+                f"Sensor camera {key[1]!r} has none of the task's objects in any picture after a reset "
                 f"({listed([thing.name for thing in things])}). Aim it at them: `sapien_utils.look_at(eye=..., "
                 "target=...)`, or leave it out.",
                 _place(checkup, key),
@@ -114,7 +114,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     if covered:
         yield Note(f"covered by other things in every picture after a reset: {listed(covered)}")
     if not found and (count := len(_drawn(env))) > MAX_OBJECTS:
-        raise NotKnown(f"{MAX_OBJECTS} of {count} objects were looked for")
+        raise NotKnown(f"only {MAX_OBJECTS} of {count} objects were looked for")
 
 
 @rule("camera-background", "warn", "_default_sensor_configs")
@@ -142,7 +142,7 @@ def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
     env = checkup.pictured.env
     fixed = {key: report for key, report in reports.items() if mount_of(env, cameras_of(env)[key]) is None}
     if not fixed:
-        raise NotApplicable("its sensor cameras are mounted on bodies")
+        raise NotApplicable("all sensor cameras are mounted on bodies")
     for key, report in fixed.items():
         share = float(report.depth.background.mean())
         if share > BACKGROUND_SHARE:
@@ -178,19 +178,19 @@ def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
     return; it renders no picture. It reports a length that differs from 1 by more than 0.001. Cameras of the
     robot are left out.
 
-    The page shows the picture that ManiSkill renders. It writes a unit quaternion, with which the
-    camera looks where the call of `look_at` aims.
+    The page shows the picture that ManiSkill renders. If the page writes the pose to the file, it writes a
+    unit quaternion, with which the camera looks where the call of `look_at` aims.
     """
     configs = checkup.look(hook_configs)
     robots = {config.uid for config in checkup.look(sensor_configs)[1]}
     own = {key: config for key, config in configs.items() if key[0] == "human" or key[1] not in robots}
     if not own:
-        raise NotApplicable("it has no camera of its own")
+        raise NotApplicable("the task has no camera of its own")
     for (kind, _), config in own.items():
         lengths = np.linalg.norm(rows_of_pose(config)[:, 3:], axis=1)
         if np.abs(lengths - 1).max() > UNIT_TOLERANCE:
             yield Found(
-                f"the quaternion of camera {config.uid!r} has length {lengths[0]:.3g}: its picture is turned and zoomed, and "
+                f"The quaternion of camera {config.uid!r} has length {lengths[0]:.3g}: its picture is turned and zoomed, and "
                 "its extrinsics are scaled. Give a unit quaternion; if look_at() looks straight up or down, move the eye "
                 "aside by 0.001 m.",
                 _site(checkup, config, HOOKS[kind]),
@@ -224,14 +224,14 @@ def camera_names(checkup: Checkup) -> Iterator[Found | Note]:
     """
     of_task, of_robot = checkup.look(sensor_configs)
     if not of_task and not of_robot:
-        raise NotApplicable("it has no sensor camera")
+        raise NotApplicable("the task has no sensor camera")
     robots = {config.uid for config in of_robot}
     for name, count in Counter(config.uid for config in of_task).items():
         if count > 1 or name in robots:
             config = [config for config in of_task if config.uid == name][-1]
             other = "the robot has one of that name too" if name in robots else f"{count} have that name"
             yield Found(
-                f"sensor camera {name!r}: {other}, and only the last one is made. Rename it.",
+                f"Sensor camera {name!r}: {other}, and only the last one is made. Rename it.",
                 _site(checkup, config),
             )
 
@@ -261,8 +261,8 @@ def camera_size(checkup: Checkup) -> Iterator[Found | Note]:
         if config.width * config.height > MAX_PIXELS:
             megabytes = config.width * config.height * 16 / 1e6
             yield Found(
-                f"sensor camera {config.uid!r} has {config.width} x {config.height} pixels: its textures take about "
-                f"{megabytes * 4096 / 1000:.0f} GB in 4096 envs. Use 128 x 128, and a human camera for films.",
+                f"Sensor camera {config.uid!r} has {config.width} x {config.height} pixels: its textures take about "
+                f"{megabytes * 4096 / 1000:.0f} GB in 4096 envs. Use 128 x 128, and a human render camera for films.",
                 _site(checkup, config),
             )
 
@@ -297,11 +297,11 @@ def ray_traced(checkup: Checkup) -> Iterator[Found | Note]:
     """
     configs = checkup.look(hook_configs)
     if not configs:
-        raise NotApplicable("it has no camera")
+        raise NotApplicable("the task has no camera")
     for (kind, name), config in configs.items():
         if is_ray_traced(str(config.shader_pack)):
             yield Found(
-                f"camera {name!r} is ray traced (shader_pack {config.shader_pack!r}), which ManiSkill refuses for several "
+                f"Camera {name!r} is ray traced (shader_pack {config.shader_pack!r}), which ManiSkill refuses for several "
                 f"envs on a GPU. {here_without_ray_tracing()} For films, give shader_pack to gym.make of one env in "
                 "human_render_camera_configs.".replace("  ", " "),
                 _site(checkup, config, HOOKS[kind]),
@@ -334,7 +334,7 @@ def sensor_reports(checkup: Checkup) -> dict[CameraKey, CameraReport]:
     task = checkup.pictured
     sensors: list[CameraKey] = [key for key in cameras_of(task.env) if key[0] == "sensor"]
     if not sensors:
-        raise NotApplicable("it has no sensor camera")
+        raise NotApplicable("the task has no sensor camera")
     reports: dict[CameraKey, list[CameraReport]] = {key: [] for key in sensors}
     objects = _objects(task.env)
     for first in range(0, RESETS * task.num_envs, task.num_envs):
@@ -374,7 +374,7 @@ def _own_configs(checkup: Checkup) -> list[Any]:
     """Configs of the task's sensor cameras. Raises NotApplicable without one."""
     of_task, _ = checkup.look(sensor_configs)
     if not of_task:
-        raise NotApplicable("it has no sensor camera of its own")
+        raise NotApplicable("the task has no sensor camera of its own")
     return of_task
 
 

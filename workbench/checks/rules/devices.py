@@ -50,8 +50,8 @@ def foreign_device(checkup: Checkup) -> Iterator[Found | Note]:
         if mix.made[0] != place[0]:
             here = f"in {mix.made[0]}:{mix.made[1]}"
         yield Found(
-            f"a tensor that was made {here} without a device meets one that is on self.device ({mix.operation}). "
-            "On a GPU this raises. Make it with device=self.device, or within `with torch.device(self.device):`.",
+            f"A tensor that was made {here} without a device meets a tensor on self.device ({mix.operation}). On a GPU "
+            "this raises. Make the first one with device=self.device, or within `with torch.device(self.device):`.",
             place,
         )
 
@@ -64,7 +64,7 @@ def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
     The GPU has to stop for each copy, in every step.
 
     ## Why
-    A GPU works behind Python: operations are queued, and Python goes on. `.item()`, `float(tensor)`, `.cpu()`
+    A GPU works asynchronously: Python queues operations and goes on. `.item()`, `float(tensor)`, `.cpu()`
     and `if tensor:` need the number now, so Python waits until the queue is empty, and the GPU then waits for
     Python. One copy for each of 4096 envs makes 4096 stops in every step.
 
@@ -128,9 +128,9 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     The rule reads the source of what the hooks of a step call, and looks for loops and comprehensions over
     `self.num_envs`, `_objs` and `sub_scenes`. It watches a build, a reset and three steps with five envs for
-    iterations over the rows of a tensor. With one env only the source can tell: without a finding the result
-    is *not known*. Loops in a build or a reset are left out. The rule does not see a loop over the length of
-    another batch, as in `range(len(distance))`.
+    iterations over the rows of a tensor. With one env it reads only the source: without a finding there, the
+    result is *not known*. Loops in a build or a reset are left out. The rule does not see a loop over the
+    length of another batch, as in `range(len(distance))`.
     """
     found: dict[tuple[str, int], Place] = {}
     for module, function in checkup.places.reached_from(*EVERY_STEP):
@@ -140,7 +140,7 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
     # Reported before anything runs: the task may raise.
     yield from map(_found_loop, found.values())
     if not any(True for _ in checkup.places.reached_from(*EVERY_STEP)):
-        raise NotApplicable("it has no hook of its own that runs at every step")
+        raise NotApplicable("the task has no hook of its own that runs at every step")
     for place in checkup.tensor_uses.iterated:
         if _is_loop(checkup, place) and place[:2] not in found:
             found[place[:2]] = place

@@ -1,4 +1,4 @@
-"""Checks of what ``evaluate`` says: success and fail, and the names of its entries."""
+"""Checks of what ``evaluate`` returns: success and fail, and the names of its entries."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from workbench.machine.text import listed, of
 READ_BY_MANISKILL = ("success", "fail", "elapsed_steps")
 """Entries of ``evaluate()`` that ManiSkill reads."""
 FLICKER_SHARE = 0.25
-"""Share of the steps at which success becomes true that may be followed by a step without success."""
+"""Maximum share of the steps at which success becomes true that may be followed by a step without success."""
 
 
 def see_success_at_reset(checkup: Checkup) -> Iterator[Seen]:
@@ -59,8 +59,8 @@ def success_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     if seeds := [seed for row in rows for seed in row.seeds]:
         yield Found(
             f"success is true right after the reset of {of(len(seeds), tried(rows), 'seed')} (seed {listed(seeds)}): "
-            "the episode would end at its first step. Place the bodies away from the goal, or ask in evaluate() for "
-            "more than they have at the start.",
+            "the episode would end at its first step. Place the bodies away from the goal, or require more in "
+            "evaluate() than is true at the start.",
             rows[0].place,
             len(seeds),
         )
@@ -105,14 +105,14 @@ def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     The rule reads the entries of `evaluate()` after a reset. A task without either breaks the rule if its
     reward is ManiSkill's sparse one. With a dense reward, no reward or its own `compute_sparse_reward` the
     result is *not applicable*: tasks of walking and balancing have no success. The rule notes how many random
-    episodes succeed, and how many of those with the actions of `--actions`. It does not find out by itself
+    episodes and how many episodes with the actions of `--actions` succeed. It does not find out by itself
     whether success can be reached. The result is *not known* if `entry-name` finds a misspelt entry.
     """
     for row in rows[:1]:
         if not row.names and not row.count:
             raise NotApplicable(
-                "its reward is not the sparse one of ManiSkill, and evaluate() has neither success nor fail: no success rate "
-                "can be counted"
+                "the task's reward is not ManiSkill's sparse one, and evaluate() has neither success nor fail: no success "
+                "rate can be counted"
             )
         elif not row.names:
             yield Found(
@@ -127,13 +127,13 @@ def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 @rule("entry-name", "warn", "evaluate")
 def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
-    """An entry of evaluate() that ManiSkill reads has the name that ManiSkill reads.
+    """Entries of evaluate() that ManiSkill should read have exactly the names that it reads.
 
     ManiSkill passes 'succes' on like any other entry, and no episode ever succeeds.
 
     ## Why
-    ManiSkill reads `success` and `fail` and passes all other entries on. It passes a misspelt one on too:
-    there is no error, episodes do not end, and the success rate is 0 after days of training.
+    ManiSkill reads `success` and `fail` and passes all other entries on, also a misspelt `succes`: there is
+    no error, episodes do not end, and the success rate is 0 after days of training.
 
     ## Mend
     Rename the entry.
@@ -192,7 +192,7 @@ def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
         if not entry.per_env:
             found = True
             yield Found(
-                f"the entry {name!r} of evaluate() is a {entry.what} for all {task.num_envs} envs together. Give it a row "
+                f"The entry {name!r} of evaluate() is a {entry.what} for all {task.num_envs} envs together. Give it a row "
                 "for each env, or leave it out: what only people read can be logged elsewhere.",
                 checkup.places.entry(name.rpartition("/")[2]),
             )
@@ -321,30 +321,30 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 def see_entries_finite(checkup: Checkup) -> Iterator[Seen]:
     """A row for each kind of rollouts, and one for each of its entries that is not finite."""
-    told: set[str] = set()
+    reported: set[str] = set()
     for episodes in checkup.rollouts:
         numbers = float(sum(rows.dtype.kind == "f" for rows in episodes.evaluate.values()))
         yield Seen((episodes.kind,), tried=len(episodes.seeds), numbers=(numbers,) if numbers else ())
         for name, rows in episodes.evaluate.items():
-            if rows.dtype.kind != "f" or name in told:
+            if rows.dtype.kind != "f" or name in reported:
                 continue
             bad = np.logical_or.reduce(~np.isfinite(rows.reshape(*rows.shape[:2], -1)), axis=2)
             if bad.any():
-                told.add(name)
+                reported.add(name)
                 place = checkup.places.entry(name.rpartition("/")[2])
                 yield _seen_at(bad, episodes, (episodes.kind, name), place)
 
 
 @outlier_check("entries-finite", see=see_entries_finite)
 def entries_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    told: set[str] = set()
+    reported: set[str] = set()
     if not any(row.numbers for row in rows):
         raise NotApplicable("evaluate() returns no numbers")
     for row in together(row for row in rows if len(row.names) == 2):
         kind, name = row.names
-        if name in told:
+        if name in reported:
             continue
-        told.add(name)
+        reported.add(name)
         count = of(len(row.seeds), tried(rows, kind), f"{kind} episode")
         yield Found(
             f"{name!r} is not finite in {count}, {row.texts[0]}. Look for a division "

@@ -1,4 +1,4 @@
-"""Checks of the files that a task names: they exist, and those of a download are declared."""
+"""Checks of the files that a task names: whether they exist, and whether downloads are declared."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ _WRITES_OR_ASKS = {
     "savez_compressed", "savetxt", "dump", "export", "imwrite", "to_csv", "glob", "listdir", "iterdir",
 }  # fmt: skip
 _DATASET_IDS = {"ycb:": "ycb"}
-"""Prefix of a model's id, as in ``get_actor_builder(scene, id="ycb:...")``, to the download that has the model."""
+"""The download that has a model, by the prefix of the model's id: ``get_actor_builder(scene,
+id="ycb:...")``."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,9 @@ class NamedFile:
     path: Path
     place: Place
     relative: bool
-    """Whether it depends on the current folder of the process."""
+    """Whether the path depends on the current folder of the process."""
     always: bool
-    """Whether it stands in no branch of an ``if``."""
+    """Whether the line is in no branch of an ``if`` or ``try``."""
 
 
 @rule("missing-file", "stop", "class")
@@ -87,13 +88,13 @@ def missing_file(checkup: Checkup) -> Iterator[Found | Note]:
         beside = Path(named.place[0]).parent / named.path
         if named.relative and beside.exists():
             yield Found(
-                f"{named.path} is found from the folder of the task's file only, and a process starts anywhere. Write "
+                f"{named.path} is found only if the process starts in the folder of the task's file. Write "
                 f"Path(__file__).parent / {str(named.path)!r}.",
                 named.place,
             )
         else:
             yield Found(
-                f"there is no {named.path}. Put the file beside the task's, and write Path(__file__).parent / ....",
+                f"There is no {named.path}. Put the file next to the task's file, and write Path(__file__).parent / ....",
                 named.place,
             )
 
@@ -141,7 +142,7 @@ def undeclared_assets(checkup: Checkup) -> Iterator[Found | Note]:
                     needed.setdefault(name, module.place(node, function.name))
     for name, place in needed.items():
         yield Found(
-            f"the task needs the download {name}, and its registration does not say so. Write "
+            f"The task needs the download {name}, which its registration does not declare. Write "
             f'@register_env("{env_id}", ..., asset_download_ids=[{name!r}]).',
             place,
         )
@@ -152,7 +153,7 @@ def _named_files(checkup: Checkup) -> Iterator[NamedFile]:
     for module, function in checkup.places.reached_from(*HOOKS):
         calls = {node.func for node in ast.walk(function) if isinstance(node, ast.Call)}
         if not _WRITES_OR_ASKS.isdisjoint(getattr(each, "attr", getattr(each, "id", "")) for each in calls):
-            continue  # it makes the files, or can do without
+            continue  # the function makes the files, or asks whether they exist
         values = _Values(checkup, module, function)
         branches = _branches(function)
         for node, path in _paths_in(function, values):

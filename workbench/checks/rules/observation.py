@@ -22,7 +22,8 @@ HUGE_NUMBER = 1000.0
 
 
 def see_observation_finite(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each leaf in random rollouts; if all are finite, one for the first leaf that is not in odd states."""
+    """A row for each leaf in random rollouts; if all are finite, one for the first leaf that is not finite in
+    odd states."""
     finite = True
     for name, rows in _leaves(checkup).items():
         bad = np.logical_or.reduce(~np.isfinite(rows), axis=2)
@@ -108,7 +109,7 @@ def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     named = [row for row in rows if row.names]
     _require_leaves(named)
     if tried(rows) < 2:
-        raise NotKnown("it needs two seeds")
+        raise NotKnown("the rule needs two seeds")
     values: dict[tuple[str, ...], set[tuple[float, ...]]] = {}
     for row in named:
         values.setdefault(row.names, set()).add(row.numbers)
@@ -122,7 +123,7 @@ def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             continue
         yield Found(
             f"{name!r} of the observation is {_text(value)} in all of {row.tried} states, over "
-            f"{tried(rows)} seeds. Leave it out, or draw it anew in _initialize_episode.",
+            f"{tried(rows)} seeds. Leave it out, or draw it in _initialize_episode.",
             row.place,
         )
 
@@ -176,7 +177,7 @@ def observation_huge(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 def _require_leaves(rows: Sequence[Seen]) -> None:
     if not rows:
-        raise NotApplicable("its observation has no numbers")
+        raise NotApplicable("the observation has no numbers")
 
 
 # --- leaves by name ------------------------------------------------------------------------------------------

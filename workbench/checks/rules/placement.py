@@ -29,7 +29,7 @@ OVERLAP_METRES = 0.002
 MOVED_METRES, TURNED_RADIANS = 0.02, 0.35
 """Metres and radians that a body may move in a second: a body that is put down 1 cm above the table may settle."""
 MOVING_SPEED = 0.01
-"""Velocity in m/s or rad/s after a reset from which on the task wants the body to move."""
+"""Velocity after a reset, in m/s or rad/s, above which the task wants the body to move."""
 SAG_LIMITS = {"prismatic": 0.02, "revolute": 0.1}
 """Metres and radians that a joint may move in a second."""
 POSTURES = 40
@@ -183,9 +183,9 @@ def falls_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         {row.names[1] for row in rows if row.names[:1] == (what,)} for what in ("wanted", "loose")
     )
     if not loose:
-        raise NotApplicable("nothing but its robot moves freely")
+        raise NotApplicable("nothing but the robot moves freely")
     if loose <= wanted:
-        raise NotKnown(f"{listed(sorted(loose))} moves from the start, or touches the robot then")
+        raise NotKnown(f"{listed(sorted(loose))} moves from the start, or touches the robot after the reset")
     # One rope has many links that fall: a finding for each owner, of the body that moves furthest.
     bodies_of: dict[str, list[Seen]] = {}
     for row in together((row for row in rows if row.names[:1] == ("body",)), worst=True):
@@ -236,7 +236,7 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
     checkup.require_several()
     task, rng = checkup.task, np.random.default_rng(4)
     checkup.reset(task, list(range(checkup.num_envs)))
-    # So that what is kept for each env differs from what a reset gives it.
+    # Make a step, so that what the task keeps for each env differs from its value after a reset.
     checkup.step(task, random_action(task.parts, task.num_envs, rng))
     failed: TaskError | None = None
     try:
@@ -252,8 +252,8 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
             continue
         for node in _whole_batches_at(function, {line for file, line in lines if file == module.file}):
             yield Found(
-                "tensors of self.num_envs rows are made in a reset of some envs. Take b = len(env_idx) for their "
-                "number of rows.",
+                "This line makes a tensor of self.num_envs rows in a reset of some envs. Give it b = len(env_idx) "
+                "rows.",
                 module.place(node, function.name),
             )
             return
@@ -262,9 +262,10 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _whole_batches_at(function: ast.FunctionDef, lines: Collection[int | None]) -> Iterator[ast.AST]:
-    """The calls that make a tensor of self.num_envs rows of which these lines use more than the rows of ``env_idx``."""
+    """Calls that make a tensor of self.num_envs rows, if these lines use more of it than the rows of
+    ``env_idx``."""
     made: dict[str, ast.AST] = {}
-    """Local name or attribute of self to the call that made its tensor."""
+    """The call that made the tensor of a local variable or attribute of self, by its name."""
     for statement in _statements(function):
         value = getattr(statement, "value", None)
         source = None if value is None else next(_uses(value, made), None)
@@ -293,8 +294,8 @@ def _name_of(node: ast.AST) -> str:
 
 
 def _uses(node: ast.AST, made: Mapping[str, ast.AST]) -> Iterator[ast.AST]:
-    """The calls that make the whole batches which a part of the source makes or names, except where it takes only some
-    rows."""
+    """Calls that make a whole batch (`_whole_batches`), if this part of the source contains the call or names
+    its result, and does not take only some rows of it."""
     batches = {id(batch): batch for batch in _whole_batches(node)}
     waiting: list[ast.AST] = [node]
     while waiting:
@@ -380,7 +381,7 @@ def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
         if np.ptp(rows[:, 2:], axis=0).max() > 0.05:
             found = True
             yield Found(
-                f"the quaternions of {name} are (0, 0, ...) in every env, such as {_text(rows[0])}: a turn about the "
+                f"The quaternions of {name} are (0, 0, ...) in every env, such as {_text(rows[0])}: a turn about the "
                 "vertical, in the order x, y, z, w. Write w first: (w, x, y, z).",
                 place,
                 len(rows),
@@ -433,13 +434,13 @@ def unit_quaternion(checkup: Checkup) -> Iterator[Found | Note]:
     poses that are set in a step.
     """
     if not any(True for _ in _quaternions(checkup)):
-        raise NotApplicable("its own lines set no pose")
+        raise NotApplicable("the author's files set no pose")
     for name, quaternions, place in _quaternions(checkup):
         length = np.linalg.norm(quaternions, axis=1)
         wrong = np.abs(length - 1) > UNIT_TOLERANCE
         if wrong.any():
             yield Found(
-                f"the quaternion of {name} has length {length[wrong][0]:.3g}: {_text(quaternions[wrong][0])}. Divide it "
+                f"The quaternion of {name} has length {length[wrong][0]:.3g}: {_text(quaternions[wrong][0])}. Divide it "
                 "by its norm, or make it with euler2quat or random_quaternions.",
                 place,
             )
@@ -460,7 +461,7 @@ def see_robot_holds(checkup: Checkup) -> Iterator[Seen]:
     """A row for each driven joint, while the controllers hold their pose for a second."""
     env = checkup.task.env
     if not checkup.task.parts:
-        raise NotApplicable("it has no robot")
+        raise NotApplicable("the task has no robot")
     for part in checkup.task.parts:
         delta = getattr(part.controller.config, "use_delta", False)
         absolute = isinstance(part.controller, PDJointPosController) and not isinstance(
@@ -469,11 +470,11 @@ def see_robot_holds(checkup: Checkup) -> Iterator[Seen]:
         if not delta and not absolute:
             raise NotKnown(f"no action holds a robot in control mode {env.control_mode}")
     if any(not _is_fixed(robot.robot) for robot in agents(env)):
-        raise NotApplicable("its robot stands on the floor: balancing is what a policy learns")
+        raise NotApplicable("the robot stands freely on the floor: a policy has to learn to balance it")
     driven = {joint.name for part in checkup.task.parts for joint in part.controller.joints}
     still, robots = checkup.still, _robots(checkup)
     if still.qpos is None:
-        raise NotKnown("its robots have different joints in each env")
+        raise NotKnown("the robots have different joints in each env")
     place = checkup.places.hook("_initialize_episode")
     column = 0
     for owner, articulation in joints_of_scene(env):
@@ -520,13 +521,13 @@ def robot_holds(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     by effort or by absolute poses of the hand, and *not applicable* for robots that stand on the floor.
     """
     if not rows:
-        raise NotApplicable("no controller moves a joint of its robot")
+        raise NotApplicable("no controller moves a joint of the robot")
     for row in together(rows):
         if row.seeds:
             yield Found(
-                f"joint {row.names[1]} moves {row.size:.2f} {row.texts[0]} in a second after the reset of "
-                f"{of(len(row.seeds), row.tried, 'seed')}, with the targets of the reset. Raise the stiffness or force limit "
-                "of its controller, or reset it to a pose within its limits that touches nothing.",
+                f"Joint {row.names[1]} moves {row.size:.2f} {row.texts[0]} in a second after the reset of "
+                f"{of(len(row.seeds), row.tried, 'seed')}, while its target does not change. Raise the stiffness or force "
+                "limit of its controller, or reset the robot to a pose within its limits that touches nothing.",
                 row.place,
                 len(row.seeds),
             )
@@ -538,14 +539,14 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
     task = checkup.task
     robots = agents(task.env)
     if not robots:
-        raise NotApplicable("it has no robot")
+        raise NotApplicable("the task has no robot")
     if len(robots) > 1:
-        raise NotKnown("it has several robots, and which of them must touch which body is not known")
+        raise NotKnown("the task has several robots, and which of them must touch which body is not known")
     if not _is_fixed(robots[0].robot):
-        raise NotApplicable("its robot moves around")
-    tool = getattr(robots[0], "tcp", None)  # what a property of the author's raises is told
+        raise NotApplicable("the robot moves around")
+    tool = getattr(robots[0], "tcp", None)  # an error in a property of the author's is reported
     if not isinstance(tool, Link):
-        raise NotKnown("its robot has no tcp, whose reach is measured")
+        raise NotKnown("the robot has no tcp, of which the reach is measured")
     base, reach = _reach(checkup, robots[0].robot, tool)
     index, poses = scene_index(task.env), checkup.starts.poses[0]
     for body, name in enumerate(index.names):
@@ -590,17 +591,20 @@ def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     """
     bodies = together(rows, worst=True)
     if not bodies:
-        raise NotApplicable("no actor of it moves freely")
+        raise NotApplicable("no actor of the task moves freely")
     for row in bodies:
         if 0 < len(row.seeds) < row.tried:
             yield Found(
-                f"{row.names[0]} is up to {row.size:.2f} m from the robot's base, whose tcp reaches {row.numbers[0]:.2f} m, in "
-                f"{of(len(row.seeds), row.tried, 'seed')} (seed {listed(row.seeds)}). Narrow the range in which it is placed.",
+                f"{row.names[0]} is up to {row.size:.2f} m from the robot's base, and the tcp reaches {row.numbers[0]:.2f} m: "
+                f"the body is out of reach in {of(len(row.seeds), row.tried, 'seed')} (seed {listed(row.seeds)}). Narrow the "
+                "range in which it is placed.",
                 row.place,
                 len(row.seeds),
             )
     if far := [row.names[0] for row in bodies if len(row.seeds) == row.tried]:
-        raise NotKnown(f"out of reach at every seed: {listed(far)}. Whether it is to be touched is not known")
+        raise NotKnown(
+            f"out of reach at every seed: {listed(far)}. Whether the robot must touch them is not known"
+        )
 
 
 def _reach(checkup: Checkup, articulation: Any, tool: Any) -> tuple[NDArray[np.float32], float]:
@@ -612,7 +616,7 @@ def _reach(checkup: Checkup, articulation: Any, tool: Any) -> tuple[NDArray[np.f
         limits = limits.clamp(-np.pi, np.pi)
         if any(str(joint.type[0]) == "prismatic" and not np.isfinite(np.ravel(joint.limits.cpu())).all()
                for joint in articulation.active_joints):  # fmt: skip
-            raise NotApplicable("its robot drives around")
+            raise NotApplicable("the robot drives around")
     base = articulation.pose.p.cpu().numpy()
     generator = torch.Generator(device=limits.device).manual_seed(0)
     reach = 0.0
@@ -625,7 +629,7 @@ def _reach(checkup: Checkup, articulation: Any, tool: Any) -> tuple[NDArray[np.f
 
 
 def where_placed(checkup: Checkup, body: str) -> Place | None:
-    """The author's line that sets its pose in a reset."""
+    """The author's line that sets the body's pose in a reset; else the one that makes or places the body."""
     owner = body.split("/", 1)[0]
     lines = [each.place for each in checkup.placed if each.name == owner and each.place is not None]
     return lines[-1] if lines else checkup.places.body(body, "_initialize_episode")
@@ -673,7 +677,7 @@ def _touched(checkup: Checkup, robots: set[str]) -> set[str]:
 
 
 def _is_fixed(articulation: Any) -> bool:
-    """Whether its root cannot move."""
+    """Whether the root link cannot move."""
     return all(each.links[0].joint.type == "fixed" for each in objects_of(articulation))
 
 

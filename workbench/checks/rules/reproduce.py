@@ -1,4 +1,4 @@
-"""Checks that a task runs in any order of resets, and does the same again."""
+"""Checks that a task runs in any order of resets, and that its episodes can be reproduced."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule resets random subsets of the envs six times, half of the times with seeds, and makes a step of
-    random actions after each reset; in the first step all actions are at their bounds. What any other check
-    raises in the task is reported under this rule too. If several envs raise and one env does not, the
-    finding says so. With one env no partial reset can be tried, and the result is *not known* unless
+    The rule resets random subsets of the envs six times, half of them with seeds, and makes a step of
+    random actions after each reset; in the first step all actions are at their bounds. An error that any
+    other check raises in the task is reported under this rule too. If several envs raise and one env does
+    not, the finding says so. With one env no partial reset can be tried, and the result is *not known* unless
     something raises. The rule does not see what fails in a state that random actions do not reach.
     """
     task, rng = checkup.task, np.random.default_rng(1)
@@ -108,7 +108,7 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     checkup.require_task()
     task, seeds = checkup.task, next(checkup.batches())
     first = _seen(task, checkup.reset(task, seeds))
-    # Others that have their own generators may be at an equal place after a reset.
+    # Reset other seeds in between: a generator of the task's own might be at the same place again.
     checkup.reset(task, [seed + 5000 for seed in seeds])
     rng = np.random.default_rng(2)
     for _ in range(3):
@@ -192,8 +192,8 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
     lost = {name: by for name, by in differing.items() if name not in noisy}
     if lost:
         yield Found(
-            f"{_named(lost)} after get_state_dict() and set_state_dict(). Keep what decides it in a body (a kinematic goal "
-            "that has a pose), or add it to the state in get_state_dict and set_state_dict.",
+            f"{_named(lost)} after get_state_dict() and set_state_dict(). Keep what decides these values in a body (a "
+            "kinematic goal that has a pose), or add it to the state in get_state_dict and set_state_dict.",
             checkup.places.hook("get_state_dict", "_initialize_episode"),
         )
 
@@ -228,7 +228,7 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
     seeds = next(checkup.batches())
     task = checkup.task
     if not task.parts:
-        raise NotApplicable("it takes no actions")
+        raise NotApplicable("the task takes no actions")
     first, second = (_episode(checkup, task, seeds) for _ in range(2))
     for step, (one, other) in enumerate(zip(first, second, strict=True)):
         if not (differing := _differing(one, other, SAME_TOLERANCE)):
@@ -290,7 +290,7 @@ def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
     ]
     if wrong:
         yield Found(
-            f"a single env is built with other shapes or colours for seed {listed(wrong)} than the env of that seed in a "
+            f"A single env is built with other shapes or colours for seed {listed(wrong)} than the env of that seed in a "
             f"batch of {checkup.num_envs}. Draw from self._batched_episode_rng[i] for env i, not from torch or numpy.",
             checkup.places.hook("_load_scene"),
             len(wrong),
@@ -320,7 +320,7 @@ def _of_result(result: StepResult) -> Numbers:
 def _rescored(task: TaskEnv) -> Numbers:
     """Reward, evaluate() and observation of the present state, for an action of zeros."""
     action = np.zeros((task.num_envs, sum(len(part.names) for part in task.parts)), np.float32)
-    # The reward of a task without one would raise.
+    # In a task without a reward, an action would make rescore() raise.
     result = task.rescore(None if task.env.reward_mode == "none" else action)
     return {**_of_result(result), **_observed(task)}
 
@@ -332,7 +332,7 @@ def _observed(task: TaskEnv) -> Numbers:
         names = flat_names(task, task.obs) if name == "obs" else None
         parts = [(name, value, "")] if names is None else split_flat(names, value)
         found |= {f"obs/{part}": numbers for part, numbers, _ in parts}
-    # A robot's touch sensors read the contacts of the last substep, of the last episode.
+    # A robot's touch sensors read the contacts of the last substep, which is of the previous episode.
     found = {name: numbers for name, numbers in found.items() if not name.startswith("obs/agent/")}
     return found
 

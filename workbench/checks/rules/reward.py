@@ -25,13 +25,14 @@ REWARD_HOOKS = {**DENSE_HOOKS, "sparse": "compute_sparse_reward"}
 MAX_NORMALIZED = 1.0 + 1e-4
 """Maximum of a normalized reward, with room for rounding."""
 FULL_REWARD = 0.999
-"""Normalized reward from which on it counts as the largest."""
+"""Minimum normalized reward that counts as the largest."""
 RATIO_TOLERANCE = 1e-3
-"""Maximum difference from the dense reward over a constant, as a share of the largest normalized reward."""
+"""Maximum difference of the normalized reward from the dense one times a constant, as a share of the largest
+normalized reward."""
 RATIO_SHARE = 0.05
-"""Share of the largest dense reward from which on the ratio is taken, since rounding decides it near 0."""
+"""Minimum dense reward for the ratio, as a share of the largest one: near 0, rounding decides the ratio."""
 CLEARLY_LOWER_SHARE = 0.05
-"""Difference of rewards, as a share of the range of all rewards, from which on it counts."""
+"""Minimum difference of rewards that counts, as a share of the range of all rewards."""
 
 
 def see_reward_finite(checkup: Checkup) -> Iterator[Seen]:
@@ -68,7 +69,7 @@ def reward_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     else:
         where = f"{of(row.count, row.tried, 'state')} in which joints and bodies were put"
     yield Found(
-        f"the reward is {row.texts[0]} in {where}, {row.texts[1]}. Look for a division, a square root or a logarithm of "
+        f"The reward is {row.texts[0]} in {where}, {row.texts[1]}. Look for a division, a square root or a logarithm of "
         "what can be 0; clamp it, or use torch.linalg.norm(..., dim=1).",
         row.place,
         row.count,
@@ -113,7 +114,7 @@ def reward_changes(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     most, least = max(row.numbers[0] for row in rows), min(row.numbers[1] for row in rows)
     if most - least < 1e-7:
         yield Found(
-            f"the reward is {rows[0].texts[0]} at each of {tried(rows)} steps of random episodes. Let it depend on a "
+            f"The reward is {rows[0].texts[0]} at each of {tried(rows)} steps of random episodes. Let it depend on a "
             "distance that the robot changes.",
             rows[0].place,
         )
@@ -124,7 +125,7 @@ def see_reward_normalized(checkup: Checkup) -> Iterator[Seen]:
     normalized or sparse reward only."""
     mode = checkup.task.env.reward_mode
     if mode not in REWARD_RANGES:
-        raise NotApplicable("its reward is neither normalized nor sparse")
+        raise NotApplicable("the reward is neither normalized nor sparse")
     least, most = REWARD_RANGES[mode]
     sparse = mode == "sparse"
     hooks = [REWARD_HOOKS[mode]] if sparse else ["compute_normalized_dense_reward", "compute_dense_reward"]
@@ -168,7 +169,7 @@ def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         ranges = [one.numbers for one in rows if one.names == row.names and one.numbers]
         low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
         yield Found(
-            f"the {row.texts[0]} reward goes from {low:.3g} to {high:.3g} {row.texts[1]}. "
+            f"The {row.texts[0]} reward goes from {low:.3g} to {high:.3g} {row.texts[1]}. "
             + (
                 "Return 1 at success, -1 at fail and 0 elsewhere."
                 if row.texts[0] == "sparse"
@@ -211,13 +212,13 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule calls both hooks on the same states, those that `reward-finite` makes, with the same action, and
-    again with `info["success"]` true in all envs. It restores the task's memory between the calls. A rising
-    straight line with an offset is noted, and is no finding. The result is *not applicable* without both
-    rewards.
+    again with `info["success"]` true in all envs. It restores the task's memory between the calls. If the
+    normalized reward rises in a straight line with the dense one but with an offset, the rule only notes it.
+    The result is *not applicable* without both rewards.
     """
     seen = checkup.look(odd_states)
     if not DENSE_HOOKS.keys() <= seen.reward.keys():
-        raise NotApplicable("it lacks a dense or a normalized dense reward")
+        raise NotApplicable("the task lacks a dense or a normalized dense reward")
     dense, normalized = (
         np.concatenate([*seen.reward[mode], *seen.told.get(mode, ())]) for mode in DENSE_HOOKS
     )
@@ -225,7 +226,7 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
     size = float(np.abs(dense[finite]).max(initial=0))
     telling = finite & (np.abs(dense) > RATIO_SHARE * size)
     if not telling.any():
-        raise NotKnown("its dense reward is 0 or not finite in all states that were tried")
+        raise NotKnown("the dense reward is 0 or not finite in all states that were tried")
     constant = float(np.median(normalized[telling] / dense[telling]))
     wrong = np.abs(normalized - constant * dense)
     off = finite & (wrong > RATIO_TOLERANCE * np.abs(normalized[finite]).max())
@@ -234,8 +235,8 @@ def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
     elif off.any():
         first, worst = int(np.flatnonzero(telling)[0]), int(np.argmax(np.where(off, wrong, 0)))
         yield Found(
-            f"the normalized reward is {normalized[worst]:.4g} where the dense reward is {dense[worst]:.4g}, and "
-            f"{normalized[first]:.4g} where it is {dense[first]:.4g}: no single constant divides them. Write "
+            f"The normalized reward is {normalized[worst]:.4g} where the dense reward is {dense[worst]:.4g}, and "
+            f"{normalized[first]:.4g} where it is {dense[first]:.4g}: no single constant is their ratio. Write "
             "`return self.compute_dense_reward(obs, action, info) / LARGEST_REWARD`.",
             checkup.places.hook("compute_normalized_dense_reward", "compute_dense_reward"),
             int(off.sum()),
@@ -317,7 +318,7 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     success pays, and no state without success may earn more. This finds the mistake even if no episode
     succeeds.
 
-    Without either, the result is *not known*.
+    If no episode can be compared and the second call finds no mistake, the result is *not known*.
     """
     ends: dict[str, list[tuple[float, ...]]] = {}
     for row in rows:
@@ -337,7 +338,7 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     if lower:
         _, at_success, elsewhere, where = max(lower)
         yield Found(
-            f"the reward is at most {at_success:.4g} at success and {elsewhere:.4g} elsewhere in the same episode "
+            f"The reward is at most {at_success:.4g} at success and {elsewhere:.4g} elsewhere in the same episode "
             f"({where}), in {of(len(lower), compared, 'episode')}. {advice}",
             place,
             len(lower),
@@ -348,7 +349,7 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             paid, elsewhere, least, most = row.numbers
             if elsewhere > paid + CLEARLY_LOWER_SHARE * (most - least):
                 yield Found(
-                    f'the reward is {paid:.4g} wherever info["success"] is true, and {elsewhere:.4g} without success '
+                    f'The reward is {paid:.4g} wherever info["success"] is true, and {elsewhere:.4g} without success '
                     f"({row.texts[0]}). {advice}",
                     row.place,
                 )
@@ -360,7 +361,7 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 def see_reward_needs_success(checkup: Checkup) -> Iterator[Seen]:
     """A row for each kind of rollouts and each batch of odd states. For a normalized reward only."""
     if checkup.task.env.reward_mode != "normalized_dense":
-        raise NotApplicable("its reward is not the normalized dense one")
+        raise NotApplicable("the reward is not the normalized dense one")
     for scored in _scored(checkup):
         most = (scored.reward >= FULL_REWARD) & ~scored.success
         tried = sum(scored.tried(column) for column in range(scored.reward.shape[1]))
@@ -400,11 +401,11 @@ def reward_needs_success(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     or state that was tried succeeds, since the rule then did not see what is paid near success.
     """
     if any(row.size > MAX_NORMALIZED for row in rows):
-        raise NotKnown("its normalized reward goes beyond 1")
+        raise NotKnown("the normalized reward goes beyond 1")
     given, places = sum(row.count for row in rows), [text for row in rows for text in row.texts]
     if given:
         yield Found(
-            f"the normalized reward is 1 without success in {given} states ({places[0]}): waiting there earns as much. "
+            f"The normalized reward is 1 without success in {given} states ({places[0]}): waiting there earns as much. "
             'Let success give the most: `reward[info["success"]] = LARGEST_REWARD`.',
             rows[0].place,
             given,
@@ -481,13 +482,13 @@ def _rewards(checkup: Checkup, episodes: Episodes) -> NDArray:
 
 def _require_reward(checkup: Checkup) -> None:
     if checkup.task.env.reward_mode == "none":
-        raise NotApplicable("it has no reward")
+        raise NotApplicable("the task has no reward")
 
 
 def _require_dense(checkup: Checkup) -> None:
     _require_reward(checkup)
     if "dense" not in checkup.task.env.reward_mode:
-        raise NotApplicable(f"its reward is {checkup.task.env.reward_mode}")
+        raise NotApplicable(f"the reward is {checkup.task.env.reward_mode}")
 
 
 def _hooks(checkup: Checkup) -> tuple[str, ...]:

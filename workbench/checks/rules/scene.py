@@ -25,14 +25,14 @@ from workbench.envs.simulation.hiding import why_not_hidden
 from workbench.machine.text import listed
 
 OVERLAP_METRES = 0.005
-"""Depth in metres from which on an overlap counts."""
+"""Minimum depth in metres of an overlap that counts."""
 MAX_LINKS = 64
 """Maximum number of links of an articulation in PhysX on the GPU."""
 MAX_TRIANGLES = 100_000
 """Maximum number of triangles of a drawn mesh."""
 _RESETS = ("_initialize_episode", "_load_scene", "_load_agent", "set_state_dict", "set_state")
 STILL_TOLERANCE = 1e-5
-"""Maximum difference of poses that count as equal, in metres and numbers of a quaternion."""
+"""Maximum difference of poses that count as equal, in metres and in components of a quaternion."""
 
 
 @rule("robot-pose", "warn", "_load_agent")
@@ -62,7 +62,7 @@ def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
     """
     robots = [each for each in _builds(checkup) if each.of_robot and each.kind == "articulation"]
     if not robots:
-        raise NotApplicable("it has no robot")
+        raise NotApplicable("the task has no robot")
     for name in dict.fromkeys(each.name for each in robots if each.quaternion is None):
         yield Found(
             f"{name} is built without an initial pose, at the origin. Write "
@@ -95,15 +95,15 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     The rule notes the builders that the author's files use while the task is built, including those of
     `actors.build_cube` and the like. It leaves out bodies without a collision shape, and bodies that stay at
-    the origin for good: static bodies, and kinematic ones and articulations without a movable joint that no
-    reset moves. [overlap-at-load](overlap-at-load.md) reports what is inside them. It also leaves out a
-    kinematic body that a reset moves, if the body is built inside nothing. Robots have their own rule
-    ([robot-pose](robot-pose.md)).
+    the origin for good: static bodies, and those kinematic bodies and articulations without a movable joint
+    that no reset moves. [overlap-at-load](overlap-at-load.md) reports other bodies inside them. The rule also
+    leaves out a kinematic body that a reset moves, unless it is built inside another body. Robots have their
+    own rule ([robot-pose](robot-pose.md)).
     """
     unposed: dict[Place | None, list[str]] = {}
     own = [*_own(checkup)]
     if not own:
-        raise NotApplicable("its own lines build no body")
+        raise NotApplicable("the author's files build no body")
     for each in own:
         if _is_unposed(checkup, each) and each.collision:
             unposed.setdefault(each.place, []).append(each.name)
@@ -118,7 +118,7 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
 def _is_unposed(checkup: Checkup, each: Built) -> bool:
     """Whether a body should have an initial pose and has none. A body that stays at the origin needs none, and a kinematic body
-    harms only a body that it is inside of."""
+    does harm only if it is built inside another body."""
     if each.quaternion is not None or each.kind == "static":
         return False
     if each.kind == "kinematic" and each.name not in _inside_others(checkup):
@@ -199,11 +199,11 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
 
 def see_kinematic_never_moved(checkup: Checkup) -> Iterator[Seen]:
     """A row for each kinematic body, with the range of its pose over resets and random episodes. Raises NotKnown if a hook of a
-    step sets a pose, which it may do later."""
+    step sets a pose: it may move a body after the steps that were tried."""
     if any(
         _sets_a_pose(function) for _, function in checkup.places.functions() if function.name not in _RESETS
     ):
-        raise NotKnown("it sets poses in a step, perhaps later than in the steps that were tried")
+        raise NotKnown("the task sets poses in a step, perhaps later than in the steps that were tried")
     index = scene_index(checkup.task.env)
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])
     yield Seen(tried=poses.shape[1])
@@ -239,9 +239,9 @@ def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     episode that was not seen. It is also *not known* with one seed. Hidden bodies are left out.
     """
     if not any(row.names for row in rows):
-        raise NotApplicable("its own lines build no kinematic body that is seen")
+        raise NotApplicable("the author's files build no visible kinematic body")
     if tried(rows) < 2:
-        raise NotKnown("it needs two seeds")
+        raise NotKnown("the rule needs two seeds")
     still: dict[Place | None, list[str]] = {}
     for row in together(rows):
         ends = np.array([one.numbers for one in rows if one.names == row.names])
@@ -322,11 +322,12 @@ def too_many_links(checkup: Checkup) -> Iterator[Found | Note]:
     """
     places = _places_of(checkup)
     if not checkup.task.env.scene.articulations:
-        raise NotApplicable("it has no articulation")
+        raise NotApplicable("the task has no articulation")
     for name, articulation in checkup.task.env.scene.articulations.items():
         if (count := len(articulation.links)) > MAX_LINKS:
             yield Found(
-                f"{name} has {count} links. Join those with fixed joints between them, or divide it.",
+                f"{name} has {count} links, more than PhysX on the GPU accepts. Join links that have a fixed joint between "
+                "them, or divide the articulation.",
                 places.get(name) or checkup.places.hook("_load_agent", "_load_scene"),
             )
 
@@ -359,7 +360,7 @@ def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
     """
     files = _mesh_files(checkup, "convex_mesh")
     if not files:
-        raise NotApplicable("no body of its own collides as the convex hull of a mesh file")
+        raise NotApplicable("no body of the author's files collides as the convex hull of a mesh file")
     unknown: list[str] = []
     for file, each in files.items():
         if (hollow := is_hollow(file)) is None:
@@ -412,8 +413,8 @@ def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
                     and value.value != "none"
                 ):
                     yield Found(
-                        f"a mesh is decomposed with {value.value} where it is built. Do it once, ship the file that it "
-                        "writes beside the mesh (.coacd.ply), and load that with decomposition='none'.",
+                        f"This line decomposes a mesh with {value.value} while the task is built. Decompose it once, ship "
+                        "the file that is written next to it (.coacd.ply), and load that file with decomposition='none'.",
                         module.place(value, function.name),
                     )
 
@@ -445,7 +446,7 @@ def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
     """
     files = _mesh_files(checkup, "file")
     if not files:
-        raise NotApplicable("no body of its own is drawn from a mesh file")
+        raise NotApplicable("no body of the author's files is drawn from a mesh file")
     unknown: list[str] = []
     for file, each in files.items():
         if (count := triangles_in(file, MAX_TRIANGLES)) is None:
@@ -461,7 +462,7 @@ def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
 
 def _require_read(unknown: list[str]) -> None:
     if unknown:
-        raise NotKnown(f"cannot be read, or has too many triangles to look at: {listed(unknown)}")
+        raise NotKnown(f"mesh files that cannot be read or have too many triangles: {listed(unknown)}")
 
 
 @rule("merged-actors", "warn", "_load_scene")
@@ -528,7 +529,7 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
 
 @rule("hidden-objects", "warn", "_load_scene")
 def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
-    """_hidden_objects has actors without collision shapes, and the merged actor instead of its parts.
+    """_hidden_objects has only actors without collision shapes, and a merged actor instead of its parts.
 
     Poses are wrong and sensors see what should be hidden, or every picture fails.
 
@@ -558,7 +559,7 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
     env: Any = checkup.task.env
     hidden = named_to_hide(env)
     if not hidden:
-        raise NotApplicable("it hides nothing from pictures")
+        raise NotApplicable("the task hides nothing from pictures")
     for thing in hidden:
         if why := why_not_hidden(thing):
             yield Found(
@@ -642,16 +643,17 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
             checkup.places.hook("__init__", "_load_scene"),
         )
     elif not alone.rebuilds:
-        raise NotApplicable(f"the seeds {listed(alone.seeds)} build the same")
+        raise NotApplicable(f"the seeds {listed(alone.seeds)} build the same scene")
 
 
 def see_env_spacing(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each body that leaves its env's space in resets and random episodes."""
+    """A row for each body that goes further than half of the spacing between envs, in resets and random
+    episodes."""
     index, half = scene_index(checkup.task.env), checkup.task.env.sim_config.spacing / 2
     moving = [i for i, kind in enumerate(index.kinds) if kind in ("dynamic", "link") and not index.hidden[i]]
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])[:, :, moving]
     if not moving:
-        raise NotApplicable("nothing in it moves")
+        raise NotApplicable("nothing in the task moves")
     away = np.nan_to_num(np.abs(poses[..., :2]).max(axis=-1))
     yield Seen(tried=away.shape[1])
     for row, body in enumerate(moving):
@@ -693,9 +695,9 @@ def env_spacing(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     if found:
         row = max(found, key=lambda row: row.size)
         yield Found(
-            f"{row.names[0]} comes {row.size:.1f} m from the middle of its env in {len(row.seeds)} of "
-            f"{tried(rows)} episodes, and the middles are {2 * row.numbers[0]:g} m apart. Return "
-            f"`SimConfig(spacing={np.ceil(2.5 * row.size):g})` from _default_sim_config, or keep it nearer.",
+            f"{row.names[0]} is up to {row.size:.1f} m from the middle of its env in {len(row.seeds)} of "
+            f"{tried(rows)} episodes, and the envs are {2 * row.numbers[0]:g} m apart. Return "
+            f"`SimConfig(spacing={np.ceil(2.5 * row.size):g})` from _default_sim_config, or keep the body nearer.",
             row.place,
             len(row.seeds),
         )
@@ -732,7 +734,8 @@ def _merges(checkup: Checkup) -> list:
 
 
 def _own(checkup: Checkup) -> Iterator[Built]:
-    """Bodies that the author's files build, without robots; of a body that is built for each env only the first."""
+    """Bodies that the author's files build, without robots; a body that is built once for each env is given
+    once."""
     lines = set()
     for each in _builds(checkup):
         if each.place is not None and not each.of_robot and (each.place, each.name) not in lines:

@@ -43,7 +43,7 @@ def reward_exploited(checkup: Checkup) -> Iterator[Found | Note]:
     training ends there: the curve of the return looks perfect, and the success rate stays at 0.
 
     ## Mend
-    Look at the episodes that are named, and ask in the reward for what `evaluate` asks for. A cube that is
+    Look at the episodes that are named, and let the reward pay for what `evaluate` checks. A cube that is
     held above the target is near it in x and y only.
 
     ```python fragment
@@ -117,10 +117,11 @@ def reward_stuck(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
-    reward. The rule reports an unsolved episode if, in each of its last steps (at most ten), two things hold.
-    No rollout earns more per step than the rollout that holds still and than the step before it, by 1/500 of
-    the range of rewards that were seen. Other rollouts earn less. A task without success never breaks the
-    rule. The rule also reports an action that takes longer than a rollout to pay: try a longer `--horizon`.
+    reward. In each of the last steps (at most ten) of an unsolved episode, the rule compares the best rollout
+    with the better of two: holding still, and the reward of the step before. It reports the episode if the
+    best rollout never gains more per step than 1/500 of the range of rewards that were seen, although the
+    rollouts differ. A task without success never breaks the rule. The rule also reports an action that takes
+    longer than a rollout to pay: try a longer `--horizon`.
     """
     yield from _verdict(checkup, "reward-stuck", "compute_dense_reward")
 
@@ -158,8 +159,8 @@ def success_lost(checkup: Checkup) -> Iterator[Found | Note]:
     Success depends on the step at which it is read, and the reward leads away from it.
 
     ## Why
-    Whether an episode counts depends on the step at which success is read. Since the reward leads on from
-    there, it asks for something other than `evaluate`.
+    Whether an episode counts depends on the step at which success is read. The reward leads away from the
+    success, so it pays for something other than what `evaluate` checks.
 
     ## Mend
     Give success the highest reward, and ask in `evaluate` for a state that lasts.
@@ -219,7 +220,7 @@ def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
     Raises:
         NotApplicable, NotKnown: nothing can be planned.
     """
-    # Each rollout is an env.
+    # Planning needs several envs: each rollout is one.
     checkup.require_several()
     cls, found = checkup.loaded.cls, list[PlannedEpisode]()
     given = {**checkup.loaded.default_kwargs, **checkup.env_kwargs}

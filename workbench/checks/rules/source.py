@@ -50,7 +50,7 @@ _GUARDS = {
 def registered(checkup: Checkup) -> Iterator[Found | Note]:
     """The class inherits BaseEnv and is registered with @register_env.
 
-    ManiSkill's own commands, its trainers and its time limit for many envs do not know the task; without any
+    ManiSkill's own commands and trainers do not find the task, and many envs get no time limit; without any
     id, gym.make cannot make it.
 
     ## Why
@@ -79,7 +79,7 @@ def registered(checkup: Checkup) -> Iterator[Found | Note]:
     env_id, limit = (_suggested_id(checkup), None) if other is None else (other.id, other.max_episode_steps)
     yield Found(
         f'{checkup.loaded.class_name} {has}: write @register_env("{env_id}", max_episode_steps={limit or 100}) above the '
-        f"class{'' if other is None else ' in place of it'}.",
+        f"class{'' if other is None else ' in place of gymnasium.register'}.",
         checkup.places.task,
     )
 
@@ -112,7 +112,7 @@ def versioned_id(checkup: Checkup) -> Iterator[Found | Note]:
     if re.search(r"-v\d+$", env_id) is None:
         versioned = re.sub(r"-v[\d.]*$", "", env_id) + "-v1"
         yield Found(
-            f"the id {env_id!r} has no version, a whole number after -v: write {versioned!r}.",
+            f"The id {env_id!r} has no version, which is -v and a whole number: write {versioned!r}.",
             _decorator(checkup),
         )
 
@@ -129,7 +129,7 @@ def time_limit(checkup: Checkup) -> Iterator[Found | Note]:
     of an episode is never logged.
 
     ## Mend
-    Give as many control steps as a slow success needs, and half of that again.
+    Allow one and a half times as many control steps as a slow success needs.
 
     ```python fragment
     @register_env("PushCup-v1", max_episode_steps=100)
@@ -144,8 +144,8 @@ def time_limit(checkup: Checkup) -> Iterator[Found | Note]:
     _needs_id(checkup)
     if checkup.loaded.max_episode_steps is None:
         yield Found(
-            f"{checkup.loaded.env_id} has no time limit: write @register_env(..., max_episode_steps=100), as many "
-            "control steps as a slow success needs.",
+            f"{checkup.loaded.env_id} has no time limit: write @register_env(..., max_episode_steps=100), one and "
+            "a half times the control steps of a slow success.",
             _decorator(checkup),
         )
 
@@ -177,8 +177,8 @@ def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
     for made in checkup.loaded.replaced:
         of, gives = ("robot", "robot_uids=") if made.is_robot else ("task", "gym.make of ")
         yield Found(
-            f"{made.name} is another {of}'s: plain ManiSkill skips this class, and {gives}{made.name!r} gives the other. "
-            f"Choose a name that no {of} has, or register with override=True.",
+            f"{made.name} is the name of another {of}: stock ManiSkill skips this class, and {gives}{made.name!r} gives "
+            f"the other one. Choose a name that no {of} has, or register with override=True.",
             (made.file, made.line, made.cls.__name__),
         )
 
@@ -190,9 +190,9 @@ def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
     ManiSkill logs a warning for each env, and the file does not say which robots were tried.
 
     ## Why
-    ManiSkill makes a task with any robot that it is asked for. `SUPPORTED_ROBOTS` tells people, and the log,
-    that a robot was never tried: rewards, reach and cameras were made for the listed robots. If the default
-    robot is not listed, each env logs a warning that hides other messages.
+    ManiSkill makes a task with any robot that `robot_uids` names. `SUPPORTED_ROBOTS` lists the robots that
+    were tried: rewards, reach and cameras were made for them, and ManiSkill warns about all others. If the
+    default robot is not listed, each env logs a warning that hides other messages.
 
     ## Mend
     List the robots, including the default one; a tuple stands for several robots at once.
@@ -216,15 +216,15 @@ def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
     supported = cls.SUPPORTED_ROBOTS
     if supported is None:
         if robot is None or robot in ("none", ()):
-            raise NotApplicable("its constructor names no robot")
+            raise NotApplicable("the task's constructor names no robot")
         yield Found(
-            f"the class does not say which robots it is for. Write SUPPORTED_ROBOTS = [{_named(robot)}].",
+            f"The class does not say which robots it is for. Write SUPPORTED_ROBOTS = [{_named(robot)}].",
             checkup.places.task,
         )
     elif robot is not None and robot not in supported and _as_tuple(robot) not in supported:
         yield Found(
-            f"the default of robot_uids, {_named(robot)}, is not in SUPPORTED_ROBOTS: ManiSkill warns about each "
-            "env. Add it there.",
+            f"The default of robot_uids, {_named(robot)}, is not in SUPPORTED_ROBOTS: ManiSkill warns about each "
+            "env. Add the robot there.",
             _class_value(checkup, "SUPPORTED_ROBOTS"),
         )
 
@@ -256,7 +256,7 @@ def reward_modes(checkup: Checkup) -> Iterator[Found | Note]:
     checkup.require_task()
     cls = checkup.loaded.cls
     if cls.get_reward is not BaseEnv.get_reward:
-        raise NotApplicable("it has a get_reward() of its own")
+        raise NotApplicable("the task has its own get_reward()")
     for mode in cls.SUPPORTED_REWARD_MODES:
         hook = REWARD_HOOKS.get(mode)
         if mode == "none" or mode == "sparse":
@@ -321,7 +321,7 @@ def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
                 continue
             close = difflib.get_close_matches(node.attr, known, n=1, cutoff=0.6)
             yield Found(
-                f"a builder has no attribute {node.attr!r}: Python sets it, and ManiSkill never reads it."
+                f"A builder has no attribute {node.attr!r}: Python sets it, and ManiSkill never reads it."
                 + (f" Write {close[0]!r}." if close else ""),
                 module.place(node, function.name),
             )
@@ -337,7 +337,7 @@ def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
             close = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
             other = f" Write self.scene.{name}()." if owner == "self" and name in known_scene else ""
             yield Found(
-                f"there is no {owner}.{name}(): this line raises AttributeError when it is reached."
+                f"There is no {owner}.{name}(): this line raises AttributeError when it is reached."
                 + (other or (f" Write {owner}.{close[0]}()." if close else "")),
                 module.place(node, function.name),
             )
@@ -386,16 +386,16 @@ def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
                 else "self._batched_episode_rng, which has a generator for each env's seed"
             )
             yield Found(
-                f"{drawn} is seeded by no reset: the same seed gives another episode each time. Draw from {write}.",
+                f"No reset seeds {drawn}: the same seed gives another episode each time. Draw from {write}.",
                 module.place(node, function.name),
             )
 
 
 @rule("backend-only-call", "warn", "class")
 def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
-    """Calls that exist in one backend only stand behind `if self.gpu_sim_enabled:` or its opposite.
+    """Calls that exist in a single backend are guarded by `if self.gpu_sim_enabled:` or its opposite.
 
-    The task runs on the CPU or on the GPU, and fails on the other.
+    The task runs on one of CPU and GPU, and fails on the other.
 
     ## Why
     A task is written on the CPU and trained on the GPU, or evaluated the other way round. `get_contacts()`
@@ -414,7 +414,7 @@ def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule reads the source of the hooks and of the functions that they call. It accepts a call behind a
-    condition that names the backend, and a call after an early return by such a condition. It also accepts
+    condition that names the backend, and a call after an early return under such a condition. It also accepts
     reads of a SAPIEN object while the scene is built. The rule does not follow objects that were put into
     variables first.
     """
@@ -456,7 +456,7 @@ def _spec(checkup: Checkup) -> Any:
 
 def _needs_id(checkup: Checkup) -> None:
     if _spec(checkup) is None:
-        raise NotApplicable("it is not registered with @register_env")
+        raise NotApplicable("the task is not registered with @register_env")
 
 
 def _suggested_id(checkup: Checkup) -> str:
@@ -464,7 +464,7 @@ def _suggested_id(checkup: Checkup) -> str:
 
 
 def _decorator(checkup: Checkup) -> Place | None:
-    """The ``@register_env`` line; else the class."""
+    """The ``@register_env`` line; else the ``class`` line."""
     if (found := checkup.places.class_definition(checkup.loaded.cls)) is not None:
         module, node = found
         for each in node.decorator_list:
@@ -474,7 +474,8 @@ def _decorator(checkup: Checkup) -> Place | None:
 
 
 def _class_value(checkup: Checkup, name: str) -> Place | None:
-    """The line of the class, or of a base class in the author's files, that assigns this name; else the class."""
+    """The line of the class, or of a base class in the author's files, that assigns this name; else the
+    ``class`` line."""
     owner = next((cls for cls in checkup.loaded.cls.__mro__ if name in vars(cls)), None)
     if owner is not None and (found := checkup.places.class_definition(owner)) is not None:
         module, node = found
@@ -508,7 +509,7 @@ def _implemented(cls: type[BaseEnv]) -> tuple[str, ...]:
 
 
 def _builders(function: ast.FunctionDef) -> dict[str, set[str]]:
-    """The attributes that the builders of each of the function's variables have."""
+    """Names of the attributes of a builder, for each of the function's variables that holds one."""
     found: dict[str, set[str]] = {}
     for node in ast.walk(function):
         if not isinstance(node, ast.Assign):

@@ -37,12 +37,12 @@ def see_bodies_stay(checkup: Checkup) -> Iterator[Seen]:
 @outlier_check("bodies-stay", see=see_bodies_stay)
 def bodies_stay(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     if not any(row.count for row in rows if not row.names):
-        raise NotApplicable("nothing in it moves")
+        raise NotApplicable("nothing in the task moves")
     for row in sorted(together(rows, worst=True), key=lambda row: -row.size):
         yield Found(
-            f"{row.texts[0]}; in this or another way it leaves the scene in "
+            f"{row.texts[0]}; in this or another way the body leaves the scene in "
             f"{of(len(row.seeds), tried(rows), 'random episode')} (seed {listed(row.seeds)}). Let nothing overlap and "
-            "nothing be thrown, or end an episode without it: return `fail` from evaluate().",
+            "nothing be thrown, or end an episode in which the body is lost: return `fail` from evaluate().",
             row.place,
             len(row.seeds),
         )

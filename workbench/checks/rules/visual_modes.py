@@ -44,7 +44,7 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
     cannot run on a real robot, which has no such numbers.
 
     ## Mend
-    Ask whether the mode has state.
+    Add the state of objects only if the mode has state.
 
     ```python fragment
     def _get_obs_extra(self, info):
@@ -58,14 +58,14 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
     Two envs observe pictures. The rule moves each dynamic body and each articulation that is no robot (40 at
     most) by some centimetres without a step, and calls `_get_obs_extra` again: a number that changes follows
     the body. Goals (kinematic and hidden bodies) may be in the observation. Contacts and forces do not change
-    without a step, so `is_grasping` is no finding. The result is *not known* if there is nothing to render
-    with, and *not applicable* for a task without observations with pictures, or in which nothing but the
-    robot moves freely.
+    without a step, so `is_grasping` is no finding. The result is *not known* if there is no renderer, and
+    *not applicable* for a task that has no observation mode with pictures, or in which nothing but the robot
+    moves freely.
     """
     told: dict[str, list[str]] = {}
     seen = {body: moved for body, moved in checkup.look(followers).items() if not moved.hidden}
     if not seen:
-        raise NotApplicable("nothing but its robot moves freely")
+        raise NotApplicable("nothing but the robot moves freely")
     for body, moved in seen.items():
         for leaf in moved.observation:
             told.setdefault(leaf, []).append(body)
@@ -81,7 +81,7 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
 
 def _require_all_moved(checkup: Checkup) -> None:
     if (count := len(scene_index(checkup.pictured.env).states)) > MAX_BODIES:
-        raise NotKnown(f"{MAX_BODIES} of {count} bodies were looked at")
+        raise NotKnown(f"only {MAX_BODIES} of {count} bodies were looked at")
 
 
 @rule("hidden-goal", "warn", "_get_obs_extra")
@@ -110,14 +110,14 @@ def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
     """
     bodies = {body: moved for body, moved in checkup.look(followers).items() if moved.hidden}
     if not bodies:
-        raise NotApplicable("it hides nothing from pictures")
+        raise NotApplicable("the task hides nothing from pictures")
     found = False
     for body, moved in bodies.items():
         if moved.meaning and not moved.observation:
             found = True
             yield Found(
-                f"{body} is hidden from pictures, {listed(sorted(moved.meaning))} of evaluate() or the reward depends "
-                "on where it is, and nothing in _get_obs_extra() does. Add its position there, in all modes.",
+                f"{body} is hidden from pictures. Its position decides {listed(sorted(moved.meaning))}, but nothing "
+                "in _get_obs_extra() depends on it. Add the position there, in all modes.",
                 checkup.places.hook("_get_obs_extra"),
             )
     if not found:
