@@ -1,4 +1,4 @@
-"""Applies and reverts edits of the author's files, only over the text they were planned on."""
+"""Applies and reverts edits of the author's files, if they have the text for which the edit was planned."""
 
 from __future__ import annotations
 
@@ -110,9 +110,7 @@ def _replace_all(changes: tuple[FileChange, ...], since: str) -> None:
             _replace_text(change.file, change.old_text, change.new_text, since)
         except RefusedEdit as refused:
             left = [made.name for made in changes[:done] if not _reverted(made, since)]
-            incomplete = (
-                f"; {' and '.join(left)} could not be restored, and has the change without the other file"
-            )
+            incomplete = f"; {' and '.join(left)} could not be restored: it has a part of the change"
             raise RefusedEdit(f"{refused.reason}{incomplete if left else ''}") from refused
 
 

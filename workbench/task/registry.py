@@ -98,9 +98,10 @@ def id_of(cls: type) -> str | None:
 
 
 def gymnasium_spec_of(cls: type) -> GymnasiumSpec | None:
-    """Spec of a class that is registered with gymnasium's own `register`, which ManiSkill's table lacks."""
-    ways = (cls, f"{cls.__module__}:{cls.__qualname__}")
-    return next((spec for spec in gymnasium_registry.values() if spec.entry_point in ways), None)
+    """Spec of a class that was registered with gymnasium's own `register`, so that ManiSkill's table does not
+    have it; None if there is none."""
+    entry_points = (cls, f"{cls.__module__}:{cls.__qualname__}")
+    return next((spec for spec in gymnasium_registry.values() if spec.entry_point in entry_points), None)
 
 
 def environment_ids() -> list[str]:
