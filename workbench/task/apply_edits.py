@@ -110,7 +110,7 @@ def _replace_all(changes: tuple[FileChange, ...], since: str) -> None:
             _replace_text(change.file, change.old_text, change.new_text, since)
         except RefusedEdit as refused:
             left = [made.name for made in changes[:done] if not _reverted(made, since)]
-            incomplete = f"; {' and '.join(left)} could not be restored: it has a part of the change"
+            incomplete = f"; {' and '.join(left)} could not be restored: the change stays there"
             raise RefusedEdit(f"{refused.reason}{incomplete if left else ''}") from refused
 
 

@@ -105,8 +105,7 @@ def with_advice(
         file = loaded.file.name
         advice.append(
             f"{loaded.chosen} of {file} was tried; the file also has {', '.join(loaded.others)}: name one of "
-            "these, as in "
-            f"{file}:{loaded.others[-1]}, or choose it as Task on the page"
+            f"these, as in {file}:{loaded.others[-1]}, or choose it as Task on the page"
         )
     if not advice:
         return error
