@@ -8,8 +8,7 @@ from workbench.page.command import Command
 
 
 class PressRow(Command, frozen=True):
-    """Select a recording; with ctrl, add it to the selection or remove it; with shift, select the range up to
-    it."""
+    """Select a recording; ctrl adds or removes it, shift selects the range up to it."""
 
     id: str
     held: Literal["", "ctrl", "shift", "ctrl+shift"] = ""

@@ -160,7 +160,7 @@ def opened_code(
         except TaskError:
             opened = open_task(task, code.or_else, on_activity=on_activity, on_finding=on_finding)
         if isinstance(opened.env.env, BatchedCpuMixin):
-            # Otherwise the last bits of an episode would depend on the earlier episodes of the same process.
+            # Without this, the last bits of an episode depend on the earlier episodes of the same process.
             opened.env.env.begins_anew = True
         try:
             yield opened

@@ -301,7 +301,7 @@ _libraries: dict[str, ModuleType] = {}
 def unload_modules(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> UnloadedModules:
     """Remove the author's modules from ``sys.modules``, so that edited helpers are read again.
 
-    Removes the modules of the folder, and the helpers of other tasks: otherwise an import of ``helper`` would
+    Removes the modules of the folder, and the helpers of other tasks: if they stayed, ``import helper`` would
     give the loaded ``helper`` of another folder. Main modules of other tasks stay (`is_other_task` of their
     name): they are not imported by name, and their classes may be in use.
     """
