@@ -55,7 +55,8 @@ class LibraryView:
     rows: tuple[LibraryRow, ...] = ()
     """Rows, sorted by name."""
     reading: tuple[int, int] | None = None
-    """Numbers of files read and to read, while reading; (0, 0) before they are counted."""
+    """Numbers of files (read, to read) while files are read; (0, 0) before they are counted, None when all
+    are read."""
     problem: str | None = None
     """Why the folder cannot be listed, as a sentence; None if it can."""
     trash: Trash = Trash()
@@ -183,7 +184,7 @@ class Library:
                     self._show(reading=(0, 0))
             self._full_scan_at = time.monotonic()
             scan = scan_folder(self.folder)
-            self._scan = replace(scan, found={})  # `_kept` has the read files
+            self._scan = replace(scan, found={})  # `_kept` has these files
             self._read_changed(scan)
 
     def _read_changed(self, scan: Scan, only: Collection[str] | None = None) -> None:

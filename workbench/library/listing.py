@@ -222,6 +222,6 @@ class Action:
     most: int | None = None
     """Maximum number of recordings at once; None for any number."""
     reads: bool = True
-    """Whether it reads the recordings; False if it also applies to files that cannot be read."""
+    """Whether the action reads the recordings; False if it also works for files that cannot be read."""
     salvages: bool = False
-    """Whether it uses the readable part of a damaged recording."""
+    """Whether the action uses the readable part of a damaged recording."""

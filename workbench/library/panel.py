@@ -406,7 +406,7 @@ class LibraryPanel(PagePart[object]):
                     tell_all(self._server, "This recording is damaged", body, "orange")
 
     def _why_unreadable(self, ids: tuple[str, ...], salvages: bool) -> str:
-        """Reason why none of these can be read; empty if one can.
+        """Reason why none of these recordings can be read; empty if one can be read.
 
         Args:
             salvages: whether the readable part of a damaged recording of the workbench is enough.

@@ -40,7 +40,7 @@ class PastRun:
 
 @dataclass(frozen=True)
 class RescoredCurve:
-    """One number of one env at the recorded control steps, oldest first."""
+    """Values of one number of one env at the recorded control steps, oldest first."""
 
     tick: NDArray[np.int64]
     """(T,) ticks, counted as in `Moment.tick`."""
@@ -175,7 +175,8 @@ class RescoredPast:
         return [*self._verdicts.values()]
 
     def names(self) -> tuple[tuple[str, ...], frozenset[str]]:
-        """Names for `curve` (``reward`` first, then what differs, then the rest), and those that differ."""
+        """Names for `curve` (``reward`` first, then the differing ones, then the rest), and the set of
+        differing names."""
         names = dict.fromkeys(["reward", *self._old, *self._new])
         differing = {name for verdict in self.verdicts() for name in verdict.differing}
         if self._new:

@@ -43,7 +43,7 @@ class RescoreGroup:
     """Episodes that are rescored in one env."""
 
     reference: TaskName
-    """The task to open, unless `recorded_source`."""
+    """The task to open, unless `recorded_source` is True."""
     options: TaskOptions
     info: EpisodeInfo
     """Info of the first episode of the group."""
@@ -51,7 +51,7 @@ class RescoreGroup:
     note: str = ""
     """Note on options that differ from the recorded ones on purpose."""
     recorded_source: bool = False
-    """Open the recorded text in `info` instead."""
+    """Whether to open the source text in `info` instead of `reference`."""
 
     @property
     def code(self) -> CodeToRun:

@@ -195,7 +195,7 @@ def _open_episode(
     if run.length == 0:
         why_not = "it has no step"
     elif use_env_states and not run.env_states:
-        why_not = "it holds no env states"
+        why_not = "it has no recorded env states"
     damaged = bool(episode.broken_files)
     if why_not:
         why_not = ". ".join((why_not, *(broken.sentence for broken in episode.broken_files)))

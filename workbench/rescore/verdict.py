@@ -78,7 +78,7 @@ class Verdict(Generic[Of]):
     missed: dict[str, str] = field(default_factory=dict)
     """Name and reason of each part of the state that could not be restored into the env."""
     why_not: str = ""
-    """Reason why the run was not rescored; all other fields are then empty."""
+    """Reason why the run was not rescored; the results of the comparison are then empty."""
     damaged: bool = False
     """Whether some files of the recording cannot be read."""
     old_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -198,7 +198,11 @@ def by_change(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
 
 
 def scalar_entries(evaluate: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """The entries of `evaluate`, (n, ...) each, that have one number or flag per row, as (n,)."""
+    """The entries of `evaluate` with one number or flag per row, as (n,) arrays.
+
+    Args:
+        evaluate: (n, ...) values of each entry.
+    """
     return {
         # An author's entry may be called "reward" too, but it is not the reward.
         "evaluate/reward" if name == "reward" else name: values.reshape(len(values))
@@ -248,8 +252,8 @@ class Rescore(Question[Rescored]):
 
 
 # The server keeps the history and sends snapshots and actions. As in the recorded run, all envs of the batch
-# step together: they may depend on each other through a shared random generator. Send these only to a worker
-# that does not play: they move its envs.
+# step together: they may depend on each other through a shared random generator. Send these questions only to
+# a worker that does not play: they move its envs.
 
 
 @dataclass(frozen=True)

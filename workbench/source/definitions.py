@@ -23,7 +23,8 @@ class Binding:
     why: str = ""
     """Reason why `value` is None."""
     imported: tuple[str, str] | None = None
-    """Module of an import, with its leading dots, and the name in it (empty for the module itself); else None."""
+    """For an import: the module with its leading dots, and the name in it (empty for the module itself). Else
+    None."""
     attribute: bool = False
     """Whether the binding is an attribute of an object, not a variable."""
 

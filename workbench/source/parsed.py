@@ -280,7 +280,8 @@ class SourceFile:
         return [Replacement(end, end, "".join(f", {text}" for text in texts))]
 
     def added_item(self, node: ast.AST, indent: str, text: Callable[[str], str]) -> list[Replacement]:
-        """Add the item `text(indent)` between the brackets, on its own lines; `indent` is the statement's."""
+        """Add the item `text(indent)` between the brackets, on its own lines; `indent` is the statement's
+        indentation."""
         start, close = self.content_span(node)
         items = self.items(node)
         own = indent + "    "

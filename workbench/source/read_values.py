@@ -151,7 +151,7 @@ class ValueReader:
     # --- values -------------------------------------------------------------------------------------
 
     def _value(self, file: SourceFile, node: ast.expr) -> Plain:
-        """The value of a checked expression."""
+        """The value of an expression that `_check` accepts."""
         return self._evaluate(file, node, node, plain_value)
 
     def _evaluate(
@@ -197,7 +197,7 @@ class ValueReader:
             raise self.computed(file, node)
 
     def _test(self, file: SourceFile, node: ast.expr) -> bool:
-        """The value of a condition."""
+        """The value of a condition. Raises Unknown."""
         if not all(isinstance(inner, _CONDITION_NODES) for inner in ast.walk(node)):
             raise self.computed(file, node)
         return self._evaluate(file, node, node, bool)
@@ -237,7 +237,7 @@ class ValueReader:
         try:
             with np.errstate(all="ignore"):
                 found = plain_value(self._run(file, _substitute(node, leaf, value), node))
-        except (ValueError, ArithmeticError):  # math.acos(1.5)
+        except (ValueError, ArithmeticError):  # such as math.acos(1.5)
             return math.nan
         return found if isinstance(found, float) else math.nan
 

@@ -94,7 +94,7 @@ def why_not_writable(path: str) -> str | None:
         return f"{path} cannot be read: {exc.strerror}"
     if not stat.S_ISREG(mode):
         return f"{path} is not an ordinary file"
-    # A rename ignores the file's mode, and root ignores every mode, so it is checked here.
+    # Check the mode here: a rename ignores the file's mode, and root ignores every mode.
     if not mode & 0o222 or not os.access(real, os.W_OK):
         return f"{path} is read-only"
     if not os.access(real.parent, os.W_OK):

@@ -38,16 +38,16 @@ _INTROSPECTION_MODULES = frozenset(
 class Symbol:
     """A function, method, constant, class attribute or import.
 
-    Names are not resolved: ``x.reset`` may be any ``reset``, so it counts as all of them, in all files, and a string that is
-    an identifier counts as a name (``getattr(self, "reset")``). If a name is computed or code inspects itself, see
-    `dynamic`.
+    Names are not resolved: ``x.reset`` may be any ``reset``, so it counts as a mention of every ``reset`` in
+    all files. A string that is an identifier counts as a name (``getattr(self, "reset")``). For computed
+    names, and code that inspects itself, see `dynamic`.
     """
 
     path: str
     name: str
     kind: Kind
     parts: Sequence[ast.AST]
-    """The nodes that form its text; for a class, without its members."""
+    """The nodes that form `text`; for a class, without its members."""
     nodes: Sequence[ast.AST]
     """Nodes of the symbol: a property with its setter is one symbol."""
     short_names: frozenset[str]
@@ -383,8 +383,8 @@ def _read_all(texts: Mapping[str, str], keep_docstrings: bool) -> dict[Key, Symb
 def line_in(old: str, new: str, line: int) -> int | None:
     """The 1-based line of `new` that corresponds to `line` of `old`; None if its function changed.
 
-    Comments, docstrings and layout do not count. A line outside of functions is compared as a statement of the file. No
-    content of the texts raises.
+    Comments, docstrings and layout do not count. A line outside of functions is compared as a statement of
+    the file. Does not raise, whatever the texts contain.
     """
     try:
         before, after = parse_python(old), parse_python(new)

@@ -36,7 +36,7 @@ class ChosenTask:
     others: tuple[str, ...]
     """Other classes of the file that can be opened by name."""
     alternatives: tuple[str, ...] = ()
-    """Names in `others` to try if no class was named and this one fails, in order."""
+    """Names in `others` to try, in order, if no class was named and `cls` cannot be opened."""
     kwargs: dict[str, Any] = field(default_factory=dict)
     """Constructor arguments in addition to the registered ones."""
     robot: Robot | None = None

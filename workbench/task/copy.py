@@ -75,7 +75,7 @@ def copied_text(
 
     Args:
         source: the file of `text`; its packages are found by their ``__init__.py``.
-        number: number of the copy; part of its ids from 2 on.
+        number: number of the copy; from 2 on, it is part of the copy's ids.
         names: names chosen for the copy, also used in its docstrings.
 
     Raises:

@@ -157,9 +157,13 @@ class Restored:
     """The result of a `Restore` or an `EnterRecording`."""
 
     env_idx: tuple[int, ...]
+    """The envs that were set."""
     source: tuple[int, ...]
+    """Env of the snapshot whose state each env of `env_idx` got."""
     origin: int
+    """The server's number of the restored moment, or `NO_MOMENT`."""
     undoes: int | None
+    """The server's number of the jump that this undoes; None if it undoes none."""
     not_carried: dict[str, str]
     """Parts that could not be restored, with the reasons; empty within one version of a task."""
     recording: str = ""
@@ -189,7 +193,7 @@ class Stepped:
     """The body of the snapshot of the whole batch at this moment (see `envs.snapshots.packing`): opaque to the
     server, whose `History.snapshot_at` makes a pickled `Snapshot` of it."""
     part_keys: tuple[int, ...] | None = None
-    """The parts of the snapshot; None if unchanged since the previous event."""
+    """Keys of the snapshot's parts; None if unchanged since the previous result."""
     new_parts: dict[int, bytes] = field(default_factory=dict)
     """Parts of the snapshot that were not sent with an earlier result, by key."""
     number: int = 0

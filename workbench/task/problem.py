@@ -44,8 +44,9 @@ HOOK_STAGES: dict[str, str] = {
     "_before_simulation_step": "step",
     "_after_simulation_step": "step",
 }
-"""Method of `BaseEnv` to the stage that the page names. `get_info`, `get_reward` and `_flatten_raw_obs` are ManiSkill's
-callers of the author's hooks; they raise because of what a hook returned (``evaluate()`` giving None in `get_info`)."""
+"""Maps a method of `BaseEnv` to the stage that the page names. `get_info`, `get_reward` and
+`_flatten_raw_obs` are ManiSkill's callers of the author's hooks; they raise because of what a hook returned
+(``evaluate()`` giving None in `get_info`)."""
 _CALLERS = ("get_info", "get_reward", "_flatten_raw_obs")
 
 
@@ -93,9 +94,9 @@ class Problem:
     message: str
     """Exception type and text, on one line."""
     file: str | None
-    """The author's file; None if no line of the author is on the traceback."""
+    """The author's file; None if no file of the author is known to be at fault."""
     line: int | None
-    """1-based line in `file`."""
+    """1-based line in `file`; None if unknown."""
     code: str | None
     """The text of that line, stripped."""
     traceback: str

@@ -106,7 +106,7 @@ def find_change(
     except _NeedsRebuild as reason:
         return Change("rebuilt", str(reason))
     except (SyntaxError, ValueError):  # ValueError: a null byte
-        return Change("rebuilt", "the version before cannot be read as Python")
+        return Change("rebuilt", "the previous version cannot be parsed as Python")
     except RecursionError:
         return Change("rebuilt", "the file is nested too deeply to be compared")
 
@@ -216,7 +216,8 @@ class _Comparison:
     # --- code that cannot be analysed ----------------------------------------------------------------
 
     def _refuse_another_order(self, family: set[Key]) -> None:
-        """Refuse a changed order of members: it numbers an enum's members and a dataclass's arguments."""
+        """Refuse a changed order of members: the order numbers an enum's members and a dataclass's
+        arguments."""
         for key, versions in self._versions.by_key.items():
             if versions[0].kind != "class" or key in family or key in self._versions.changed:
                 continue
@@ -318,7 +319,8 @@ class _Comparison:
 
 
 def _goes_on_after_super(nodes: Iterable[ast.AST]) -> bool:
-    """Whether an ``__init__`` does more than set constants after BaseEnv's has built and reset the env."""
+    """Whether an ``__init__`` does more than set constants after ``BaseEnv.__init__`` has built and reset the
+    env."""
     for node in nodes:
         if not isinstance(node, ast.FunctionDef):
             return True

@@ -46,7 +46,7 @@ class SourceWatcher:
     after a rename, creation or deletion in their folder (as most editors save). Once ``stat`` is stable the texts are
     compared: a ``touch``, a ``git checkout`` of the same content or a line-end conversion is no change.
 
-    `on_change` may call `follow` and `stop`. What it raises is reported, and watching continues.
+    `on_change` may call `follow` and `stop`. An exception of `on_change` is reported, and watching continues.
     """
 
     def __init__(self, on_change: Callable[[set[Path]], None]) -> None:

@@ -24,7 +24,7 @@ FOLLOWED = (
     "While the task is open live, every save of this file and of the modules next to it runs without asking, "
     "even if another program or person saves it. Rescore runs the file as it is at the time of rescoring."
 )
-"""Warning before continuing live with a file that a recording references."""
+"""Warning in a question about a file whose later saves will run too."""
 
 
 class Consent(Enum):
@@ -137,7 +137,7 @@ class CodeToRun:
     """Code that a recording references or contains."""
 
     reference: TaskName
-    """The task to open; ignored if `recorded_text` is True."""
+    """The task to open; not examined if `recorded_text` is True."""
     info: EpisodeInfo
     """Info of the recording."""
     recorded_text: bool = False
