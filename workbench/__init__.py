@@ -40,8 +40,8 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    # Lazily, since the process that serves the page imports this package, and must start without ManiSkill, which takes
-    # seconds and a graphics driver.
+    # Import lazily: the process that serves the page imports this package, and must start without ManiSkill,
+    # whose import takes seconds and needs a graphics driver.
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

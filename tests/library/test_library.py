@@ -412,7 +412,7 @@ def test_a_note_that_cannot_be_saved_is_an_error_and_leaves_no_partial_file(
     library.refresh()
     (tmp_path / "a.json").write_text("{}")
     before = tree(tmp_path)
-    with pytest.raises(LibraryError, match="a could not be kept .*is not a recording"):
+    with pytest.raises(LibraryError, match="a could not be saved .*is not a recording"):
         library.set_note(["a1"], "x")
     assert tree(tmp_path) == before
     with pytest.raises(LibraryError, match="not in the library any more"):

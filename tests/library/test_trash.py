@@ -64,7 +64,7 @@ def test_links_are_moved_as_links_and_restoring_overwrites_nothing(tmp_path: Pat
     batch = move_to_trash(tmp_path, [paths])
     assert batch is not None and outside(tmp_path) == {} and not paths[2].is_symlink()
     paths[0].write_text("a newer one")
-    with pytest.raises(TrashError, match="a.json was left where it is: there is a file of that name already"):
+    with pytest.raises(TrashError, match="a.json was not moved: there is already a file with that name"):
         restore_from_trash(tmp_path, batch)
     assert outside(tmp_path) == {"a.json": b"a newer one"} and not paths[2].is_symlink()
     paths[0].unlink()

@@ -188,7 +188,7 @@ task.hook()
         ("note(self.far)", "9.0 < self.far"),
         ("note(self.own)", "3.5 < self.own"),
         ("self.made()", "0.5 < cls.near"),
-        ("note(self.half)", "`self.half` cannot be read in the file: it is the file's own half"),
+        ("note(self.half)", "`self.half` cannot be read in the file: half is a function or class"),
         ("note(more)", "`more` cannot be read in the file: it is a parameter of hook"),
         ("vars(self)['x'] = 1; note(self.x)", "the assignment of `self.x` is not found in the file"),
     ],

@@ -65,7 +65,7 @@ def test_if_the_requested_task_fails_the_others_are_named_and_none_is_opened(fil
         assert "no cubes" in problem.message and "TwoEnv of several.py was tried" in problem.message
         assert "OneEnv" in problem.message and "several.py:" in problem.message
         assert problem.file == str(file) and problem.line is not None
-    with pytest.raises(TaskError, match="which also has .*OneEnv.*name one"):
+    with pytest.raises(TaskError, match="also has .*OneEnv.*name one"):
         open_task(str(file), OPTIONS)
 
 

@@ -207,7 +207,7 @@ def test_an_answer_about_a_file_that_changed_meanwhile_runs_nothing(foreign: Pat
         file.with_name("helper.py").write_text("A = 3\n")
         return Consent.ONCE
 
-    with pytest.raises(NotCleared, match="changed while you were asked about it; try it again"):
+    with pytest.raises(NotCleared, match="changed while you were asked about it; try again"):
         Clearances(ask=ask).clear(todays(foreign))
 
 

@@ -8,7 +8,7 @@ from workbench.page.command import Command
 
 
 class PressRow(Command, frozen=True):
-    """Select a recording; ctrl adds it to the selection or removes it, shift selects all up to it."""
+    """Select a recording; ctrl adds or removes it, shift selects the range up to it."""
 
     id: str
     held: Literal["", "ctrl", "shift", "ctrl+shift"] = ""
@@ -143,7 +143,7 @@ class SortRows(Command, frozen=True):
 
 
 class FilterRows(Command, frozen=True):
-    """List only these recordings."""
+    """List only the recordings with this outcome."""
 
     outcome: Literal["all", "success", "no success", "broken"]
 
@@ -156,12 +156,12 @@ class ClearRowFilter(Command, frozen=True):
 
 
 class LookForRows(Command, frozen=True):
-    """List the recordings that contain these words."""
+    """List only the recordings that contain all of these words."""
 
     words: str
 
 
 class FilterTask(Command, frozen=True):
-    """List only the recordings of this task, or those of all tasks."""
+    """List only the recordings of this task; null lists those of all tasks."""
 
     task: str | None

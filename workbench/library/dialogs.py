@@ -23,7 +23,7 @@ MAX_NAMES = 6
 
 
 MAX_LISTED_TAGS = 12
-"""Maximum number of listed tags that are in use."""
+"""Maximum number of tags in use that the dialog lists."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class _Question:
 class LibraryEdits:
     """Dialogs for tags, notes and deletion, and their operations; one dialog at a time. Used on the loop.
 
-    It is a dialog over the page, since a form in the scrolled table would be out of view. It acts on the recordings for
-    which it was opened, not on those selected when the answer arrives.
+    A dialog covers the page, because a form in the scrolled table could be out of view. It edits the
+    recordings for which it was opened, even if others are selected when the user answers.
     """
 
     def __init__(self, server: viser.ViserServer, library: Library) -> None:
@@ -71,7 +71,7 @@ class LibraryEdits:
         known = sorted({tag for row in self._library.view().rows for tag in row.tags})
         explained = "Words, separated by commas."
         if len(rows) > 1:
-            explained += " Shown are the tags that all of them have; their other tags stay."
+            explained += " The field shows the tags that all of these recordings have; their other tags stay."
         if known:
             explained += f" In use: {', '.join(known[:MAX_LISTED_TAGS])}."
         self._ask("Tags", "", rows, explained, "Save", answered, ", ".join(shared))
@@ -81,7 +81,11 @@ class LibraryEdits:
         if not rows:
             return
         notes = {row.note for row in rows}
-        explained = "" if len(notes) == 1 else "They have different notes; this one replaces them."
+        explained = (
+            ""
+            if len(notes) == 1
+            else "These recordings have different notes; this note replaces all of them."
+        )
 
         def answered(typed: str) -> None:
             self._library.set_note(ids, typed[:MAX_NOTE_CHARACTERS])
@@ -182,7 +186,12 @@ class LibraryEdits:
             self._tell(error)
         except Exception as error:
             report_failure("An edit of the library failed", error)
-            tell_all(self._server, "Failed", "It failed; the reason is in the terminal.", "red")
+            tell_all(
+                self._server,
+                "Failed",
+                "The change to the library failed; the reason is in the terminal.",
+                "red",
+            )
 
     def _tell(self, error: LibraryError) -> None:
         tell_all(self._server, "Not possible", str(error), seconds=8.0)

@@ -43,7 +43,7 @@ PUBLISH_SECONDS = 0.3
 
 
 class LibraryError(OSError):
-    """An operation on recordings failed; the message includes the remedy."""
+    """An operation on recordings failed; the message is shown on the page."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class LibraryView:
     rows: tuple[LibraryRow, ...] = ()
     """Rows, sorted by name."""
     reading: tuple[int, int] | None = None
-    """Numbers of files read and to read, while reading; (0, 0) before they are counted."""
+    """Numbers of files (read, to read) while files are read; (0, 0) before they are counted, None when all
+    are read."""
     problem: str | None = None
     """Why the folder cannot be listed, as a sentence; None if it can."""
     trash: Trash = Trash()
@@ -72,7 +73,7 @@ class Library:
     index; then names, sizes and times are compared, and files that differ are read on a thread (`watch`), newest first.
     Tags, notes and deletion change the files.
 
-    A page sends only ids, which are looked up here; paths come from the rows.
+    A page sends only ids; their paths come from the rows, so a page cannot name a path.
 
     Args:
         folder: need not exist yet. Only tags, notes and the trash are written into it.
@@ -107,7 +108,8 @@ class Library:
         return self._by_id.get(id)
 
     def thumbnails(self, ids: Sequence[str]) -> dict[str, bytes]:
-        """JPEGs by id; recordings without one are left out. An export without pictures uses that of its recording."""
+        """JPEGs by id; recordings without one are left out. An export without pictures gets the JPEG of the
+        recording that it was exported from."""
         by_id, index = self._by_id, self._index
         wanted = {id: [by_id[id], by_id.get(by_id[id].copy_of)] for id in ids if id in by_id}
         places = [row.place for rows in wanted.values() for row in rows if row is not None]
@@ -143,7 +145,7 @@ class Library:
                 self._index = None
 
     def _places(self) -> list[Path]:
-        """The most recently written folders with recordings below this one."""
+        """Folders of the recordings, the most recently written first; at most `_MAX_FOLDERS`."""
         newest = sorted(self.view().rows, key=lambda row: -(row.written or 0.0))
         return list(dict.fromkeys(row.paths[0].parent for row in newest if row.paths))[:_MAX_FOLDERS]
 
@@ -158,7 +160,8 @@ class Library:
                 log.exception("The library in %s could not be read; trying again.", self.folder)
                 self._publish(problem="The library could not be read. The reason is in the terminal.")
             self._scan_requested.clear()
-            # Spend at most a tenth of the time on scans: a huge folder that is written to would keep the thread busy.
+            # Pause for nine times as long as the scan took, within limits: a huge folder that is written to
+            # all the time would keep the thread busy.
             self._scan_requested.wait(
                 min(max(SCAN_SECONDS, 9 * (time.monotonic() - began)), MAX_PAUSE_SECONDS)
             )
@@ -181,11 +184,12 @@ class Library:
                     self._show(reading=(0, 0))
             self._full_scan_at = time.monotonic()
             scan = scan_folder(self.folder)
-            self._scan = replace(scan, found={})  # `_kept` has the read files
+            self._scan = replace(scan, found={})  # `_kept` has these files
             self._read_changed(scan)
 
     def _read_changed(self, scan: Scan, only: Collection[str] | None = None) -> None:
-        """Read changed files; with `only`, just those of these keys, to show the result of an operation at once."""
+        """Read changed files. With `only`, read just the files of these keys, to show the result of an
+        operation at once."""
         with self._changing:
             before = self._view.reading
             changed = [
@@ -298,7 +302,7 @@ class Library:
                     except (OSError, ValueError) as error:
                         why = getattr(error, "strerror", None) or error
                         raise LibraryError(
-                            f"Tags and note of {row.name} could not be kept ({why}). "
+                            f"Tags and note of {row.name} could not be saved ({why}). "
                             "They are written into the recording's folder, which must be writable."
                         ) from error
             finally:
@@ -308,8 +312,9 @@ class Library:
         """Move all files of these recordings to the trash; returns the name of the deletion for `undo_delete`.
 
         Raises:
-            LibraryError: a file contains other recordings too, and nothing was moved; or a file could not be moved, after
-                earlier recordings were.
+            LibraryError: nothing was moved, because a file also contains recordings that are not in `ids`, or
+                belongs to a LeRobot dataset, or no longer exists; or a file could not be moved, but those
+                before it were.
         """
         with self._changing:
             keys = self._keys_to_delete(ids)
@@ -334,8 +339,8 @@ class Library:
         for key in keys:
             if key.split("/")[-2:] == DATASET_KEY and "/" in key:
                 raise LibraryError(
-                    f"{clean_text(key.removesuffix('/meta/info'), 400)} is a LeRobot dataset, a folder of many files, and is not "
-                    "deleted from here: delete the folder."
+                    f"{clean_text(key.removesuffix('/meta/info'), 400)} is a LeRobot dataset, a folder of many "
+                    "files, which the library does not delete: delete the folder yourself."
                 )
             of_file = {row.id for row in self._view.rows if row.place[0] == key}
             if not selected >= of_file:

@@ -44,12 +44,12 @@ class IndexedFiles:
 class LibraryIndex:
     """The index of one folder. Thread-safe; its methods do not fail.
 
-    All its content can be read again from the files, so a broken index is deleted, and a process that finds it locked for
-    `LOCKED_SECONDS` continues without it. SQLite survives concurrent processes and kills.
+    All its content can be read again from the files. So a broken index is deleted, and an operation that
+    finds the index locked for `LOCKED_SECONDS` is skipped. SQLite survives concurrent processes and kills.
 
-    It is in the user's cache folder, or in memory if that is not writable. It is not in the library's folder: a foreign
-    folder could contain an index that is a link to another program's database, or that has a journal naming files to
-    delete.
+    The index is in the user's cache folder, or in memory if that folder is not writable. It is not in the
+    library's folder: a foreign folder could contain an index that is a link to another program's database, or
+    whose journal names files to delete.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -59,7 +59,7 @@ class LibraryIndex:
         _remove_oldest(self._path)
 
     def load(self) -> dict[str, IndexedFiles]:
-        """All its content by key."""
+        """All indexed files, by key."""
 
         def read(database: sqlite3.Connection) -> dict[str, IndexedFiles]:
             kept = {}
@@ -118,7 +118,8 @@ class LibraryIndex:
                 with self._database:
                     return work(self._database)
             except (sqlite3.Error, msgspec.MsgspecError, ValueError, TypeError) as error:
-                # Python's own errors have no code. The low byte is the primary error code, the rest its variant.
+                # Only SQLite's errors have a code. Its low byte is the primary error code, the rest is the
+                # variant.
                 code = getattr(error, "sqlite_errorcode", None) or 0
                 if code & 0xFF not in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
                     log.info("The index of the library is rebuilt: %s", error)
@@ -154,7 +155,7 @@ def _connect(name: str) -> sqlite3.Connection:
         with database:
             for table in _TABLES:
                 database.execute(f"CREATE TABLE IF NOT EXISTS {table}")
-            # A read-only folder is detected only here.
+            # Write once: only a write fails if the folder is read-only.
             database.execute("DELETE FROM read WHERE key = ''")
     except sqlite3.Error:
         database.close()

@@ -18,7 +18,7 @@ from workbench.machine.files import read_regular_file, replace_file
 _PREFIX, _SUFFIX = ".job-", ".status"
 _MAX_BYTES = 1 << 18
 _MAX_FILES = 64
-"""Maximum number of status files that are read: a job in 64 parts has as many."""
+"""Maximum number of status files that are read from one folder; a job in 64 parts writes 64."""
 _WRITE_SECONDS = 1.0
 SILENT_SECONDS = 20.0
 """Age of the last status after which a job counts as dead."""
@@ -59,7 +59,8 @@ class JobStatus:
     written_at: float = 0.0
     """Unix time in seconds."""
     place: str = ""
-    """Folder into which it records, below the folder of the library; set by the reader."""
+    """Folder that the job records into, relative to the library's folder; empty for that folder. Set by the
+    reader."""
 
     @property
     def failed(self) -> int:
@@ -71,12 +72,12 @@ class JobStatus:
         return left / self.rate if self.state == "running" and self.rate > 0 else None
 
     def is_silent(self, now: float) -> bool:
-        """Whether the job ended without a last status."""
+        """Whether the job is dead: its last status says ``running``, but is older than `SILENT_SECONDS`."""
         return self.state == "running" and now - self.written_at > SILENT_SECONDS
 
 
 class StatusFile:
-    """Writes a job's status, at most once a second. Errors of writing are ignored: they must not end the job."""
+    """Writes a job's status, at most once a second. Write errors are ignored: they must not end the job."""
 
     def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
         self._folder, self._clock = folder.absolute(), clock
@@ -98,7 +99,8 @@ class StatusFile:
             replace_file(self._path, msgspec.json.encode(replace(status, written_at=now)))
 
     def remove_old(self, status: JobStatus) -> None:
-        """Remove status files of jobs older than an hour, and the last status of earlier runs of this job."""
+        """Remove status files older than an hour, and those of earlier runs of this job that have ended or
+        died."""
         now = self._clock()
         mine = (status.command, status.task, status.part)
         for path in sorted(self._folder.glob(f"{_PREFIX}*{_SUFFIX}"))[: 10 * _MAX_FILES]:
@@ -117,7 +119,7 @@ def read_jobs(folder: Path, now: float, below: Iterable[Path] = ()) -> tuple[Job
     are skipped, and texts are cleaned.
 
     Args:
-        below: further folders inside it.
+        below: subfolders of `folder` whose jobs are read too.
     """
     found: list[JobStatus] = []
     for place in dict.fromkeys((folder, *below)):

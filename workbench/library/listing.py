@@ -32,7 +32,7 @@ DOES: tuple[type[Command], ...] = (
     commands.LookForRows,
     commands.ClearRowFilter,
 )
-"""Commands that `apply` handles; any other one only drops rows that no longer exist."""
+"""Commands that `apply` handles; for any other command it returns `Listing.list` unchanged."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class RowArrangement:
 class LibraryList:
     """The user's choices in the list.
 
-    Selection works like in a file manager: a press selects one row, ctrl toggles it, shift selects a range from the last
-    one. Rows that are not listed are not selected, or a deletion would include rows that a filter hides.
+    Selection works as in a file manager: a press selects one row, ctrl toggles a row, shift selects the range
+    from the anchor. Only listed rows can be selected: a deletion must not include rows that a filter hides.
     """
 
     arrangement: RowArrangement = RowArrangement()
@@ -65,22 +65,24 @@ class LibraryList:
     cursor: str | None = None
     """Id of the row that was last pressed or reached by keys."""
     follow: bool = False
-    """Whether browsers scroll to the cursor: after a key, which may leave the visible rows."""
+    """Whether browsers scroll to the cursor: true after a key, which may move the cursor out of view."""
     anchor: str | None = None
     """Id of the row from which shift selects."""
     place: int = 0
-    """Row number of the cursor when it was set; the cursor stays there if its row is deleted."""
+    """Row number of the cursor when it was set. If that row is deleted, the next arrow key goes to the row at
+    this number."""
 
 
 @dataclass(frozen=True, eq=False)
 class Listing:
-    """The list for the library's rows at one moment; it is drawn, and commands apply to it."""
+    """The list of the library's rows at one moment, as the page draws it; commands apply to it."""
 
     library: tuple[LibraryRow, ...]
     """All rows of the library."""
     wanted: LibraryList
     list: LibraryList
-    """The choices without rows that are not listed and without a task that has no recordings."""
+    """`wanted` without rows that are not listed, and without a task filter for which there is no
+    recording."""
     rows: tuple[LibraryRow, ...]
     """The listed rows, in order."""
 
@@ -100,11 +102,11 @@ class Listing:
 def make_listing(
     wanted: LibraryList, library: tuple[LibraryRow, ...], before: Listing | None = None
 ) -> Listing:
-    """List rows.
+    """Filter and sort the library's rows, and drop choices that no longer apply.
 
     Args:
         library: all rows of the library.
-        before: an earlier listing; unchanged parts are reused.
+        before: an earlier listing, whose unchanged parts are reused.
     """
     if before is not None and before.library is not library:
         before = None
@@ -179,7 +181,8 @@ def _press(listing: Listing, id: str, toggle: bool = False, to_anchor: bool = Fa
 
 
 def _move(listing: Listing, by: int, to_anchor: bool = False) -> LibraryList:
-    """Move the cursor by an arrow key, from its row or its last position."""
+    """Move the cursor by `by` rows and select its row. Without a cursor, put it where it was last, or on the
+    shown page."""
     listed, ids = listing.list, [row.id for row in listing.rows]
     if not ids:
         return listed
@@ -219,6 +222,6 @@ class Action:
     most: int | None = None
     """Maximum number of recordings at once; None for any number."""
     reads: bool = True
-    """Whether it reads the recordings; False if it also applies to files that cannot be read."""
+    """Whether the action reads the recordings; False if it also works for files that cannot be read."""
     salvages: bool = False
-    """Whether it uses the readable part of a damaged recording."""
+    """Whether the action uses the readable part of a damaged recording."""

@@ -68,17 +68,18 @@ LIST = (*DOES, UndoDelete, EmptyTrash, TypeAnswer, AnswerDialog)
 
 
 class LibraryPanel(PagePart[object]):
-    """The table in the present container, the same for all open pages.
+    """The library's table in the current container; all open pages show the same table.
 
-    A page of rows with pictures has 150 KB, and the selection changes with every press, so the selection is a separate style
-    sheet that marks rows by their numbers, and only that is sent. A row keeps its number as long as the page exists, so a
-    press selects the pressed row even if the table has moved meanwhile.
+    A separate style sheet marks the selected rows by their numbers. Each press changes only this style sheet:
+    sending the rows with their pictures would take 150 KB. A row keeps its number as long as the page exists,
+    so the marks stay on their rows if the table changes meanwhile.
 
     Thumbnails are read on a separate thread when the rows of the shown page change; rows are shown before their thumbnails.
 
     Args:
         on_open: gets the ids of one to `MAX_SIDE_BY_SIDE` recordings, in the order of the table.
             Called on the loop, and must not block.
+        running: returns the version of the open task; None if no task is open.
     """
 
     def __init__(
@@ -98,17 +99,17 @@ class LibraryPanel(PagePart[object]):
             Action(
                 "Open",
                 OpenSelected(),
-                "Open it in the review (Enter, or double-click)",
+                "Open in the review (Enter, or double-click)",
                 on_open,
                 MAX_SIDE_BY_SIDE,
                 salvages=True,
             ),
             Action("Tag", TagSelected(), "Add or remove tags (T)", self._edits.ask_tags, reads=False),
-            Action("Note", NoteSelected(), "Edit its note (Shift+T)", self._edits.ask_note, reads=False),
+            Action("Note", NoteSelected(), "Edit the note (Shift+T)", self._edits.ask_note, reads=False),
             Action(
                 "Delete",
                 DeleteSelected(),
-                "Move its files to the trash (Delete)",
+                "Move the files to the trash (Delete)",
                 self._edits.ask_delete,
                 reads=False,
             ),
@@ -346,8 +347,8 @@ class LibraryPanel(PagePart[object]):
         if view.problem is not None or view.reading is not None:
             return ""
         return (
-            f"There are no recordings in {self._folder} yet. Recordings made there, on the Episodes tab of "
-            "a task or with workbench record, appear here."
+            f"There are no recordings in {self._folder} yet. Recordings that are made in this folder, on the "
+            "Episodes tab of a task or with workbench record, appear here."
         )
 
     def _draw_tools(self, view: LibraryView, listing: Listing) -> None:
@@ -393,19 +394,19 @@ class LibraryPanel(PagePart[object]):
             body = f"Select a row of the library first: {action.label} applies to the selection."
             tell_all(self._server, "Nothing is selected", body, seconds=8.0)
         elif action.most is not None and len(ids) > action.most:
-            body = f"{action.label} takes at most {action.most} at once."
-            tell_all(self._server, f"{len(ids)} are selected", body, seconds=8.0)
+            body = f"{action.label} works for at most {action.most} recordings at once: select fewer."
+            tell_all(self._server, f"{len(ids)} recordings are selected", body, seconds=8.0)
         elif action.reads and (why := self._why_unreadable(ids, action.salvages)):
             tell_all(self._server, f"{action.label} needs a recording that is not damaged", why, "red")
         else:
             action.run(ids)
             for row in self._library.view().rows if action.salvages else ():
                 if row.id in ids and row.problem:
-                    body = f"{row.problem} What can be read of it is shown."
+                    body = f"{row.problem} The part that can be read is shown."
                     tell_all(self._server, "This recording is damaged", body, "orange")
 
     def _why_unreadable(self, ids: tuple[str, ...], salvages: bool) -> str:
-        """Reason why none of these can be read; empty if one can.
+        """Reason why none of these recordings can be read; empty if one can be read.
 
         Args:
             salvages: whether the readable part of a damaged recording of the workbench is enough.

@@ -19,15 +19,15 @@ COLUMNS: tuple[Column, ...] = ("task", "date", "seed", "steps", "return", "succe
 SECOND_LINE: tuple[Column, ...] = ("name", "version", "tags", "note")
 HINTS: dict[Column, str] = {
     "task": "Env id of the task",
-    "date": "When it was recorded",
-    "seed": "Seed of the reset that began it",
+    "date": "Time of the recording",
+    "seed": "Seed of the reset that began the episode",
     "steps": "Control steps",
     "return": "Sum of the rewards",
-    "success": "At the last step; 'once' if only at an earlier step, 'stopped' if it was cut off before its end",
-    "version": "Hash of the task's source; orange where the open task runs another one",
+    "success": "At the last step; 'once': only earlier; 'stopped': no success, and stopped before its end",
+    "version": "Hash of the task's source; orange if the open task runs another version",
     "tags": "Tags",
     "note": "Note",
-    "name": "Name of its files",
+    "name": "Name of the recording's files",
 }
 
 
@@ -41,9 +41,9 @@ class OpenVersion:
 
 Outcome = Literal["all", "success", "no success", "broken"]
 MEANS: dict[Outcome, str] = {
-    "all": "Every recording. An export counts with the recording that it was made of",
+    "all": "Every recording; a recording and its exports count as one",
     "success": "Success at the last step",
-    "no success": "No success at the last step, also where it was stopped before its end",
+    "no success": "No success at the last step, including episodes that were stopped before their end",
     "broken": "Something is wrong with the files",
 }
 HASH_CHARACTERS = 7
@@ -67,13 +67,13 @@ def has_outcome(row: LibraryRow, outcome: Outcome) -> bool:
 
 
 def has_words(row: LibraryRow, words: Sequence[str]) -> bool:
-    """Whether each of these lower-case words occurs in the row's task, tags, note, name, source hash or action source;
-    ``seed:3`` means that seed."""
-    said = "\n".join(
+    """Whether each of these lower-case words occurs in the row's task, tags, note, name, source hash, action
+    source or problem; the word ``seed:3`` matches the seed."""
+    searched = "\n".join(
         (row.task, *row.tags, row.note, row.name, row.source_hash, row.acted_by, row.problem or "")
     ).lower()
     return all(
-        row.seed is not None and word == f"seed:{row.seed}" if word.startswith("seed:") else word in said
+        row.seed is not None and word == f"seed:{row.seed}" if word.startswith("seed:") else word in searched
         for word in words
     )
 
@@ -106,7 +106,7 @@ def none_like_that(words: str, outcome: Outcome, task: str | None) -> str:
     }
     kind = kinds[outcome]
     words = words.strip()
-    return f"No {kind}{wanted} has \u201c{words}\u201d." if words else f"There is no {kind}{wanted}."
+    return f"No {kind}{wanted} contains \u201c{words}\u201d." if words else f"There is no {kind}{wanted}."
 
 
 def begins_descending(column: Column) -> bool:
@@ -115,7 +115,8 @@ def begins_descending(column: Column) -> bool:
 
 
 def ordered(rows: Iterable[LibraryRow], column: Column, descending: bool) -> list[LibraryRow]:
-    """Sort rows; those without a value come last in both directions, ties are newest first."""
+    """Sort rows. Rows without a value come last in both directions; rows with equal values are sorted newest
+    first."""
     newest_first = sorted(rows, key=lambda row: (-(row.written or 0.0), row.name))
     known = [row for row in newest_first if _key(row, column) is not None]
     unknown = [row for row in newest_first if _key(row, column) is None]
@@ -145,7 +146,7 @@ def cells(row: LibraryRow, running: OpenVersion | None, now: datetime.datetime) 
     """The texts of a row's cells.
 
     Args:
-        running: None if no task is open.
+        running: version of the open task; None if no task is open.
         now: present time, in the time zone of the shown dates.
     """
     when = None if row.date is None else row.date.astimezone(now.tzinfo)
@@ -198,7 +199,7 @@ def _short_date(when: datetime.datetime, now: datetime.datetime) -> str:
 
 
 def in_words(rows: Sequence[LibraryRow]) -> str:
-    """``3 recordings (9 files, 1.2 MB)``."""
+    """Text of the numbers and the size, such as ``3 recordings (9 files, 1.2 MB)``."""
     files = {path for row in rows for path in row.paths}
     by_files = {row.paths: row.size for row in rows}
     what, of = counted(len(rows), "recording"), counted(len(files), "file")
@@ -206,9 +207,9 @@ def in_words(rows: Sequence[LibraryRow]) -> str:
 
 
 def job_text(job: JobStatus, now: float) -> str:
-    """State of a job, as the end of a sentence."""
+    """State of a job, to append to the line with its counts."""
     if job.is_silent(now):
-        return ", ended without a message: the same command resumes it if it had --job"
+        return ", ended without a final status: if it had --job, run the same command again to resume it"
     if job.state == "stopped":
         return ", stopped"
     if job.state == "failed":

@@ -17,8 +17,9 @@ TRASH = ".trash"
 class Trash:
     """Content of the trash.
 
-    Each deletion is a folder named by its time, with the files under their old paths below the library's folder, so undoing
-    it needs no list. The file that makes a recording appear in the library moves first and is restored last.
+    Each deletion is a folder named by its time, in which the files keep their paths relative to the library's
+    folder, so undo needs no list. The file that makes a recording appear in the library moves first and is
+    restored last.
     """
 
     batches: tuple[str, ...] = ()
@@ -29,8 +30,8 @@ class Trash:
 
 
 class TrashError(OSError):
-    """Files could not be moved; the message contains the file and the reason. The recording's other files were not moved, or
-    the message contains their place."""
+    """Files could not be moved or deleted; the message names the file and the reason. The recording's other
+    files are where they were; if not, the message says where they are."""
 
 
 def move_to_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | None:
@@ -40,7 +41,9 @@ def move_to_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | N
         TrashError: a file could not be moved; earlier recordings were moved.
     """
     if (folder / TRASH).is_symlink():
-        raise TrashError(f"{folder / TRASH} is a link, so nothing was moved there. Remove it.")
+        raise TrashError(
+            f"{folder / TRASH} is a link, so nothing was moved there. Remove the link and try again."
+        )
     now = datetime.datetime.now()
     batch = f"{now:%Y-%m-%dT%H-%M-%S.%f}-{uuid.uuid4().hex[:6]}"
     moved = False
@@ -59,7 +62,7 @@ def restore_from_trash(folder: Path, batch: str) -> tuple[str, ...]:
     root = folder / TRASH / batch
     if batch not in read_trash(folder).batches:
         raise TrashError("That deletion is no longer in the trash.")
-    # The .json must be restored last.
+    # Restore the .json last, or the library would show a recording whose other files are missing.
     order = {".h5": 0, ".rrd": 1, ".json": 2}
     files = sorted(
         (path for path in root.rglob("*") if path.is_symlink() or path.is_file()),
@@ -114,12 +117,14 @@ def _move_together(pairs: Sequence[tuple[Path, Path]]) -> bool:
             _move(source, target)
             done.append((source, target))
     except OSError as error:
-        what = f"{pairs[len(done)][0]} was left where it is: {error.strerror or error}."
+        what = f"{pairs[len(done)][0]} was not moved: {error.strerror or error}."
         for source, target in reversed(done):
             try:
                 _move(target, source)
             except OSError as again:
-                what += f" {source} is {target} now and could not be moved back: {again.strerror or again}."
+                what += (
+                    f" {source} is now at {target} and could not be moved back: {again.strerror or again}."
+                )
         raise TrashError(what) from error
     return bool(done)
 
@@ -127,5 +132,5 @@ def _move_together(pairs: Sequence[tuple[Path, Path]]) -> bool:
 def _move(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     if os.path.lexists(target):
-        raise FileExistsError(None, "there is a file of that name already", os.fspath(target))
+        raise FileExistsError(None, "there is already a file with that name", os.fspath(target))
     os.rename(source, target)

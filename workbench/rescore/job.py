@@ -1,4 +1,4 @@
-"""Rescores recordings in one or several processes: fixed chunks of recordings of one task, and a verdict for each."""
+"""Rescores recordings in one or several processes, in fixed chunks of recordings of one task."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from workbench.task.problem import Problem, TaskError
 from workbench.task.reference import RecordedTask, named_file
 
 _MAX_CHUNK_STARTS = 3
-"""Maximum number of times that a chunk is started when its workers die."""
+"""Maximum number of times that a chunk is started if its workers die."""
 _SUFFIXES = (".rrd", ".h5", ".json")
 """Suffixes of the files of one recording."""
 
@@ -39,8 +39,8 @@ class Recording:
     place: int
     """Index in the order of the files."""
     path: bytes
-    """Path as bytes, so that it is not relocated: a recording that is not sent to workers has the same path on all machines;
-    see `Work.files`."""
+    """Path as bytes, so that it is not relocated to a worker's folder (see `Work.files`): a recording that is
+    not sent to the workers has the same path on all machines."""
     travels: Path | None
     """The path, if the recording is sent to the workers; else None."""
     part: str | None
@@ -66,7 +66,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class RescoredRecording:
-    """Result of an item."""
+    """Result of one recording."""
 
     place: int
     verdict: Verdict[Source]
@@ -96,10 +96,12 @@ class RescoreSetup:
     of_chunk: tuple[int, ...]
     """Index in `codes` for each chunk."""
     items: Mapping[int, Recording]
-    """Recordings by number; the numbers of chunk k begin with ``k * chunk``."""
+    """Recordings by number; the numbers of chunk k begin at ``k * chunk``."""
     chunk: int
     use_env_states: bool = False
     elsewhere: bool = False
+    """Whether workers on other machines read the recordings from a shared folder, because they are too large
+    to send."""
 
     def code_of(self, chunk: Chunk) -> int:
         return self.of_chunk[chunk.numbers[0] // self.chunk]
@@ -130,7 +132,7 @@ def rescore_recordings(
 
     Args:
         on_progress: called with the number of rescored episodes, of all episodes, and of control steps so far.
-        on_finding: called once for each place where a task breaks a rule without being stopped.
+        on_finding: called once for each line at which a rule is broken without stopping the task.
 
     Raises:
         PoolError: a process that rescores failed, or processes die repeatedly.
@@ -223,7 +225,7 @@ class _Stopped(Exception):
 def rescore_items(setup: RescoreSetup, queue: ItemQueue) -> None:
     """Rescore the chunks of one worker. An exception of the author's code becomes the verdict of its recordings."""
     torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
-    here = CurrentFolder()  # a task may change it
+    here = CurrentFolder()  # a task may change the working directory
     chunk = queue.next()
     with suppress(_Stopped):
         while chunk is not None:
@@ -250,8 +252,8 @@ class _Rescorer:
     queue: ItemQueue
 
     def run(self, code: RescoredBy, chunk: Chunk | None) -> Chunk | None:
-        """Rescore this chunk and the following ones of the same code, until the code raises, which may leave its envs in any
-        state. Returns the next chunk."""
+        """Rescore this chunk and the following chunks of the same code. Stops when the code raises, because
+        its envs may then be in any state. Returns the next chunk to rescore."""
         try:
             with opened_code(
                 code,
@@ -293,7 +295,7 @@ class _Rescorer:
         return True
 
     def _source(self, number: int) -> Source:
-        """Source of a recording on this machine; its id is the number."""
+        """Source of a recording on this machine, with `number` as its id."""
         of = self.setup.items[number]
         path = of.travels or of.source().path
         if self.setup.elsewhere and not path.parent.is_dir():

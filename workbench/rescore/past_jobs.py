@@ -17,7 +17,8 @@ from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreEffect,
 from workbench.rescore.verdict import RescoredMoments, RescoreMoments
 
 _CHUNK_SECONDS = 0.1
-"""Target duration of one question, after which progress is shown and a stop takes effect."""
+"""Target duration of one request to the process; progress is shown, and a stop takes effect, between
+requests."""
 _MAX_MOMENTS = 64
 _SUMMARY_SECONDS = 0.5
 """Interval between summaries."""
@@ -26,7 +27,8 @@ _SUMMARY_SECONDS = 0.5
 class PastRescorer:
     """Rescores the history in the background process, a few moments at a time.
 
-    To stop, it sends no more questions; a process that does not answer (the new code may hang) is killed.
+    To stop a job, it sends no more requests; if the process does not answer (the new code may hang), it is
+    killed.
     """
 
     def __init__(self, process: Background, happen: Callable[[RescoringTold], object]) -> None:
@@ -38,11 +40,11 @@ class PastRescorer:
         self._process, self._happen = process, happen
         self._jobs = Jobs(lambda: None, self._failed)
         self._told = RescoringTold(0, RescoreView())
-        """State and results of the running or the last job."""
+        """State and results of the running job, or of the last one."""
         self._past: RescoredPast | None = None
 
     def perform(self, effect: RescoreEffect) -> None:
-        """Start the effect; called on the loop."""
+        """Cancel the current job and carry out the effect; called on the loop."""
         self._jobs.stop()
         if self._past is not None:
             self._past.release()
@@ -54,7 +56,7 @@ class PastRescorer:
                 self._past = None
 
     def close(self) -> None:
-        """Cancel the job, and accept no more."""
+        """Cancel the job, and accept no further jobs."""
         do(self._jobs.close)
 
     def _failed(self, failure: JobFailed) -> None:
@@ -105,15 +107,16 @@ class PastRescorer:
             return
         self._tell(state="loading")
         if self._process.num_envs == past.num_envs:
-            # Loading tries the new code at the env's current moment, where the last job ended. There the code may raise or
-            # hang although it runs from the recorded start states: so restore one of these first.
+            # Loading tries the new code at the env's current moment, where the last job ended. The code may
+            # raise or hang there, although it works from the recorded start states. So restore a recorded
+            # start state first.
             await self._ask(past, past.runs()[0][:1])
         try:
             await self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))
         except JobFailed as failure:
             if failure.problem is None:
                 raise
-            raise JobFailed("the new code could not be loaded to rescore with", failure.problem) from failure
+            raise JobFailed("the new code could not be loaded for rescoring", failure.problem) from failure
 
     async def _replay_steps(
         self, past: RescoredPast, rows: range, on_answer: Callable[[RescoredMoments, float], None]

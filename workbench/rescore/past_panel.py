@@ -49,7 +49,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
             "curve",
             (self._name,),
             self._name,
-            hint="Which number is plotted, as recorded and with the new code",
+            hint="The number that is plotted, as recorded and with the new code",
         )
         self._curve.visible = False
         self._add_chart()
@@ -95,11 +95,11 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
 
     def _of_row(self, verdict: Verdict[PastRun]) -> dict[str, Any]:
         env, at = place = _place(verdict)
-        kept = at >= self._first
+        in_history = at >= self._first
         return {
             "name": f"{env}, from {verdict.of.tick}",
             "hint": f"Env {env}, the episode that began after {counted(verdict.of.tick, 'step')}. "
-            + ("Show the moment" if kept else "The moment is no longer in the history"),
+            + ("Click to show the moment" if in_history else "The moment is no longer in the history"),
             "selected": self._shown == place,
         }
 
@@ -143,9 +143,10 @@ def _place(verdict: Verdict[PastRun]) -> tuple[int, int]:
 
 
 def chart_data(curve: RescoredCurve, shown: int | None) -> tuple[NDArray, NDArray, NDArray, float | None]:
-    """x, the recorded curve, the new curve, and the place of the shown moment on x, if it is there.
+    """x (control steps), the recorded curve, the new curve, and x of the shown moment, or None if it is not
+    on the chart.
 
-    A long curve is cut to its newest part, or to the part around the shown moment.
+    A long curve is cut to the part around the shown moment, or to its newest part.
     """
     place = None if shown is None else int(np.searchsorted(curve.serial, shown))
     part = part_round(len(curve.tick), place)

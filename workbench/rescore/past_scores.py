@@ -19,28 +19,28 @@ MAX_ENTRIES = 24
 
 @dataclass(frozen=True, eq=False)
 class PastRun:
-    """Successive moments of one env without a jump (a reset, or a restored past moment)."""
+    """Moments of one env from a jump (a reset, or a restored past moment) to the next jump."""
 
     env: int
     begin: int
-    """Control steps of its episode before its first moment."""
+    """Control steps of the episode before the first moment of the run."""
     serials: NDArray[np.int64]
-    """(T + 1,) serials of its moments."""
+    """(T + 1,) serials of the moments."""
     tick: int = 0
-    """Control steps before its first moment, counted as on the timeline."""
+    """Control steps before the first moment, counted as on the timeline."""
 
     @property
     def name(self) -> str:
         return f"env {self.env}"
 
     def at(self, step: int) -> int:
-        """Serial of the moment after a control step of its episode."""
+        """Serial of the moment after this control step of the episode."""
         return int(self.serials[step - self.begin])
 
 
 @dataclass(frozen=True)
 class RescoredCurve:
-    """One number of one env at the recorded control steps, oldest first."""
+    """Values of one number of one env at the recorded control steps, oldest first."""
 
     tick: NDArray[np.int64]
     """(T,) ticks, counted as in `Moment.tick`."""
@@ -55,15 +55,17 @@ class RescoredCurve:
 class RescoredPast:
     """Old and new scores of the history, one row per moment, filled as results arrive. Used on the loop.
 
-    The bodies' drift from the record is kept for each moment and env, since it decides whether a comparison is reliable.
-    From a kept reset on it is mostly zero to the last bit, because there envs start with fresh physics (measured: PushCube,
-    PickCube and StackCube none, PushT 7e-8 m, PushCube with a restored past moment 6e-8 m). It may grow if the oldest kept
-    moment is in the middle of an episode, and for tasks whose state does not fit a snapshot (see
+    The bodies' drift from the record is stored for each moment and env, because it decides whether a
+    comparison is reliable. After a reset that is in the history the drift is mostly zero to the last bit,
+    because envs start there with fresh physics (measured: none in PushCube, PickCube and StackCube, 7e-8 m in
+    PushT, 6e-8 m in PushCube with a restored past moment). The drift may grow if the oldest moment of the
+    history is in the middle of an episode, and in tasks whose state does not fit a snapshot (see
     `envs.snapshots.snapshot`).
     """
 
     def __init__(self, history: History, seen: int | None = None, has_reward: bool = True) -> None:
-        """Take the moments of `history`, up to the first jump without a snapshot.
+        """Take the moments of `history` up to the first jump without a snapshot; none if its oldest moment
+        has no snapshot.
 
         Args:
             seen: serial of the moment that the page shows; its run is replayed first.
@@ -92,12 +94,12 @@ class RescoredPast:
         for row, moment in enumerate(self._moments):
             self._write(self._old, row, moment.as_recorded)
         self._drift = np.zeros((count, envs, 2), np.float32)
-        # Number, over the batch, of the run that each env is in at each row.
+        # The run of each env at each row; runs are numbered over the whole batch.
         within = np.cumsum(self._jumped, axis=0) - 1
         sizes = within[-1] + 1 if count else np.zeros(0, np.int64)
         self._run = within + (np.cumsum(sizes) - sizes)
         self._changed: set[int] = set()
-        """Numbers of runs with new rows since the last call of `verdicts`."""
+        """Numbers of the runs that got new rows since the last call of `verdicts`."""
         self._verdicts: dict[int, Verdict[PastRun]] = {}
 
     @property
@@ -110,8 +112,8 @@ class RescoredPast:
         return int((self._is_step & self._rescored).sum())
 
     def runs(self) -> list[range]:
-        """Rows to replay, as runs that each begin with a jump of all envs. The shown run comes first, then the newest ones,
-        because a history may hold minutes of simulation.
+        """Rows to replay, as runs that each begin with a jump of all envs. The shown run comes first, then
+        the others from the newest to the oldest, because a history may contain minutes of simulation.
         """
         begins = [int(row) for row in np.flatnonzero(self._jumped.all(axis=1))]
         ends = [*begins[1:], len(self._serial)]
@@ -131,10 +133,10 @@ class RescoredPast:
         return MomentToRescore(None, pickle.dumps(self._moments[row].snapshot), envs)
 
     def add(self, row: int, step: StepResult) -> None:
-        """Take the new scores of a row.
+        """Store the new scores of a row.
 
         Raises:
-            ValueError: the bodies of the env differ from those of the record, so that the two cannot be compared.
+            ValueError: the env has other bodies than the record, so the two cannot be compared.
         """
         was = self._moments[row].step.poses
         if step.poses.shape != was.shape:
@@ -173,7 +175,8 @@ class RescoredPast:
         return [*self._verdicts.values()]
 
     def names(self) -> tuple[tuple[str, ...], frozenset[str]]:
-        """Names for `curve` (``reward`` first, then what differs, then the rest), and those that differ."""
+        """Names for `curve` (``reward`` first, then the differing ones, then the rest), and the set of
+        differing names."""
         names = dict.fromkeys(["reward", *self._old, *self._new])
         differing = {name for verdict in self.verdicts() for name in verdict.differing}
         if self._new:
@@ -188,7 +191,7 @@ class RescoredPast:
         first, end = self._run[:, env].searchsorted([number, number + 1])
         counts = self._rescored[first:end] & self._is_step[first:end]
         counts[0] = self._rescored[first]
-        # Without jumps of other envs in between the run is a slice, which is ten times as fast.
+        # If no other env jumped during the run, its rows are a slice, which is ten times as fast.
         rows = slice(first, end) if counts.all() else first + counts.nonzero()[0]
         serials = self._serial[rows]
         if len(serials) < 2:

@@ -43,7 +43,7 @@ class RescoreGroup:
     """Episodes that are rescored in one env."""
 
     reference: TaskName
-    """The task to open, unless `recorded_source`."""
+    """The task to open, unless `recorded_source` is True."""
     options: TaskOptions
     info: EpisodeInfo
     """Info of the first episode of the group."""
@@ -51,7 +51,7 @@ class RescoreGroup:
     note: str = ""
     """Note on options that differ from the recorded ones on purpose."""
     recorded_source: bool = False
-    """Open the recorded text in `info` instead."""
+    """Whether to open the source text in `info` instead of `reference`."""
 
     @property
     def code(self) -> CodeToRun:
@@ -72,9 +72,10 @@ def group_episodes(
 
     Args:
         num_envs: maximum number of envs of a group.
-        task: task to open for all of them, instead of the recorded one.
-        file: task file to open for episodes whose task is in it.
-        recorded_source: rescore each with the text that it was recorded with.
+        base: options for what a recording does not determine; see `options_of`.
+        task: task to open for all episodes, instead of the recorded one.
+        file: task file to open for the episodes whose task is in it.
+        recorded_source: rescore each episode with the source text in its recording.
     """
     groups: dict[str, RescoreGroup] = {}
     broken_files: list[Verdict[Source]] = []
@@ -93,7 +94,8 @@ def group_episodes(
         if recorded_source and (besides := side_files_text(info.source_file, info.side_files)):
             note = f"{note}. {besides}" if note else besides
         reference = task or (file and class_in(file, info.task)) or reference_of(info)
-        # Recordings that were made here are trusted: they must not share a group with others.
+        # Recordings that were made here are trusted: they must not share a group with recordings from
+        # elsewhere.
         about = [str(reference), info.task, options.env_kwargs, text, made_here(info).value]
         key = json.dumps(about, sort_keys=True, default=str)
         group = groups.get(key) or RescoreGroup(reference, options, info, (), note, recorded_source)
@@ -186,7 +188,8 @@ class Rescorer:
         recorded_source: bool = False,
         use_env_states: bool = False,
     ) -> None:
-        """Rescore these files; arguments as in `group_episodes`."""
+        """Rescore these files; `file` and `recorded_source` as in `group_episodes`, `use_env_states` as in
+        `replay_recordings.rescore`."""
         if not files:
             return
         self._rescoring = self._rescoring.begun(RescoreView("loading", total=len(files), unit="episodes"))
@@ -237,7 +240,7 @@ class Rescorer:
             )
             await self._rescore_each(job, groups, cleared, use_env_states)
         finally:
-            self._process.end()  # with the code that the recordings named
+            self._process.end()  # so that code of the recordings does not stay loaded
         self._tell(state="done")
 
     async def _rescore_each(
@@ -299,8 +302,8 @@ class Rescorer:
 
 
 def _write_text(info: EpisodeInfo, stack: ExitStack, job: Job) -> str:
-    """Enter `recorded_source` in this process, so that the text is removed even if the other process is killed. Raises
-    CannotEnterRecording."""
+    """Enter `recorded_source` on `stack`; returns the reference to open. It is entered in this process, so
+    that the text is removed even if the background process is killed. Raises CannotEnterRecording."""
     reference = stack.enter_context(recorded_source(info))
     if job.stopped:
         stack.close()

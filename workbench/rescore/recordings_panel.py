@@ -38,13 +38,13 @@ MAX_NAMES = 3
 
 @dataclass(frozen=True)
 class Code:
-    """Choice of code to run recordings with. It is a file that the server knows: a page never sends a path."""
+    """A choice of the code that rescores recordings. A page sends only its label, never a path."""
 
     label: str = field(compare=False)
     told: str = field(compare=False)
     """Text for the page that names the files."""
     file: Path | None = None
-    """File that takes precedence over the files named by the recordings."""
+    """File to use for the tasks in it, instead of the files named by the recordings."""
     recorded: bool = False
 
 
@@ -52,14 +52,15 @@ def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code
     """The choices for these recordings; the current code and the recorded text are always the first two.
 
     Args:
-        infos: Infos of the open recordings; those of others are unknown before they are rescored.
-        known: Other task files, not named by the recordings.
+        infos: Infos of the open recordings; other recordings are not read before they are rescored.
+        known: Task files that the server knows; those that the recordings name are skipped.
     """
     named = list({str(reference): reference for reference in map(reference_of, infos)}.values())
     own = {file for file in map(named_file, named) if file is not None}
     codes = [Code(TODAYS, _todays(infos, named)), Code(RECORDED, _recorded(infos), recorded=True)]
     for file in dict.fromkeys(known):
-        # Without open recordings the tasks are unknown; recordings of other tasks are skipped later.
+        # Without open recordings the tasks are unknown: list every file. A recording whose task is not in the
+        # chosen file is rescored with the file that it names.
         if file not in own and (not infos or any(class_in(file, info.task) for info in infos)):
             taken = {code.label for code in codes}
             label = file.name if file.name not in taken else str(Path(file.parent.name, file.name))
@@ -71,9 +72,9 @@ def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code
 def _todays(infos: Sequence[EpisodeInfo], named: Sequence[RecordedTask]) -> str:
     if not infos:
         return "Each recording with the file it names, as it is now."
-    told = [_in_words(reference) for reference in named[:MAX_NAMES]]
+    texts = [_in_words(reference) for reference in named[:MAX_NAMES]]
     more = f", and {len(named) - MAX_NAMES} more" if len(named) > MAX_NAMES else ""
-    return f"With {', '.join(told)}{more}."
+    return f"With {', '.join(texts)}{more}."
 
 
 def _in_words(reference: RecordedTask) -> str:
@@ -108,12 +109,12 @@ def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
 
 
 class RescorePanel(RescoredPanel[ReviewView, Source]):
-    """The panel in the current container.
+    """The parts of the Rescore tab, in the current container.
 
     Args:
         server: The page.
         rescorer: Rescores the recordings.
-        review: Shows the episode of a row, and knows the open recordings.
+        review: The review that shows the episode of a row, and has the open recordings.
         library: Library of the recordings that may be rescored.
         choices: Choices that are kept while pages are replaced.
         known: Returns other task files that the server knows.
@@ -162,7 +163,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         self._selected: str | None = None
 
     def rescore_and_notify(self, ids: Sequence[str]) -> None:
-        """Start `rescore` and notify every page, for a click outside of this tab."""
+        """Call `rescore` and notify every page; for a click outside this tab."""
         if not ids:
             tell_all(self._server, "Nothing to rescore", "No recording is selected or open.")
             return
@@ -190,7 +191,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
             case ChooseRescoreCode(code=label):
                 code = next((code for code in self._codes if code.label == label), None)
                 if code is None:
-                    raise Refused("This code is not among those that can be chosen.")
+                    raise Refused("This code can no longer be chosen: choose another one from the list.")
                 self._choices.code = code
             case RestoreRecordedStates(on=on):
                 self._choices.use_env_states = on
@@ -200,7 +201,8 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
                 super().do(command, visitor)
 
     def _chosen(self) -> Code:
-        """The chosen code; the first choice if the chosen one is no longer available, so that no hidden code is used."""
+        """The chosen code; if it is no longer listed, the first choice, so that no code is used that the page
+        does not show."""
         return next((code for code in self._codes if code == self._choices.code), self._codes[0])
 
     # --- drawing -----------------------------------------------------------------------------------
@@ -216,13 +218,13 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
 
     def draw(self, view: ReviewView) -> None:
         self._draw_codes(view)
-        told = self._rescorer.view
-        can_begin = bool(view.opened) and told.state not in RUNNING
+        rescored = self._rescorer.view
+        can_begin = bool(view.opened) and rescored.state not in RUNNING
         begin = tool("Rescore the open recordings", RescoreOpen(), tone="main")
         self._begin.content = tools_html([begin] if can_begin else [])
         self._states.show(self._choices.use_env_states)
-        self._draw_status(told, idle=IDLE)
-        self._draw_list(by_change(told.verdicts))
+        self._draw_status(rescored, idle=IDLE)
+        self._draw_list(by_change(rescored.verdicts))
         self._draw_curve()
 
     def _draw_codes(self, view: ReviewView) -> None:

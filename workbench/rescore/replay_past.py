@@ -28,6 +28,7 @@ def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMome
             return RescoredMoments(tuple(steps), missed, error.problem)
         steps.append(step)
         if len(moment.env_idx) == opened.env.num_envs:
-            # Only for jumps of all envs: a jump of some envs never restores state of the whole batch, in play neither.
+            # Only for jumps of all envs: a jump of some envs does not restore state of the whole batch, not
+            # even while playing.
             missed |= report.not_carried
     return RescoredMoments(tuple(steps), missed)

@@ -70,12 +70,12 @@ class _Rescoring:
 
     @property
     def at(self) -> int:
-        """Number of the state that the env is in."""
+        """Index of the recorded state that corresponds to the env's current state."""
         return len(self.reward)
 
     def verdict(self) -> Verdict[Source]:
         run = self.run
-        # A recording of another program may lack rewards: there is nothing to compare with.
+        # A recording of another program may lack rewards: then there is nothing to compare with.
         had_reward = not np.isnan(run.reward).all()
         old = run.reward if had_reward else np.zeros(0)
         now = {name: np.array(rows) for name, rows in self.evaluate.items()}
@@ -102,8 +102,8 @@ def rescore(
     """Rescore these episodes with the open task's code; yields the verdicts in the order in which the episodes end, and the
     progress a few times a second.
 
-    Each env begins an episode (`replay.begin_run`), takes its actions, and then continues with the next one, independent of
-    the other envs. Envs without an episode do not move.
+    Each env begins an episode (`replay.begin_run`), applies its actions, and then continues with the next
+    episode, independent of the other envs. Envs without an episode do not move.
 
     Args:
         use_env_states: restore every recorded state after its step, so that nothing drifts.
@@ -146,7 +146,13 @@ def opened_code(
     on_activity: Callable[[str], None] = lambda activity: None,
     on_finding: Callable[[Finding], None] = lambda finding: None,
 ) -> Iterator[OpenedTask]:
-    """Context manager that opens the task of a code. Raises TaskError, CannotEnterRecording."""
+    """Context manager that opens the task of `code`; if it cannot be opened with `code.options`, with
+    `code.or_else`.
+
+    Raises:
+        TaskError: the task cannot be opened with either, or the block raised.
+        CannotEnterRecording: the recorded source cannot be used.
+    """
     text = nullcontext(code.task) if code.recorded is None else recorded_source(code.recorded)
     with text as task:
         try:
@@ -154,7 +160,7 @@ def opened_code(
         except TaskError:
             opened = open_task(task, code.or_else, on_activity=on_activity, on_finding=on_finding)
         if isinstance(opened.env.env, BatchedCpuMixin):
-            # Without this an episode depends, in the last bits, on the earlier episodes of the same process.
+            # Without this, the last bits of an episode depend on the earlier episodes of the same process.
             opened.env.env.begins_anew = True
         try:
             yield opened
@@ -164,7 +170,8 @@ def opened_code(
 
 
 def answer(request: Rescore, on_progress: Callable[[int, int, Rescored], None]) -> Rescored:
-    """Carry out `request` in a worker: all results go to `on_progress`, and an exception of the code is returned."""
+    """Carry out `request` in a worker. All results go to `on_progress`; the answer contains only an exception
+    of the code."""
     try:
         code = RescoredBy(request.task, request.options, request.or_else)
         with CurrentFolder().again(), opened_code(code) as opened:
@@ -188,7 +195,7 @@ def _open_episode(
     if run.length == 0:
         why_not = "it has no step"
     elif use_env_states and not run.env_states:
-        why_not = "it holds no env states"
+        why_not = "it has no recorded env states"
     damaged = bool(episode.broken_files)
     if why_not:
         why_not = ". ".join((why_not, *(broken.sentence for broken in episode.broken_files)))
@@ -238,7 +245,7 @@ def _add_scores(
 ) -> None:
     for name, values in scalar_entries(step.evaluate).items():
         rows = rescoring.evaluate.setdefault(name, [])
-        # The terms of a reward exist from the first step on.
+        # Pad with NaN: some entries, such as the terms of a reward, exist only after the first step.
         rows += [np.nan] * (rescoring.at - len(rows))
         rows.append(float(values[env]))
     recorded = rescoring.run.state(rescoring.at)

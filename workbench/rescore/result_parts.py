@@ -39,13 +39,13 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
     every = 0.25
     does: tuple[type[Command], ...] = (ShowRescored, TurnRescored)
     advice = ""
-    """Sentence that is shown if bodies were far from the record."""
+    """Sentence that is shown if bodies drifted from the record."""
 
     def __init__(self, server: viser.ViserServer, column: str) -> None:
         self._server, self._column = server, column
         self._listed: Sequence[Verdict[Of]] = ()
         self._failed_since = ""
-        """Reason of a failed rescoring, as the status shows it; the rows do not repeat it."""
+        """Reason of a failed rescoring. The status shows it, so the rows do not repeat it."""
 
     def _add_status(self, label: str) -> None:
         self._stop = self._server.gui.add_html(tools_html([tool(label, StopRescoring())]), visible=False)
@@ -80,10 +80,10 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
 
     def _row(self, place: int) -> dict[str, Any]:
         verdict = self._listed[place]
-        told = self._failed_since and verdict.why_not.startswith(self._failed_since)
+        in_status = self._failed_since and verdict.why_not.startswith(self._failed_since)
         return {
             "badge": None,
-            "changed": "not rescored" if told else verdict_text.change_text(verdict),
+            "changed": "not rescored" if in_status else verdict_text.change_text(verdict),
             "returns": "" if verdict.why_not else verdict_text.returns_text(verdict),
             "drift": f"drifted {verdict_text.drift_text(verdict)}" if verdict.drifted else "",
             "same": not verdict.differs,
@@ -102,20 +102,21 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
                 self._pages = self._pages.turned(by, len(self._listed))
 
     def _key_of(self, verdict: Verdict[Of]) -> str:
-        """Key that distinguishes its run from the others."""
+        """Key that distinguishes the verdict's run from the other runs."""
         raise NotImplementedError
 
     def _of_row(self, verdict: Verdict[Of]) -> dict[str, Any]:
-        """Name of the run, a hint, and whether it is selected."""
+        """Values of a row for the template: the run's name, a hint, and whether it is selected."""
         raise NotImplementedError
 
     def _show(self, verdict: Verdict[Of]) -> None:
-        """Show the run."""
+        """Show the verdict's run."""
         raise NotImplementedError
 
 
 def status_html(rescored: RescoreView, title: str = "", idle: str = "", advice: str = "") -> str:
-    """
+    """HTML of the state and the results of rescoring.
+
     Args:
         title: Title above the status.
         idle: Text before anything is rescored.

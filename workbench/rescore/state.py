@@ -29,11 +29,12 @@ class RescoreView:
     """State and results of the last rescoring job."""
 
     state: RescoreState = "none"
-    """``asking``: whether the code may run; ``loading``: the code is loaded in the background process."""
+    """``asking``: waiting for permission to run the code; ``loading``: the recordings are read, or the code
+    is loaded in the background process."""
     serial: int = 0
     """Grows with every change."""
     verdicts: tuple[Verdict[Any], ...] = ()
-    """Verdicts so far, including runs that are rescored in part."""
+    """Verdicts so far, including those of partly rescored runs."""
     done: int = 0
     total: int = 0
     unit: str = "steps"
@@ -64,11 +65,11 @@ class RescoreView:
 
 @dataclass(frozen=True)
 class Rescoring:
-    """The running or the last job that rescores the history, or recordings."""
+    """The running or the last job, which rescores the history or recordings."""
 
     view: RescoreView = RescoreView()
     past: RescoredPast | None = field(default=None, compare=False)
-    """Scores of the history, which are modified in place. None for recordings."""
+    """Scores of the history, modified in place; None for recordings."""
     job: int = 0
     """Number of the job."""
 
@@ -77,7 +78,7 @@ class Rescoring:
         return self.view.state in RUNNING
 
     def begun(self, view: RescoreView, past: RescoredPast | None = None) -> Rescoring:
-        """State with the next job, which begins with this view."""
+        """The state when the next job begins, with this view."""
         return replace(self, past=past, job=self.job + 1).shows(view)
 
     def shows(self, view: RescoreView) -> Rescoring:
@@ -85,7 +86,8 @@ class Rescoring:
         return replace(self, view=replace(view, serial=self.view.serial + 1))
 
     def curve(self, name: str, env: int) -> RescoredCurve | None:
-        """The curve of `RescoredPast.curve`; None before the first job. Called on the loop."""
+        """Result of `RescoredPast.curve`; None before the first job, and for recordings. Called on the
+        loop."""
         return None if self.past is None else self.past.curve(name, env)
 
 
@@ -114,7 +116,7 @@ class BeginRescoring:
 
 @dataclass(frozen=True)
 class EndRescoring:
-    """Cancel the job, and free its moments; results so far stay."""
+    """Cancel the job and free its moments; the results so far stay."""
 
 
 RescoreEffect = BeginRescoring | EndRescoring
@@ -163,7 +165,7 @@ def apply(rescoring: Rescoring, event: object, before: Run, run: Run) -> Change:
 
 
 def rescore_after_load(past: PastAfterLoad, view: RescoreView) -> Literal["rescore", "keep", "forget"]:
-    """Decide whether to rescore the history with the loaded version, keep the last results, or forget them with the episodes.
+    """Decide whether to rescore the history with the loaded version, keep the last results, or forget them.
 
     Args:
         past: effect of the load on the history.

@@ -18,7 +18,7 @@ from workbench.task.problem import Problem
 from workbench.task.reference import TaskName
 
 DOUBTFUL_METRES, DOUBTFUL_RADIANS = 1e-3, 1e-2
-"""Distance of a body from the recorded state beyond which a comparison is doubtful."""
+"""Distance and rotation of a body from the recorded state beyond which a comparison is doubtful."""
 FLAGS = ("success", "fail")
 MAIN = ("reward", *FLAGS)
 Of = TypeVar("Of")
@@ -26,7 +26,7 @@ Of = TypeVar("Of")
 
 @dataclass(frozen=True)
 class Scores:
-    """Reward of a run, and the entries of evaluate that are one number or flag."""
+    """Reward of a run, and the entries of evaluate that are scalars or flags."""
 
     reward: NDArray
     """(T,); empty if none was recorded."""
@@ -38,10 +38,11 @@ class Scores:
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Generic[Of]):
-    """Comparison of one run: T control steps and T + 1 states. It ends with the shorter of both scores, even if the current
-    code would have ended the episode earlier.
+    """Comparison of one run: T control steps and T + 1 states. It covers the steps that both scores have,
+    also those after a step at which the current code would have ended the episode.
 
-    The run is replayed for the comparison, so the verdict also has the distance from the recorded states.
+    Rescoring replays the run, so the verdict also has the distance of the replayed states from the recorded
+    ones.
     """
 
     of: Of
@@ -56,8 +57,9 @@ class Verdict(Generic[Of]):
     has: tuple[str, ...] = ("reward",)
     """Names among reward, success and fail that the record or the current code has."""
     returns: tuple[float, float] = (0.0, 0.0)
+    """Sums of the rewards, as (recorded, rescored)."""
     largest: float = 0.0
-    """Largest change of one reward."""
+    """Largest absolute change of the reward of a step."""
     first_difference: int | None = None
     """The first step whose reward, success or fail differs; None if all are equal."""
     look_at: int | None = None
@@ -71,13 +73,14 @@ class Verdict(Generic[Of]):
     drift_at: int | None = None
     """Step after which a body was furthest from the recorded state."""
     start_differs: bool = False
-    """Whether the reset with its seed gave a different first state, and the recorded one was restored."""
+    """Whether the reset with the recorded seed gave another first state, so that the recorded state was
+    restored."""
     missed: dict[str, str] = field(default_factory=dict)
     """Name and reason of each part of the state that could not be restored into the env."""
     why_not: str = ""
-    """Reason why the run was not rescored; all other fields are then empty."""
+    """Reason why the run was not rescored; the results of the comparison are then empty."""
     damaged: bool = False
-    """Whether some of its files cannot be read."""
+    """Whether some files of the recording cannot be read."""
     old_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     new_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
@@ -120,7 +123,8 @@ def compare(
 
     Args:
         old: recorded scores, at least as long as `new`.
-        drift: (T + 1, 2) metres and radians of the furthest body from each recorded state; None if unknown.
+        drift: (T + 1, 2) largest distance (m) and rotation (rad) of a body from each recorded state; None if
+            unknown.
         begin: number of steps of the episode before the run.
     """
     steps = len(new.reward)
@@ -128,7 +132,7 @@ def compare(
     has |= {name: name in old.evaluate or name in new.evaluate for name in FLAGS}
     both = [n for n, values in new.evaluate.items() if len(old.evaluate.get(n, ())) >= len(values)]
     names = ("reward", *both)
-    # In one array for speed: this is called for hundreds of runs several times a second.
+    # All entries are in one array for speed: this is called for hundreds of runs several times a second.
     was, now = np.full((2, len(names), steps + 1), np.nan)
     if len(old.reward):
         was[0, 1:], now[0, 1:] = old.reward[:steps], new.reward
@@ -137,7 +141,7 @@ def compare(
         was[row, :length], now[row, :length] = old.evaluate[name][:length], new.evaluate[name]
     apart = gap(was, now)
     differs = too_far(was, apart, axis=1)
-    # Many files lack values for the first state of a run.
+    # A missing first value is no difference: many files lack values for the first state of a run.
     differs[:, 0] &= ~np.isnan(was[:, 0])
     others = {name: differs[row].nonzero()[0] for row, name in enumerate(names)}
     turned: dict[str, tuple[int | None, int | None]] = {}
@@ -194,7 +198,11 @@ def by_change(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
 
 
 def scalar_entries(evaluate: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """The entries of `evaluate`, (n, ...) each, that have one number or flag per row, as (n,)."""
+    """The entries of `evaluate` with one number or flag per row, as (n,) arrays.
+
+    Args:
+        evaluate: (n, ...) values of each entry.
+    """
     return {
         # An author's entry may be called "reward" too, but it is not the reward.
         "evaluate/reward" if name == "reward" else name: values.reshape(len(values))
@@ -208,7 +216,7 @@ def _first(flag: NDArray[np.bool_], begin: int) -> int | None:
 
 
 def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
-    """(states,) of an entry that is a flag; False where it is missing."""
+    """(states,) values of a flag entry; False in the states without a value."""
     found = np.zeros(states, bool)
     if values is not None:
         found[: len(values)] = values[:states] > 0.5
@@ -231,8 +239,8 @@ class Rescored:
 
 @dataclass(frozen=True)
 class Rescore(Question[Rescored]):
-    """Open a task in a worker without one, and read and rescore these episodes with it. The first part is sent when the task
-    is open; the answer holds only what is not in the parts yet."""
+    """Open a task in a worker that has no open task, and rescore these episodes with it. The first part is
+    sent when the task is open; the answer contains only results that were not sent as parts."""
 
     part: ClassVar[Any] = Rescored
     task: TaskName
@@ -243,8 +251,9 @@ class Rescore(Question[Rescored]):
     use_env_states: bool
 
 
-# The server keeps the history and sends snapshots and actions. The envs of the batch step together again, since they may
-# depend on each other through a shared random generator. Only for a worker that does not play, because its envs move.
+# The server keeps the history and sends snapshots and actions. As in the recorded run, all envs of the batch
+# step together: they may depend on each other through a shared random generator. Send these questions only to
+# a worker that does not play: they move its envs.
 
 
 @dataclass(frozen=True)
@@ -268,7 +277,7 @@ class RescoredMoments:
     not_carried: dict[str, str]
     """State that jumps of all envs could not restore, with the reasons."""
     problem: Problem | None = None
-    """Exception of the moment after `steps`."""
+    """Exception at the first moment without a result in `steps`."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from workbench.episodes.row import Source
 from workbench.machine.text import length, mean_text, number_text
 from workbench.rescore.verdict import FLAGS, MAIN, Verdict
 
-PUT_IN = " With the recorded states restored at every step, nothing drifts."
+PUT_IN = " If the recorded state is restored after every step, nothing drifts."
 """Advice about drift from a recording."""
 _MAX_NAMES = 4
 
@@ -39,13 +39,13 @@ def change_text(verdict: Verdict[Any]) -> str:
 
 
 def _flag_text(name: str, was: int | None, now: int | None) -> str:
-    """Text of the steps at which a flag turned true, in the record and now; None for never."""
+    """Text of the first steps at which a flag was true, in the record and now; None for never."""
     before = "never" if was is None else f"at step {was}"
     return f"{name} never now, was {before}" if now is None else f"{name} now at step {now}, was {before}"
 
 
 def _reward_change(verdict: Verdict[Any]) -> str:
-    """Text of the change of the rewards, or of the return that is not finite."""
+    """Text of the largest change of the reward; if that is not finite, text of the returns."""
     if math.isfinite(verdict.largest):
         return f"reward by up to {number_text(verdict.largest)}"
     was, now = verdict.returns
@@ -77,7 +77,7 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
     """One sentence on what differs.
 
     Args:
-        others: other differing entries, such as those that only one version has.
+        others: names of further entries that differ, such as those that only one version has.
     """
     rescored = [verdict for verdict in verdicts if not verdict.why_not]
     if not rescored:
@@ -126,13 +126,13 @@ def drift_summary(verdicts: Sequence[Verdict[Any]], advice: str = "") -> str:
     furthest = max(known, key=lambda verdict: verdict.metres or 0.0)
     metres, radians = furthest.metres or 0.0, max(verdict.radians for verdict in known)
     if metres == 0 and radians == 0:
-        return "Every body is where it was, to the last bit, so any difference comes from the code."
+        return "Every body is exactly where it was recorded, so any difference comes from the code."
     amount = f"{length(metres)} and {math.degrees(radians):.2g}°"
     if not (far := count_drifted(known)):
         return f"States drifted by at most {amount}: the rewards are comparable."
     return (
-        f"In {counted(far, 'episode')} bodies came up to {amount} from where they were, furthest in {furthest.of.name}: "
-        f"differences there may come from that, and not from the code.{advice}"
+        f"In {counted(far, 'episode')} bodies drifted by up to {amount}, furthest in {furthest.of.name}: "
+        f"differences there may come from the drift and not from the code.{advice}"
     )
 
 

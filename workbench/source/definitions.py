@@ -12,6 +12,8 @@ from workbench.source.parsed import FUNCTIONS, LOOPS, RefusedEdit, Scope, Source
 
 @dataclass(frozen=True, eq=False)
 class Binding:
+    """A place in the text that binds a name or an attribute."""
+
     file: SourceFile
     name: str
     node: ast.AST
@@ -21,21 +23,23 @@ class Binding:
     why: str = ""
     """Reason why `value` is None."""
     imported: tuple[str, str] | None = None
-    """Module of an import, with its leading dots, and the name in it (empty for the module itself); else None."""
+    """For an import: the module with its leading dots, and the name in it (empty for the module itself). Else
+    None."""
     attribute: bool = False
     """Whether the binding is an attribute of an object, not a variable."""
 
     @property
     def dotted(self) -> str:
-        """The imported module or name; empty if it is not an import."""
+        """The imported module or name; empty if the binding is not an import."""
         return "" if self.imported is None else ".".join(filter(None, self.imported))
 
 
 class Project:
     """The author's files, parsed on demand.
 
-    Branches depend on the running task, so a definition in one may or may not hold. Readers are over-counted rather than
-    missed: any file that has the name counts, and too many readers only mean that a value is written in another place.
+    Which branches run depends on the task, so a definition in a branch may or may not hold. Readers are
+    over-counted rather than missed: every file that contains the name counts. A reader too many only means
+    that a new value is written where it is used, not where it is defined.
     """
 
     def __init__(self, texts: Mapping[str, str]) -> None:
@@ -45,13 +49,13 @@ class Project:
         self._bindings: dict[ast.AST, dict[str, list[Binding]]] = {}
 
     def file(self, path: str) -> SourceFile:
-        # Cached here too, since nodes are compared by identity and `parse_file` caches only the last files.
+        # Cached here too: nodes are compared by identity, and `parse_file` caches only the last files.
         if path not in self._files:
             self._files[path] = parse_file(path, self.texts[path])
         return self._files[path]
 
     def own_file(self, path: str) -> SourceFile:
-        """The file at `path`. Raises RefusedEdit if it is not one of the author's."""
+        """The file at `path`. Raises RefusedEdit if it is not one of the author's files."""
         if path not in self.texts:
             raise RefusedEdit(f"{path} is not one of your files")
         return self.file(path)
@@ -96,11 +100,12 @@ class Project:
         read: ast.AST,
         concerns: Callable[[str, str], bool] = lambda path, owner: True,
     ) -> str | None:
-        """Text with the place of another reader of the binding than `read` in the file `reader`; None if there is none.
+        """The place, as text, of a reader of the binding other than the node `read` of the file `reader`;
+        None if there is none.
 
         Args:
-            concerns: returns whether an object of a class (file and name) may have the binding as an attribute. On other
-                objects than ``self`` every attribute of that name counts.
+            concerns: returns whether an object of a class (file and name) may have the binding as an
+                attribute. On objects other than ``self``, every attribute with the name counts.
         """
         home, name = binding.file, binding.name
         scope = home.scopes(binding.node)[0]
@@ -124,10 +129,10 @@ class Project:
         return None
 
     def attribute_stores(self, name: str, classes: Collection[tuple[str, str]]) -> list[Binding]:
-        """The assignments to an attribute of that name, on any object that may be of these classes.
+        """The assignments to the attribute `name` of any object that may be of these classes.
 
         Args:
-            classes: file and name of the object's class and of those that it inherits.
+            classes: file and name of the object's class and of its base classes.
         """
         found: list[Binding] = []
         for file in self.files_with_word(name):
@@ -173,7 +178,7 @@ def _bound_in(file: SourceFile, scope: Scope) -> Iterator[Binding]:
             if isinstance(base, ast.Name):
                 yield Binding(file, base.id, _statement(file, node), None, "a part of it is set")
         elif isinstance(node, (*FUNCTIONS, ast.ClassDef)) and not isinstance(node, ast.Lambda):
-            yield Binding(file, node.name, node, None, f"it is the file's own {node.name}")
+            yield Binding(file, node.name, node, None, f"{node.name} is a function or class")
         elif isinstance(node, (ast.Import, ast.ImportFrom)):
             yield from _imported(file, node)
         elif isinstance(node, (ast.ExceptHandler, ast.MatchAs, ast.MatchStar)) and node.name is not None:
@@ -245,7 +250,8 @@ def _stored(file: SourceFile, node: ast.Attribute) -> Binding:
 
 
 def reaching(file: SourceFile, bindings: list[Binding], use: ast.AST | None, scope: Scope) -> list[Binding]:
-    """The `bindings` of one name that may hold at `use`; None: at the end of their scope."""
+    """The `bindings` of one name that may hold at the node `use`, or at the end of `scope` if `use` is
+    None."""
     found: list[Binding] = []
     around = [scope] if use is None else list(file.ancestors(use))
     for binding in bindings:
@@ -292,7 +298,8 @@ def _exclusive(file: SourceFile, a: ast.AST, b: ast.AST) -> bool:
 
 
 def _other_element(file: SourceFile, node: ast.AST, mine: ast.AST) -> bool:
-    """Whether `node` reads another element than `mine`: ``CAMERA["fov"]`` where mine is the name in ``CAMERA["eye"]``."""
+    """Whether `node` and `mine` read different elements, as the two names in ``CAMERA["fov"]`` and
+    ``CAMERA["eye"]``."""
     keys = []
     for name in (node, mine):
         outer = file.parents.get(name)

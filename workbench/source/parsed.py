@@ -101,7 +101,7 @@ class SourceFile:
             start, end = opens, closes
 
     def _room(self, node: ast.AST) -> Span:
-        """The span that may hold the parentheses of a node, without those of a call around it."""
+        """The span in which parentheses around a node belong to the node, and not to a call around it."""
         outer = self.parents.get(node)
         if isinstance(outer, ast.keyword):
             node, outer = outer, self.parents[outer]
@@ -167,7 +167,7 @@ class SourceFile:
         """The expression with exactly this span. Raises RefusedEdit if there is none."""
         if span not in self._expressions:
             raise RefusedEdit(
-                f"{self.name} differs from the text that ran; save it, let it load and ask again"
+                f"{self.name} differs from the text that ran: save it, let it load and try again"
             )
         return self._expressions[span]
 
@@ -209,7 +209,7 @@ class SourceFile:
     # --- parents and scopes -------------------------------------------------------------------------
 
     def ancestors(self, node: ast.AST) -> Iterator[ast.AST]:
-        """Enclosing nodes, from its parent outwards."""
+        """Enclosing nodes, from the parent of `node` outwards."""
         while node in self.parents:
             node = self.parents[node]
             yield node
@@ -229,7 +229,8 @@ class SourceFile:
         return found
 
     def qualname(self, scope: ast.AST) -> str:
-        """``__qualname__`` of a class or function, or of the one that contains another node."""
+        """``__qualname__`` of a class or function; for any other node, that of the class or function around
+        it."""
         scopes = (
             [scope, *self.scopes(scope)]
             if isinstance(scope, (ast.ClassDef, *FUNCTIONS))
@@ -253,7 +254,7 @@ class SourceFile:
         at = 0
         for change in sorted(replacements, key=lambda change: (change.start, change.end)):
             if change.start < at:
-                raise RefusedEdit("two changes fall on the same place of the file")
+                raise RefusedEdit("two changes overlap in the file")
             # Use the file's own line ends.
             parts += [self.text[at : change.start], plain_line_ends(change.text).replace("\n", newline)]
             at = change.end
@@ -279,7 +280,8 @@ class SourceFile:
         return [Replacement(end, end, "".join(f", {text}" for text in texts))]
 
     def added_item(self, node: ast.AST, indent: str, text: Callable[[str], str]) -> list[Replacement]:
-        """Add the item `text(indent)` between the brackets, on its own lines; `indent` is the statement's."""
+        """Add the item `text(indent)` between the brackets, on its own lines; `indent` is the statement's
+        indentation."""
         start, close = self.content_span(node)
         items = self.items(node)
         own = indent + "    "
@@ -296,7 +298,7 @@ class SourceFile:
             return found if comma else [Replacement(end, end, ","), *found]
         found = []
         if one_line:
-            # Each item gets its own line: otherwise, the first would share a line with the bracket.
+            # Put each item on its own line, or the first would share a line with the bracket.
             gaps = [start, *(self.after_comma(item[1]) or item[1] for item in items[:-1])]
             found = [Replacement(gap, item[0], f"\n{own}") for gap, item in zip(gaps, items, strict=True)]
         return [
@@ -350,7 +352,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
 
 def walk(node: ast.AST) -> Iterator[ast.AST]:
-    """`node` and all below it, statements in the order of the text."""
+    """`node` and all nodes below it; statements come in the order of the text."""
     waiting = [node]
     while waiting:
         found = waiting.pop()
@@ -407,7 +409,7 @@ class TracedValue:
     """Name (`KnownFunction.name`) of the called function; empty for other expressions."""
     parts: Mapping[str, TracedValue] = field(default_factory=dict)
     """Elements of a list by index; arguments of a call by parameter; ``of``: the number within an expression that may be
-    edited in place of the expression."""
+    edited instead of the whole expression."""
     slope: float = 1.0
     offset: float = 0.0
     """value = slope * `parts["of"].value` + offset"""
@@ -436,7 +438,7 @@ class Trace:
     parts: Mapping[str, TracedValue]
     """Arguments that could be followed."""
     unknown: Mapping[str, str]
-    """Reasons for the other arguments."""
+    """Reasons why the other arguments could not be followed."""
 
 
 def _numbers(value: Plain) -> Iterator[float]:

@@ -59,7 +59,7 @@ _Made = TypeVar("_Made")
 
 
 class Unknown(Exception):
-    """A value cannot be followed; the message is the reason for the author."""
+    """A value cannot be followed to the text that defines it; the message tells the author why."""
 
 
 def trace_call(
@@ -72,7 +72,7 @@ def trace_call(
         values: the values of the requested parameters.
 
     Returns:
-        None if the call is in none of the project's files.
+        None if the call is not in one of the project's files.
     """
     code = frame.f_code
     place = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,) * 4)
@@ -114,9 +114,10 @@ def _same(a: Plain, b: Plain) -> bool:
 class ValueReader:
     """Follows the arguments of one call while its frame exists.
 
-    The frame has the value of every name, and its code the exact position of the call. A name is followed to its
-    assignment: by the text if only one can hold, else to the one that has the running value. Any doubt raises `Unknown`,
-    since the result decides whether a line of the author's file is edited.
+    The frame has the value of every name, and the frame's code has the exact position of the call. A name is
+    followed to its assignment. If several assignments may hold, it is followed to the one whose value equals
+    the running value. Any doubt raises `Unknown`, because the result decides which line of the author's file
+    is edited.
     """
 
     def __init__(self, project: Project, file: SourceFile, call: ast.expr, frame: FrameType) -> None:
@@ -127,7 +128,7 @@ class ValueReader:
         return Unknown(f"`{file.one_line(node)}` is computed when the task runs")
 
     def part(self, file: SourceFile, node: ast.expr, reads: Reads = ()) -> TracedValue:
-        """The parts of an expression. Raises Unknown."""
+        """The traced value of an expression that the names `reads` lead to. Raises Unknown."""
         if len(reads) > _MAX_NAME_CHAIN:
             raise Unknown(f"`{file.code(node)}` is defined by itself")
         if isinstance(node, ast.IfExp):
@@ -150,7 +151,7 @@ class ValueReader:
     # --- values -------------------------------------------------------------------------------------
 
     def _value(self, file: SourceFile, node: ast.expr) -> Plain:
-        """The value of a checked expression."""
+        """The value of an expression that `_check` accepts."""
         return self._evaluate(file, node, node, plain_value)
 
     def _evaluate(
@@ -196,15 +197,16 @@ class ValueReader:
             raise self.computed(file, node)
 
     def _test(self, file: SourceFile, node: ast.expr) -> bool:
-        """The value of a condition."""
+        """The value of a condition. Raises Unknown."""
         if not all(isinstance(inner, _CONDITION_NODES) for inner in ast.walk(node)):
             raise self.computed(file, node)
         return self._evaluate(file, node, node, bool)
 
     def _with_editable_number(self, file: SourceFile, node: ast.expr, whole: TracedValue) -> TracedValue:
-        """`whole` with the number within it that is best edited, if there is one.
+        """`whole`, with the number within it to edit as its part, if there is one.
 
-        That is the 60 of ``60 * np.pi / 180`` and the 0.2 of ``HEIGHT + 0.2``, which still follows HEIGHT.
+        Examples: the 60 of ``60 * np.pi / 180``; the 0.2 of ``HEIGHT + 0.2``, so that the value still follows
+        HEIGHT.
         """
         leaves = list(_leaves(node))
         named = any(not _is_number(leaf) and not self._is_from_library(file, leaf) for leaf in leaves)
@@ -235,14 +237,15 @@ class ValueReader:
         try:
             with np.errstate(all="ignore"):
                 found = plain_value(self._run(file, _substitute(node, leaf, value), node))
-        except (ValueError, ArithmeticError):  # math.acos(1.5)
+        except (ValueError, ArithmeticError):  # such as math.acos(1.5)
             return math.nan
         return found if isinstance(found, float) else math.nan
 
     # --- calls --------------------------------------------------------------------------------------
 
     def _function(self, file: SourceFile, node: ast.Call) -> KnownFunction:
-        """The function that `node` calls. Raises Unknown for an unknown one, and for arguments by ``*``."""
+        """The function that `node` calls. Raises Unknown for an unknown function, and for arguments by
+        ``*``."""
         if not is_starred(node) and _is_named(node.func):
             found = self._evaluate(file, node.func, node, known_functions().get)
             if found is not None:
@@ -298,7 +301,7 @@ class ValueReader:
             return None
 
     def _imported_file(self, binding: Binding) -> SourceFile | None:
-        """The author's file that an import is from; None for a library."""
+        """The author's file that a binding is imported from; None for a library."""
         assert binding.imported is not None
         names = self._namespace(binding.file, binding.file.module)[0]
         try:
@@ -309,7 +312,8 @@ class ValueReader:
         return self._project.file(path) if path in self._project.texts else None
 
     def _follow(self, file: SourceFile, node: ast.expr) -> tuple[SourceFile, ast.expr, str | None]:
-        """File and expression that defines a name, and another reader of it. Raises Unknown."""
+        """The file and the expression that define a name, and the place of another reader (None if there is
+        none). Raises Unknown."""
         project = self._project
         if isinstance(node, ast.Subscript):
             return self._element(file, node)
@@ -352,7 +356,7 @@ class ValueReader:
         return binding.file, binding.value, others
 
     def _binding_of_run(self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding]) -> Binding:
-        """The binding that has the running value."""
+        """The binding whose value equals the running value. Raises Unknown if it is not exactly one."""
         fitting = []
         for binding in bindings:
             try:
@@ -420,13 +424,13 @@ class ValueReader:
 
 
 def classes_of(cls: type) -> set[tuple[str, str]]:
-    """File and name of a class, and of those that it inherits."""
+    """File and name of a class and of its base classes."""
     modules = [(sys.modules.get(base.__module__), base.__qualname__) for base in cls.__mro__]
     return {(str(getattr(module, "__file__", None)), name) for module, name in modules}
 
 
 def _concerned_by(binding: Binding) -> Callable[[str, str], bool]:
-    """Function that returns whether an object of a class may have an attribute's binding; see `Project.readers`."""
+    """The argument `concerns` of `Project.readers` for a binding."""
     file = binding.file
     around = next((scope for scope in file.scopes(binding.node) if isinstance(scope, ast.ClassDef)), None)
     home = None if around is None else _class_named(file.path, file.qualname(around))
@@ -434,7 +438,7 @@ def _concerned_by(binding: Binding) -> Callable[[str, str], bool]:
         return lambda path, owner: True
 
     def concerns(path: str, owner: str) -> bool:
-        # A class that inherits both has the attribute in the methods of either.
+        # A class that inherits both classes has the attribute in the methods of both.
         return any((path, owner) in classes_of(cls) for cls in (home, *_subclasses(home)))
 
     return concerns
@@ -524,10 +528,10 @@ def module_of(path: str) -> ModuleType:
 
 @dataclass(frozen=True)
 class KnownFunction:
-    """A library function whose value depends on its arguments alone, so that a call may be evaluated again."""
+    """A library function whose value depends only on its arguments, so that a call may be evaluated again."""
 
     name: str = ""
-    """Name for `TracedValue.function`; empty if it needs none."""
+    """Name for `TracedValue.function`; empty if `parameters` is empty."""
     parameters: tuple[str, ...] = ()
     """Parameters in order, of a function whose arguments may be edited."""
     converts: bool = False

@@ -1,4 +1,4 @@
-"""Edits traced values: finds where in the source each is written, and makes the text of the new value."""
+"""Edits traced values: finds where each value is written in the source, and makes its new text."""
 
 from __future__ import annotations
 
@@ -24,10 +24,12 @@ from workbench.source.parsed import (
 class Changes:
     """Collects edits of traced values and turns them into replacements of text.
 
-    A value is edited where it is written if nothing else reads it there. Otherwise (one ``pose`` for two cameras, a
-    constant that the scene uses), the new value is written in place of the name, only for this use, with a note.
+    A value is edited where it is defined if nothing else reads it. If something else reads it too (one
+    ``pose`` for two cameras, a constant that the scene uses), the new value replaces the name at this use
+    only, with a note.
 
-    Places come from the worker, whose texts may differ: a place that is no expression of these files raises RefusedEdit.
+    Places come from the worker, whose texts may differ: a place that is not an expression in these files
+    raises RefusedEdit.
     """
 
     def __init__(self, project: Project) -> None:
@@ -87,7 +89,7 @@ class Changes:
     # --- new values ---------------------------------------------------------------------------------
 
     def number(self, value: TracedValue, requested: float, decimals: int) -> None:
-        """Edit `value` to `requested`, unless both are equal to `decimals` decimals."""
+        """Edit `value` to `requested`; no edit if rounding to `decimals` decimals gives the old value."""
         if written_value(value, requested, decimals) == value.value:
             return
         inner, requested, decimals = _inner_target(value, requested, decimals)
@@ -105,15 +107,16 @@ class Changes:
         return any(part in self.texts or part in self.added for part in value.walk())
 
     def emit(self, value: TracedValue, known: int = 0) -> None:
-        """Turn the edits within `value` into replacements. The first `known` of its reads are already handled."""
+        """Turn the edits within `value` into replacements. The first `known` of `value.reads` are already
+        handled."""
         if not self.is_edited(value):
             return
         for index, read in enumerate(value.reads[known:], known):
             if read.others is not None:
                 file, node = self.find(read.at)
                 self.note(
-                    f"`{file.code(node)}` is also read elsewhere ({read.others}), so the new value is written in its "
-                    "place, for this camera alone"
+                    f"`{file.code(node)}` is also read elsewhere ({read.others}), so the new value replaces "
+                    "the name here, for this camera alone"
                 )
                 self.replace(file, node, self.rendered(value, index + 1, file))
                 return
@@ -135,7 +138,7 @@ class Changes:
         if not self.is_edited(value):
             home, named = self.find(value.reads[known].at) if value.reads[known:] else (file, node)
             if home is into and not isinstance(home.scopes(named)[0], ast.ClassDef):
-                # Skip a name of a class body, which its methods do not see.
+                # Do not use a name of a class body: the class's methods do not see it.
                 return home.code(named)
         if isinstance(value.value, float):
             if self.is_edited(value):

@@ -43,14 +43,15 @@ class blamed:
             # Call no more of the author's code to explain the error: it may hang again.
             files, cls = self._loaded.source_files, self._loaded.cls
             raise TaskError(problem_from_exception(error, self._stage, files, cls)) from error
-        # Also SystemExit and an author's BaseException, which must not end the worker. Done here, because a caller may
-        # have restored the previous version and its texts already.
+        # Also SystemExit and an author's BaseException, which must not end the worker. The problem is made
+        # here: later, a caller may have restored the previous version and its texts.
         if error is None or isinstance(error, TaskError) or is_ctrl_c(error) or self._is_closed(error):
             return
         raise TaskError(self._problem(error)) from error
 
     def _is_closed(self, error: BaseException) -> bool:
-        """Whether the GeneratorExit closes one of our generators, and was not raised by the author's code."""
+        """Whether `error` is a GeneratorExit that closes a generator of the workbench, not one that the
+        author's code raised."""
         if not isinstance(error, GeneratorExit):
             return False
         files = {str(file) for file in self._loaded.source_files}
@@ -78,7 +79,7 @@ class blamed:
         try:
             returned = env.evaluate()
         except Exception:
-            return None  # report the first error
+            return None  # report the original error
         return check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
 
 

@@ -38,16 +38,16 @@ _INTROSPECTION_MODULES = frozenset(
 class Symbol:
     """A function, method, constant, class attribute or import.
 
-    Names are not resolved: ``x.reset`` may be any ``reset``, so it counts as all of them, in all files, and a string that is
-    an identifier counts as a name (``getattr(self, "reset")``). If a name is computed or code inspects itself, see
-    `dynamic`.
+    Names are not resolved: ``x.reset`` may be any ``reset``, so it counts as a mention of every ``reset`` in
+    all files. A string that is an identifier counts as a name (``getattr(self, "reset")``). For computed
+    names, and code that inspects itself, see `dynamic`.
     """
 
     path: str
     name: str
     kind: Kind
     parts: Sequence[ast.AST]
-    """The nodes that form its text; for a class, without its members."""
+    """The nodes that form `text`; for a class, without its members."""
     nodes: Sequence[ast.AST]
     """Nodes of the symbol: a property with its setter is one symbol."""
     short_names: frozenset[str]
@@ -57,7 +57,8 @@ class Symbol:
 
     @cached_property
     def text(self) -> str:
-        """Equal in two versions if and only if the code is: without comments, docstrings and layout."""
+        """The code without comments, docstrings and layout; equal in two versions if and only if the code is
+        equal."""
         return "\n".join([self.kind, *map(ast.dump, self.parts)])
 
     @cached_property
@@ -105,7 +106,7 @@ def _scope(path: str, body: list[ast.stmt], owner: str | None) -> Iterator[Symbo
     for name, statements in list(groups.items()):
         several = len(statements) > 1 and not all(isinstance(s, ast.FunctionDef) for s in statements)
         if name in taken or several:
-            # The definition in effect depends on what ran, so they form one symbol.
+            # Which definition is in effect depends on what ran, so all of them form one symbol.
             loose += groups.pop(name)
     prefix = "" if owner is None else f"{owner}."
     for name, statements in groups.items():
@@ -156,7 +157,7 @@ def _one_import_each(body: list[ast.stmt]) -> Iterator[ast.stmt]:
     """``from x import a, b`` as two statements, so that adding a name does not change the others."""
     for statement in body:
         if isinstance(statement, ast.ImportFrom) and statement.module == "__future__":
-            # Annotations are ignored, and the other features are the default now.
+            # Skip it: annotations are ignored, and the other features are the default now.
             continue
         if isinstance(statement, ast.Import):
             yield from (ast.copy_location(ast.Import([alias]), statement) for alias in statement.names)
@@ -197,7 +198,8 @@ def _runs_as_script_only(statement: ast.stmt) -> bool:
 
 
 def _mentions(parts: Iterable[ast.AST]) -> tuple[frozenset[str], str | None]:
-    """The names in `parts`, and the first one that may reach more than is named."""
+    """The names in `parts`, and the first name by which the code may reach more than it names; see
+    `Symbol.dynamic`."""
     names: set[str] = set()
     dynamic: list[str] = []
     modules: set[str] = set()
@@ -263,9 +265,10 @@ def _remove_docstrings(tree: ast.Module) -> None:
 
 
 class TwoVersions:
-    """One graph of both versions: nodes are symbols by file and name, edges the names that either version mentions.
+    """One graph of both versions. A node is a symbol, by file and name, in both versions. An edge leads to
+    every symbol that a name in the node may mean, in either version.
 
-    Either version may use a name that one of them mentions. Pure: nothing is imported or executed.
+    Pure: nothing is imported or executed.
     """
 
     def __init__(self, old: Mapping[str, str], new: Mapping[str, str]) -> None:
@@ -301,7 +304,8 @@ class TwoVersions:
         return {key for name in symbol.mentions & self._named.keys() for key in self._named[name]}
 
     def reach(self, roots: Iterable[Key]) -> dict[Key, Key | None]:
-        """All symbols that can be reached from `roots`, each with the one it was reached from (None for a root)."""
+        """All symbols that can be reached from `roots`, each with the symbol before it on the way (None for a
+        root)."""
         found: dict[Key, Key | None] = dict.fromkeys(roots)
         waiting = list(found)
         while waiting:
@@ -313,7 +317,7 @@ class TwoVersions:
         return found
 
     def affected(self) -> set[Key]:
-        """The changed symbols, and all that may reach one of them."""
+        """The changed symbols, and all symbols that may reach one of them."""
         users: dict[Key, set[Key]] = {}
         for key in self.by_key:
             for used in self._edges(key):
@@ -379,8 +383,8 @@ def _read_all(texts: Mapping[str, str], keep_docstrings: bool) -> dict[Key, Symb
 def line_in(old: str, new: str, line: int) -> int | None:
     """The 1-based line of `new` that corresponds to `line` of `old`; None if its function changed.
 
-    Comments, docstrings and layout do not count. A line outside of functions is compared as a statement of the file. No
-    content of the texts raises.
+    Comments, docstrings and layout do not count. A line outside of functions is compared as a statement of
+    the file. Does not raise, whatever the texts contain.
     """
     try:
         before, after = parse_python(old), parse_python(new)
@@ -426,7 +430,8 @@ def _code_text(node: ast.stmt) -> str:
 
 
 def _matching_line(old: str, new: str, line: int, before: ast.stmt, after: ast.stmt) -> int:
-    """The line of `after` with the same text that is nearest to the same offset; the offset itself if there is none."""
+    """The line of `after` with the same text, the nearest to the same offset from the first line; if no line
+    has the text, the line at that offset."""
     text = old.splitlines()[line - 1].strip()
     at = after.lineno + line - before.lineno
     end = after.end_lineno or after.lineno

@@ -34,9 +34,9 @@ class ChosenTask:
     env_id: str | None
     """Registered id; None for a class that is not registered."""
     others: tuple[str, ...]
-    """Other classes of the file that can be named."""
+    """Other classes of the file that can be opened by name."""
     alternatives: tuple[str, ...] = ()
-    """Names in `others` to try if no class was named and this one fails, in order."""
+    """Names in `others` to try, in order, if no class was named and `cls` cannot be opened."""
     kwargs: dict[str, Any] = field(default_factory=dict)
     """Constructor arguments in addition to the registered ones."""
     robot: Robot | None = None
@@ -49,7 +49,8 @@ def choose_task(
     text: str,
     registrations: registry.Registrations,
 ) -> ChosenTask:
-    """The class `requested` of a module that was just executed, or the default: its last registered task, or a robot.
+    """The class `requested` of a module that was just executed. If it is None: the last registered task, else
+    the last task, else the last robot.
 
     Args:
         text: text of the file.
@@ -118,14 +119,15 @@ def robot_scene_text(robot: Robot, file: Path) -> str:
     place = module_name(file)
     name = place.name if (file.parent / "__init__.py").is_file() else file.stem
     return (
-        f"{file.name} has no task but an agent, {robot.class_name} with the uid {robot.uid!r}: it is shown in {_SCENE}. "
-        f"To see it in a task, type in {place.search_folder}: "
+        f"{file.name} has an agent but no task: {robot.class_name}, with the uid {robot.uid!r}, is shown in "
+        f"{_SCENE}. To see it in a task, type in {place.search_folder}: "
         f"workbench open PickCube-v1 --import {name} --env robot_uids={robot.uid}"
     )
 
 
 def missing_class(requested: str, found: object, name: str, file: Path, names: list[str]) -> TaskError:
-    """Error for a class `requested` that is no task class of `name`, whose task classes are `names`."""
+    """Error for a `requested` class that is not a task class of the file or module `name`, which has the task
+    classes `names`."""
     if found is not None:
         return task_error(f"{requested} in {name} is not a class that inherits BaseEnv", file)
     close = difflib.get_close_matches(requested, names, n=1)

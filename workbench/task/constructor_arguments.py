@@ -73,7 +73,7 @@ def _imported_arguments(
     if not module:
         return None
     if not level and is_library(module[0]):
-        # Not the author's code, and imported for the task anyway.
+        # Import it: it is not the author's code, and the task imports it anyway.
         try:
             cls = getattr(importlib.import_module(".".join(module)), name, None)
         except ImportError:

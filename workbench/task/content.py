@@ -53,7 +53,8 @@ class TaskContent:
 
     @property
     def file_sums(self) -> dict[str, str]:
-        """Path, relative to the task's folder, to the file's ``sha256sum``; the task's own file first."""
+        """The ``sha256sum`` of each file, by its path relative to the task's folder; the task's own file
+        first."""
         paths = [self.main, *sorted(path for path in self.texts if path != self.main)]
         raw = {path: self.texts[path].encode("utf-8", "surrogatepass") for path in paths}
         return {self.name(path): self.sums.get(path) or sha256(raw[path]).hexdigest() for path in paths}
@@ -72,11 +73,12 @@ class TaskContent:
 def read_content(file: Path) -> TaskContent:
     """The texts that opening `file` would run.
 
-    Finds imports inside functions too. A text that imports by computed names could load any module of the folder, so then
-    all of them are included.
+    Finds imports inside functions too. A text that imports by computed names could load any module of the
+    folder, so all modules of the folder are then included.
 
     Raises:
-        CannotRead: it is not an ordinary file of Python text, or there is too much of it.
+        CannotRead: a file is not an ordinary file of Python text, or is too large, or there are more than
+            `MAX_MODULES`.
     """
     file = real_path(file)
     return _ContentReader(file).content()
@@ -106,7 +108,7 @@ class _ContentReader:
         return TaskContent(str(self._file), self._texts, tuple(self._unseen), self._computed, self._sums)
 
     def _packages_above(self) -> Iterator[Path]:
-        """The packages of a file in a package, which run before it."""
+        """The ``__init__.py`` of each package that contains the file; these run before the file."""
         folder = self._file.parent
         while folder != self._root and folder.is_relative_to(self._root):
             yield folder / "__init__.py"

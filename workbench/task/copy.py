@@ -27,7 +27,7 @@ class NewNames:
     """New names for a copy."""
 
     ids: dict[str, str] = field(default_factory=dict)
-    """New ids by the original's id; an id that is missing here is renamed as in any copy."""
+    """New ids by the original's id; an id that is missing here gets the default name of a copy."""
     classes: dict[str, str] = field(default_factory=dict)
 
 
@@ -75,11 +75,11 @@ def copied_text(
 
     Args:
         source: the file of `text`; its packages are found by their ``__init__.py``.
-        number: number of the copy; part of its ids from 2 on.
+        number: number of the copy; from 2 on, it is part of the copy's ids.
         names: names chosen for the copy, also used in its docstrings.
 
     Raises:
-        CannotCopy: it cannot be copied, such as a file that imports relatively but is in no package.
+        CannotCopy: the file cannot be copied; for example, it has relative imports but is not in a package.
     """
     try:
         file = SourceFile(str(source), text)
@@ -97,7 +97,7 @@ def copied_text(
         if not package:
             raise CannotCopy(f"{first}, which the copy does not have")
         if any(text[slice(*file.inner_span(node))] != "__file__" for node in places):
-            raise CannotCopy(f"{first} inside a text of several lines")
+            raise CannotCopy(f"{first} inside a multi-line string")
         name = _free_name("installed_task", text)
         changes += [Replacement(*file.inner_span(node), f"{name}.__file__") for node in places]
         at = file.import_place()
@@ -120,7 +120,7 @@ def _renamed(file: SourceFile, names: NewNames) -> Iterator[Replacement]:
     """Replacements of class names where they are defined and used, and of ids and class names in docstrings.
 
     Raises:
-        CannotCopy: the file has another meaning for a new name.
+        CannotCopy: the file uses a new name already.
     """
     used = {_bound(node) for node in file.nodes}
     for new in names.classes.values():
@@ -152,21 +152,20 @@ def _absolute(file: SourceFile, node: ast.ImportFrom, package: list[str]) -> Rep
     """The relative import `node` as an absolute one."""
     where = f"line {node.lineno} imports {'.' * node.level}{node.module or ''}"
     if not package:
-        raise CannotCopy(
-            f"{where}, a module of the same folder that is in no package: copy both files yourself"
-        )
+        raise CannotCopy(f"{where}, a module of its folder, which is not a package: copy both files yourself")
     # The last part is the module's own name, which a package's __init__ does not have.
     inside = package if file.name == "__init__.py" else package[:-1]
     try:
         full = importlib.util.resolve_name("." * node.level + (node.module or ""), ".".join(inside))
     except ImportError as error:
-        raise CannotCopy(f"{where}, which is beyond its package") from error
+        raise CannotCopy(f"{where}, which is outside its package") from error
     start = file.inner_span(node)[0]
     return Replacement(start, file.token_after(start, "import"), f"from {full} ")
 
 
 def registrations_in(tree: ast.Module) -> Iterator[tuple[ast.ClassDef, ast.Call, ast.expr | None]]:
-    """Each class with its ``@register_env(...)`` and the id argument of that."""
+    """Each registered class, its ``@register_env(...)`` call, and the id argument of the call (None if it has
+    none)."""
     for node in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
         for call in node.decorator_list:
             if isinstance(call, ast.Call) and ast.unparse(call.func).endswith("register_env"):

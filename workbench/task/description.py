@@ -129,7 +129,7 @@ class TaskDescription:
     in_place_of: str | None = None
     """The class of the file that was tried first and failed."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of ``gym.make`` for such an env, as far as JSON can represent them."""
+    """Keyword arguments with which ``gym.make`` makes such an env, as far as JSON can represent them."""
     objects: tuple[ObjectToSee, ...] = ()
     """Objects that a camera can be measured on."""
     joints: tuple[str, ...] = ()
@@ -137,7 +137,7 @@ class TaskDescription:
     notices: tuple[str, ...] = ()
     """Notices about a working task, as sentences."""
     parse_cameras: str = "parse_camera_configs"
-    """Name, in the installed version, of ManiSkill's function for what a camera hook returns."""
+    """Name of the installed ManiSkill's function that parses what a camera hook returns."""
     outlier_rules: Mapping[str, Finding] = field(default_factory=dict)
     """The rules that an outlier can break, by id; each value is a finding template at the hook that the rule guards. Rules
     that are off, or silenced at the hook, are left out."""
@@ -157,9 +157,13 @@ class Restored:
     """The result of a `Restore` or an `EnterRecording`."""
 
     env_idx: tuple[int, ...]
+    """The envs that were set."""
     source: tuple[int, ...]
+    """Env of the snapshot whose state each env of `env_idx` got."""
     origin: int
+    """The server's number of the restored moment, or `NO_MOMENT`."""
     undoes: int | None
+    """The server's number of the jump that this undoes; None if it undoes none."""
     not_carried: dict[str, str]
     """Parts that could not be restored, with the reasons; empty within one version of a task."""
     recording: str = ""
@@ -169,8 +173,8 @@ class Restored:
     number: int = 0
     """Number of the `EnterRecording` that this result answers; 0 for a `Restore`."""
     replayed: tuple[int, ...] = ()
-    """Indices of the envs that were replayed up to the state. For them the state is not an exact point (from which the same
-    actions give the same bits); a restored state is."""
+    """Indices of the envs that were replayed up to the state. Their state is not an exact point, from which
+    the same actions give the same bits; a restored state is one."""
 
 
 @dataclass(frozen=True)
@@ -184,16 +188,16 @@ class Stepped:
     captured: tuple[Picture, ...] = ()
     """Pictures of exactly this step (only while capturing)."""
     seeds: NDArray[np.int64] | None = None
-    """(N,) episode seed of each env, if this has a reset."""
+    """(N,) episode seed of each env, if this result is of a reset."""
     snapshot: bytes = b""
     """The body of the snapshot of the whole batch at this moment (see `envs.snapshots.packing`): opaque to the
     server, whose `History.snapshot_at` makes a pickled `Snapshot` of it."""
     part_keys: tuple[int, ...] | None = None
-    """The parts of the snapshot; None if unchanged since the previous event."""
+    """Keys of the snapshot's parts; None if unchanged since the previous result."""
     new_parts: dict[int, bytes] = field(default_factory=dict)
-    """Parts that have not been sent yet."""
+    """Parts of the snapshot that were not sent with an earlier result, by key."""
     number: int = 0
-    """Counts these events since the worker started; `Pictures.number` refers to it."""
+    """Number of this result, counted since the worker started; `Pictures.number` refers to it."""
     restored: Restored | None = None
     columns: dict[str, NDArray] = field(default_factory=dict)
     """(N, ...) arrays by the names of `envs.state_columns`: ``state/actors/cube``, ``obs/agent/qpos``. Only while
@@ -203,8 +207,8 @@ class Stepped:
     placed: dict[CameraKey, CameraSettings] = field(default_factory=dict)
     """The cameras that are placed by hand (only while capturing)."""
     resumed: bool = False
-    """The envs have the state that the previous worker left: the result follows from no result of this worker, but nothing
-    was reset."""
+    """Whether the envs continue from the state that the previous worker left. The result then does not follow
+    from an earlier result of this worker, although nothing was reset."""
 
 
 @dataclass(frozen=True)
@@ -226,8 +230,9 @@ class RecordArguments:
         fast_pictures: render simplified meshes: several times as many pictures per second without a GPU, slightly different
             from a GPU's. The recordings are marked, in their .json and in the review.
         max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
-        seconds_per_seed: wall time limit of an episode: it ends at its next step, solved or not. Which episodes reach it
-            depends on the machine and its load, so a second run may differ.
+        seconds_per_seed: wall time limit of an episode: after it, the episode ends at its next step, solved
+            or not. Which episodes reach the limit depends on the machine and its load, so a second run may
+            differ.
     """
 
     task: str

@@ -38,7 +38,7 @@ class TaskFile:
     path: Path
     """Absolute path, without links."""
     ids: tuple[str, ...]
-    """Ids that the file registers, as far as they are written as plain text."""
+    """Ids that the file registers, as far as they are string literals."""
     classes: tuple[str, ...]
     """Task classes of the file, in the order of the text."""
     not_python: bool = False
@@ -116,7 +116,7 @@ def read_task_file(path: Path) -> TaskFile | None:
         raw = read_regular_file(path, MAX_FILE_BYTES)
     except (OSError, ValueError):
         return None
-    # Checked before parsing, which takes 20 ms for a large file.
+    # Check this before parsing, which takes 20 ms for a large file.
     if b"BaseEnv" not in raw and b"register_env" not in raw:
         return None
     try:
@@ -145,7 +145,7 @@ def _python_files(root: Path) -> Iterator[Path]:
         for entry in entries:
             if entry.name.startswith("."):
                 continue
-            # Not through links: they can form cycles and lead out of the folder.
+            # Do not follow links: they can form cycles and lead out of the folder.
             if _is(entry.is_dir):
                 if depth < MAX_DEPTH and entry.name not in _NO_TASKS_IN:
                     waiting.append((Path(entry.path), depth + 1))

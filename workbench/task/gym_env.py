@@ -46,41 +46,45 @@ def make(
 ) -> gym.Env:
     """Make a gymnasium env of `num_envs` envs, like ``gym.make`` on a GPU.
 
-    gymnasium's own ``make`` is called with a spec whose entry point builds the batched env, so training code, ManiSkill's
-    wrappers and its baselines find the usual spec, time limit and class. Nothing is registered or replaced: ``gym.make`` of
-    the same id stays ManiSkill's, and the arguments in ``env.spec`` are those of stock ManiSkill, so that its own tools
-    replay what ``RecordEpisode`` writes. It differs from ``gym.make`` where stock ManiSkill would fail:
+    gymnasium's own ``make`` is called with a spec whose entry point builds the batched env, so training code,
+    ManiSkill's wrappers and its baselines find the usual spec, time limit and class. Nothing is registered or
+    replaced: ``gym.make`` of the same id still makes ManiSkill's env. The arguments in ``env.spec`` are those
+    of stock ManiSkill, so its tools can replay what ``RecordEpisode`` writes. This function differs from
+    ``gym.make`` where stock ManiSkill would fail:
 
     * ``num_envs`` above 1 works without a GPU.
     * A task whose first reward mode is not implemented (its ``step`` raises NotImplementedError in stock ManiSkill) gets
-      the richest one that is. Else the default is stock ManiSkill's: the first of ``SUPPORTED_REWARD_MODES``.
-    * ``render_backend`` is found if it is not given; without a driver an env without pictures gets
-      ``render_backend="none"``, and one that needs pictures is refused.
+      the richest mode that is implemented. For other tasks the default is stock ManiSkill's: the first of
+      ``SUPPORTED_REWARD_MODES``.
+    * ``render_backend`` is chosen if it is not given. Without a graphics driver, an env without pictures gets
+      ``render_backend="none"``, and an env that needs pictures raises BackendUnavailable.
     * ``max_episode_steps=-1`` gives an env without a limit; ManiSkill's wrapper would end every episode.
     * Missing assets raise an error that names them, instead of a question on standard input.
 
     Args:
-        task: a registered id (``PickCube-v1``), a file (``push.py``, ``push.py:PushEnv``), a class of a module
-            (``lab.tasks:PushEnv``) or a class that inherits BaseEnv. Each call executes a file again, as the page does;
-            ``gym.make`` then knows an id that it registers too. A module is imported as by ``import``.
+        task: a registered id (``PickCube-v1``), a file (``push.py``, ``push.py:PushEnv``), a class of a
+            module (``lab.tasks:PushEnv``) or a class that inherits BaseEnv. Each call executes a file again,
+            as the page does; ``gym.make`` then knows the ids that the file registers, too. A module is
+            imported as by ``import``.
         num_envs: number of envs in the batch.
-        backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation, which needs CUDA and PhysX's GPU
-            library. ``auto``: the CPU, even if there is a GPU, since the tests of GPU simulation have passed nowhere
-            so far. Replaces ``sim_backend``.
-        max_episode_steps: the time limit; None for the registered one, -1 for none.
+        backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation, which needs CUDA and
+            PhysX's GPU library. ``auto``: the CPU, even if there is a GPU, because the tests of GPU
+            simulation have not passed on any machine so far. Replaces ``sim_backend``.
+        max_episode_steps: the time limit in control steps; None for the registered limit, -1 for no limit.
         threads: threads that step the envs on the CPU; None for one per core that the process may use.
-        rules: rules of GPU simulation, checked on the CPU: ``stop`` raises if one is broken, ``warn`` warns, ``off``
-            checks none. None raises if other envs' state is overwritten, else warns; for an installed task it only
-            warns.
-        pictures: ``exact``: identical to stock ManiSkill, to the bit. ``fast``: several times as many per second on the
-            CPU, since robots and other heavy meshes are simplified to the detail that the cameras can see; warns that a
-            policy trained on them sees different pictures on a GPU.
+        rules: rules of GPU simulation, checked on the CPU: ``stop`` raises if one is broken, ``warn`` warns,
+            ``off`` checks none. None: raises if a task overwrites the state of other envs, and warns for all
+            other rules; for an installed task, only warns.
+        pictures: ``exact``: identical to stock ManiSkill, to the bit. ``fast``: several times as many per
+            second on the CPU, because robots and other heavy meshes are simplified to the detail that the
+            cameras can see; warns that a policy trained on such pictures sees different pictures on a GPU.
         kwargs: arguments of ``gym.make`` for the task: ``obs_mode``, ``reward_mode``, ``control_mode``,
             ``render_mode``, ``robot_uids``, ``sensor_configs``, ``reconfiguration_freq``, ``sim_config`` ...
 
     Raises:
-        TaskError: no such id, file or class, or the file cannot be imported; says where and why.
-        MissingAssets: a download is needed; names it and the command.
+        TaskError: there is no such id, file or class, or the file cannot be imported; the message says where
+            and why.
+        MissingAssets: a download is needed; the message names it and the command.
         BackendUnavailable: this machine has no GPU simulation, or no renderer for the requested pictures.
         ValueError, TypeError: arguments that contradict each other.
     """
@@ -118,9 +122,10 @@ def make(
 
 
 _FAST_PICTURES = (
-    'pictures="fast" renders simplified meshes: a policy trained on these pictures sees different ones on a GPU, with stock '
-    "ManiSkill and with the default, exact. In ManiSkill's tabletop tasks they differ by 0.3 of 255 on average, and by more "
-    "than 10 in 0.4 % of the pixels (128 x 128; more in `workbench help benchmarks`)."
+    'pictures="fast" renders simplified meshes: a policy trained on these pictures sees different pictures on a '
+    'GPU, in stock ManiSkill and with the default, pictures="exact". In ManiSkill\'s tabletop tasks the pictures '
+    "differ by 0.3 of 255 on average, and by more than 10 in 0.4 % of the pixels (128 x 128; more in "
+    "`workbench help benchmarks`)."
 )
 
 
@@ -144,7 +149,8 @@ def _build(
 
 
 def _line_of(cls: type[BaseEnv], error: TypeError) -> tuple[str, int] | None:
-    """The author's line that raised `error`; else (as for an unknown keyword) that of the constructor."""
+    """The author's line that raised `error`; if there is none, as for an unknown keyword, the line of the
+    constructor."""
     lines = [(frame.filename, frame.lineno or 1) for frame in traceback.extract_tb(error.__traceback__)]
     raised_at = next((line for line in reversed(lines) if not is_installed(line[0])), None)
     return raised_at or definition_line(cls.__init__)

@@ -227,11 +227,13 @@ _RANDOM_NAMES = ("random", "rng", "generator", "count", "cycle", "iter", "random
 def changed_while_running(
     symbols: Sequence[Symbol], libraries: Collection[str]
 ) -> tuple[Symbol, Symbol] | None:
-    """A value of a file or class that may be changed while the task runs, and the code that may; None if there is none.
+    """A value of a file or class that may be changed while the task runs, and the code that may change it;
+    None if there is none.
 
-    Executing a file again creates its values again: right for a constant, wrong for a cache. ``MESHES = {}`` that
-    `_load_scene` filled would be empty under an env whose scene is still the old one. A value may be changed if code assigns
-    to its items or attributes, calls a mutating method, or passes it to other code.
+    Executing a file again creates its values again, which is right for a constant and wrong for a cache.
+    ``MESHES = {}`` that `_load_scene` filled would be empty under an env whose scene is still the old one. A
+    value may be changed if code assigns to its items or attributes, calls a mutating method, or passes it to
+    other code.
     """
     values = {symbol.short: symbol for symbol in symbols if symbol.kind == "value"}
     natures: dict[str, _Nature] = {}
@@ -257,7 +259,7 @@ def _functions(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def written_attributes(symbol: Symbol | None) -> set[str]:
-    """Names of the attributes that a function assigns to, itself or their items."""
+    """Names of the attributes that a function sets or changes in place, or whose items it sets."""
     found: set[str] = set()
     for node in (n for part in (symbol.nodes if symbol is not None else ()) for n in ast.walk(part)):
         target: ast.AST = node

@@ -52,7 +52,7 @@ def is_own_file(path: str, folder: Path) -> bool:
 
 def is_library(name: str) -> bool:
     """Whether the top-level module `name` is a library's, even if an author has a file of that name."""
-    # In this order, since reading the contents of the distributions takes 0.1 s, once.
+    # In this order: reading the contents of the distributions takes 0.1 s, once.
     if _library_spec(name) is None or name in _INSTALLED_BY_MISTAKE:
         return False
     return name in sys.stdlib_module_names or name in _dependency_names()
@@ -108,7 +108,8 @@ def search_first(folder: Path, permanent: bool = False) -> None:
 
 @contextmanager
 def searched_first(folder: Path) -> Iterator[None]:
-    """`search_first` within the context."""
+    """Context manager that applies `search_first` to its block; entries that the block adds to ``sys.path``
+    stay."""
     path, guarded = list(sys.path), _finder_is_installed()
     search_first(folder)
     try:
@@ -121,7 +122,8 @@ def searched_first(folder: Path) -> Iterator[None]:
 
 
 def remove_library_finder() -> None:
-    """Remove the finder, once no author's folder is on ``sys.path``; nothing happens if one is permanent."""
+    """Remove the finder, after the last author's folder has left ``sys.path``. Does nothing if a folder is
+    permanent."""
     if _permanent_folder:
         return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, LibraryFinder)]

@@ -71,7 +71,7 @@ class LoadedTask:
     source_files: tuple[Path, ...]
     """The task's file first, then the imported modules of its folder."""
     source: dict[str, str]
-    """Path to the text that was executed, for each of `source_files`."""
+    """The executed text of each of `source_files`, by path."""
     source_hash: str
     """sha256 over `source` with relative paths, 12 hex digits."""
     max_episode_steps: int | None
@@ -88,9 +88,10 @@ class LoadedTask:
     robot: Robot | None = None
     """The robot, shown in a scene of ManiSkill, for a file without a task."""
     replaced: tuple[registry.Registration, ...] = ()
-    """Names that another task or robot has (``PickCube-v1``): plain ManiSkill would skip this file's class."""
+    """Registrations under a name that another task or robot has (``PickCube-v1``): plain ManiSkill would skip
+    them."""
     named_like_libraries: tuple[Path, ...] = ()
-    """Files of its folder that no import finds, because a library has their name."""
+    """Files of the task's folder that no import finds, because a library has their name."""
 
     @property
     def chosen(self) -> str:
@@ -115,8 +116,9 @@ class LoadedTask:
         if self.replaced:
             names = ", ".join(one.name for one in self.replaced)
             found.append(
-                f"{self.file} registers {names}, which exists already: here it is this file's class from now on, and "
-                "plain ManiSkill would skip that class. Choose another name to have both, or register with override=True."
+                f"{self.file} registers {names}, which exists already: the workbench uses this file's class from "
+                "now on, but plain ManiSkill would skip it. Choose another name to have both, or register with "
+                "override=True."
             )
         return tuple(found)
 
@@ -140,8 +142,9 @@ _loads: dict[Path, _Load] = {}
 def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> LoadedTask:
     """Import the task that `reference` names: ``file.py``, ``file.py:ClassName``, ``package.module:ClassName`` or an id.
 
-    All or nothing: the file is executed again with the modules of its folder. If that fails, the modules, registrations
-    and tracebacks of the last good version are restored: it may be running, and import lazily.
+    All or nothing: the file is executed again with the modules of its folder. If that fails, the modules,
+    registrations and texts for tracebacks of the last good version are restored: that version may be running,
+    and import lazily.
 
     Args:
         reference: a `RecordedTask` opens only a registered id or approved texts, never a path.
@@ -196,7 +199,8 @@ def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
                 ""
                 if task.file is not None
                 else (
-                    ", and its file was found neither in or above the folder of the recording, nor below the current one"
+                    ", and its file was found neither in or above the recording's folder, nor below the "
+                    "current folder"
                 )
             )
             raise task_error(
@@ -410,7 +414,8 @@ IMPORT_HINT = (
 def task_of_class(cls: type[BaseEnv], env_id: str) -> LoadedTask:
     """The `LoadedTask` of a class that exists already.
 
-    With the executed texts if `load_task` loaded its file, else with the text on disk.
+    Its source is the executed texts if `load_task` loaded its file, else the text on disk; empty for a class
+    without a file.
     """
     for load in _loads.values():
         # Excludes a class that the file only imports.
@@ -476,7 +481,7 @@ def _source_fields(finder: AuthorFinder) -> dict[str, Any]:
 
 
 def _fields(source: Mapping[str, str], file: Path | None, folder: Path) -> dict[str, Any]:
-    # In a package a helper may be read before the task's file.
+    # The task's file first: in a package a helper may be read before it.
     files = sorted((Path(path) for path in source), key=lambda path: path != file)
     return {
         "source_files": tuple(files),
@@ -560,4 +565,4 @@ def _module_hint(name: str, finder: AuthorFinder) -> str:
     close = difflib.get_close_matches(name, siblings, n=1)
     if close:
         return f"there is {close[0]}.py in the file's folder"
-    return f"neither in the file's folder nor installed for {sys.executable}"
+    return f"it is neither in the file's folder nor installed for {sys.executable}"

@@ -242,7 +242,7 @@ def read_source(path: str | Path) -> str:
     """The text of a Python source file, see `decode`.
 
     Raises:
-        OSError: it cannot be read, is not a regular file, or is too large for a program.
+        OSError: it cannot be read, is not a regular file, or is larger than `MAX_SOURCE_BYTES`.
         SyntaxError: it is not text.
     """
     return plain_line_ends(read_exactly(path)[1])
@@ -279,7 +279,7 @@ def exact_text(path: str, raw: bytes) -> tuple[str, str]:
 
 
 def _is_in(path: str, root: str) -> bool:
-    """Whether `path` is the folder `root`, or below it and the author's own."""
+    """Whether `path` is the folder `root`, or a folder of the author below it."""
     real = os.path.realpath(path or os.curdir)
     root = os.path.realpath(root)
     return real == root or is_own_file(os.path.join(real, "x.py"), Path(root))
@@ -295,15 +295,15 @@ class UnloadedModules:
 
 
 _libraries: dict[str, ModuleType] = {}
-"""Cache of modules known to be a library's: checking three thousand takes 7 ms."""
+"""Cache of the modules of libraries: checking three thousand modules takes 7 ms."""
 
 
 def unload_modules(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> UnloadedModules:
     """Remove the author's modules from ``sys.modules``, so that edited helpers are read again.
 
-    Removes the modules of the folder, and helpers of other tasks: ``helper`` of another folder would be found before this
-    one's. Main modules of other tasks stay (`is_other_task` of their name): they are not imported by name, and their
-    classes may be in use.
+    Removes the modules of the folder, and the helpers of other tasks: if they stayed, ``import helper`` would
+    give the loaded ``helper`` of another folder. Main modules of other tasks stay (`is_other_task` of their
+    name): they are not imported by name, and their classes may be in use.
     """
     folder = finder.own_folder
     unloaded: dict[str, ModuleType] = {}

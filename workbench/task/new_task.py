@@ -1,4 +1,4 @@
-"""Writes a new task into the user's folder, from an example (its template) or an installed task."""
+"""Writes a new task into the user's folder, from a template (an example task) or an installed task."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class Template:
     name: TemplateName
     """Name for ``workbench new --from``."""
     example: str
-    """File of the template among the examples."""
+    """File name of the template among the examples."""
     about: str
 
 
 TEMPLATES = (
-    Template("minimal", "minimal.py", "the least that a task can be: a robot, a cube, and when it is done"),
+    Template("minimal", "minimal.py", "the smallest task: a robot, a cube, and a condition for success"),
     Template("tabletop", "push_cube.py", "a whole task on a table: reward, cameras, observations, fail"),
     Template("articulated", "articulated.py", "a drawer that is built in code, and pulled open"),
     Template("multi-robot", "two_robots.py", "two arms that lift one bar together"),

@@ -48,9 +48,9 @@ class OpenedTask:
     env: TaskEnv
     description: TaskDescription
     first: StepResult
-    """After the reset with the requested seed."""
+    """Result of the reset with the requested seed."""
     milliseconds: dict[str, float]
-    """Wall time of each part: import, build, reset, rehearse, geometry."""
+    """Wall time of each part in milliseconds: import, build, reset, rehearse, geometry."""
 
 
 class Clock:
@@ -73,7 +73,7 @@ class Opening:
     on_activity: Callable[[str], None] = lambda activity: None
     """Called with the next part of the work, for a status line."""
     on_finding: Callable[[Finding], None] = warn_of
-    """Called once for each place that breaks a rule without being stopped."""
+    """Called once for each line at which a rule is broken without stopping the task."""
     begins_anew: bool = False
     """Whether each reset is an exact point (`BatchedCpuMixin.begins_anew`), for a session that seeks back."""
     clock: Clock = field(default_factory=Clock)
@@ -86,7 +86,8 @@ def with_advice(
     again: Callable[[], LoadedTask],
     knows_others: bool = False,
 ) -> TaskError:
-    """The error of a task that failed to open, with advice: another task of the file, or one env.
+    """The error of a task that failed to open, with advice in its message: open another task of the file, or
+    one env.
 
     Args:
         again: imports the task again; the failed import was undone.
@@ -97,13 +98,14 @@ def with_advice(
         tried = min(options.num_envs, _MAX_SEEDS_TRIED)
         if _runs_alone(again, options, tried):
             advice.append(
-                f"this works with 1 env, from each of {tried} seeds, and not with {options.num_envs}; --num-envs 1 opens it"
+                f"the task works with 1 env, from each of {tried} seeds, but not with {options.num_envs}: open it "
+                "with --num-envs 1"
             )
     if loaded.others and loaded.file is not None and not knows_others:
         file = loaded.file.name
         advice.append(
-            f"{loaded.chosen} of {file} was tried, which also has {', '.join(loaded.others)}: name one, as in "
-            f"{file}:{loaded.others[-1]}, or choose it as Task on the page"
+            f"{loaded.chosen} of {file} was tried; the file also has {', '.join(loaded.others)}: name one of "
+            f"these, as in {file}:{loaded.others[-1]}, or choose it as Task on the page"
         )
     if not advice:
         return error
@@ -113,11 +115,13 @@ def with_advice(
 
 
 _MAX_SEEDS_TRIED = 8
-"""Maximum number of seeds that one env is tried with: an error of 16 envs may come from the state of one of them."""
+"""Maximum number of seeds with which one env is tried: an error of 16 envs may come from the state of one of
+them."""
 
 
 def _may_be_of_the_batch(error: TaskError) -> bool:
-    """Whether the error is a wrong shape (from torch, numpy or a check) and has no advice yet."""
+    """Whether one env may avoid the error: a broken rule, or a wrong shape (from torch, numpy or a check).
+    Refusals of the core have their own advice."""
     cause = error.__cause__
     if isinstance(cause, BrokenRule):
         return True
@@ -185,7 +189,8 @@ def import_task(
     """Import a task's class, with `source` instead of the files on disk if given. Raises TaskError."""
     opening.on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
     if "render_backend" not in options.env_kwargs and (renderer := find_renderer()) is not None:
-        # SAPIEN refuses another device while a material of the author's module or of a failed build is alive.
+        # Before the import: SAPIEN refuses another device while a material of the author's module or of a
+        # failed build is alive.
         keep_render_device(renderer.render_backend)
     import_modules(options.imports)
     loaded = load_task(reference, source=source)
@@ -263,7 +268,8 @@ def _built(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Opened
 def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
     """Do one reset, one step and one partial reset, and check what they return.
 
-    A task that imports and builds can still fail in these, which must be known before the running version is replaced.
+    A task that imports and builds can still fail in these. The failure must be found before the running
+    version is replaced.
 
     Raises:
         TaskError: one of them fails.
@@ -350,9 +356,10 @@ def warm_up(options: TaskOptions, keep_going: Callable[[], bool]) -> None:
     of each kind of camera compiles its shaders. The robot's files, the render system and the shaders are the same for
     any task.
 
-    Fails only if the author's own load would fail too (no renderer, no GPU), which reports the error better.
+    A TaskError of the build is ignored: the author's own load would fail too (no renderer, no GPU), and its
+    report is better.
     """
-    # The only one of the author's arguments that decides whether rendering is possible.
+    # Of the author's arguments, only this one decides whether rendering is possible.
     renderer = {name: value for name, value in options.env_kwargs.items() if name == "render_backend"}
     try:
         opened = open_task(_SMALL_TASK, replace(options, num_envs=1, env_kwargs=renderer, imports=()))

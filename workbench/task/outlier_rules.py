@@ -16,7 +16,7 @@ _OTHER_HOOKS = {
         "_initialize_episode",
     ),  # authors do not write `step`: a body that flies off was placed in a reset
 }
-"""Hooks to blame for rules whose own hook is not the author's."""
+"""Hooks to blame, in order, if the author has not defined the rule's own hook."""
 
 
 def rules_of_outliers(loaded: LoadedTask, choice: Degree | None) -> dict[str, Finding]:
@@ -24,7 +24,7 @@ def rules_of_outliers(loaded: LoadedTask, choice: Degree | None) -> dict[str, Fi
     are off, or silenced at the hook, are left out.
 
     Args:
-        choice: degree of all rules; None for each rule's own.
+        choice: degree of all rules; None for each rule's own degree.
     """
     found: dict[str, Finding] = {}
     for name in sorted(OUTLIER_RULES):

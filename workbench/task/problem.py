@@ -44,8 +44,9 @@ HOOK_STAGES: dict[str, str] = {
     "_before_simulation_step": "step",
     "_after_simulation_step": "step",
 }
-"""Method of `BaseEnv` to the stage that the page names. `get_info`, `get_reward` and `_flatten_raw_obs` are ManiSkill's
-callers of the author's hooks; they raise because of what a hook returned (``evaluate()`` giving None in `get_info`)."""
+"""Maps a method of `BaseEnv` to the stage that the page names. `get_info`, `get_reward` and
+`_flatten_raw_obs` are ManiSkill's callers of the author's hooks; they raise because of what a hook returned
+(``evaluate()`` giving None in `get_info`)."""
 _CALLERS = ("get_info", "get_reward", "_flatten_raw_obs")
 
 
@@ -93,9 +94,9 @@ class Problem:
     message: str
     """Exception type and text, on one line."""
     file: str | None
-    """The author's file; None if no line of the author is on the traceback."""
+    """The author's file; None if no file of the author is known to be at fault."""
     line: int | None
-    """1-based line in `file`."""
+    """1-based line in `file`; None if unknown."""
     code: str | None
     """The text of that line, stripped."""
     traceback: str
@@ -139,7 +140,7 @@ def place_text(file: str | None, line: int | None) -> str:
 
 
 def task_error(message: str, file: Path | None = None) -> TaskError:
-    """Error for a task that cannot be loaded, raised by no line of the author's code."""
+    """Error for a task that cannot be loaded, if no line of the author's code raised it."""
     return TaskError(Problem("import", shorten(message), None if file is None else str(file), None, None, ""))
 
 
@@ -152,11 +153,17 @@ def problem_from_exception(
 ) -> Problem:
     """The problem of `exc` for the author of `own_files`.
 
-    Its line is the innermost frame of `exc`, or else of its causes, in `own_files` or in a file called from there that no
-    package has installed. A hook of `HOOK_STAGES` on the traceback replaces `stage`, except while importing. If no frame is
-    the author's, the line is the place that a note names; else, if a hook is known and `cls` (the task's class) is given,
-    that hook's ``def``; else `otherwise` (file and line). The message begins with the first exception of the chain, and
-    with what the core's notes say came before.
+    Its line is the first of these that exists:
+
+    * the line that one of the core's notes names, unless the author's innermost line raised the exception;
+    * the innermost frame of `exc`, or else of its causes, in `own_files` or another file that is not installed;
+    * with `cls` (the task's class), the ``def`` of an override that cannot take the failed call's arguments;
+    * with `cls`, the ``def`` of the author's hook of the stage, except for the stages ``build`` and ``step``;
+    * `otherwise` (file and line).
+
+    A hook of `HOOK_STAGES` on the traceback replaces `stage`, unless `stage` is ``import``, ``syntax``,
+    ``policy`` or ``worker``. The message begins with the core's notes about earlier errors, and with the
+    first exception of the chain.
     """
     own = {str(path) for path in own_files}
     chain = [*chain_of(exc)]
@@ -229,7 +236,7 @@ def format_traceback(exc: BaseException) -> str:
 def definition_line(function: object) -> tuple[str, int] | None:
     """File and 1-based line of the ``def`` of a function, method or property; None for others.
 
-    A code object's first line is that of its first decorator.
+    The ``def`` is searched, because a code object's first line is that of its first decorator.
     """
     if isinstance(function, property):
         function = function.fget
@@ -269,10 +276,11 @@ def check_step_returns(
 ) -> Problem | None:
     """The first wrong type or shape in what one step of `num_envs` envs of `cls` returned, or None.
 
-    ManiSkill 3.0.1 does not check them. Some mistakes raise far from their cause (``success`` as a Python bool: "'bool'
-    object has no attribute 'clone'", inside `BaseEnv.step`). Others are silent with several envs: ``success`` of shape
-    ``()`` gives a ``terminated`` of shape ``()``; a reward of shape ``(N, 1)`` or ``()``, or a Python float, is returned
-    and broadcasts against ``(N,)`` into ``(N, N)`` in a trainer. With one env all of them look right.
+    ManiSkill 3.0.1 does not check types and shapes. Some mistakes raise far from their cause (``success`` as
+    a Python bool: "'bool' object has no attribute 'clone'", inside `BaseEnv.step`). Others are silent with
+    several envs: ``success`` of shape ``()`` gives a ``terminated`` of shape ``()``; a reward of shape
+    ``(N, 1)`` or ``()``, or a Python float, is returned and broadcasts against ``(N,)`` into ``(N, N)`` in a
+    trainer. With one env all of them look right.
 
     Args:
         evaluate: what ``evaluate()`` returned: a dict with ``success`` and ``fail`` as bool tensors of shape (N,); other
@@ -326,12 +334,13 @@ def _syntax_problem(exc: SyntaxError) -> Problem:
 def _message(exc: BaseException) -> str:
     name = type(exc).__qualname__
     try:
-        # Python's own text of a SyntaxError ends in "(file.py, line 3)", of a parsed text in "(<string>, line 3)".
+        # Not str(exc) of a SyntaxError, which ends in "(file.py, line 3)", or "(<string>, line 3)" for a
+        # parsed text.
         text = str(exc.msg if isinstance(exc, SyntaxError) else exc)
     except Exception as failure:  # the author's own __str__ may raise
         text = f"<its __str__ raised {type(failure).__qualname__}>"
     if isinstance(exc, BdbQuit) and not text:
-        text = "a debugger's prompt was quit, or had no terminal; it was called just before this line: remove the call"
+        text = "a debugger's prompt was quit, or had no terminal: remove its call, just before this line"
     return shorten(f"{name}: {text}{_suggestion(exc)}" if text.strip() else name)
 
 
@@ -372,8 +381,8 @@ def _place_in(exc: BaseException, own: Collection[str]) -> _Line | None:
 
 
 def _override_of_other_arguments(exc: BaseException, cls: type, own: Collection[str]) -> _Line | None:
-    """The author's method whose parameters differ from those of the method that it overrides, if a call of it raised `exc`:
-    Python raises that TypeError in the caller."""
+    """The line of the author's method that cannot be called like the method that it overrides, if such a call
+    raised `exc`. Python raises this TypeError in the caller, so the traceback does not show the method."""
     frames = [frame for frame, _ in tracebacks.walk_tb(exc.__traceback__)]
     if not isinstance(exc, TypeError) or not frames:
         return None
@@ -386,7 +395,8 @@ def _override_of_other_arguments(exc: BaseException, cls: type, own: Collection[
 
 
 def _takes(method: object, overridden: object) -> bool:
-    """Whether a method can be called with all arguments of the one that it overrides, by name or in order."""
+    """Whether `method` can be called with all arguments of the method that it overrides, by name or in
+    order."""
     try:
         mine, theirs = inspect.signature(method), inspect.signature(overridden)  # type: ignore[arg-type]
     except (TypeError, ValueError):  # no function
@@ -413,9 +423,11 @@ def _is_raised_at(exc: BaseException, place: _Line | None) -> bool:
 
 
 def _hands_on(frame: FrameType, below: list[FrameType]) -> bool:
-    """Whether a constructor's frame is in its ``super().__init__()``, which called a method of the object that failed.
+    """Whether `frame` is a constructor that calls the base class's constructor, which called the object's
+    method that failed.
 
-    ``BaseEnv.__init__`` builds the scene and resets, so the line of its call does not show where they fail.
+    ``BaseEnv.__init__`` builds the scene and resets, so the line that calls it does not show where the build
+    or reset fails.
     """
     same = [
         one.f_code.co_name == "__init__"

@@ -77,7 +77,7 @@ def looks_like_file(env_id: str) -> bool:
 def is_path(reference: str) -> bool:
     """Whether `reference` has the form of a path, contains a slash and exists, or names a file in the current folder.
 
-    A folder may have the name of an env id.
+    A folder in the current folder does not count: it may have the name of an env id.
     """
     if looks_like_file(reference) or reference in (".", ".."):
         return True
@@ -116,7 +116,7 @@ def check_task_file(file: Path) -> None:
             raise task_error(f"{file} is a folder; name a .py file in it{inside}")
         if not file.exists():
             if file.is_symlink():
-                raise task_error(f"{file} is a link to {file.readlink()}, which is no file")
+                raise task_error(f"{file} is a link to {file.readlink()}, which does not exist")
             raise missing_file(file)
         if not file.is_file():
             # Reading a pipe or a device may block forever.
@@ -130,7 +130,7 @@ def check_task_file(file: Path) -> None:
 
 
 def missing_file(file: Path) -> TaskError:
-    """The error that there is no such file, with similar names beside it."""
+    """Error for a file that does not exist, with similar names in its folder."""
     if not file.parent.is_dir():
         return task_error(f"{file} does not exist, nor does its folder {file.parent}")
     # Compare stems: the common suffix makes unrelated short names similar.
@@ -141,7 +141,8 @@ def missing_file(file: Path) -> TaskError:
 
 
 def reference_to_class(reference: TaskName, file: Path, class_name: str) -> TaskName:
-    """The reference of another class of the same file or package; `file` is the file of the class that `reference` gave."""
+    """The reference of another class of the same file or package; `file` is the file of the class that
+    `reference` opened."""
     if isinstance(reference, RecordedTask):
         return replace(reference, class_name=class_name)
     named = split_reference(reference)

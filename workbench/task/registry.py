@@ -98,9 +98,10 @@ def id_of(cls: type) -> str | None:
 
 
 def gymnasium_spec_of(cls: type) -> GymnasiumSpec | None:
-    """Spec of a class that is registered with gymnasium's own `register`, which ManiSkill's table lacks."""
-    ways = (cls, f"{cls.__module__}:{cls.__qualname__}")
-    return next((spec for spec in gymnasium_registry.values() if spec.entry_point in ways), None)
+    """Spec of a class that was registered with gymnasium's own `register`, so that ManiSkill's table does not
+    have it; None if there is none."""
+    entry_points = (cls, f"{cls.__module__}:{cls.__qualname__}")
+    return next((spec for spec in gymnasium_registry.values() if spec.entry_point in entry_points), None)
 
 
 def environment_ids() -> list[str]:
@@ -124,10 +125,11 @@ def is_robot(value: object) -> bool:
 def registering(is_own: Callable[[str], bool], registrations: Registrations) -> Iterator[None]:
     """Context manager that records in `registrations` what files with `is_own(path)` register.
 
-    ManiSkill's `@register_env` keeps the old class of a known id ("already registered. Skip"), so a file that is executed
-    on every save would keep its first version, and one with a built-in id would be ignored. So the two decorators are
-    replaced by ones that clear the name first. The tables are not reset afterwards, whether the body raises or not: see
-    `Registrations.undo`. Registrations of libraries that the file imports are left alone, since those stay imported.
+    ManiSkill's `@register_env` keeps the old class of a known id ("already registered. Skip"), so a file that
+    is executed on every save would keep its first version, and one with a built-in id would be ignored. So
+    the two decorators are replaced by decorators that clear the name first. The tables are not reset
+    afterwards, whether the body raises or not: see `Registrations.undo`. Registrations of libraries that the
+    file imports are left alone, because the libraries stay imported.
 
     Depends on undocumented names of mani_skill 3.0.1; tests/task/test_registry.py fails if one moves.
     """

@@ -59,7 +59,8 @@ class Inherited:
 
     names: frozenset[str]
     used_at_build: frozenset[str] = frozenset()
-    """Names that the code of these classes (except BaseEnv) uses: they may call them while building."""
+    """Names that the code of these classes (except BaseEnv) uses: it may call their functions while the env
+    is built."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +75,12 @@ class Change:
 
     @property
     def tried_hooks(self) -> frozenset[str]:
-        """Hooks that computing the current moment's reward, evaluation and observation does not run."""
+        """The hooks that run only in a reset or a step, not when the current moment is scored again."""
         return self.hooks & (RESET_HOOKS | STEP_HOOKS)
 
 
 class _NeedsRebuild(Exception):
-    """The reason why the env must be rebuilt."""
+    """The env must be rebuilt; the message is the reason."""
 
 
 def find_change(
@@ -105,7 +106,7 @@ def find_change(
     except _NeedsRebuild as reason:
         return Change("rebuilt", str(reason))
     except (SyntaxError, ValueError):  # ValueError: a null byte
-        return Change("rebuilt", "the version before cannot be read as Python")
+        return Change("rebuilt", "the previous version cannot be parsed as Python")
     except RecursionError:
         return Change("rebuilt", "the file is nested too deeply to be compared")
 
@@ -215,7 +216,8 @@ class _Comparison:
     # --- code that cannot be analysed ----------------------------------------------------------------
 
     def _refuse_another_order(self, family: set[Key]) -> None:
-        """Refuse a changed order of members: it numbers an enum's members and a dataclass's arguments."""
+        """Refuse a changed order of members: the order numbers an enum's members and a dataclass's
+        arguments."""
         for key, versions in self._versions.by_key.items():
             if versions[0].kind != "class" or key in family or key in self._versions.changed:
                 continue
@@ -232,7 +234,7 @@ class _Comparison:
                 (node,) = symbol.nodes
                 assert isinstance(node, ast.ClassDef)
                 if node.keywords or getattr(node, "type_params", ()):
-                    raise _NeedsRebuild(f"the class {symbol.name} is made with arguments")
+                    raise _NeedsRebuild(f"the class {symbol.name} has keyword arguments or type parameters")
                 for decorator in node.decorator_list:
                     if not ast.unparse(decorator).partition("(")[0].endswith("register_env"):
                         raise _NeedsRebuild(
@@ -257,13 +259,13 @@ class _Comparison:
             value, code = found
             raise _NeedsRebuild(
                 f"{self._label(value.key)} may be changed while the task runs, by {self._label(code.key)}: "
-                "it would start again with the new file"
+                "executing the new file would set it back to its first value"
             )
         running = self._versions.reach(self._versions.members(family, _RUNS_LATER))
         for key, by in running.items():
             if by is not None and key not in family and self._versions.by_key[key][0].kind == "class":
                 raise _NeedsRebuild(
-                    f"{self._label(by)} uses the class {self._label(key)}, which may have instances"
+                    f"{self._label(by)} uses the class {self._label(key)}, of which old instances may exist"
                 )
 
     def _refuse_memoized(self, affected: set[Key]) -> None:
@@ -294,7 +296,7 @@ class _Comparison:
                     raise _NeedsRebuild(f"{label} uses {name}, so cameras are not as configured")
                 continue
             for name in sorted(symbol.mentions & _RANDOM_NAMES):
-                raise _NeedsRebuild(f"{label} uses {name}: the cameras would be drawn again")
+                raise _NeedsRebuild(f"{label} uses {name}: the cameras would be sampled again")
             for node in (node for part in symbol.nodes for node in ast.walk(part)):
                 moves = isinstance(node, ast.Attribute) and node.attr in _MOVES
                 if moves and root_name(node) == "self":
@@ -317,7 +319,8 @@ class _Comparison:
 
 
 def _goes_on_after_super(nodes: Iterable[ast.AST]) -> bool:
-    """Whether an ``__init__`` does more than set constants after BaseEnv's has built and reset the env."""
+    """Whether an ``__init__`` does more than set constants after ``BaseEnv.__init__`` has built and reset the
+    env."""
     for node in nodes:
         if not isinstance(node, ast.FunctionDef):
             return True

@@ -58,7 +58,8 @@ class TaskText:
             raise SettingError(error.reason) from error
 
     def find(self, name: str) -> Constant | Argument:
-        """The constant or argument that `name` sets. Raises SettingError if there is none, several, or it is no literal."""
+        """The constant or argument that `name` sets. Raises SettingError if there is none, if there are
+        several, or if its value is not a literal."""
         cls = self._task_class()
         arguments = None if cls is None else arguments_of(self._file, self._path, cls)
         found: dict[str, Constant | Argument | SettingError] = {}
@@ -106,8 +107,8 @@ class TaskText:
         lines = [self._file.line(one.node) for one in bindings]
         where = f"{name} (line {lines[0]} of {self._file.name})"
         if len(bindings) > 1:
-            told = listed([str(line) for line in lines], 5)
-            return SettingError(f"{name} is set in several lines of {self._file.name}: {told}")
+            places = listed([str(line) for line in lines], 5)
+            return SettingError(f"{name} is set in several lines of {self._file.name}: {places}")
         (one,) = bindings
         if one.imported is not None:
             return SettingError(f"{where} is imported: only constants of the file itself can be set")

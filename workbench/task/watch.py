@@ -20,8 +20,8 @@ QUIET_SECONDS = 0.03
 BURST_SECONDS = 0.2
 """Maximum wait for the end of a burst."""
 READ_SECONDS = 0.25
-"""Interval of reading the files even if their ``stat`` is unchanged: a network mount may update it late, and two saves
-within one tick of a file system's clock have the same one."""
+"""Interval of reading the files even if their ``stat`` is unchanged: a network mount may update ``stat``
+late, and two saves within one tick of a file system's clock have the same ``stat``."""
 GONE_SECONDS = 0.3
 """Time for which a file must be missing or empty before that counts as its new content, not as half of a save."""
 STOP_SECONDS = 1.0
@@ -46,7 +46,7 @@ class SourceWatcher:
     after a rename, creation or deletion in their folder (as most editors save). Once ``stat`` is stable the texts are
     compared: a ``touch``, a ``git checkout`` of the same content or a line-end conversion is no change.
 
-    `on_change` may call `follow` and `stop`. What it raises is reported, and watching continues.
+    `on_change` may call `follow` and `stop`. An exception of `on_change` is reported, and watching continues.
     """
 
     def __init__(self, on_change: Callable[[set[Path]], None]) -> None:
@@ -66,8 +66,8 @@ class SourceWatcher:
 
         Args:
             paths: files, which need not exist.
-            texts: their known texts by path, so that a save between a load and this call is noticed. Paths that are not in
-                it and not followed yet are read now.
+            texts: known texts of these files by path, so that a save between a load and this call is noticed.
+                A file without a text that is not followed yet is read now.
         """
         texts = texts or {}
         followed = [_real(Path(path).expanduser()) for path in paths]
@@ -153,7 +153,8 @@ class SourceWatcher:
 
 
 def _real(path: Path) -> Path:
-    """The file behind links. A link to anything else (a device, by mistake) is itself watched until it is a file again."""
+    """The file that a link leads to. A link to anything else (a device, by mistake) is watched itself until
+    it leads to a file."""
     real = real_path(path)
     return real if os.path.isfile(real) else real_path(path.parent) / path.name
 

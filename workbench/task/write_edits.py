@@ -1,4 +1,4 @@
-"""Applies and reverts edits of the author's files, only over the text they were planned on."""
+"""Applies and reverts edits of the author's files, if they have the text for which the edit was planned."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def why_not_writable(path: str) -> str | None:
         return f"{path} cannot be read: {exc.strerror}"
     if not stat.S_ISREG(mode):
         return f"{path} is not an ordinary file"
-    # A rename ignores the file's mode, and root ignores every mode, so it is checked here.
+    # Check the mode here: a rename ignores the file's mode, and root ignores every mode.
     if not mode & 0o222 or not os.access(real, os.W_OK):
         return f"{path} is read-only"
     if not os.access(real.parent, os.W_OK):
@@ -110,9 +110,7 @@ def _replace_all(changes: tuple[FileChange, ...], since: str) -> None:
             _replace_text(change.file, change.old_text, change.new_text, since)
         except RefusedEdit as refused:
             left = [made.name for made in changes[:done] if not _reverted(made, since)]
-            incomplete = (
-                f"; {' and '.join(left)} could not be restored, and has the change without the other file"
-            )
+            incomplete = f"; {' and '.join(left)} could not be restored: the change stays there"
             raise RefusedEdit(f"{refused.reason}{incomplete if left else ''}") from refused
 
 

@@ -21,10 +21,10 @@ HASH_CHARACTERS = 12
 MAX_NAME_CHARACTERS = 400
 """Maximum length of a shown name."""
 FOLLOWED = (
-    "While it is open live, every save of this file and of the modules next to it runs without asking, whoever saves it. "
-    "Rescore uses the file as it is at that time."
+    "While the task is open live, every save of this file and of the modules next to it runs without asking, "
+    "even if another program or person saves it. Rescore runs the file as it is at the time of rescoring."
 )
-"""Warning before continuing live with a file that a recording references."""
+"""Warning in a question about a file whose later saves will run too."""
 
 
 class Consent(Enum):
@@ -49,7 +49,7 @@ class CodeFile:
     """A source text that would run."""
 
     name: str
-    """Path of the task's own file; for a module, relative to it."""
+    """Path of the task's own file; for a module, its path relative to the task's folder."""
     hash: str
     """First digits of its SHA-256."""
     text: str
@@ -72,13 +72,14 @@ class TrustQuestion:
     computed: bool = False
     """Whether the task computes its imports, so that all files of its folder count as modules."""
     trusted_before: bool = False
-    """Whether another version of the same files was trusted; see `CodeFile.since`, unless `nothing_known`."""
+    """Whether another version of the same files was trusted; `CodeFile.since` compares with it, unless
+    `nothing_known`."""
     gone: tuple[str, ...] = ()
     """Modules of the last trusted version that no longer exist."""
     followed: bool = False
     """Whether later saves of these files run too."""
     agreed: bool = False
-    """Whether these texts may already run; only `followed` is new."""
+    """Whether these texts may run already, so that the question is only about later saves."""
     more: int = 0
     """Number of questions after this one."""
     listed: bool = False
@@ -101,7 +102,8 @@ class TrustQuestion:
 
     @property
     def nothing_known(self) -> bool:
-        """Whether the last trusted version is not known file by file."""
+        """Whether a trusted version exists, but the hashes of its files were dropped, so changes cannot be
+        marked."""
         return self.trusted_before and not self.gone and all(one.since is Since.SAME for one in self.files)
 
 
@@ -109,8 +111,8 @@ class NotCleared(Exception):
     """Code must not run; the message is the reason.
 
     Attributes:
-        question: The question whose yes would allow it, if there is one.
-        trust_helps: Whether no question is asked but ``--trust`` would allow it.
+        question: The question to which the answer yes would allow the code, if there is one.
+        trust_helps: True if only ``--trust`` would allow the code, and no question.
     """
 
     def __init__(self, why: str, question: TrustQuestion | None = None, trust_helps: bool = False) -> None:
@@ -135,7 +137,7 @@ class CodeToRun:
     """Code that a recording references or contains."""
 
     reference: TaskName
-    """The task to open; ignored if `recorded_text` is True."""
+    """The task to open; not examined if `recorded_text` is True."""
     info: EpisodeInfo
     """Info of the recording."""
     recorded_text: bool = False
@@ -154,13 +156,14 @@ class _Undecided:
 
 
 class Clearances:
-    """Decides about all code of recordings; it asks about each text once.
+    """Decides whether code of recordings and listed files may run. Asks the user about each text once.
 
-    A recording is untrusted unless its seal proves that it was made here. Its task is opened without a question if it is an
-    id of an installed package, a file that the user named (on the command line, or open live), or the file that this
-    installation had open when it recorded. For anything else the texts are read, not run, and the user is asked; the answer
-    is stored by their hash. The approved texts run even if the file changes. Later saves run only if the file is followed
-    (continuing live), which is a separate question.
+    A recording is untrusted unless its seal proves that it was made here. Its task is opened without a
+    question if it is an id of an installed package, a file that the user named (on the command line, or open
+    live), or the file that this installation had open when it recorded. For anything else the texts are read,
+    not run, and the user is asked; the answer is stored by the hash of the texts. Exactly the approved texts
+    run, even if the file changes later. Later saves run only if the file is followed (continuing live), which
+    is a separate question.
 
     Args:
         named: Returns the files that the user named: on the command line, or by having them open live.
@@ -196,7 +199,7 @@ class Clearances:
     def clear_all(
         self, codes: Sequence[CodeToRun], stopped: Callable[[], bool] = lambda: False
     ) -> list[TaskName | NotCleared]:
-        """The task to open, or the refusal, for each of several; asks about each text once."""
+        """The task to open, or the refusal, for each of `codes`; asks about each text once."""
         decisions = [self._without_asking(one) for one in codes]
         to_ask: dict[str, tuple[CodeToRun, _Undecided]] = {}
         for one, decision in zip(codes, decisions):
@@ -251,7 +254,7 @@ class Clearances:
         return RecordedTask(file.name, content.main, class_name, content.texts)
 
     def _answer(self, question: TrustQuestion, content: TaskContent, stopped: Callable[[], bool]) -> Consent:
-        """Ask the question; store the answer if it is yes."""
+        """Ask the question; a yes is stored."""
         answer = Consent.NO if self._ask is None or stopped() else self._ask(question, stopped)
         if answer is Consent.ALWAYS:
             self._store.trust(content, question.followed)
@@ -260,7 +263,8 @@ class Clearances:
         return answer
 
     def refused_arguments(self, info: EpisodeInfo, made: InstallationSeal | None = None) -> str | None:
-        """Why an env must not get the arguments of this recording; None if it may. Foreign recordings must not name files."""
+        """Why an env must not get the arguments of this recording; None if it may get them. A recording that
+        was not made here must not name files for the env to read."""
         if self._all_trusted or (made or made_here(info)) is not InstallationSeal.NO:
             return None
         named = [_printable(text) for text in paths_in_arguments(info)]
@@ -272,7 +276,7 @@ class Clearances:
         )
 
     def _without_asking(self, code: CodeToRun) -> TaskName | NotCleared | _Undecided:
-        """The decision, if it needs no question."""
+        """The decision; `_Undecided` if it needs a question."""
         made = made_here(code.info)
         if (why := self.refused_arguments(code.info, made)) is not None:
             return NotCleared(why, trust_helps=True)
@@ -333,7 +337,7 @@ def _question(
 
 def _changed(content: TaskContent) -> NotCleared:
     return NotCleared(
-        f"the code of {_printable(content.main)} was changed while you were asked about it; try it again"
+        f"the code of {_printable(content.main)} was changed while you were asked about it; try again"
     )
 
 
@@ -351,17 +355,17 @@ def code_files(content: TaskContent, before: Mapping[str, str] | None = None) ->
             since = Since.CHANGED if name in before else Since.NEW
         shown = content.main if paths[name] == content.main else name
         files.append(CodeFile(_printable(shown), found[:HASH_CHARACTERS], content.texts[paths[name]], since))
-    # Changed modules first, since they are hard to find in a long list.
+    # Changed modules first, or they would be hard to find in a long list.
     return (*files[:1], *sorted(files[1:], key=lambda file: file.since is Since.SAME))
 
 
 def _registered(reference: RecordedTask) -> TaskName | NotCleared:
-    """The reference, unless its env id is a path."""
+    """The reference; a refusal if its env id is a path."""
     if not looks_like_file(reference.env_id):
         return reference
     return NotCleared(
-        f"a recording names the file {_printable(reference.env_id)} as its task, and a path that a recording names in place of "
-        "an id is never opened: if you know the task's file, name it yourself with --task FILE"
+        f"a recording names the file {_printable(reference.env_id)} in place of a task's id, and such a file is "
+        "never opened: if you know the task's file, name it yourself with --task FILE"
     )
 
 
@@ -374,7 +378,7 @@ def _is_unchanged(content: TaskContent) -> bool:
 
 
 def paths_in_arguments(info: EpisodeInfo) -> list[str]:
-    """Texts in the recorded arguments of an env that look like a path, which a task may open."""
+    """Texts in the recorded arguments of an env that look like a path; a task may open such a path."""
     found: list[str] = []
     waiting: list[Any] = [info.env_kwargs, info.reset_options, info.control_mode]
     while waiting:

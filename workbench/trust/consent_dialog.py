@@ -58,10 +58,11 @@ class TrustDialog:
         return True
 
     def answer(self, command: AnswerTrust) -> None:
-        """Answer the shown question. Raises `Refused` if another one is shown, or if it is already answered."""
+        """Answer the shown question. Raises `Refused` if another question is shown, or if this one is already
+        answered."""
         is_shown = self._waiting and self._waiting[0].name == command.question
         if not is_shown or not self._take(Consent(command.answer)):
-            raise Refused("This question was answered or withdrawn before.")
+            raise Refused("This question was already answered or withdrawn.")
 
     def _take(self, answer: Consent) -> bool:
         """Answer the first question; returns False if it is already answered."""
@@ -99,7 +100,8 @@ class TrustDialog:
         self._closed = True
 
     def _keep_shown(self) -> None:
-        """Open the dialog of the first question, also after a page switch has removed it."""
+        """Open the dialog of the first question if it is not open, such as after a page switch has removed
+        it."""
         if self._window is not None and not self._window.modal.closed:
             return
         pending = self._waiting[0]
@@ -108,7 +110,7 @@ class TrustDialog:
             self._window = Dialog(self._server, TITLE)
             with self._window.modal:
                 gui.add_html(buttons_html(pending.name, pending.question.more))
-                # After the buttons, so that no element of it gets the focus; page.css puts it above them.
+                # After the buttons, so that a button gets the focus; page.css shows the question above them.
                 gui.add_html(question_html(pending.question))
 
     def _take_down(self) -> None:
@@ -136,6 +138,6 @@ def question_html(question: TrustQuestion) -> str:
         shown = file.text[: min(MAX_TEXT_CHARACTERS, left)]
         left -= len(shown)
         left_out = len(file.text) - len(shown)
-        said = {"name": file.name, "hash": file.hash, "since": file.since.value, "text": shown}
-        files.append({**said, "left_out": left_out})
+        values = {"name": file.name, "hash": file.hash, "since": file.since.value, "text": shown}
+        files.append({**values, "left_out": left_out})
     return render("trust_question", asked=question, files=files, followed=FOLLOWED)

@@ -18,13 +18,13 @@ STORE_FILE = "trusted_tasks.json"
 MAX_ENTRIES = 5000
 """Maximum number of entries; the oldest are dropped."""
 MAX_ENTRIES_WITH_FILES = 200
-"""Number of newest entries that keep the hashes of their files: those of 300 modules take 30 kB."""
+"""Number of the newest entries that keep the hashes of their files; the hashes of 300 modules take 30 kB."""
 
 
 class _Entry(msgspec.Struct, frozen=True):
     hash: str
     file: str
-    """Path of the file when the user was asked, to report that a text has changed."""
+    """Path of the file when the user was asked; used to report that its text has changed."""
     when: str
     followed: bool = False
     """Whether later texts saved to `file` may run too."""
@@ -85,7 +85,9 @@ class TrustStore:
                     kept = [known for known in self._read(repair=True) if known.hash != entry.hash]
                     self._write([*kept, entry][-MAX_ENTRIES:])
             except OSError as error:
-                self._warn_once(f"Your answer cannot be stored and is asked again in the next run: {error}")
+                self._warn_once(
+                    f"Your answer cannot be stored, so you will be asked again in the next run: {error}"
+                )
 
     def _all(self) -> Iterator[_Entry]:
         """Entries of this run, then those on disk, which are read only if those of this run do not match."""
@@ -109,7 +111,7 @@ class TrustStore:
         except (msgspec.MsgspecError, RecursionError) as error:
             self._warn_once(f"{user_folder() / STORE_FILE} is broken, so nothing is trusted: {error}")
             if repair:
-                self._warn_once(f"The broken one is {set_aside(STORE_FILE)} now.")
+                self._warn_once(f"The broken file was renamed to {set_aside(STORE_FILE)}.")
             return []
 
     def _write(self, entries: Sequence[_Entry]) -> None:
