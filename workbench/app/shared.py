@@ -90,7 +90,7 @@ class Shared:
         library.watch()
         opened = Recordings(library, review)
         if self.session is None:
-            # With a live env, its recorder has already recovered them, and is writing.
+            # A live session's recorder has already recovered the episodes, and may be writing new ones.
             self._recovering.begin(lambda: self._recover(opened))
         return opened
 
