@@ -34,7 +34,7 @@ def show_help(name: str) -> int:
     if not out.is_terminal:
         out.print(page, width=width)
         return Exit.DONE
-    # less prints a text that fits the window, and passes colours on; the person's own LESS takes precedence.
+    # less exits at once if the text fits the window, and keeps colours. The user's own LESS takes precedence.
     os.environ.setdefault("LESS", "FRX")
     with out.pager(styles=shutil.which("less") is not None):
         out.print(page, width=width)

@@ -157,7 +157,8 @@ def new(
     *,
     origin: Annotated[str, tyro.conf.arg(name="from", metavar="TEMPLATE")] = "",
 ) -> int:
-    """Write NAME.py into this folder: a starting task that opens and passes its checks. Asks for what is not given.
+    """Write NAME.py into this folder: a starting task that opens and passes its checks. Asks for missing
+    arguments.
 
     Args:
         name: name of the file, such as stack_two; its class is StackTwoEnv and its id StackTwo-v1.
@@ -240,7 +241,8 @@ def share(
 
     Args:
         files: recordings, or folders of them.
-        mp4: a film of the camera with this name, of "scene" (the 3-D view), or of "cameras" (one film each); repeatable.
+        mp4: make a film of the camera with this name; "scene" films the 3-D view, and "cameras" makes one
+            film of each camera; repeatable.
         html: the animated 3-D view as one HTML file that needs no server and no network.
         sheet: frames of each camera over time, in one picture.
         out: folder for the results; existing files are not overwritten.
@@ -277,12 +279,12 @@ def export(
             print which. Without it, such a recording ends the export.
         task: the task in words, for language-conditioned policies; default: its id.
         fps: frames per second; the control rate must be a whole multiple of it. Default: the control rate.
-        cameras: names of cameras; default: all. Give none (--cameras) for a dataset without films.
+        cameras: names of cameras; default: all. --cameras without a name makes a dataset without films.
         state: observations that become observation.state, such as agent/qpos; default: the robot's whole proprioception.
         environment_state: observations that become observation.environment_state, such as extra; default: none.
     """
     if (lerobot is None) == (maniskill is None):
-        return refuse("say what to make: --lerobot FOLDER or --maniskill FILE.h5, one of them")
+        return refuse("say what to make: give either --lerobot FOLDER or --maniskill FILE.h5")
     if fps is not None and fps < 1:
         return refuse(f"--fps must be 1 or more, not {fps}")
     if lerobot is None:
