@@ -115,7 +115,7 @@ def installed(distribution: str) -> str | None:
 
 @cache
 def package_versions() -> Mapping[str, str]:
-    """Versions of the packages that an episode depends on, as this process has them."""
+    """Installed versions of the packages that an episode depends on, by name."""
     versions = {name: installed(name) for name in _EPISODE_PACKAGES}
     return {name: version for name, version in versions.items() if version is not None}
 

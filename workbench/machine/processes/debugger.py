@@ -120,7 +120,8 @@ def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., N
 
 
 def port_for_debugger(wanted: int | None) -> int:
-    """A free port of this machine: `wanted`; if that is None, `DEFAULT_PORT` or, if it is taken, any other.
+    """A free port of this machine: `wanted`. If `wanted` is None: `DEFAULT_PORT`, or any other port if that
+    one is taken.
 
     Raises:
         ValueError: debugpy is not installed, or `wanted` is taken or not a port.
