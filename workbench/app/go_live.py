@@ -46,9 +46,9 @@ NEW_ENVS = 4
 
 
 _POLL_SECONDS = 0.05
-"""Interval at which the transition checks whether a live env exists."""
+"""Interval at which a transition checks `is_over`."""
 _OPEN_TIMEOUT_SECONDS = 2.0
-"""Timeout, at the end of the program, for a session that is being opened."""
+"""Maximum time that `close` waits for a session that is being opened."""
 MakeSession = Callable[[TaskName, TaskOptions], Session]
 
 

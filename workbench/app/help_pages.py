@@ -91,7 +91,7 @@ def topics() -> tuple[Topic, ...]:
 
 
 def _overview_file(folder: Path) -> Path:
-    """Path of README: in the folder in a wheel, next to the folder in a checkout."""
+    """Path of README.md: in `folder` in a wheel, next to `folder` in a checkout."""
     inside = folder / "README.md"
     return inside if inside.is_file() else folder.parent / "README.md"
 

@@ -1,4 +1,4 @@
-"""Opens a listed task in place of the open one: asks for consent, replaces the session, and keeps the old one's work."""
+"""Opens a listed task in place of the open one: asks for consent, and replaces the session."""
 
 from __future__ import annotations
 

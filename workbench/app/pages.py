@@ -29,13 +29,13 @@ frames a second)."""
 PANELS_TIMEOUT_SECONDS = 0.01
 """Longest time in each frame that the 3-D view waits for the panels to be sent."""
 RETRY_SECONDS = 1.0
-"""Time until a page that could not be drawn is tried again."""
+"""Time after which a page that could not be drawn is drawn again."""
 _IDLE_SECONDS = 0.1
 """Time after which a page is drawn again although nothing has changed."""
 _POLL_SECONDS = 0.02
-"""Interval at which the thread checks whether another page is wanted."""
+"""Interval at which the thread checks whether another page is requested."""
 _BUILD_TIMEOUT_SECONDS = 10.0
-"""Timeout, at the end of the program, for a page that is being drawn."""
+"""Maximum time that `stop` waits for a page that is being drawn."""
 
 Which = Literal["start", "live", "review"]
 
@@ -100,7 +100,7 @@ class Pages:
         self._wishes: queue.SimpleQueue[_PageRequest] = queue.SimpleQueue()
         self._ending = False
         self.shown: Which | None = None
-        """The page that is shown."""
+        """Name of the page that is shown; None while a page is being built."""
         self._page: ShownPage | None = None
         self._dark = True
         self._told = RateLimitedLog()

@@ -121,7 +121,7 @@ class Session:
             on_notice: called, on any thread, with a message for the terminal.
         """
         self.reference = task
-        """The task as it was opened."""
+        """Reference with which the task was opened; see also `present_reference`."""
         self._on_event = on_event
         self._print = on_line
         settings = Settings()
@@ -422,7 +422,7 @@ class Session:
         """Handle an event; returns whether `on_event` needs it.
 
         Args:
-            on_disk: for a loaded version, whether the files still have its texts.
+            on_disk: for a loaded version, whether the files still contain the code that was loaded.
         """
         match event:
             case TaskFailed() if self._worker.load_pending and event.problem.interrupted:

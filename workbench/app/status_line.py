@@ -110,7 +110,8 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
 
 
 def _recording(recording: RecordingStatus) -> Literal["", "waits", "on"]:
-    """Whether a step of any env would be recorded."""
+    """``on`` if steps are recorded, ``waits`` if all envs to record wait for their next reset; empty without
+    a recording."""
     if not recording.active:
         return ""
     return "waits" if recording.waiting == len(recording.env_idx) else "on"
@@ -159,7 +160,7 @@ def _state(view: SessionView, busy: Busy | None) -> str:
 
 def _doing(busy: Busy) -> str:
     if busy.awaited:
-        return f"for a debugger to attach, {busy.seconds:.0f} s; the log says where"
+        return f"for a debugger to attach, {busy.seconds:.0f} s; the log has the address"
     if busy.held:
         at = f" at {place(busy)}" if busy.file else ""
         return f"by a debugger{at} for {busy.seconds:.0f} s; continue in the debugger, not on this page"

@@ -244,13 +244,13 @@ def _print_summary(report: CheckReport, root: Path) -> None:
     others = ("silenced", "not_applicable", "not_known", "failed")
     words += [f"{counts[state]} {state_text(state)}" for state in others if counts[state]]
     words += [f"{len(report.ignored)} ignored"] if report.ignored else []
-    said = f"{_safe(report.task.env_id)}: {', '.join(words)}."
+    summary = f"{_safe(report.task.env_id)}: {', '.join(words)}."
     if report.seconds:
-        said += f" {report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
+        summary += f" {report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
         if report.picture_seconds:
-            said += f" and {report.picture_seconds:.1f} s for the first pictures"
-        said += "."
-    _print(said)
+            summary += f" and {report.picture_seconds:.1f} s for the first pictures"
+        summary += "."
+    _print(summary)
 
 
 def _print_by_reason(label: str, results: tuple[RuleResult, ...]) -> None:

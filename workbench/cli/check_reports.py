@@ -188,8 +188,8 @@ def as_junit(said: Reported) -> str:
     suite = ElementTree.SubElement(suites, "testsuite", {**named, **totals})
     suite.extend(cases)
     if report.comments:
-        told = [f"{shown_path(one.file, root)}:{one.line}: {one.message}" for one in report.comments]
-        ElementTree.SubElement(suite, "system-out").text = xml_text("\n".join(told))
+        lines = [f"{shown_path(one.file, root)}:{one.line}: {one.message}" for one in report.comments]
+        ElementTree.SubElement(suite, "system-out").text = xml_text("\n".join(lines))
     ElementTree.indent(suites)
     return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
 

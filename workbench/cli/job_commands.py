@@ -44,7 +44,7 @@ def record(
 
     Args:
         debug: wait for a debugger (debugpy, such as VS Code's) before the task is loaded, with one worker; breakpoint()
-            stops in it. Anyone who can log in to this machine can attach too.
+            stops in the debugger. Anyone who can log in to this machine can attach too.
     """
     if lacks_maniskill("record"):
         return Exit.REFUSED

@@ -115,7 +115,7 @@ def open_page(
         pictures: how the page renders camera pictures: exact; fast, with simplified meshes; or auto, which is fast during
             motion and exact at rest. Observations and recordings are always exact.
         debug: let a debugger (debugpy, such as VS Code's) attach to the task's process, from this machine only; breakpoint()
-            stops in it. Anyone who can log in to this machine can attach too.
+            stops in the debugger. Anyone who can log in to this machine can attach too.
         debug_port: port for the debugger; 5678 if it is free, else any. Implies --debug.
         debug_wait: wait for a debugger to attach before the task is loaded. Implies --debug.
     """
@@ -273,10 +273,10 @@ def export(
         files: recordings, or folders of them.
         lerobot: new folder for a LeRobot dataset (version 3); must not exist yet.
         maniskill: new file (.h5, with a .json) of ManiSkill demonstrations, as its baselines load them; must not exist
-            yet. Only --only-successes and --only-fitting apply to it.
+            yet. Of the other options, only --only-successes and --only-fitting apply.
         only_successes: leave out recordings that never reach success.
-        only_fitting: leave out recordings that cannot be read or lack what the first one has (cameras, dimensions), and
-            print which. Without it, such a recording ends the export.
+        only_fitting: leave out recordings that cannot be read or lack data of the first one (cameras,
+            dimensions), and print their names. Without this option, such a recording ends the export.
         task: the task in words, for language-conditioned policies; default: its id.
         fps: frames per second; the control rate must be a whole multiple of it. Default: the control rate.
         cameras: names of cameras; default: all. --cameras without a name makes a dataset without films.
@@ -369,7 +369,7 @@ def main(args: Sequence[str] | None = None) -> None:
     except BrokenPipeError:  # ``workbench open --help | head``
         code = end_quietly()
     except ImportError:
-        # An installed package that is too old lacks names that are imported from it.
+        # The cause may be an installed package that is too old: it lacks names that we import from it.
         from workbench.machine.versions import unmet_lines
 
         if (unmet := unmet_lines()) is None:

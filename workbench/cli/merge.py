@@ -169,7 +169,7 @@ def _print(merged: JobParts, output: MergeOutput) -> int:
 
 
 def _with_missing(code: int, missing: int, what: str, names: Iterable[str] = ()) -> int:
-    """Print what is missing; returns the exit code."""
+    """Print the missing results, if any. Returns `Exit.FAILED` if there are any, else `code`."""
     if missing:
         some = listed(list(names), 20)
         print_text(f"{missing} of the job's {what} are in none of these files{some and ': '}{some}")

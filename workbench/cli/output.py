@@ -122,7 +122,7 @@ def interrupted(kept: str = "") -> int:
     """Print that Ctrl-C ended a command; returns the exit code.
 
     Args:
-        kept: what was kept.
+        kept: text about the results that were kept.
     """
     refuse(f"interrupted; {kept}" if kept else "interrupted")
     return Exit.INTERRUPTED

@@ -34,7 +34,7 @@ def exit_after(error: BaseException, kept: str = EPISODES_KEPT) -> int:
 
     Args:
         error: one of `JOB_ENDS`.
-        kept: what was kept, for the message after Ctrl-C.
+        kept: text about the results that were kept, for the message after Ctrl-C.
     """
     if isinstance(error, TaskError):
         print_problem(error.problem)

@@ -252,7 +252,12 @@ def _gpu() -> list[DoctorFinding]:
 
 
 def _ask_child(code: str) -> Any:
-    """Run `code` in a child process; returns its last line as JSON, or the last line of its error if it fails."""
+    """Run `code` in a child process. Returns the last line of stdout, decoded from JSON; if the process
+    fails, the last line of stderr as text.
+
+    Raises:
+        _TookTooLong: the process takes longer than `CHILD_TIMEOUT_SECONDS`.
+    """
     try:
         child = subprocess.run(
             python_command("-c", code),
@@ -295,7 +300,8 @@ def _reading() -> list[DoctorFinding]:
             "reading",
             None,
             "recordings are read in separate processes, with limits on memory and time only: this kernel has no Landlock",
-            "Linux 5.13 and newer have it, unless it is turned off. Without it, open only recordings of people you trust.",
+            "Linux 5.13 and newer have Landlock, unless it is turned off. Without it, open only recordings "
+            "of people you trust.",
         )
     ]
 

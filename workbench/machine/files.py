@@ -225,7 +225,7 @@ def _must_be_regular(path: str | os.PathLike[str], mode: int) -> None:
 def _too_large(path: str | os.PathLike[str], size: int | None, most_bytes: int) -> FileTooLarge:
     has = "has more" if size is None else f"has {_size_text(size)}, more"
     return FileTooLarge(
-        errno.EFBIG, f"{has} than the {_size_text(most_bytes)} that such a file may have", os.fspath(path)
+        errno.EFBIG, f"{has} than the limit of {_size_text(most_bytes)} for such a file", os.fspath(path)
     )
 
 

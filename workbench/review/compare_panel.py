@@ -30,7 +30,8 @@ MAX_ROWS = 30
 
 
 class ReviewComparePanel(PagePart[ReviewView]):
-    """Compares the first recording with another; a press on a row goes to the first state at which its entry differs."""
+    """Compares the first recording with another. Each row is an entry; a press on it goes to the first state
+    at which the entry differs."""
 
     does = (CompareWith, SwapWithFirst, ChooseTolerance)
 

@@ -165,7 +165,7 @@ def facts_html(chosen: Opened, changed: str) -> str:
     """Facts about a recording, as HTML.
 
     Args:
-        changed: which symbols of its task changed since the recording.
+        changed: symbols of the recording's task that changed since the recording, as text.
     """
     info = chosen.episode.info
     return render(

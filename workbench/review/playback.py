@@ -79,8 +79,9 @@ class Review:
         """
         Args:
             library: finds recordings by their ids.
-            read: reads the recording of a row, sharing shapes with others, until it is stopped; raises OSError or
-                UnreadableRecording with a sentence. None for `read_recording`.
+            read: reads the recording of a row, sharing shapes with other recordings; stops when its last
+                argument returns True; raises OSError or UnreadableRecording with a sentence. None for
+                `read_recording`.
             make_scene: makes scenes of recordings without one; None leaves them without.
             clock: returns seconds.
             most_bytes: memory limit for the recordings of one opening; None for `MEMORY_SHARE`.

@@ -57,7 +57,7 @@ ALL_CAMERAS = "every camera"
 SHARED = {"the selected recordings": False, "the open recordings": True}
 SUCCESSES_HINT = "Leave out recordings that reach success at no step"
 FITTING_HINT = (
-    "Leave out recordings that cannot be read, or lack what the first one has; the result names them"
+    "Leave out recordings that cannot be read, or lack data of the first one; the result names them"
 )
 TASK_HINT = "In words, for policies that take a language instruction; empty: the task's id"
 MAX_RESULTS = 6

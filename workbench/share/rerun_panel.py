@@ -104,7 +104,7 @@ def _stores(moments: Moments) -> Iterator[tuple[str, int]]:
         try:
             yield read_store_id(path), step
         except (ValueError, OSError) as error:
-            log.warning("rerun cannot be told to open %s at step %d: %s", path.name, step, error)
+            log.warning("rerun cannot open %s at step %d: %s", path.name, step, error)
 
 
 def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:
