@@ -66,8 +66,8 @@ class JobArguments:
         cpus_per_worker: CPU cores for each worker on a cluster.
         gpus_per_worker: GPUs, or fractions of one, for each worker on a cluster.
         job: file that keeps the results as they arrive. If it already holds results of the same job, the job resumes.
-        shard: run only one part of the job, as in 3/64 for the third of 64; workbench merge joins the parts. Without
-            --job the results are kept in a file named after the part.
+        shard: run only one part of the job, as in 3/64 for the third of 64 parts; workbench merge joins them.
+            Without --job the results are kept in a file named after the part.
     """
 
     workers: int | None = None

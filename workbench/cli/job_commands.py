@@ -301,7 +301,7 @@ def merge(
     fail_on: FailOn = "stop",
 ) -> int:
     """Merge the parts of a job that were run with --shard, and print the output of the whole command. Runs nothing. The exit
-    code is 1 if parts are missing, else that of the command.
+    code is 1 if parts are missing, else the exit code of the command.
 
     Args:
         files: job files of all parts.

@@ -341,7 +341,7 @@ def not_trusted_lines(error: NotTrusted) -> list[str]:
     if not questions:
         return lines
     if can_ask():
-        return [*lines, "Nothing was run: you agreed to none of it."]
+        return [*lines, "Nothing was run: you did not allow any of the code."]
     named: list[str] = []
     for question in questions[:MAX_QUESTIONS]:
         named.append(f"    {question_text(question)}")

@@ -80,7 +80,8 @@ def real_path(path: Path) -> Path:
 def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> bool:
     """Write or replace a file in one step. Returns False, and changes nothing, if its content is no longer `expected`.
 
-    If `path` is a link, the file that it points to is replaced. The file keeps its mode and owner.
+    If `path` is a link, the file that it points to is replaced. The file keeps its mode, and its owner if
+    this user may set it.
 
     Raises:
         OSError: the file cannot be written; its content is unchanged.

@@ -162,7 +162,7 @@ def unmet_lines() -> tuple[str, str] | None:
         return None
     if not unmet:
         return None
-    wrong = (f"{r} is {'missing' if v is None else f'wanted, {v} is installed'}" for r, v in unmet)
+    wrong = (f"{r} is {'missing' if v is None else f'required, {v} is installed'}" for r, v in unmet)
     return f"{'; '.join(wrong)}.", f"Type: {pip_command('install', *(str(r) for r, _ in unmet))}"
 
 

@@ -49,7 +49,7 @@ class ReviewPanel(PagePart[ReviewView]):
         server: The page.
         review: The review of the page.
         on_go_live: Called with the id of the selected recording and the shown state, when the user continues live from
-            there, and again to cancel that.
+            there, and again to cancel the transition.
         going: Returns a text: what the transition to the live env waits for; empty if there is no transition.
     """
 

@@ -46,7 +46,8 @@ class SceneProcess:
     def __call__(
         self, episodes: Sequence[Episode], check: Callable[[], None], on_progress: Callable[[int, str], None]
     ) -> Iterator[tuple[Episode, tuple[str, ...]] | SceneError]:
-        """Yield each episode with its scene and a list of what could not be restored, or the reason why it gets none.
+        """Yield for each episode: a copy with its scene, and texts on what could not be restored; or the
+        reason why there is no scene.
 
         Args:
             check: called a few times a second; an exception in it ends the work.

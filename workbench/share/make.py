@@ -108,7 +108,7 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
 
     Raises:
         UnreadableRecording: a recording is damaged, and nothing can be made.
-        ValueError: no recording has the data; the message contains what each lacks.
+        ValueError: no recording has the data; the message says for each recording what is missing.
         OSError: a file cannot be written; the message contains the reason. Finished files stay.
         RuntimeError: this machine cannot render.
     """

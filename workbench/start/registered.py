@@ -80,7 +80,7 @@ class RegisteredView:
     doing: str = ""
     """``listing the tasks``, ``drawing PickCube-v1``; empty if there is no work."""
     problem: str = ""
-    """Why there is no list, as sentences."""
+    """Why there is no list, or why no more pictures are made, as sentences."""
 
     @property
     def waiting(self) -> int:

@@ -139,7 +139,7 @@ def port_for_debugger(wanted: int | None) -> int:
                 reason = error
                 continue
             return probe.getsockname()[1]
-    raise ValueError(f"--debug-port {wanted} cannot be listened on: {reason.strerror}")
+    raise ValueError(f"cannot listen on --debug-port {wanted}: {reason.strerror}")
 
 
 def listening_text(port: int, waits: bool) -> str:

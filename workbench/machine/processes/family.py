@@ -186,7 +186,8 @@ class Keeper(Protocol):
 
 
 def end_family(keeper: Keeper) -> None:
-    """End a process that called `begin_family` and all that it started; returns when all have ended."""
+    """End a process that called `begin_family` and all that it started; returns when the process has ended.
+    If it does not react, it is killed, and processes that detached themselves may stay."""
     keeper.terminate()
     try:
         keeper.wait(timeout=2 * _END_TIMEOUT_SECONDS)
