@@ -60,7 +60,7 @@ def test_recording_is_shown_on_every_tab_and_in_the_title(desk: Desk) -> None:
     expect(desk.page).to_have_title(re.compile("REC"))
     desk.press("n")
     expect(desk.page.get_by_role("columnheader", name="env 1")).to_be_visible()
-    expect(mark).to_have_attribute("title", re.compile("Env 1, which is selected, is not recorded"))
+    expect(mark).to_have_attribute("title", re.compile("The selected env 1 is not recorded"))
     expect_on_every_tab(desk, mark)
     desk.press("p", "s", "s", "Shift+R")
     expect(mark).to_contain_text("1 episode ")

@@ -64,7 +64,7 @@ def test_a_package_older_than_the_range_is_named_with_the_pip_command(
         main.main(["review", str(tmp_path)])
     first, second = capsys.readouterr().err.splitlines()
     assert ended.value.code == 2
-    assert first.startswith("viser>=99 is wanted, ") and second.endswith(" 'viser>=99'")
+    assert first.startswith("viser>=99 is required, ") and second.endswith(" 'viser>=99'")
 
 
 @pytest.mark.parametrize("given", [["--envs-per-worker", "0"], ["--envs_per_worker=0"]])

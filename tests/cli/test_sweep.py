@@ -104,7 +104,7 @@ def test_an_upload_is_a_complete_sweep_and_is_resumed(
     assert all((there / row.recording).is_file() for row in results.episodes)
     assert not list((tmp_path / "here").glob("*/*"))
     printed = capsys.readouterr().out
-    assert f"workbench review here, once what is below {there.as_uri()} is copied there" in printed
+    assert f"workbench review here, after copying the contents of {there.as_uri()} into it" in printed
     made = {file: file.stat().st_mtime_ns for file in there.glob("*/*")}
     assert sweep(*given) == 0
     assert {file: file.stat().st_mtime_ns for file in there.glob("*/*")} == made

@@ -59,11 +59,11 @@ def test_a_file_that_appeared_meanwhile_is_not_overwritten(
     if not links:
         monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError(errno.EPERM, "no links")))
     path = tmp_path / "a.mp4"
-    with pytest.raises(FileExistsError, match="is not written over"):
+    with pytest.raises(FileExistsError, match="is not overwritten"):
         with new_file(path) as temporary:
             temporary.write_bytes(b"ours")
             path.write_bytes(b"of another")
     assert files_of(tmp_path) == {"a.mp4": b"of another"}
-    with pytest.raises(FileExistsError, match="is not written over"):
+    with pytest.raises(FileExistsError, match="is not overwritten"):
         write(path)
     assert files_of(tmp_path) == {"a.mp4": b"of another"}

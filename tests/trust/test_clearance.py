@@ -240,7 +240,7 @@ def test_foreign_arguments_cannot_name_files(
             Clearances(ask=Answering(Consent.ALWAYS)).clear(wanted)
         assert refused.value.trust_helps
         Clearances(all_trusted=True).clear(wanted)
-    with pytest.raises(SceneError, match="numbers and curves only"):
+    with pytest.raises(SceneError, match="only numbers and curves"):
         SceneProcess()._make(None, read_episode(foreign), lambda: None, print)  # type: ignore[arg-type]
 
 

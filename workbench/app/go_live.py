@@ -42,13 +42,13 @@ from workbench.trust.clearance import Clearances, CodeToRun, NotCleared
 
 ONE, ALL = "the selected env", "all envs"
 NEW_ENVS = 4
-"""Envs of a session that is opened for "all envs"."""
+"""Number of envs of a new session if all envs get the recorded state."""
 
 
 _POLL_SECONDS = 0.05
-"""Interval at which the transition checks whether a live env exists."""
+"""Interval at which a transition checks `is_over`."""
 _OPEN_TIMEOUT_SECONDS = 2.0
-"""Timeout, at the end of the program, for a session that is being opened."""
+"""Maximum time that `close` waits for a session that is being opened."""
 MakeSession = Callable[[TaskName, TaskOptions], Session]
 
 
@@ -69,7 +69,8 @@ class _Transition:
     """Session that gets the recorded state; None until the consent is given. Set last."""
 
     def is_over(self) -> bool:
-        """Whether to show the live page now: the state is restored, the task failed, or it may have to be interrupted."""
+        """Whether to show the live page now: the state is restored, the task failed, or the task has been
+        busy for so long that the user may want to interrupt it."""
         if self.session is None:
             return False
         view = self.session.view()
@@ -93,13 +94,13 @@ class _Transition:
 class GoLive:
     """Continues recordings in a live env.
 
-    If the recording's task is already open, its env (or all envs) gets the recorded state. If not, `GoLive` opens another
-    session, and later closes it and removes the folder of a recorded text. The review stays until the live page has
-    something to show. Used on the loop, except `close`.
+    If the recording's task is already open, its selected env (or all envs) gets the recorded state. If not,
+    `GoLive` opens another session. It later closes that session, and removes the folder of recorded code. The
+    review page stays until the live page has something to show. Call all methods on the loop, except `close`.
 
     Args:
         shared: The pages, and the open session, if any.
-        make_session: Opens a task; gets what `Session` gets.
+        make_session: Opens a task with these options.
         clearances: Decide which code named by recordings may run.
         base: Options that all opened tasks share.
     """
@@ -120,7 +121,8 @@ class GoLive:
         self._ending = BlockingPool("end-session")
 
     def go(self, id: str, state: int) -> None:
-        """Continue live from a state of an opened recording; if that is in progress, cancel it."""
+        """Continue live from this state of the opened recording `id`. If a transition is in progress, only
+        cancel it."""
         if self._transition is not None:
             self._give_up()
             return
@@ -157,7 +159,8 @@ class GoLive:
                 self._transition = None
 
     def _open_already(self, info: EpisodeInfo) -> Session | None:
-        """An open session with this task in its current code."""
+        """The open session that runs this task with its current code, not with recorded code; None if there
+        is none."""
         session = self._shared.session
         if session is not None and (self._own is None or self._own[1] is None):
             task = session.view().task
@@ -168,10 +171,12 @@ class GoLive:
         return known if task is not None and not why_not_enter(task, info) else None
 
     async def _open(self, transition: _Transition, recorded_source: bool) -> Session | None:
-        """Another session for the recording's task; None if the transition is cancelled meanwhile.
+        """Open another session for the recording's task. Returns None if the transition is cancelled
+        meanwhile.
 
         Raises:
-            CannotEnterRecording, NotCleared: the task must not be opened.
+            CannotEnterRecording: the recorded code is not in the recording, or cannot be written to a folder.
+            NotCleared: the code must not run.
         """
         info, num_envs = transition.info, NEW_ENVS if self.everywhere else 1
 
@@ -224,12 +229,12 @@ class GoLive:
         return "" if transition is None else transition.words()
 
     def review_is_back(self) -> None:
-        """Cancel a transition unless it waits for consent, because the review page is shown again."""
+        """Cancel a transition whose session is open, because the review page is shown again."""
         if self._transition is not None and self._transition.session is not None:
             self._transition = None
 
     def can_go_home(self) -> bool:
-        """Whether the live session was opened here."""
+        """Whether the live session is another one than the session that the user opened."""
         home = self._shared.home
         return home is not None and self._shared.session is not home
 
@@ -242,15 +247,16 @@ class GoLive:
         self._let_go()
 
     def let_go(self) -> None:
-        """Cancel a transition and end a session that was opened here, because the user opens another task."""
+        """Cancel a transition, and end a session that was opened here. Called when the user opens another
+        task."""
         self._give_up()
         self._let_go()
 
     def close(self) -> None:
-        """End the session opened here; the pages must be stopped. Called on another thread than the loop."""
+        """End the session opened here. The pages must have been stopped. Must not be called on the loop."""
         do(self.let_go)
         self._opening.close(_OPEN_TIMEOUT_SECONDS)
-        do(lambda: None)  # a session that was opened meanwhile has ended by now
+        do(lambda: None)  # let the loop start the end of a session that was opened meanwhile
         self._ending.close()
 
     def _let_go(self) -> None:
@@ -272,7 +278,8 @@ class GoLivePart(PagePart[ReviewView]):
         self._go_live = go_live
         go_live.review_is_back()
         self._about: object = None
-        """Recording and code that the note below the choice of code is about."""
+        """(recording id, whether its recorded code is chosen) for the note that is shown below the choice of
+        code."""
         gui = server.gui
         self._folder = gui.add_folder("Continue live", expand_by_default=False, visible=False)
         with self._folder:

@@ -1,4 +1,4 @@
-"""The documents as topics: a list, their text, and the pages that *Help* opens in the browser."""
+"""Lists, finds and renders the documents for ``workbench help`` and the page's *Help*."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HEADERS = {
     "Cache-Control": "no-cache",
 }
 _INTRODUCTION_CHARACTERS = 1000
-"""Length of the start of a page that is searched for its subject."""
+"""Length of a page's introduction: a search lists pages with the words in their introduction first."""
 _LITTLE_WORDS = frozenset("a an and for how i in is it my of on or the to with your".split())
 OVERVIEW = "overview"
 """The topic made of the README."""
@@ -45,7 +45,7 @@ FIRST = (
     OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "solve",
     "sweep", "cluster", "batched_env", "safety", "limits", "gallery", "rules", "keys", "cli",
 )  # fmt: skip
-"""Order of the topics; those that are not listed follow by name."""
+"""Order of the topics. All other topics follow, sorted by name."""
 _DOCS = "web_assets/docs/"
 _SCREENSHOTS = "web_assets/screenshots/"
 
@@ -57,12 +57,13 @@ class Topic:
     group: str
     """One of `GROUPS`, or `RULE_PAGES`."""
     path: str
-    """From the root of a checkout; links of the page are relative to it."""
+    """Path from the root of a checkout. Links on the page are relative to its folder."""
     text: str
     """Markdown."""
 
     def link(self, address: str) -> tuple[str, str]:
-        """The path from the root of a checkout that a link on this page leads to, and its ``#fragment``."""
+        """Resolve a link on this page. Returns the target's path from the root of a checkout, and its
+        ``#fragment`` (empty if there is none)."""
         parts = urlsplit(address)
         inside = f"#{parts.fragment}" if parts.fragment else ""
         return posixpath.normpath(
@@ -90,7 +91,7 @@ def topics() -> tuple[Topic, ...]:
 
 
 def _overview_file(folder: Path) -> Path:
-    """Path of README: in the folder in a wheel, next to the folder in a checkout."""
+    """Path of README.md: in `folder` in a wheel, next to `folder` in a checkout."""
     inside = folder / "README.md"
     return inside if inside.is_file() else folder.parent / "README.md"
 
@@ -102,7 +103,8 @@ def _topic(name: str, group: str, path: str, file: Path) -> Topic:
 
 
 def find_topic(name: str) -> Topic | None:
-    """The topic of this name; ``Batched env`` and ``batched-env`` name ``batched_env``, and ``rows_lost`` ``rows-lost``."""
+    """The topic of this name; None if there is none. Case does not matter, and spaces, ``-`` and ``_`` are
+    the same: ``Batched env`` and ``batched-env`` both find ``batched_env``."""
     wanted = _as_named(name.strip().lower().removesuffix(".md"))
     return next((topic for topic in topics() if _as_named(topic.name) == wanted), None)
 
@@ -112,8 +114,8 @@ def _as_named(name: str) -> str:
 
 
 def topics_about(words: str) -> list[Topic]:
-    """Topics whose text contains each of these words, in any case and order; topics that begin with them come first. Pages
-    of rules only if no other topic matches."""
+    """Topics whose text contains each of these words, in any case and order. Topics with the words in their
+    introduction come first. Pages of rules are returned only if no other topic matches."""
     wanted = _words(words)
     if not wanted:
         return []
@@ -139,8 +141,8 @@ def by_path(path: str) -> Topic | None:
 
 
 def reply(path: str, query: Mapping[str, str]) -> tuple[int, str, bytes]:
-    """The page of a topic by its name; the overview for an empty one; or the list of topics about the words of the query's
-    ``search``. Reads no file by a name that a browser sends."""
+    """Status, content type and page of the topic named `path`; of the overview if `path` is empty; or of the topics about
+    the words of the query's ``search``. `path` is only compared with topic names, so a browser cannot read other files."""
     words = query.get("search", "").strip()
     topic = None if words else find_topic(path or OVERVIEW)
     groups = [(group, [one for one in topics() if one.group == group]) for _, group in GROUPS]
@@ -201,7 +203,8 @@ def html_of(topic: Topic) -> str:
 
 
 def _coloured(code: str, language: str, attributes: str) -> str:
-    """The lines of a diff as HTML with their signs as classes; empty for other code, which markdown-it then only escapes."""
+    """HTML of a diff, with a CSS class on added and on removed lines. Empty for other languages: markdown-it
+    then escapes the code."""
     if language != "diff":
         return ""
     kinds = {"-": "gone", "+": "come"}

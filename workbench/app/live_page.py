@@ -98,7 +98,8 @@ DOES: frozenset[type[Command]] = frozenset(
 )
 """Commands that the page itself carries out; the session and the parts of the page carry out the others."""
 PANELS_PERIOD_SECONDS = 0.06
-"""Interval at which the panels are drawn while the envs play, every second frame; numbers cannot be read faster."""
+"""Interval at which the panels are drawn while the envs play: every second frame. Faster numbers cannot be
+read."""
 PICTURES_HINT = (
     "Exact pictures are SAPIEN's own. Fast pictures show simplified meshes and take a fraction of the time without a graphics "
     "card. Auto: fast while something moves, exact when it stands still. This page records exact pictures only."
@@ -108,17 +109,18 @@ ENVS_TAB, LOG, ALL_PICTURES = "Envs", "Log", "All pictures"
 ENVS_WIDTHS_PIXELS = 220, 640
 """Minimum and maximum width of the table of envs."""
 ENVS_SHARE = 0.2
-"""Share of the page's width for the table of envs. It leaves columns out; the user can drag its edge."""
+"""Maximum share of the page's width for the table of envs. The table omits columns that do not fit; the user
+can drag its edge."""
 WIDE_PIXELS = 1200
-"""Width of a page from which on the table of envs is open at first."""
+"""Minimum width of a page for opening the table of envs by itself."""
 
 
 class Page:
-    """The workbench's page on this server, showing this session.
+    """The live page of a session.
 
-    Each redraw takes one immutable snapshot of the session, and every part compares it with what it drew last. Callbacks
-    of the page run in any thread and order, and only ask the session for something. While no page is open nothing is
-    drawn or rendered.
+    Each redraw takes one immutable snapshot of the session, and every part compares it with the one that it
+    drew last. Callbacks of the page run in any thread and order, and only send requests to the session. While
+    no browser shows the page, nothing is drawn or rendered.
 
     Args:
         server: The viser server.
@@ -130,8 +132,8 @@ class Page:
         stage: The 3-D view; None makes one.
         also: Further commands for the palette, which the caller carries out.
         clock: Clock of all parts of the page.
-        editor: Address of a line in the author's editor, as `parse_editor` gives it.
-        chooser: Opens another task; None for a page that keeps its own.
+        editor: URL template that opens a line in the author's editor, from `parse_editor`.
+        chooser: Opens another task; None for a page that cannot change its task.
     """
 
     def __init__(
@@ -169,7 +171,7 @@ class Page:
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH_PIXELS)
         file = named_file(session.reference)
-        # viser's header stands in the bar, which has the name.
+        # viser's header is in the bar, and the bar already shows the name.
         server.gui.set_panel_label(" ")
 
         # A hash, since the path may be long.
@@ -276,7 +278,7 @@ class Page:
         return self._session.wait(seen, timeout)
 
     def counted(self, visitors: int) -> None:
-        """Take the number of browsers that show the page; without any, nothing is rendered."""
+        """Set the number of browsers that show the page. At 0, nothing is rendered."""
         if visitors != self._visitors_counted:
             self._visitors_counted = visitors
             self._session.happen(PagesCounted(visitors))
@@ -358,7 +360,7 @@ class Page:
         visitor.send(render("open_address", link=link))
 
     def _unfolded(self, panel: str) -> None:
-        """Handle that a page shows this panel."""
+        """Handle the report of a page that the user unfolded this panel."""
         if panel == ENVS:
             self._envs_open = True
             self._fit_envs()
@@ -367,7 +369,8 @@ class Page:
             self._studio.unfold()
 
     def _fit_envs(self) -> None:
-        """Set the table's width to that of its columns, once for each page width: the user may have dragged its edge."""
+        """Set the table's width to the width of its columns. Done once for each page width, because the user
+        may have dragged the table's edge."""
         wanted = self._envs.wanted_width()
         page = self._narrowest()
         if page in (0, self._envs_fitted) or not wanted:
@@ -381,7 +384,8 @@ class Page:
         return min((visitor.page_width for visitor in self._visitors.all() if visitor.page_width), default=0)
 
     def _open_envs_at_first(self, view: SessionView) -> None:
-        """Open the table of several envs, where there is room for it and the user has not closed it."""
+        """Open the table of envs if there are several envs, the page is wide enough, and the user has not yet
+        opened or closed the table."""
         several = view.task is not None and view.task.num_envs > 1
         if self._view_choice.table is None and several and self._narrowest() >= WIDE_PIXELS:
             self._open_envs()
@@ -406,7 +410,7 @@ class Page:
     def _draw_scene(self, view: SessionView) -> None:
         task, step, seen = view.task, view.step, shown_cameras(view)
         if task is None:
-            # The bodies are those of the previous page.
+            # The 3-D view still has the bodies of the previous page.
             self._scene.hide()
             return
         if (
@@ -455,7 +459,11 @@ class Page:
         self._framing.frame_untouched(lambda aspect: self._viewpoint(view, aspect))
 
     def frame(self, view: SessionView, untouched_only: bool = False) -> None:
-        """Frame the scene in every open page (or only untouched ones) and in pages opened later."""
+        """Frame the scene in every open page, and in pages opened later.
+
+        Args:
+            untouched_only: of the open pages, frame only those in which the user has not moved the view.
+        """
         if self._layout is not None and view.task is not None:
             self._framing.frame(lambda aspect: self._viewpoint(view, aspect), untouched_only)
 
@@ -495,7 +503,8 @@ class Page:
 
 
 def _shown_of(view: SessionView) -> tuple[object, object]:
-    """Keys of the panels' content and of the part that must be drawn at once, as `DrawThrottle` takes them."""
+    """Arguments for `DrawThrottle.is_due`: a key of the panels' content, and a key of what must be drawn at
+    once."""
     steps_go_on = view.playing and view.state == "running" and view.timeline.shown is None
     waited_for = (
         view.settings,

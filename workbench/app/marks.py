@@ -34,8 +34,8 @@ EPISODES = "Episodes"
 
 
 class Marks(PagePart[SessionView]):
-    """One row between the status line and the tabs, in its own element: the status line is redrawn four times a second,
-    and a press on it would be lost.
+    """The row of marks between the status line and the tabs. It is an element of its own: the status line is
+    redrawn four times a second, and a press on a mark in it would be lost.
 
     Args:
         server: The page.
@@ -105,9 +105,7 @@ def moved_mark(view: SessionView) -> dict[str, object] | None:
         return None
     names, one = ", ".join(moved), len(moved) == 1
     what = "camera moved" if one else "cameras moved"
-    hint = (
-        f"{names} {'is' if one else 'are'} not where the file says, in every env and in all that is recorded."
-    )
+    hint = f"{names} {'differs' if one else 'differ'} from the pose in the file, in every env and recording."
     return {
         "what": what,
         "names": names,
@@ -126,9 +124,10 @@ def recording_mark(view: SessionView) -> dict[str, object] | None:
     # Nothing here may change with each step: a redraw would replace the element during a press.
     hint = f"Recording {envs_in_words(recording.env_idx)}."
     if recording.waiting:
-        hint += f" {counted(recording.waiting, 'env')} of them {'begins' if recording.waiting == 1 else 'begin'} with the next reset: no step of {'it' if recording.waiting == 1 else 'them'} is recorded before."
+        whose = "its" if recording.waiting == 1 else "their"
+        hint += f" Recording of {counted(recording.waiting, 'env')} starts at {whose} next reset."
     if view.selected_env not in recording.env_idx:
-        hint += f" Env {view.selected_env}, which is selected, is not recorded."
+        hint += f" The selected env {view.selected_env} is not recorded."
     every = len(recording.env_idx) == count > 1
     return {
         "envs": f"all {count} envs" if every else envs_in_words(recording.env_idx, 2),
@@ -142,7 +141,8 @@ def recording_mark(view: SessionView) -> dict[str, object] | None:
 
 
 def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
-    """Number of flagged envs and the reason of the first, as label and hint; None without flagged envs."""
+    """(label, hint) with the number of flagged envs and the reason why the first one is flagged; None if no
+    env is flagged."""
     count = int(np.count_nonzero(mask(rows, "flagged")))
     env = first_flagged(rows)
     if env is None:
@@ -150,5 +150,5 @@ def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
     outlier = (rows.outliers.get(env) or rows.last.outliers[env])[0]
     when = f"step {outlier.step}" + ("" if env in rows.outliers else " of the previous episode")
     envs = "" if rows.num_envs == 1 else f"{count} of {rows.num_envs} envs "
-    hint = f"In env {env}, {when}: {outlier.text}. Click to see it; the table of envs (B) has them all."
+    hint = f"In env {env}, {when}: {outlier.text}. Click to see it; the table of envs (B) lists all."
     return f"⚑ {envs}flagged: {outlier.reason}", hint

@@ -1,4 +1,4 @@
-"""Opens a listed task in place of the open one: asks for consent, replaces the session, and keeps the old one's work."""
+"""Opens a listed task in place of the open one: asks for consent, and replaces the session."""
 
 from __future__ import annotations
 
@@ -39,15 +39,16 @@ class Choices:
 
 
 _SHOW_TIMEOUT_SECONDS = 10.0
-"""Timeout of the old session for the page of the new one."""
+"""Maximum time that the old session stays open until the page of the new one is shown."""
 
 
 class OpenTask:
     """Opens the task that the user chooses from the list.
 
-    It opens one task at a time, since a question may wait for minutes and a session that ends writes its recordings. The
-    last request counts: the question for an earlier one is withdrawn. The page of the new session is shown first, then the
-    old session is closed as at the end of the program. Used on the loop, except `close`.
+    It opens one task at a time: the user may take minutes to allow the code, and a closing session writes its
+    recordings. The newest request wins: it withdraws the question of an earlier one. The page of the new
+    session is shown first, then the old session is closed as at the end of the program. Call all methods on
+    the loop, except `close`.
 
     Args:
         shared: The pages and the open session.
@@ -94,7 +95,8 @@ class OpenTask:
     async def create(self, name: str, template: TemplateName) -> None:
         """Write a new task into the folder of the list, and open it; see `Chooser.create`."""
         made = await self._aside.run(lambda: write_new_task(name, template, self.catalogue.folder))
-        # Not by its number: a search that began before the file was written may end now without it.
+        # Not by its number in the list: a search that began before the file was written may end now and lack
+        # the file.
         self._want(self.catalogue.add_file(made.file, made.env_id))
 
     def doing(self) -> str:
@@ -146,15 +148,16 @@ class OpenTask:
             reference = await self._aside.run(lambda: self._cleared(entry))
         except NotCleared as error:
             if not self._withdrawn():
-                self._say(f"{entry.name} is not opened", sentence(str(error)))
+                self._say(f"{entry.name} was not opened", sentence(str(error)))
             return
         self._doing = f"Opening {entry.name} …"
         if not self._withdrawn():
             await self._change(reference, entry)
 
     def _cleared(self, entry: Entry) -> TaskName:
-        """The task to open; asks the user if necessary, and waits for the answer. It does not ask for a file in the folder in
-        which the workbench was started, for an example, or for a task that was open in this run.
+        """The task to open. Asks the user whether its file may run, and waits for the answer. Does not ask
+        for a registered id, an example, a file below the folder in which the workbench was started, or a task
+        that was open in this run.
 
         Raises:
             NotCleared: the task must not run.
@@ -171,7 +174,8 @@ class OpenTask:
         if old is not None:
             old.do(PauseRun())
             self._kept[self._open_reference] = old.kept_work()
-            # Not a recording's texts: they name a path, but are other code.
+            # Not the recorded code of a recording: it has the path of a file, but may differ from the file's
+            # code.
             if isinstance(old.reference, str):
                 self._ran.add(self._open_reference)
         kept = self._kept.get(entry.lasting)
@@ -183,7 +187,7 @@ class OpenTask:
         shown = asyncio.wrap_future(shared.pages.show("live", anew=True))
         await asyncio.wait([shown], timeout=_SHOW_TIMEOUT_SECONDS)
         if old is not None:
-            self._doing = "Closing the task before: its recordings are written …"
+            self._doing = "Closing the previous task: writing its recordings …"
             await self._aside.run(old.close)
 
     def _say(self, title: str, text: str) -> None:

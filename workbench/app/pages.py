@@ -24,17 +24,18 @@ from workbench.page.widgets.visitors import Done, Visitor
 log = logging.getLogger(__name__)
 
 FRAME_SECONDS = 1 / 30
-"""Period of a frame. More pushes slow a browser down (measured: with 350 a second it draws 13 to 30 frames a second)."""
+"""Period of a frame. More updates slow a browser down (measured: at 350 updates a second it draws 13 to 30
+frames a second)."""
 PANELS_TIMEOUT_SECONDS = 0.01
 """Longest time in each frame that the 3-D view waits for the panels to be sent."""
 RETRY_SECONDS = 1.0
-"""Time until a page that could not be drawn is tried again."""
+"""Time after which a page that could not be drawn is drawn again."""
 _IDLE_SECONDS = 0.1
 """Time after which a page is drawn again although nothing has changed."""
 _POLL_SECONDS = 0.02
-"""Interval at which the thread checks whether another page is wanted."""
+"""Interval at which the thread checks whether another page is requested."""
 _BUILD_TIMEOUT_SECONDS = 10.0
-"""Timeout, at the end of the program, for a page that is being drawn."""
+"""Maximum time that `stop` waits for a page that is being drawn."""
 
 Which = Literal["start", "live", "review"]
 
@@ -48,11 +49,12 @@ class ShownPage(Protocol):
         ...
 
     def wait(self, seen: int, timeout: float) -> int:
-        """Sleep until there is something newer than this serial, at most `timeout` seconds; returns the newest serial."""
+        """Block until the page has a newer serial than `seen`, at most `timeout` seconds; returns the newest
+        serial."""
         ...
 
     def counted(self, visitors: int) -> None:
-        """Take the number of browsers that show the page."""
+        """Set the number of browsers that show the page."""
         ...
 
     def redraw(self) -> None:
@@ -78,12 +80,12 @@ class _PageRequest:
 class Pages:
     """Shows one of several pages on the same server, and redraws it whenever there is something new to show.
 
-    viser has one page per server, so a page is removed whole and the other is built in its place; every open browser
-    follows. The session and the review continue, the bodies in the 3-D view stay (`View3D`), and nothing is sent before
-    the new page was drawn once, so that no empty control is ever visible.
+    viser has one page per server, so a page is removed whole and the next one is built in its place; every
+    open browser follows. The session and the review continue, the bodies in the 3-D view stay (`View3D`), and
+    nothing is sent before the new page was drawn once, so that no empty control is ever visible.
 
-    If a page cannot be drawn, every open browser shows a notice and the page is tried again: a page that looks alive but
-    is frozen is worse.
+    If a page cannot be drawn, every open browser shows a notice, and drawing is retried: without the notice,
+    a frozen page would look alive.
 
     Args:
         server: The viser server.
@@ -98,7 +100,7 @@ class Pages:
         self._wishes: queue.SimpleQueue[_PageRequest] = queue.SimpleQueue()
         self._ending = False
         self.shown: Which | None = None
-        """The page that is shown."""
+        """Name of the page that is shown; None while a page is being built."""
         self._page: ShownPage | None = None
         self._dark = True
         self._told = RateLimitedLog()
@@ -116,15 +118,15 @@ class Pages:
         Args:
             anew: rebuild the page even if it is shown, because its session was replaced.
         """
-        wish = _PageRequest(which, anew)
-        self._wishes.put(wish)
-        return wish.shown
+        request = _PageRequest(which, anew)
+        self._wishes.put(request)
+        return request.shown
 
     def do(self, command: Command, visitor: Visitor) -> Done:
         """Let the page that is shown carry out a command."""
         page = self._page
         if page is None:
-            raise Refused("Another page is being built; try it again.")
+            raise Refused("Another page is being built; try again.")
         return page.do(command, visitor)
 
     def stop(self) -> None:
@@ -153,7 +155,8 @@ class Pages:
             self._sleep(max(pause, due - time.monotonic()))
 
     def _newer(self, page: ShownPage, seen: int) -> int:
-        """The newest serial of the page, as soon as there is something to draw or another page is wanted."""
+        """Wait for something to draw, a request for another page, or `_IDLE_SECONDS`; returns the page's
+        newest serial."""
         until = time.monotonic() + _IDLE_SECONDS
         while (newest := page.wait(seen, _POLL_SECONDS)) == seen and time.monotonic() < until:
             if not self._wishes.empty() or self._ending:
@@ -209,7 +212,7 @@ class Pages:
             if visitors:
                 page.redraw()
         except Exception as error:
-            # Drawing is retried every second: not every failure prints a traceback.
+            # Drawing is retried every second, so the log limits the number of tracebacks.
             self._told.happened(type(error), "The page could not be drawn; trying again.", error)
             tell_all(
                 self._server,
@@ -227,7 +230,7 @@ def next_frame(due: float, began: float) -> float:
 
     Args:
         due: Scheduled time of the last frame, in seconds.
-        began: Time at which it was drawn.
+        began: Time at which drawing it began, in seconds.
     """
     return max(due + FRAME_SECONDS, began + FRAME_SECONDS / 2)
 
@@ -237,8 +240,8 @@ def draw_apart(
 ) -> None:
     """Send the panels first, unless they are None, then the 3-D view in a batch of its own.
 
-    A browser handles a batch as a whole, and a batch with anything of the 3-D view waits for the next frame of that view,
-    which may take long; numbers and buttons need not wait.
+    A browser handles a batch as a whole. A batch that changes the 3-D view waits for the view's next frame,
+    which may take long; numbers and buttons must not wait for it.
     """
     if panels is not None:
         with server.atomic():

@@ -77,7 +77,7 @@ def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
             (
                 f"Control mode {mode}",
                 UseControlMode(mode=mode),
-                "in effect" if mode == task.control_mode else "makes the envs again",
+                "in effect" if mode == task.control_mode else "rebuilds the envs",
             )
             for mode in control_modes(view)
         ),

@@ -17,7 +17,7 @@ REFUSED_SECONDS = 8.0
 
 
 class RecordingProblems:
-    """Watches the live session for problems, also while another page is shown, since it continues to record.
+    """Watches the live session for recording problems. The session records also while another page is shown.
 
     Args:
         session: Returns the live session, if there is one.
@@ -35,7 +35,7 @@ class RecordingProblems:
         self._watching = do(lambda: begin(self._watch()))
 
     def close(self) -> None:
-        """Called on another thread than the loop."""
+        """Stop watching. Must not be called on the loop."""
         do(self._watching.cancel)
 
     async def _watch(self) -> None:

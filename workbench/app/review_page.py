@@ -69,7 +69,7 @@ from workbench.start.panel import OpenDialog
 from workbench.sweep.panel import SweepPanel
 
 PANELS_PERIOD_SECONDS = 0.1
-"""Interval at which the panels are drawn while a recording plays; numbers cannot be read faster."""
+"""Interval at which the panels are drawn while a recording plays. Faster numbers cannot be read."""
 PANEL_WIDTH_PIXELS = 340
 LIBRARY_WIDTH_PIXELS = 520
 MIN_VIEW_PIXELS = 240
@@ -77,12 +77,12 @@ MIN_VIEW_PIXELS = 240
 MIN_VIEW_BY_SWEEP_PIXELS = 400
 """Minimum width of the view for watching an episode of a sweep next to its table; the timeline needs most of it."""
 NARROW_VIEW_PIXELS = 700
-"""Width of the view next to the library below which there is no room for both."""
+"""Minimum width of the view for keeping the library open next to it when a recording is opened."""
 WIDTH_TIMEOUT_SECONDS = 20.0
 """Time within which a page reports the new width of its view."""
 BACK = "Back to the live env"
 LIBRARY = "library"
-"""Name of the panel in the page's report that the panel was unfolded."""
+"""Name of the library panel in `TellUnfolded`."""
 DOES: frozenset[type[Command]] = frozenset(
     {
         ShowLive,
@@ -144,12 +144,13 @@ class ReviewPage:
         """Folds and unfolds rerun's panel."""
         self._other_folded = False
         self._unfolded = "", 0.0
-        """Name of the panel (library or rerun) that was unfolded last, and when, until the width was checked."""
+        """(panel unfolded last: library or rerun, time); ("", 0) once the width of the view has been
+        checked."""
         self._told = DrawThrottle(PANELS_PERIOD_SECONDS, clock)
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH_PIXELS)
-        server.gui.set_panel_label(" ")  # viser's header stands in the bar
+        server.gui.set_panel_label(" ")  # viser's header is in the bar
         self._opening = OpenDialog(server, open_task)
         with add_bar(server):
             self._opening.add_button()
@@ -346,7 +347,8 @@ class ReviewPage:
         self._library_open = shown
         self._unfolded = "", 0.0
         if shown:
-            # While it is folded, the other panel and the view share the width.
+            # The folded library left its width to the view. If the view would now get too narrow, fold
+            # rerun's panel.
             self._other_folded = 0 < self._smallest_view() < LIBRARY_WIDTH_PIXELS + MIN_VIEW_PIXELS
             if self._other_folded:
                 self._fold_other(True)
@@ -358,15 +360,15 @@ class ReviewPage:
                 self._fold_other(False)
 
     def _panel_unfolded(self, panel: str) -> None:
-        """Handle that a page shows this panel."""
+        """Handle the report of a page that the user unfolded this panel."""
         if panel == LIBRARY:
             self._library_open = True
         self._unfolded = panel, self._clock()
 
     def _fold_what_crowds(self) -> None:
-        """Fold the panel that was unfolded first if library and rerun leave no room for the view.
+        """If library and rerun leave no room for the view, fold the one that was unfolded first.
 
-        A page reports its new width some time later; while rerun loads, that takes seconds.
+        A page reports the new width of its view with a delay, which is seconds while rerun loads.
         """
         last, since = self._unfolded
         if not last or not 0 < self._smallest_view() < MIN_VIEW_PIXELS:
@@ -506,7 +508,7 @@ class ReviewTimeline(TimeBar[ReviewView]):
         wanted = (view.position, view.selected, view.opened_serial, view.anchors, view.align)
         if wanted == self._drawn:
             return
-        # Only the cursor and the texts follow the position.
+        # Only the cursor and the texts depend on the position.
         if wanted[1:] != self._drawn[1:]:
             self._fixed = fixed_values(view)
         self._drawn = wanted

@@ -36,14 +36,15 @@ class App:
     Args:
         gated_server: The server of the pages.
         recordings: The folder that is recorded to and reviewed.
-        make_session: Opens a task that a recording names; gets what `Session` gets.
+        make_session: Opens a task that a recording names, with these options.
         base: Options that all tasks named by recordings share.
         session: The live env, if there is one.
         tasks: Task files that may define the envs of foreign recordings.
         trust: Run code named by recordings without asking.
         on_notice: Called, on any thread, with a message for the terminal.
-        editor: Address of a line in the author's editor, as `parse_editor` gives it.
-        choices: Further entries of the list of tasks, and how a chosen task is opened; None: no recent tasks, `make_session`.
+        editor: URL template that opens a line in the author's editor, from `parse_editor`.
+        choices: Further entries of the list of tasks, and how a chosen task is opened. With None there are no
+            recent tasks, and `make_session` opens the task.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class App:
         )
         self._editor = editor
         self.renew_token: Callable[[], None] | None = None
-        """Set before the first page is shown, if there is a token."""
+        """Makes a new token. Set before the first page is shown; None if the page needs no token."""
         shared.visitors.do = self._do
         self._dialog = TrustDialog(shared.server)
         clearances = Clearances(shared.task_files, self._dialog.ask, all_trusted=trust)

@@ -83,7 +83,8 @@ class KeptWork:
 
 
 class Session:
-    """One task, one worker, any number of pages. All methods may be called on any thread, and return at once.
+    """One task, one worker, any number of pages. All methods may be called on any thread; all but `wait` and
+    `close` return at once.
 
     Its state is one value, which changes on the loop (`machine.loop`): `happen` takes an event, `apply` returns the next
     state and the effects, and `_perform` starts each effect. Nothing waits for the env. When the worker dies, `Supervisor`
@@ -112,14 +113,15 @@ class Session:
             history_bytes: memory limit of the history.
             worker: limits of the worker process, and whether there is a spare one.
             kept: work of the previous session of this task; its options replace `options`.
-            check: whether the rules are checked after each load, until a `CheckAfterSave`.
+            check: whether the rules are checked after each load, until a `CheckAfterSave` changes this.
             make_worker: makes the supervisor; tests without a worker process replace it.
             on_event: called with every event of the worker, and with its death as `TaskFailed`, on the supervisor's thread.
-            on_line: called with the lines that the worker printed, on other threads; lines of a flood are dropped.
+            on_line: called with each line that the worker prints, on another thread; in a flood, lines are
+                dropped.
             on_notice: called, on any thread, with a message for the terminal.
         """
         self.reference = task
-        """The task as it was opened."""
+        """Reference with which the task was opened; see also `present_reference`."""
         self._on_event = on_event
         self._print = on_line
         settings = Settings()
@@ -150,7 +152,7 @@ class Session:
             output=self._printed.feed,
         )
         self._background = Background()
-        """Asks questions of the background process."""
+        """Sends questions to the background process."""
         self._checks = CheckJobs(self._background, self._happen)
         self._profiles = ProfileJobs(self._background, self._happen)
         self._plans = PlanJobs(self._happen)
@@ -186,11 +188,11 @@ class Session:
             Refused: a command makes no sense now; nothing has changed.
         """
         for begun in do(lambda: self._happen(event)):
-            wait_for_disk(begun)  # when this returns, saves are noticed
+            wait_for_disk(begun)  # a file that is saved after `happen` has returned must be noticed
 
     def _happen(self, event: SessionEvent) -> list[Future[None]]:
-        """Handle an event; returns the work started off the loop. If an effect fails, the others are still performed: the failure
-        is reported, or raised to the caller."""
+        """Handle an event; returns the work started off the loop. If an effect fails, the others are still
+        performed. The failure is raised if the event is a command, else reported."""
         before, begun, failure = self._state, list[Future[None]](), None
         self._state, effects = apply(before, event, Now(time.monotonic(), time.time()))
         for effect in effects:
@@ -264,7 +266,8 @@ class Session:
 
     @property
     def present_reference(self) -> TaskName:
-        """The present name of the task: another class of the file, or a copy of the file, may have been chosen since."""
+        """The task's current reference. Differs from `reference` if another class or a copy of the file was
+        chosen since."""
         return self._run.reference
 
     @on_loop
@@ -327,7 +330,8 @@ class Session:
             with contextlib.suppress(NoPolicy):
                 if file == Path(find_policy(run.policy, run.folder)[0]).absolute():
                     return True
-        # A module that has never loaded is in no `source_files`. Resolved: a path may leave the folder again by "..".
+        # A module that has never loaded is in no `source_files`. Resolve the path: ".." in it may leave the
+        # folder.
         folder = run.own_folder
         beside = folder is not None and file.resolve().is_relative_to(folder.resolve())
         return beside and file.suffix == ".py" and file.is_file()
@@ -389,12 +393,12 @@ class Session:
         """Handle an event of the worker. Called on the supervisor's thread, which continues after the event was handled."""
         # Files are read here: a disk that hangs must not block the loop.
         if isinstance(event, TaskFailed):
-            # Before the user sees the problem and fixes the file.
+            # Watch the files before the user sees the problem and saves a fix.
             files = self.look(lambda run: files_at_fault(run, event))
             wait_for_disk(do(lambda: self._perform(Follow(files))) if files else None)
         on_disk = True
         if isinstance(event, Loaded):
-            # The watcher finds changes made after this.
+            # Find changes made since the files were read; the watcher finds later ones.
             looked = do(lambda: self._aside.begin(partial(_is_on_disk, event.task.source)))
             wait_for_disk(looked)
             on_disk = not looked.done() or looked.cancelled() or looked.result()
@@ -418,7 +422,7 @@ class Session:
         """Handle an event; returns whether `on_event` needs it.
 
         Args:
-            on_disk: for a loaded version, whether the files still have its texts.
+            on_disk: for a loaded version, whether the files still contain the code that was loaded.
         """
         match event:
             case TaskFailed() if self._worker.load_pending and event.problem.interrupted:
@@ -449,7 +453,8 @@ class Session:
 
     def _on_policy_saved(self) -> None:
         """Reload the policy. Called on the watcher's thread."""
-        # A policy in the task's folder is also watched as a module of the task, for which a save reports "nothing changed".
+        # A policy in the task's folder is also watched as a module of the task, and that watcher reports
+        # "nothing changed". So the log names the reload of the policy.
         self._log("the policy's file was saved: it is read again")
         self.happen(PolicySaved())
 

@@ -24,7 +24,7 @@ from workbench.review.recorded_scene import SceneProcess
 MIN_FREE_BYTES = 4 << 30
 """Minimum free RAM for rendering catalogue thumbnails while a task is open."""
 _RECOVERY_TIMEOUT_SECONDS = 10.0
-"""Timeout, at the end of the program, for the recovery of episodes."""
+"""Maximum time that `close` waits for the recovery of episodes."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,8 @@ class Shared:
 
     @property
     def recordings(self) -> Recordings:
-        """The recordings. The first access, by the first review page, reads the folder; it stays open until the program ends."""
+        """The recordings. The first access, by the first review page, reads the folder; later accesses return
+        the same object."""
         self._recordings = self._recordings or self._open_recordings()
         return self._recordings
 
@@ -90,7 +91,7 @@ class Shared:
         library.watch()
         opened = Recordings(library, review)
         if self.session is None:
-            # With a live env, its recorder has already recovered them, and is writing.
+            # A live session's recorder has already recovered the episodes, and may be writing new ones.
             self._recovering.begin(lambda: self._recover(opened))
         return opened
 

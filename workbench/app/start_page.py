@@ -19,7 +19,7 @@ from workbench.start.panel import TaskList
 
 
 class StartPage:
-    """The list of tasks in a panel over the whole window (``.wb-start`` in page.css), since there is no scene.
+    """The list of tasks. There is no scene, so its panel fills the window (``.wb-start`` in page.css).
 
     Args:
         shared: The objects that all pages share.

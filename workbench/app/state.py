@@ -100,7 +100,8 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
     new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
-    # Rescoring starts before checks: of two jobs of one priority the later one runs first. Effects of the run come after
-    # them: when a load is done, a recording continues before a recorded run is entered.
+    # Of two jobs with the same priority, the one that starts later runs first: rescoring starts before
+    # checks. Effects of the run come after the jobs: when a load is done, the recording must continue before
+    # a recorded run is entered.
     for_jobs = [*for_recording, *for_rescoring, *for_checks, *for_profile, *for_seeds, *for_solver]
     return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio]

@@ -110,7 +110,8 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
 
 
 def _recording(recording: RecordingStatus) -> Literal["", "waits", "on"]:
-    """Whether a step of any env would be recorded."""
+    """``on`` if steps are recorded, ``waits`` if all envs to record wait for their next reset; empty without
+    a recording."""
     if not recording.active:
         return ""
     return "waits" if recording.waiting == len(recording.env_idx) else "on"
@@ -132,8 +133,8 @@ MIN_SLOWING_SHARE = 0.3
 
 
 def slowed_by(view: SessionView) -> tuple[str, str] | None:
-    """The part of recording and watching that takes most of the measured time while playing, as a short and a full
-    text; None for neither."""
+    """What slows playing, recording or rendering for the page, as a short and a full text; None if neither
+    takes at least `MIN_SLOWING_SHARE` of the time."""
     task, recorded, watched = view.task, view.recorded_share, view.watched_share
     if task is None or max(recorded, watched) < MIN_SLOWING_SHARE:
         return None
@@ -159,12 +160,12 @@ def _state(view: SessionView, busy: Busy | None) -> str:
 
 def _doing(busy: Busy) -> str:
     if busy.awaited:
-        return f"for a debugger to attach, {busy.seconds:.0f} s; the log says where"
+        return f"for a debugger to attach, {busy.seconds:.0f} s; the log has the address"
     if busy.held:
         at = f" at {place(busy)}" if busy.file else ""
-        return f"by a debugger{at} for {busy.seconds:.0f} s; continue from there, not from this page"
+        return f"by a debugger{at} for {busy.seconds:.0f} s; continue in the debugger, not on this page"
     if busy.getting_ready:
-        return f"a new worker is getting ready for {busy.seconds:.0f} s"
+        return f"a new worker has been starting for {busy.seconds:.0f} s"
     return f"{busy.doing} for {busy.seconds:.0f} s"
 
 

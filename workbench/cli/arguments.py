@@ -66,8 +66,8 @@ class JobArguments:
         cpus_per_worker: CPU cores for each worker on a cluster.
         gpus_per_worker: GPUs, or fractions of one, for each worker on a cluster.
         job: file that keeps the results as they arrive. If it already holds results of the same job, the job resumes.
-        shard: run only one part of the job, as in 3/64 for the third of 64; workbench merge joins the parts. Without
-            --job the results are kept in a file named after the part.
+        shard: run only one part of the job, as in 3/64 for the third of 64 parts; workbench merge joins them.
+            Without --job the results are kept in a file named after the part.
     """
 
     workers: int | None = None
@@ -85,15 +85,15 @@ _OLD_NAMES = {"--envs-per-worker": "--num-envs"}
 
 def with_new_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Replace old option names; returns the new arguments, and a notice for each old name."""
-    given, told = list(arguments), dict[str, str]()
+    given, notices = list(arguments), dict[str, str]()
     for place, one in enumerate(given):
         name, equals, value = one.partition("=")
         if one == "--":
             break
         if (new := _OLD_NAMES.get(name.replace("_", "-"))) is not None:
             given[place] = f"{new}{equals}{value}"
-            told[name] = f"{name} is called {new} now; the next release drops the old name"
-    return given, list(told.values())
+            notices[name] = f"{name} is called {new} now; the next release drops the old name"
+    return given, list(notices.values())
 
 
 @dataclass(frozen=True)
@@ -222,12 +222,12 @@ def plan_options(plan: PlanArguments) -> PlanOptions:
 
 
 def separated(names: Sequence[str]) -> tuple[str, ...]:
-    """The names of an option that is given several times, or once with commas."""
+    """The names given to an option that is repeated, or has several names separated by commas."""
     return tuple(name for one in names for name in one.replace(",", " ").split())
 
 
 def imported(names: Sequence[str]) -> tuple[str, ...]:
-    """The modules of ``--import``, checked and not imported. Raises ValueError."""
+    """Check the module names of ``--import`` without importing them; returns them. Raises ValueError."""
     from workbench.task.reference import find_module, is_module_name, not_found_text
 
     for name in names:
@@ -254,7 +254,7 @@ def history_bytes(text: str) -> int:
 
     size = size_in_bytes(text)
     if size is None or not 2**20 <= size <= 2**40:
-        raise ValueError(f"--history takes a size of at least 1MB, such as 256MB or 2GB; got {text!r}")
+        raise ValueError(f"--history takes a size from 1MB to 1TB, such as 256MB or 2GB; got {text!r}")
     return int(size)
 
 
@@ -269,7 +269,7 @@ def why_unwritable(*files: Path | None) -> str | None:
         except OSError as error:
             return f"{file} cannot be written: the folder {folder} cannot be made ({error.strerror})"
         if file.is_dir():
-            return f"{file} is a folder: give a file in it"
+            return f"{file} is a folder: name a file in it"
         if not os.access(folder, os.W_OK):
             return f"{file} cannot be written: you may not write into {folder}"
     return None

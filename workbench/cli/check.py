@@ -82,7 +82,7 @@ def check_in_terminal(
         run: where the work runs; None for as many processes as cores and chunks allow.
     """
     run = run or JobArguments()
-    here, root = CurrentFolder(), Path.cwd()  # a task may change it
+    here, root = CurrentFolder(), Path.cwd()  # a task may change the current folder
     try:
         total, chunks = count_rules(degrees_of_request(what)), count_chunks(what)
         items = count_items(what, shard_of(run).part(chunks))
@@ -109,7 +109,7 @@ def check_in_terminal(
                 if result.state in ("broken", "failed"):
                     line = f"{result.rule}: {result.state}"
                 elif result.problem is not None:
-                    # An exception of the task leaves most rules undecided for the same reason: printed once.
+                    # One exception of the task may leave most rules undecided: print each reason only once.
                     line = f"not known: {result.why}"
                 if line and not err.is_terminal and line not in told:
                     told.add(line)
@@ -244,13 +244,13 @@ def _print_summary(report: CheckReport, root: Path) -> None:
     others = ("silenced", "not_applicable", "not_known", "failed")
     words += [f"{counts[state]} {state_text(state)}" for state in others if counts[state]]
     words += [f"{len(report.ignored)} ignored"] if report.ignored else []
-    said = f"{_safe(report.task.env_id)}: {', '.join(words)}."
+    summary = f"{_safe(report.task.env_id)}: {', '.join(words)}."
     if report.seconds:
-        said += f" {report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
+        summary += f" {report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
         if report.picture_seconds:
-            said += f" and {report.picture_seconds:.1f} s for the first pictures"
-        said += "."
-    _print(said)
+            summary += f" and {report.picture_seconds:.1f} s for the first pictures"
+        summary += "."
+    _print(summary)
 
 
 def _print_by_reason(label: str, results: tuple[RuleResult, ...]) -> None:

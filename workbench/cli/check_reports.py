@@ -30,7 +30,7 @@ REPORT_IT = (
     "an error of the workbench, not of the task; please report it, with the traceback that --json-file writes"
 )
 CANNOT_CHECK = "cannot-check"
-"""Id, in a report, of an error that ends a check before a rule is checked; no rule has this id."""
+"""Id in reports for an error that ends the check before any rule is checked. No rule has this id."""
 _UNDECIDED: tuple[State, ...] = ("failed", "not_known")
 _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -45,7 +45,7 @@ class Reported:
     """The current folder of the command."""
     fail_on: FailOn
     error: Problem | None = None
-    """Reason why nothing was checked; None if something was."""
+    """Why no rule was checked; None if rules were checked."""
 
     def fails(self, finding: Finding) -> bool:
         return fails(finding.degree, self.fail_on)
@@ -71,7 +71,8 @@ def shown_path(file: str, root: Path) -> str:
 
 
 def repository_of(folder: Path) -> Path:
-    """Root of the git checkout that contains the folder, to which CI's paths are relative; else the folder."""
+    """Root of the git checkout that contains the folder; the folder itself if there is none. CI expects paths
+    relative to this root."""
     return next((each for each in (folder, *folder.parents) if (each / ".git").exists()), folder)
 
 
@@ -168,7 +169,7 @@ def json_text(value: Any) -> str:
 
 def as_junit(said: Reported) -> str:
     """JUnit XML with a test case for each rule, in pytest's format, which GitLab, Jenkins and GitHub Actions read. A finding
-    below ``--fail-on`` is output of a passing test."""
+    below ``--fail-on`` appears as output of a passing test."""
     report = said.report
     root = repository_of(said.root)
     cases = [_case(result, said, root) for result in report.results]
@@ -187,8 +188,8 @@ def as_junit(said: Reported) -> str:
     suite = ElementTree.SubElement(suites, "testsuite", {**named, **totals})
     suite.extend(cases)
     if report.comments:
-        told = [f"{shown_path(one.file, root)}:{one.line}: {one.message}" for one in report.comments]
-        ElementTree.SubElement(suite, "system-out").text = xml_text("\n".join(told))
+        lines = [f"{shown_path(one.file, root)}:{one.line}: {one.message}" for one in report.comments]
+        ElementTree.SubElement(suite, "system-out").text = xml_text("\n".join(lines))
     ElementTree.indent(suites)
     return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
 
@@ -283,7 +284,7 @@ def as_sarif(said: Reported) -> str:
         }
         for finding, reason in silenced
     ]
-    # As notifications: a result would be an alert, and an undecided rule is no alert.
+    # Undecided rules are notifications: code scanning would show a result as an alert.
     notes = [
         {
             "level": "note" if one.problem is None else "error",

@@ -34,7 +34,7 @@ def show_help(name: str) -> int:
     if not out.is_terminal:
         out.print(page, width=width)
         return Exit.DONE
-    # less prints a text that fits the window, and passes colours on; the person's own LESS takes precedence.
+    # less exits at once if the text fits the window, and keeps colours. The user's own LESS takes precedence.
     os.environ.setdefault("LESS", "FRX")
     with out.pager(styles=shutil.which("less") is not None):
         out.print(page, width=width)
@@ -58,16 +58,18 @@ def _list_topics() -> None:
 
 
 def _not_found(name: str) -> str:
-    said = plain_text(name.strip())
+    wanted = plain_text(name.strip())
     names = [topic.name for topic in topics()]
-    about = [topic.name for topic in topics_about(said)]
+    about = [topic.name for topic in topics_about(wanted)]
     # Several words are a search, not a mistyped name.
-    close = difflib.get_close_matches(said.lower(), names, 1) if len(said.split()) == 1 or not about else []
+    close = (
+        difflib.get_close_matches(wanted.lower(), names, 1) if len(wanted.split()) == 1 or not about else []
+    )
     if close:
-        return f"There is no topic {said!r}. Did you mean {close[0]!r}? workbench help lists all topics."
+        return f"There is no topic {wanted!r}. Did you mean {close[0]!r}? workbench help lists all topics."
     if about:
-        return f"There is no topic {said!r}. These mention it: {', '.join(about)}"
-    return f"There is no topic {said!r}, and no topic mentions it. workbench help lists all topics."
+        return f"There is no topic {wanted!r}. These mention it: {', '.join(about)}"
+    return f"There is no topic {wanted!r}, and no topic mentions it. workbench help lists all topics."
 
 
 def for_terminal(topic: Topic) -> str:

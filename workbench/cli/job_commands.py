@@ -39,12 +39,12 @@ def record(
     run: JobArguments = _DEFAULT_JOB,
     debug: bool = False,
 ) -> int:
-    """Record episodes of a task without a page: an .rrd, and ManiSkill's own .h5 with its .json, for each. Episodes in
-    which the task's code raises are listed at the end, with exit code 1.
+    """Record episodes of a task without a page, each as an .rrd and as ManiSkill's own .h5 with its .json.
+    Episodes in which the task's code raises are listed at the end, with exit code 1.
 
     Args:
         debug: wait for a debugger (debugpy, such as VS Code's) before the task is loaded, with one worker; breakpoint()
-            stops in it. Anyone who can log in to this machine can attach too.
+            stops in the debugger. Anyone who can log in to this machine can attach too.
     """
     if lacks_maniskill("record"):
         return Exit.REFUSED
@@ -88,18 +88,20 @@ def check(
     junit: Path | None = None,
     sarif: Path | None = None,
 ) -> int:
-    """Check a task for mistakes that show up on a GPU cluster or in training, with the line of each. The exit code is 1
-    if a rule is broken, and 2 if the task cannot be imported.
+    """Check a task for mistakes that show up on a GPU cluster or in training, and print the line of each. The
+    exit code is 1 if a rule is broken, and 2 if the task cannot be imported.
 
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         select: check only this rule; repeatable, or comma-separated. workbench help rules lists them.
         ignore: do not check this rule; repeatable, or comma-separated.
-        actions: zero, hold, a policy as module:function or file.py:function, or a file, as for workbench record. It acts
-            in additional episodes, besides those with random actions, for the rules of evaluate() and of rewards.
-        solve: also plan episodes with the task's own reward, and check the reward by them: takes minutes more. See
-            workbench help solve.
-        fail_on: lowest degree of a finding that makes the exit code 1; never only reports.
+        actions: zero, hold, a policy as module:function or file.py:function, or a file, as for workbench
+            record. The check runs additional episodes with these actions for the rules of evaluate() and of
+            rewards.
+        solve: also plan episodes with the task's own reward, and check the reward in them. This takes some
+            minutes more. See workbench help solve.
+        fail_on: lowest degree of a finding that makes the exit code 1. With never, findings do not change the
+            exit code.
         json: print the result as JSON instead of text.
         json_file: also write the result to this file, as JSON.
         junit: also write the result to this file as JUnit XML, with a test case for each rule.
@@ -110,7 +112,7 @@ def check(
         return Exit.REFUSED
     from workbench.task.reference import why_missing
 
-    # With a report, the error belongs in the report as well.
+    # If a report is requested, the error must be in the report as well.
     reports = json or any(file is not None for file in (json_file, junit, sarif))
     if (why := why_missing(task)) is not None and not reports:
         return refuse(why)
@@ -118,7 +120,7 @@ def check(
 
     try:
         options = envs.options()
-        # Checked before torch is imported: a typo is reported at once.
+        # Check the names before torch is imported, to report a typo at once.
         degree_of_each(separated(select), separated(ignore))
     except ValueError as error:
         return refuse(str(error))
@@ -168,8 +170,9 @@ def solve(
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         seeds: number of seeds to try. At least 8 are needed to conclude that no rule is broken.
         max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
-        seconds_per_seed: wall time limit of a seed: it ends at its next step, solved or not. Which seeds reach it depends
-            on the machine and its load, so a second run may differ.
+        seconds_per_seed: wall time limit of a seed. A seed that reaches the limit ends at its next step,
+            solved or not. Which seeds reach it depends on the machine and its load, so a second run may
+            differ.
         pictures: record the pictures of every camera.
         out: folder for the recordings.
         upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
@@ -178,8 +181,8 @@ def solve(
             have the degree warn. With never, the exit code is 0 even if no seed is solved.
         json: print the result as JSON instead of text.
         json_file: also write the result to this file, as JSON.
-        csv: print a row for each seed as CSV instead of text, with the rules that it is an example of; their messages
-            are in the JSON.
+        csv: print a row for each seed as CSV instead of text. A row names the broken rules that the seed is
+            an example of; their messages are in the JSON.
         csv_file: also write the rows to this file, as CSV.
         junit: also write the result to this file as JUnit XML.
     """
@@ -191,7 +194,8 @@ def solve(
         return refuse(why)
     if json and csv:
         return refuse(
-            "--json and --csv both print the result: give one of them, and --json-file or --csv-file"
+            "--json and --csv both print the result: print one, and write the other with --json-file or "
+            "--csv-file"
         )
     if (why := why_unwritable(json_file, csv_file, junit)) is not None:
         return refuse(why)
@@ -245,7 +249,8 @@ def sweep(
             module:function or file.py:function.
         max_steps: maximum length of an episode; default: the task's own limit, or 200 steps if it has none.
         pictures: record the pictures of every camera.
-        out: folder for the recordings and results.parquet; default: sweeps/, in a folder named after the task.
+        out: folder for the recordings and results.parquet; default: a folder named after the task, in
+            sweeps/.
         upload: fsspec URL, such as s3://bucket/folder, to upload each finished episode to instead of keeping it in
             the folder; results.parquet is in both.
         json_file: also write the results to this file, as JSON.
@@ -296,11 +301,12 @@ def merge(
     fail_on: FailOn = "stop",
 ) -> int:
     """Merge the parts of a job that were run with --shard, and print the output of the whole command. Runs nothing. The exit
-    code is 1 if parts are missing, else that of the command.
+    code is 1 if parts are missing, else the exit code of the command.
 
     Args:
         files: job files of all parts.
-        job: also write one job file for the whole; the command resumes from it to run missing parts.
+        job: also write one job file for the whole job. The command that was sharded can resume from this
+            file, to run missing parts.
         out: copy the episodes of all parts into this folder.
         json_file: also write the result to this file, as JSON (check, rescore, solve and sweep).
         csv_file: also write the result to this file, as CSV (rescore, solve and sweep).
@@ -340,7 +346,7 @@ def rescore(
         places: recordings (.json, .h5 or .rrd of the workbench, .h5 of ManiSkill's RecordEpisode) and folders of them.
         task: a task file, file.py:ClassName, package.module:ClassName or id to rescore all of them with, instead of the
             task that each recording names.
-        recorded_source: rescore each with the source code that it was recorded with.
+        recorded_source: rescore each recording with the source code that it was recorded with.
         use_env_states: restore the recorded state after each step, so that the rollout cannot drift from the recording.
         csv: print the table as CSV instead of text.
         csv_file: also write the table to this file, as CSV.
@@ -359,7 +365,8 @@ def rescore(
         return refuse("--task and --recorded-source each choose the code to rescore with: give one of them")
     if csv and json:
         return refuse(
-            "--csv and --json both print the table: give one of them, and --csv-file or --json-file"
+            "--csv and --json both print the table: print one, and write the other with --csv-file or "
+            "--json-file"
         )
     if (why := why_unwritable(csv_file, json_file)) is not None:
         return refuse(why)

@@ -115,7 +115,7 @@ def open_page(
         pictures: how the page renders camera pictures: exact; fast, with simplified meshes; or auto, which is fast during
             motion and exact at rest. Observations and recordings are always exact.
         debug: let a debugger (debugpy, such as VS Code's) attach to the task's process, from this machine only; breakpoint()
-            stops in it. Anyone who can log in to this machine can attach too.
+            stops in the debugger. Anyone who can log in to this machine can attach too.
         debug_port: port for the debugger; 5678 if it is free, else any. Implies --debug.
         debug_wait: wait for a debugger to attach before the task is loaded. Implies --debug.
     """
@@ -157,7 +157,8 @@ def new(
     *,
     origin: Annotated[str, tyro.conf.arg(name="from", metavar="TEMPLATE")] = "",
 ) -> int:
-    """Write NAME.py into this folder: a starting task that opens and passes its checks. Asks for what is not given.
+    """Write NAME.py into this folder: a starting task that opens and passes its checks. Asks for missing
+    arguments.
 
     Args:
         name: name of the file, such as stack_two; its class is StackTwoEnv and its id StackTwo-v1.
@@ -240,7 +241,8 @@ def share(
 
     Args:
         files: recordings, or folders of them.
-        mp4: a film of the camera with this name, of "scene" (the 3-D view), or of "cameras" (one film each); repeatable.
+        mp4: make a film of the camera with this name; "scene" films the 3-D view, and "cameras" makes one
+            film of each camera; repeatable.
         html: the animated 3-D view as one HTML file that needs no server and no network.
         sheet: frames of each camera over time, in one picture.
         out: folder for the results; existing files are not overwritten.
@@ -271,18 +273,18 @@ def export(
         files: recordings, or folders of them.
         lerobot: new folder for a LeRobot dataset (version 3); must not exist yet.
         maniskill: new file (.h5, with a .json) of ManiSkill demonstrations, as its baselines load them; must not exist
-            yet. Only --only-successes and --only-fitting apply to it.
+            yet. Of the other options, only --only-successes and --only-fitting apply.
         only_successes: leave out recordings that never reach success.
-        only_fitting: leave out recordings that cannot be read or lack what the first one has (cameras, dimensions), and
-            print which. Without it, such a recording ends the export.
+        only_fitting: leave out recordings that cannot be read or lack data of the first one (cameras,
+            dimensions), and print their names. Without this option, such a recording ends the export.
         task: the task in words, for language-conditioned policies; default: its id.
         fps: frames per second; the control rate must be a whole multiple of it. Default: the control rate.
-        cameras: names of cameras; default: all. Give none (--cameras) for a dataset without films.
+        cameras: names of cameras; default: all. --cameras without a name makes a dataset without films.
         state: observations that become observation.state, such as agent/qpos; default: the robot's whole proprioception.
         environment_state: observations that become observation.environment_state, such as extra; default: none.
     """
     if (lerobot is None) == (maniskill is None):
-        return refuse("say what to make: --lerobot FOLDER or --maniskill FILE.h5, one of them")
+        return refuse("say what to make: give either --lerobot FOLDER or --maniskill FILE.h5")
     if fps is not None and fps < 1:
         return refuse(f"--fps must be 1 or more, not {fps}")
     if lerobot is None:
@@ -367,7 +369,7 @@ def main(args: Sequence[str] | None = None) -> None:
     except BrokenPipeError:  # ``workbench open --help | head``
         code = end_quietly()
     except ImportError:
-        # An installed package that is too old lacks names that are imported from it.
+        # The cause may be an installed package that is too old: it lacks names that we import from it.
         from workbench.machine.versions import unmet_lines
 
         if (unmet := unmet_lines()) is None:

@@ -43,7 +43,8 @@ from workbench.sweep.job import SweepOptions, collect_sweep
 
 @dataclass(frozen=True)
 class MergeOutput:
-    """Output in addition to the text, as far as the command that was run in parts has it."""
+    """Output in addition to the text. Each command that can run in parts has some of these files; see
+    `_WRITES`."""
 
     json_file: Path | None = None
     csv_file: Path | None = None
@@ -86,11 +87,12 @@ def _require_known(merged: JobParts, output: MergeOutput) -> None:
     for name in ("json_file", "csv_file", "junit", "sarif"):
         if getattr(output, name) is not None and name not in _WRITES[merged.command]:
             option = name.replace("_", "-")
-            raise JobFileError(f"workbench {merged.command} has no such result: leave out --{option}")
+            raise JobFileError(f"workbench {merged.command} does not write such a file: leave out --{option}")
 
 
 def _together(merged: JobParts, out: Path | None) -> JobParts:
-    """The merged results, with all episodes in one folder; JobFileError if they are in several and `out` is None."""
+    """Copy the episodes of all parts into the folder `out`; returns the results with that folder. If `out` is
+    None, returns `merged`, or raises JobFileError if its episodes are in several folders."""
     if merged.command not in ("record", "solve", "sweep"):
         return merged
     results: dict[int, Written | None] = merged.results(Written | None)
@@ -167,10 +169,10 @@ def _print(merged: JobParts, output: MergeOutput) -> int:
 
 
 def _with_missing(code: int, missing: int, what: str, names: Iterable[str] = ()) -> int:
-    """Print what is missing; returns the exit code."""
+    """Print the missing results, if any. Returns `Exit.FAILED` if there are any, else `code`."""
     if missing:
-        told = listed(list(names), 20)
-        print_text(f"{missing} of the job's {what} are in none of these files{told and ': '}{told}")
+        some = listed(list(names), 20)
+        print_text(f"{missing} of the job's {what} are in none of these files{some and ': '}{some}")
         return Exit.FAILED
     return code
 

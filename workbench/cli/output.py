@@ -57,7 +57,7 @@ class SafeConsole(Console):
                 yield segment
                 continue
             style = segment.style
-            # rich would print a link's address unescaped.
+            # Drop the link: rich would print its address unescaped.
             if style is not None and style.link is not None:
                 style = style.update_link(None)
             yield Segment(plain_text(segment.text, "\n"), style)
@@ -122,7 +122,7 @@ def interrupted(kept: str = "") -> int:
     """Print that Ctrl-C ended a command; returns the exit code.
 
     Args:
-        kept: what was kept.
+        kept: text about the results that were kept.
     """
     refuse(f"interrupted; {kept}" if kept else "interrupted")
     return Exit.INTERRUPTED
@@ -169,7 +169,8 @@ def print_problem(problem: Problem) -> None:
 
 
 def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> None:
-    """Print the failures of a job that continued after them: each kind once, with its items.
+    """Print the failures of a job that continued after them: each kind of failure once, with the items that
+    it affects.
 
     Args:
         names: returns the name of an item.
@@ -178,8 +179,8 @@ def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> 
 
     for problem, numbers in by_kind(failures):
         print_problem(problem)
-        told = listed([names(number) for number in numbers], _MAX_FAILED_ITEMS)
-        err.print(escape(f"    without a result, {len(numbers)} in all: {told}"), soft_wrap=True)
+        items = listed([names(number) for number in numbers], _MAX_FAILED_ITEMS)
+        err.print(escape(f"    without a result, {len(numbers)} in all: {items}"), soft_wrap=True)
 
 
 def print_finding(finding: Finding) -> None:
@@ -223,12 +224,12 @@ def print_event(event: Event) -> None:
 def _what_runs(failed: TaskFailed) -> str:
     """Describe which version runs after a failure, and how to continue."""
     if failed.at_run:
-        of = "the policy" if failed.problem.stage == "policy" else "the version"
+        what = "the policy" if failed.problem.stage == "policy" else "the version"
         process = f"; another process loads the version again: {failed.spoiled}" if failed.spoiled else ""
-        return f"{of} failed while the task ran; the task is paused{process}; save a fixed file, or reset to continue"
+        return f"{what} failed while the task ran; the task is paused{process}; save a fixed file, or reset to continue"
     if failed.spoiled or failed.problem.stage == "worker":
-        return "the last good version comes back where it was"
-    return "the last good version stays as it was, running or paused"
+        return "the last good version is loaded again, in the state in which it was"
+    return "the last good version stays loaded, running or paused as before"
 
 
 def print_line(line: PrintedLine) -> None:
@@ -278,7 +279,7 @@ class TerminalPrompt:
                 "show: print the text first; y: run it and ask again next time; a: run it and trust this text from now on; "
                 "n: do not run it"
             )
-            choices += f"; q: nor the {question.more} more" if question.more else ""
+            choices += f"; q: run neither it nor the {question.more} others" if question.more else ""
             while True:
                 self._out.print(f"[bold]Run it?[/] ({choices}) \\[n] ", end="", soft_wrap=True)
                 try:
@@ -296,8 +297,8 @@ def print_question(question: TrustQuestion, out: Console) -> None:
     def print_escaped(text: str, style: str = "") -> None:
         out.print(escape(plain_text(text)), style=style, soft_wrap=True)
 
-    holds = "hold this text" if question.recorded_text else "name this file"
-    print_escaped(f"Recordings of {question.task} {holds}, which you have not allowed for good:")
+    how = "contain this code" if question.recorded_text else "name this file"
+    print_escaped(f"Recordings of {question.task} {how}, and you have not yet chosen to always trust it:")
     for place, file in enumerate(question.files):
         if place == 1:
             print_escaped(_modules_text(question))
@@ -315,7 +316,8 @@ def print_question(question: TrustQuestion, out: Console) -> None:
     for what in question.unseen:
         print_escaped(what, "yellow")
     print_escaped(
-        "It can read and change everything that you can. The digits are the start of each file's sha256sum."
+        "This code can read and change everything that you can. The digits are the start of each file's "
+        "sha256sum."
     )
 
 
@@ -331,14 +333,15 @@ def print_texts(question: TrustQuestion, out: Console) -> None:
 def not_trusted_lines(error: NotTrusted) -> list[str]:
     """Explain why nothing was run, and what to do."""
     lines = [
-        f"Nothing was run: {reason}. Add it, which allows all code in this run, if you know where the recording comes from."
+        f"Nothing was run: {reason}. --trust allows all code in this run: add it only if you know where the "
+        "recording comes from."
         for reason in error.reasons
     ]
     questions = error.questions
     if not questions:
         return lines
     if can_ask():
-        return [*lines, "Nothing was run: you agreed to none of it."]
+        return [*lines, "Nothing was run: you did not allow any of the code."]
     named: list[str] = []
     for question in questions[:MAX_QUESTIONS]:
         named.append(f"    {question_text(question)}")
@@ -347,16 +350,16 @@ def not_trusted_lines(error: NotTrusted) -> list[str]:
         named.append(f"    and {len(questions) - MAX_QUESTIONS} more")
     return [
         *lines,
-        "Nothing was run: you have not agreed to run the code that the recordings name or hold:",
+        "Nothing was run: you have not agreed to run the code that the recordings name or contain:",
         *named,
-        "Read the code. Then run the command in a terminal, where it asks you (and show prints the text); or add --trust, which "
-        "allows the code in this run; or give your own task file with --task.",
+        "Read the code. Then run the command in a terminal, where it asks you (the answer show prints the "
+        "code); or add --trust, which allows the code in this run; or name your own task file with --task.",
     ]
 
 
 def _modules_text(question: TrustQuestion) -> str:
     if question.recorded_text:
-        return "They also hold the modules that it may import:"
+        return "The recordings also contain the modules that this code may import:"
     if question.computed:
         return "Its imports cannot be determined by reading it, so it may import every module next to it:"
     return "It imports these modules next to it:"

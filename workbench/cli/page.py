@@ -37,7 +37,7 @@ from workbench.task.reference import TaskName, named_file
 _CLOSING_SECONDS = 1.4
 """Timeout for closing, restarted by each written episode: a disk may hang."""
 _Requests = queue.SimpleQueue[Callable[[], object] | int]
-"""What the command does next, or its exit code."""
+"""Queue of functions that the command calls next; an int ends the command with this exit code."""
 
 
 @loop_in_main
@@ -176,7 +176,7 @@ class _HowToOpen:
         def on_event_and_note(event: Event) -> None:
             on_event(event)
             if isinstance(event, Loaded):
-                # Only now: it would delay the task, for which the person waits.
+                # Not before the task has loaded: reading would delay the task, for which the user waits.
                 start_reading()
                 made = replace(event.options or options, seed=0)
                 if noted[-1:] != [made]:
@@ -207,7 +207,7 @@ class _HowToOpen:
 
 
 def _for_others(options: TaskOptions) -> TaskOptions:
-    """Options of one task for another, without its own keyword arguments."""
+    """The options of one task as options of other tasks: without the keyword arguments of its class."""
     kwargs = {name: value for name, value in options.env_kwargs.items() if name in RUN_KEYWORDS}
     return replace(options, env_kwargs=kwargs)
 
@@ -246,8 +246,8 @@ def _serve(
     renew = partial(requests.put, partial(_renew_token, gated_server))
     if gated_server.options.token:
         app.renew_token = renew
+    # Not SIGHUP: a closed terminal sends it to end its processes.
     on_signal(signal.SIGUSR1, renew)
-    # Not SIGHUP: it ends the processes of a closed terminal.
     for number in (signal.SIGINT, signal.SIGTERM):
         on_signal(number, partial(requests.put, 0))
     try:
@@ -291,7 +291,7 @@ def _print_address(gated_server: GatedServer) -> None:
     if gated_server.options.socket is not None:
         print_text(f"  socket  {gated_server.options.socket}")
         print_text(f"  first   {gated_server.ssh_hint}   on the machine with the browser")
-        print_text(f"  page    {gated_server.url}   there")
+        print_text(f"  page    {gated_server.url}   in that browser")
     else:
         print_addresses(gated_server.addresses())
         print_text(f"  remote  {gated_server.ssh_hint}")

@@ -64,8 +64,8 @@ class RecordBar:
         Args:
             total: number of requested episodes, if known.
             doing: text of the bar while episodes run.
-            first_seed: seed of the first episode if actions are planned: a control step takes long then, so the bar shows the
-                current step of each seed.
+            first_seed: seed of the first episode if actions are planned. A planned control step takes long,
+                so the bar then shows the current step of each seed.
             named: name of an episode by its number, if there is no first seed.
         """
         self._doing, self._first_seed, self._named = doing, first_seed, named
@@ -95,7 +95,7 @@ class RecordBar:
         self._bar.update(self._row, description=text, completed=kept)
 
     def _say(self, line: str) -> None:
-        """Print a progress line if there is no terminal: in a file or a pipe the bar is drawn only once, at the end,
+        """Print a progress line if stderr is not a terminal: there the bar is drawn only once, at the end,
         and a log would be silent for hours."""
         if not err.is_terminal:
             self._said = time.monotonic()
@@ -150,7 +150,7 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
         requested, _ = with_given_actions(what)
         if recovered := recover_confined(what.out):
             err.print(f"recovered {_episodes(len(recovered))} that an earlier recording left unfinished")
-        # Before the task is opened: the error of a failed import would not name this cause.
+        # Print this before the task is opened: the error of a failed import would not name this cause.
         hidden = hidden_modules_text(what.task)
         for notice in hidden:
             warn(notice)
@@ -223,7 +223,8 @@ def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
     if recorded.start_corrected:
         count = _episodes(recorded.start_corrected)
         print_text(
-            f"{count} did not start as recorded with the recorded seed, and were set to the recorded first state."
+            f"{count} did not start in the recorded state after a reset with the recorded seed, and got that "
+            "state."
         )
     if recorded.written and not recorded.written[0].address:
         folder = shlex.quote(str(recorded.written[0].path.parent))

@@ -55,7 +55,7 @@ from workbench.task.reference import RecordedTask, TaskName, named_file
 from workbench.trust.clearance import Clearances, NotCleared, NotTrusted
 
 _MAX_LISTED = 30
-"""Maximum number of recordings up to which unchanged ones are listed too."""
+"""Maximum number of recordings for which unchanged ones are listed too."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,8 @@ def rescore_all(
     """Rescore; returns the verdicts in the order of the files, and notes about intended differences from the recording.
 
     Args:
-        on_progress: called with the number of rescored episodes, of all episodes, and of control steps so far.
+        on_progress: called with the number of rescored episodes, the number of all episodes, and the number
+            of control steps so far.
         clearances: decides which code that recordings name may run; None never asks.
         on_notice: called before the task is opened, for each file in the task's folder that no import finds.
         run: where the work runs; the verdicts do not depend on it.
@@ -119,7 +120,8 @@ def rescore_all(
     Raises:
         NotTrusted: a recording names code that is not trusted, and asking is impossible or every answer was no.
         FileNotFoundError, UnreadableRecording: there is nothing to rescore.
-        TaskError: no task can be opened, or each raises; if only some do, their verdicts carry the error.
+        TaskError: every task fails to open or raises. If only some tasks do, their verdicts contain the
+            error.
         CannotEnterRecording: like TaskError, for recorded source code that cannot be opened.
         PoolError: as `rescore_recordings` does.
         OSError, ValueError: as `run_by` does.
@@ -222,7 +224,8 @@ def _sum(value: Any) -> str:
 def _require_success(
     groups: Sequence[RescoreGroup], place: Mapping[str, int], results: Sequence[RescoredRecording]
 ) -> None:
-    """Raise the error of the first group if all groups failed; a single missing task must not end the others."""
+    """Raise the error of the first group if all groups failed. One missing task must not hide the results of
+    others."""
     by_place = {result.place: result for result in results}
     first: RescoredRecording | None = None
     for group in groups:
@@ -238,7 +241,8 @@ def _require_success(
 
 
 def _cleared(groups: list[RescoreGroup], clearances: Clearances) -> list[TaskName | NotCleared]:
-    """Task to open for each group, decided before any of them runs: all or nothing if asking is impossible."""
+    """Task to open for each group, decided before any of them runs. If asking is impossible, one refused task
+    ends the command."""
     cleared = clearances.clear_all([group.code for group in groups])
     not_cleared = [one for one in cleared if isinstance(one, NotCleared)]
     refused = [one.question for one in not_cleared if one.question is not None]
@@ -265,7 +269,7 @@ def rescore_in_terminal(what: RescoreOptions, output: RescoreOutput, trust: bool
 
 def _rescore(what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments) -> int:
     """Rescore and print; returns the exit code. Raises the errors of `rescore_all`, and OSError for a table."""
-    here = CurrentFolder()  # a task may change it
+    here = CurrentFolder()  # a task may change the current folder
     if (left_alone := unused_gpu_text(what.base.backend)) is not None:
         warn(left_alone)
     asks = can_ask()  # before the bar takes the terminal
@@ -346,7 +350,7 @@ def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:
         for verdict in shown:
             _print_lines(verdict, out)
     if alike := len(verdicts) - len(shown):
-        out.print(f"{alike} unchanged ones are not listed; --csv-file lists all", soft_wrap=True)
+        out.print(f"{alike} unchanged episodes are not listed; --csv-file lists all", soft_wrap=True)
     out.print(escape(verdict_text.summary(verdicts)), soft_wrap=True)
 
 

@@ -34,7 +34,7 @@ def exit_after(error: BaseException, kept: str = EPISODES_KEPT) -> int:
 
     Args:
         error: one of `JOB_ENDS`.
-        kept: what was kept, for the message after Ctrl-C.
+        kept: text about the results that were kept, for the message after Ctrl-C.
     """
     if isinstance(error, TaskError):
         print_problem(error.problem)
@@ -78,7 +78,8 @@ def job_path(arguments: JobArguments, command: str) -> Path | None:
 
 
 def is_recorded(folder: Path) -> Callable[[Written | None], bool]:
-    """Whether the episode of a result is still in the folder, if it was kept there."""
+    """A function that returns False for a result whose episode is missing from the folder. Uploaded episodes
+    are not in the folder, so it returns True for them."""
     return lambda one: one is None or bool(one.address) or (folder / f"{one.path.stem}.json").exists()
 
 

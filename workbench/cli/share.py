@@ -102,7 +102,7 @@ def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]],
     except (OSError, RuntimeError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
-        return interrupted("what was finished is kept")
+        return interrupted("finished files are kept")
     finally:
         for request, one in made:
             for path in one.paths:

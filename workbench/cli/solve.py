@@ -85,8 +85,9 @@ class SolveOutput:
 
 
 def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments = ONE_WORKER) -> int:
-    """Solve, print, and write the reports; returns the exit code. Ctrl-C keeps and reports what is done."""
-    here = CurrentFolder()  # a task may change it
+    """Solve, print, and write the reports; returns the exit code. Ctrl-C keeps and reports the finished
+    episodes."""
+    here = CurrentFolder()  # a task may change the current folder
     failures: list[Failure] = []
 
     def named(number: int) -> str:
@@ -239,8 +240,9 @@ def as_csv(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
 
 
 def as_junit(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
-    """JUnit XML with a test case for each broken rule of `planning.verdicts`, which fails if the command does, and one for
-    each seed, which is skipped if it was not solved: that alone is no fault of the task."""
+    """JUnit XML with a test case for each broken rule of `planning.verdicts` and for each seed. The case of a
+    rule fails if its degree fails the command. The case of an unsolved seed is skipped: one unsolved seed is
+    no fault of the task."""
     cases = [_case(what, f"seed {one.seed}", one.seconds) for one in report.seeds]
     for case, one in zip(cases, report.seeds, strict=True):
         if not one.solved_at:

@@ -76,8 +76,8 @@ def parse_settings(given: Sequence[str]) -> tuple[Setting, ...]:
         if any(one.name == name for one in settings):
             raise ValueError(f"--set names {name} twice: give all its values at once, as in --set {name}=1,2")
         read = _values(values)
-        told = [json.dumps(value, sort_keys=True) for value in read]
-        if len({float(one) if _is_number(one) else one for one in told}) < len(told):
+        texts = [json.dumps(value, sort_keys=True) for value in read]
+        if len({float(one) if _is_number(one) else one for one in texts}) < len(texts):
             raise ValueError(f"--set {text}: a value is given twice")
         settings.append(Setting(name, tuple(read)))
     return tuple(settings)
@@ -111,8 +111,9 @@ def _is_number(text: str) -> bool:
 
 
 def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments = ONE_WORKER) -> int:
-    """Sweep, print, and write the results; returns the exit code. Ctrl-C keeps and reports what is done."""
-    here = CurrentFolder()  # a task may change it
+    """Sweep, print, and write the results; returns the exit code. Ctrl-C keeps and reports the finished
+    episodes."""
+    here = CurrentFolder()  # a task may change the current folder
     points = what.points
 
     def named(number: int) -> str:
@@ -122,7 +123,8 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
         job = job_path(run, "sweep")
         if (what.out / RESULTS).exists() and not (job is not None and job.exists()):
             raise ValueError(
-                f"{what.out} holds the results of another sweep: name a folder with --out, or remove it"
+                f"{what.out} holds the results of another sweep: name another folder with --out, or remove "
+                "this one"
             )
         recordings_of(what)
         try_folder(what.out)
@@ -174,7 +176,8 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
 
 
 def _is_recorded(out: Path) -> Callable[[Written | None], bool]:
-    """Whether the episode of a result is still in the folder of its point, if it was kept there."""
+    """A function that returns False for a result whose episode is missing from the folder of its point.
+    Uploaded episodes are not in the folder, so it returns True for them."""
     return lambda one: (
         one is None or bool(one.address) or (out / one.path.parent.name / f"{one.path.stem}.json").exists()
     )
@@ -207,7 +210,7 @@ def print_report(report: SweepReport, what: SweepOptions, has_table: bool) -> in
     """Print the points, the best first, and the failures; returns the exit code.
 
     Args:
-        has_table: whether its table of results was written.
+        has_table: whether the table of results was written.
     """
     print_points(report.results)
     if report.failures:
@@ -215,7 +218,7 @@ def print_report(report: SweepReport, what: SweepOptions, has_table: bool) -> in
         print_failures(report.failures, lambda number: _named(what, points, number))
     if has_table and any(one.steps is not None for one in report.results.episodes):
         table, folder = what.out / RESULTS, shlex.quote(str(what.out))
-        copied = f", once what is below {what.upload} is copied there" if what.upload else ""
+        copied = f", after copying the contents of {what.upload} into it" if what.upload else ""
         print_text(f"Each episode is a row of {table}. Look at them with: workbench review {folder}{copied}")
     return Exit.FAILED if report.failures else Exit.DONE
 
@@ -314,9 +317,9 @@ def as_csv(results: SweepResults) -> str:
     writer.writerow([*header, "recording", "failure"])
     for row in results.episodes:
         values = [value_text(results.points[row.point][name]) for name in names]
-        told = _row(results, row)
+        entries = _row(results, row)
         writer.writerow(
-            [row.point, *values, *(told[name] for name in _COLUMNS)]
+            [row.point, *values, *(entries[name] for name in _COLUMNS)]
             + [row.means.get(name) for name in means]
             + [row.recording, row.failure]
         )
@@ -328,5 +331,5 @@ _COLUMNS = ("seed", "success", "success_at_end", "solved_at", "steps", "return")
 
 def _row(results: SweepResults, row: Any) -> dict[str, Any]:
     values = row.seed, row.success, row.success_at_end, row.solved_at, row.steps, row.total_reward
-    told = dict(zip(_COLUMNS, values, strict=True))
-    return {**told, "means": dict(row.means), "recording": row.recording, "failure": row.failure}
+    entries = dict(zip(_COLUMNS, values, strict=True))
+    return {**entries, "means": dict(row.means), "recording": row.recording, "failure": row.failure}

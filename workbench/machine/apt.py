@@ -33,7 +33,7 @@ def has_apt() -> bool:
 
 
 def can_install_packages() -> bool:
-    """Whether this is root on a machine with apt."""
+    """Whether this process runs as root on a machine with apt."""
     return has_apt() and os.geteuid() == 0
 
 
@@ -49,7 +49,7 @@ def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: fl
     """Run apt-get without questions, waiting for dpkg's lock, which an unattended upgrade may hold.
 
     Raises:
-        AptFailed: it is missing, failed, or took longer than `timeout_s`.
+        AptFailed: apt-get is missing, failed, or took longer than `timeout_s`.
     """
     command = [
         "apt-get",
@@ -174,11 +174,12 @@ def read_apt_sources(folder: Path = Path("/etc/apt")) -> list[AptSource]:
 
 
 def backports_source(sources: list[AptSource], codename: str) -> str | None:
-    """A deb822 source for ``CODENAME-backports`` on the mirror that ``CODENAME`` itself comes from.
+    """A deb822 source for ``CODENAME-backports`` on the mirror of ``CODENAME`` itself; None if no source has
+    ``CODENAME``'s ``main``.
 
-    That mirror may be the only one that the machine reaches; its trust options (``Signed-By``, ``Trusted``) are copied,
-    since apt would refuse the source without them. None if no source has that release's ``main``. Adding backports upgrades
-    nothing: their Release file has ``NotAutomatic``.
+    That mirror may be the only one that the machine reaches. Its trust options (``Signed-By``, ``Trusted``)
+    are copied, since apt would refuse the source without them. Adding backports upgrades nothing: their
+    Release file has ``NotAutomatic``.
     """
     for source in sources:
         if codename in source.suites and "main" in source.components:

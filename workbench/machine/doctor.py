@@ -158,8 +158,8 @@ def _packages() -> list[DoctorFinding]:
 
 
 def _maniskill() -> list[DoctorFinding]:
-    """Check ManiSkill (its release, a nightly build, or both, of which one has overwritten the other), and that it and
-    the related packages have the private names that the workbench uses."""
+    """Check which ManiSkill is installed (the release, a nightly build, or both, which overwrite each other's
+    files), and that ManiSkill and the related packages have the private names that the workbench uses."""
     topic = "ManiSkill"
     if (lacking := lines_if_lacking("A task")) is not None:
         return [DoctorFinding(topic, False, *lacking)]
@@ -185,7 +185,7 @@ def _maniskill() -> list[DoctorFinding]:
         return [DoctorFinding("versions", None, what, advice)]
     found = versions.maniskill()
     if found is None:
-        return [DoctorFinding(topic, True, "on Python's path, and not as an installed distribution")]
+        return [DoctorFinding(topic, True, "on Python's path, but not installed as a distribution")]
     what = f"{found[1]}, its release: tested with the workbench"
     if found[0] == "mani_skill-nightly":
         what = (
@@ -213,7 +213,7 @@ def _render_device() -> list[DoctorFinding]:
 
 
 def _gpu() -> list[DoctorFinding]:
-    """Check CUDA through torch, then PhysX on it, without a download by SAPIEN."""
+    """Check CUDA with torch, then PhysX's GPU library, without letting SAPIEN download it."""
     answer = _ask_child(GPU_SCRIPT)
     if isinstance(answer, str):
         return [
@@ -252,7 +252,12 @@ def _gpu() -> list[DoctorFinding]:
 
 
 def _ask_child(code: str) -> Any:
-    """Run `code` in a child process; returns its last line as JSON, or the last line of its error if it fails."""
+    """Run `code` in a child process. Returns the last line of stdout, decoded from JSON; if the process
+    fails, the last line of stderr as text.
+
+    Raises:
+        _TookTooLong: the process takes longer than `CHILD_TIMEOUT_SECONDS`.
+    """
     try:
         child = subprocess.run(
             python_command("-c", code),
@@ -276,9 +281,7 @@ def _cores_and_memory() -> list[DoctorFinding]:
     total, free = memory.total / 2**30, memory.available / 2**30
     what = f"{cores} cores, {total:.1f} GiB of memory, {free:.1f} GiB of it available"
     if free < MIN_MEMORY_GIB:
-        advice = (
-            f"Less than {MIN_MEMORY_GIB:.0f} GiB available: close something, or use a smaller --num-envs."
-        )
+        advice = f"Less than {MIN_MEMORY_GIB:.0f} GiB available: close other programs, or use a smaller --num-envs."
         return [DoctorFinding("cores, memory", None, what, advice)]
     return [DoctorFinding("cores, memory", True, what)]
 
@@ -287,14 +290,18 @@ def _reading() -> list[DoctorFinding]:
     """Check the confinement of the processes that read recordings."""
     version = landlock_version()
     if version:
-        what = f"recordings are read in processes that may read their folder and write nothing (Landlock {version})"
+        what = (
+            "recordings are read in processes that can read the recordings' folder and write nothing "
+            f"(Landlock {version})"
+        )
         return [DoctorFinding("reading", True, what)]
     return [
         DoctorFinding(
             "reading",
             None,
             "recordings are read in separate processes, with limits on memory and time only: this kernel has no Landlock",
-            "Linux 5.13 and newer have it, unless it is turned off. Without it, open only recordings of people you trust.",
+            "Linux 5.13 and newer have Landlock, unless it is turned off. Without it, open only recordings "
+            "of people you trust.",
         )
     ]
 
@@ -360,7 +367,7 @@ def how_to_get_chromium() -> str:
     named = os.environ.get(CHROMIUM_VARIABLE)
     if named:
         return (
-            f"{CHROMIUM_VARIABLE}={named} is no Chromium that runs: correct the path or unset the variable."
+            f"{CHROMIUM_VARIABLE}={named} is not a working Chromium: correct the path or unset the variable."
         )
     if has_apt() and os_release().get("ID") == "debian":
         return "Type: sudo apt-get install --no-install-recommends chromium fonts-liberation"

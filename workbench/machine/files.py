@@ -19,7 +19,8 @@ _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.E
 
 @contextmanager
 def written_beside(path: Path, content: bytes, mode: int = 0o666) -> Iterator[Path]:
-    """Context with a temporary file with `content` in the folder of `path`, synced to disk; removed after the block.
+    """Context that gives the path of a temporary file in the folder of `path`, with this content, synced to
+    disk. The file is removed after the block.
 
     Raises:
         OSError: the file cannot be written.
@@ -37,7 +38,7 @@ def written_beside(path: Path, content: bytes, mode: int = 0o666) -> Iterator[Pa
 
 
 def give_name(temporary: Path, path: Path) -> None:
-    """Give the file at `temporary` the free name `path`; `temporary` may then be gone.
+    """Give the file at `temporary` the name `path`, which must be free. Afterwards `temporary` may be gone.
 
     Raises:
         FileExistsError: `path` exists.
@@ -79,7 +80,8 @@ def real_path(path: Path) -> Path:
 def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> bool:
     """Write or replace a file in one step. Returns False, and changes nothing, if its content is no longer `expected`.
 
-    A link stays a link; mode and owner stay.
+    If `path` is a link, the file that it points to is replaced. The file keeps its mode, and its owner if
+    this user may set it.
 
     Raises:
         OSError: the file cannot be written; its content is unchanged.
@@ -88,9 +90,9 @@ def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> b
     with written_beside(path, content) as temporary:
         with contextlib.suppress(FileNotFoundError):  # a new file has no mode to keep
             status = path.stat()
-            with contextlib.suppress(PermissionError):  # a group's file with another owner
+            with contextlib.suppress(PermissionError):  # another user owns the file
                 os.chown(temporary, status.st_uid, status.st_gid)
-            with contextlib.suppress(PermissionError):  # a drive without modes
+            with contextlib.suppress(PermissionError):  # a file system without modes
                 os.chmod(temporary, stat.S_IMODE(status.st_mode))
         if expected is not None and read_regular_file(path, MAX_COMPARED_BYTES) != expected:
             return False
@@ -132,13 +134,13 @@ def new_file(path: Path) -> Iterator[Path]:
 def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:  # would be mistaken for the file's own name
+    except FileExistsError as error:  # `new_file` would report that the file itself exists
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(path)) from error
 
 
 def _taken(path: Path) -> FileExistsError:
     return FileExistsError(
-        f"There is a file {path} already, and it is not written over: move it, or name another folder."
+        f"There is a file {path} already, and it is not overwritten: move it, or name another folder."
     )
 
 
@@ -224,7 +226,7 @@ def _must_be_regular(path: str | os.PathLike[str], mode: int) -> None:
 def _too_large(path: str | os.PathLike[str], size: int | None, most_bytes: int) -> FileTooLarge:
     has = "has more" if size is None else f"has {_size_text(size)}, more"
     return FileTooLarge(
-        errno.EFBIG, f"{has} than the {_size_text(most_bytes)} that such a file may have", os.fspath(path)
+        errno.EFBIG, f"{has} than the limit of {_size_text(most_bytes)} for such a file", os.fspath(path)
     )
 
 

@@ -45,7 +45,8 @@ def _absolute(found: Callable[..., Path]) -> Path:
     except RuntimeError as error:
         raise NoUserFolder(f"this user has no home folder ({error})") from error
     if not folder.is_absolute():
-        # Earlier versions of platformdirs return a path below the current folder, which may be a downloaded one.
+        # Earlier versions of platformdirs return a path below the current folder, which may be a folder of
+        # downloads.
         raise NoUserFolder(f"the user's folder has no absolute path ({folder})")
     return folder
 
@@ -59,7 +60,7 @@ def read_private(name: str, folder: Path | None = None) -> bytes | None:
     """Read a file of the user folder; None if it does not exist.
 
     Args:
-        folder: in place of `user_folder`.
+        folder: folder of the file; None for `user_folder`.
 
     Raises:
         NoUserFolder: the folder or the file belongs to another user, or others may write to it.
@@ -74,7 +75,7 @@ def read_private(name: str, folder: Path | None = None) -> bytes | None:
         _check_private(path.parent, path.parent.stat())
         _check_private(path, status := os.fstat(descriptor))
         if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:
-            raise NoUserFolder(f"{path} is no ordinary file of at most {MAX_FILE_BYTES >> 20} MB")
+            raise NoUserFolder(f"{path} is not a regular file of at most {MAX_FILE_BYTES >> 20} MB")
         # After the checks, since fdopen raises for a folder and leaves the descriptor open.
         with os.fdopen(descriptor, "rb", closefd=False) as file:
             return file.read(MAX_FILE_BYTES)
@@ -86,7 +87,7 @@ def write_private(name: str, content: bytes, folder: Path | None = None) -> None
     """Write a file of the user folder, readable only by this user; makes the folder if it is missing.
 
     Args:
-        folder: in place of `user_folder`.
+        folder: folder of the file; None for `user_folder`.
 
     Raises:
         OSError: the file cannot be written; it is unchanged.
@@ -123,7 +124,7 @@ def locked(name: str, folder: Path | None = None) -> Iterator[None]:
     """Context that holds a lock of this name against other processes and threads.
 
     Args:
-        folder: in place of `user_folder`.
+        folder: folder of the lock file; None for `user_folder`.
 
     Raises:
         OSError: the lock file cannot be made.
@@ -149,7 +150,7 @@ def _check_private(path: Path, status: os.stat_result) -> None:
     if os.geteuid() != 0 and status.st_uid not in (os.geteuid(), 0):
         raise NoUserFolder(f"{path} belongs to another user")
     if status.st_mode & 0o022:
-        raise NoUserFolder(f"others than this user may write to {path}: chmod go-w {path}")
+        raise NoUserFolder(f"other users may write to {path}; to forbid it, type: chmod go-w {path}")
 
 
 # --- the page's files -------------------------------------------------------------------------------
@@ -191,7 +192,8 @@ _AT_FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
 
 
 class CurrentFolder:
-    """The current folder at construction, held by descriptor, so that it may be renamed."""
+    """The folder that is current at construction. It is held by a descriptor, so it may be renamed
+    meanwhile."""
 
     def __init__(self) -> None:
         self._fd = os.open(".", _AT_FOLDER)

@@ -20,7 +20,7 @@ from typing import Any, ParamSpec, TypeVar
 from workbench.machine.processes.watched_thread import report_failure
 
 _POLL_SECONDS = 0.05
-"""Interval between checks whether a result is still wanted."""
+"""Interval at which `result_of` calls `check`."""
 _tasks: set[asyncio.Task[Any]] = set()
 Value = TypeVar("Value")
 Args = ParamSpec("Args")

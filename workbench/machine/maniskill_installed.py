@@ -1,4 +1,4 @@
-"""Finds which ManiSkill is installed, and the command to type if none or both distributions are. Does not import it."""
+"""Finds the installed distributions of ManiSkill without importing it; advises if none or both are there."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ EXTRAS: Mapping[str, str] = {"mani_skill": "maniskill", "mani_skill-nightly": "n
 
 
 def lacks_maniskill() -> bool:
-    """Whether ``import mani_skill`` would find no code. Assets may leave a folder of that name, which does not count."""
+    """Whether ``import mani_skill`` would find no code. A folder of that name that contains only assets does
+    not count."""
     spec = find_spec("mani_skill")
     return spec is None or spec.origin is None
 
@@ -48,7 +49,7 @@ def lines_if_lacking(what: str, arguments: Sequence[str] | None = None) -> tuple
         name, version = next(iter(found.items()))
         return (
             f"{what} needs ManiSkill: {name} {version} is installed in {sys.prefix} without its files, which were "
-            "deleted when another distribution of it was removed.",
+            "deleted when another distribution of ManiSkill was removed.",
             f"Type: {pip_command('uninstall', name)} && {pip_command('install', f'{name}=={version}')}",
         )
     command = command_to_install("mani_skill", arguments)
@@ -56,22 +57,24 @@ def lines_if_lacking(what: str, arguments: Sequence[str] | None = None) -> tuple
 
 
 def lines_if_mixed() -> tuple[str, str, str] | None:
-    """Three lines if both distributions are installed: what that means, and the commands that keep one of them. Else None."""
+    """Three lines if both distributions are installed: the problem, and the commands that keep one of them.
+    Else None."""
     found = installed_maniskills()
     if len(found) < 2:
         return None
     release, nightly = (f"{name}=={version}" for name, version in found.items())
     uninstall = pip_command("uninstall", *found)
     return (
-        f"{release} and {nightly} are both installed, and one has written over files of the other: keep one of them.",
+        f"{release} and {nightly} are both installed, and one has overwritten files of the other: keep one "
+        "of them.",
         f"To keep the release, type: {uninstall} && {pip_command('install', release)}",
         f"To keep the nightly build, type: {uninstall} && {pip_command('install', nightly)}",
     )
 
 
 def command_to_install(name: str, arguments: Sequence[str] | None = None) -> str:
-    """The command that installs this distribution of ManiSkill into the environment of this process: with uv if uv made it,
-    else with pip. The environment of a uv tool is rebuilt, not extended.
+    """The command that installs this distribution of ManiSkill into the environment of this process: with uv
+    if uv made the environment, else with pip. The environment of a uv tool is rebuilt, not extended.
     """
     kind = _uv_environment()
     ours = shlex.quote(f"{DISTRIBUTION}[{EXTRAS[name]}]{_came_from()}")
@@ -85,8 +88,8 @@ def command_to_install(name: str, arguments: Sequence[str] | None = None) -> str
 
 
 def pip_command(verb: str, *requirements: str) -> str:
-    """The command that installs or uninstalls these in the environment of this process: with uv if uv made it, else with
-    pip."""
+    """The command that installs or uninstalls these requirements in the environment of this process: with uv
+    if uv made the environment, else with pip."""
     python = shlex.quote(sys.executable)
     if _uv_environment() is not None:
         command = f"uv pip {verb} --python {python}"

@@ -43,7 +43,7 @@ class RenderProbe:
     device: str | None = None
     """Argument of ``sapien.Device``: ``cuda``, or ``cpu`` for any other Vulkan device."""
     missing_libraries: tuple[str, ...] = ()
-    """Names in `SYSTEM_LIBRARIES` that cannot be loaded; with any, `ok` is False."""
+    """Names in `SYSTEM_LIBRARIES` that cannot be loaded. If there are any, `ok` is False."""
     why_no_ray_tracing: str | None = None
     """Why this device cannot draw ray traced pictures, as a clause; None if it can."""
 

@@ -57,9 +57,10 @@ def unpack_private_mesa(
 ) -> dict[str, str]:
     """Fetch `package` with the libraries that this machine lacks and unpack them into the user's cache.
 
-    apt needs root for dpkg's database, not for fetching: with lists and cache in a separate folder it resolves, checks the
-    same signatures and downloads; `dpkg-deb` unpacks. VK_DRIVER_FILES and LD_LIBRARY_PATH then point the process that
-    renders to driver and libraries. Deleting the folder undoes everything.
+    apt needs root for dpkg's database, not for fetching: with lists and cache in a separate folder it
+    resolves dependencies, checks the same signatures and downloads; `dpkg-deb` unpacks. VK_DRIVER_FILES and
+    LD_LIBRARY_PATH then point the process that renders to driver and libraries. Deleting the folder undoes
+    everything.
 
     Args:
         package: the package with lavapipe.
@@ -99,7 +100,7 @@ def unpack_private_mesa(
                 raise AptFailed(f"{archive.name} could not be unpacked: {done.stderr.strip()}")
         if not list(_manifests(unpacked)):
             raise AptFailed(
-                f"{package} {version.version} brought no lavapipe driver ({len(archives)} packages)"
+                f"{package} {version.version} contains no lavapipe driver ({len(archives)} packages unpacked)"
             )
         shutil.rmtree(target, ignore_errors=True)
         unpacked.rename(target)
@@ -137,13 +138,14 @@ def _manifests(root: Path) -> list[Path]:
 
 
 def _point_manifests_into(root: Path) -> None:
-    """Name the unpacked driver in the manifests; Debian's name a system path, or a bare library name."""
+    """Write the path of the unpacked driver into the manifests: Debian's contain a system path or a bare
+    library name."""
     for manifest in _manifests(root):
         content = json.loads(manifest.read_text())
         driver = Path(content["ICD"]["library_path"]).name
         found = sorted(root.glob(f"usr/lib/**/{driver}"))
         if not found:
-            raise AptFailed(f"{manifest.name} names {driver}, which the package does not carry")
+            raise AptFailed(f"{manifest.name} names {driver}, which the package does not contain")
         content["ICD"]["library_path"] = str(found[0])
         manifest.write_text(json.dumps(content))
 
@@ -203,7 +205,7 @@ def plan_mesa() -> MesaPlan | None:
 
 
 def ensure_render_device(install: bool) -> RenderProbe:
-    """Find a render device, and with `install` provide what is missing. Slow only where it installs.
+    """Find a render device, and with `install` provide what is missing.
 
     A working driver is left alone. Without one, Mesa's lavapipe (24.3 or newer) is used, from the distribution or from
     Debian's backports. For root it is installed with apt. For other users it is unpacked into the user's cache; the process
@@ -235,10 +237,11 @@ def use_private_driver() -> None:
 def known_render_device(install: bool) -> RenderProbe:
     """The result of `ensure_render_device`, cached on disk until something that determines it changes.
 
-    A probe imports SAPIEN and makes a Vulkan device, and `make open` asks twice before the worker starts. If a device fails
-    although nothing changed, the worker, a separate process, reports it.
+    A probe imports SAPIEN and makes a Vulkan device, and `make open` needs the result twice before the worker
+    starts. If a device fails although nothing changed, the worker, a separate process, reports it.
     """
-    # One file per answer: with a driver of the user's own, `make open` asks a second time with its variables.
+    # One file per environment: with a driver in the user's cache, `make open` probes again with the driver's
+    # variables.
     name = f"render-device-{hashlib.blake2b(repr(_what_decides()).encode(), digest_size=8).hexdigest()}.json"
     with contextlib.suppress(OSError, msgspec.MsgspecError):
         if (kept := read_private(name, cache_folder())) is not None:
@@ -252,8 +255,9 @@ def known_render_device(install: bool) -> RenderProbe:
 
 
 def _what_decides() -> list[str]:
-    """Everything that determines the result: versions, environment variables, driver files with their age, the machine's
-    devices, and the request."""
+    """Everything that determines the cached result: the kernel, the Python environment, environment
+    variables, driver files with their modification times, devices, the versions of SAPIEN and torch, and the
+    fields of `RenderProbe`."""
     named = (*DRIVER_VARIABLES, "LD_LIBRARY_PATH", "SAPIEN_VULKAN_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES")
     files = [*driver_files(), *_manifests(private_mesa_folder())]
     devices = [*Path("/dev").glob("nvidia*"), *Path("/dev/dri").glob("*")]
@@ -312,7 +316,7 @@ def _install_mesa(probe: RenderProbe) -> RenderProbe:
     return (
         after
         if after.ok
-        else _with_advice(after, f"{MESA} {package.version} is installed and does not help.")
+        else _with_advice(after, f"{MESA} {package.version} is installed, but SAPIEN still cannot render.")
     )
 
 
@@ -330,8 +334,8 @@ def _command_to_type() -> str:
     if plan is None:
         name = release.get("PRETTY_NAME", "this system")
         return (
-            f"{name} has no Mesa 24.3 or newer, which SAPIEN's software rendering needs. Debian 12 (backports) and "
-            "13, and Ubuntu 24.04 with its updates, do; or install your GPU's Vulkan driver."
+            f"{name} has no Mesa 24.3 or newer, which SAPIEN's software rendering needs. Debian 12 "
+            "(backports), Debian 13 and Ubuntu 24.04 (updates) have it. Or install your GPU's Vulkan driver."
         )
     if plan.package is not None:
         return f"Type: sudo apt-get install -t {plan.package.suite} {MESA}"

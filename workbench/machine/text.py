@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _UNITS = (("m", 1.0, 1.0), ("cm", 1e-2, 1e-2), ("mm", 1e-3, 1e-4), ("µm", 1e-6, 1e-6), ("nm", 1e-9, 0.0))
-"""Name, size, and the least length for which it is used."""
+"""(name, size in metres, shortest length in metres for which the unit is used)."""
 
 
 def number_text(value: float, form: str = ".4g") -> str:
@@ -76,7 +76,8 @@ HARMLESS = frozenset((0, 1, 2, 3, 4, 7, 9, 22, 23, 24, 27, 29, *range(30, 50), *
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    r"""`text` with every control, unseen and direction character escaped as Python does (``\x1b``), except those in `keep`.
+    r"""`text` with control, invisible and direction characters escaped as Python does (``\x1b``), except
+    those in `keep`.
 
     Such characters can clear a terminal, rename its window, write to the clipboard, move the cursor over other text, or make a
     name look like another.
@@ -89,14 +90,15 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def short_line(text: str, longest: int) -> str:
-    """`text` on one line of about `longest` characters, as `plain_text`; a longer one loses its middle."""
+    """`text` as `plain_text` on one line. If it is longer than `longest` characters, its middle is replaced
+    by ``...``."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
     return plain_text(text)
 
 
 def only_colours(text: str, keep: str = "\n\t") -> str:
-    """`text` as `plain_text`, but with its colours."""
+    """`text` as `plain_text`, but with its colour sequences, if all their codes are `HARMLESS`."""
     if not _ESCAPED.search(text):
         return text
     parts: list[str] = []
@@ -111,7 +113,7 @@ def only_colours(text: str, keep: str = "\n\t") -> str:
 
 
 def colour_codes(numbers: str) -> Iterator[tuple[int, ...]]:
-    """The codes, each with its arguments: (31,), (38, 5, 208), (48, 2, 0, 0, 0)."""
+    """Yield each code of a colour sequence with its arguments: (31,), (38, 5, 208), (48, 2, 0, 0, 0)."""
     parts = iter(numbers.split(";"))
     for part in parts:
         if ":" in part:
@@ -132,7 +134,7 @@ def colour_codes(numbers: str) -> Iterator[tuple[int, ...]]:
 
 
 class SafeStream:
-    """A text stream that passes only text and its colours."""
+    """A text stream that writes through `only_colours`."""
 
     def __init__(self, raw: Any) -> None:
         self.raw = raw

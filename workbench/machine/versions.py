@@ -115,7 +115,7 @@ def installed(distribution: str) -> str | None:
 
 @cache
 def package_versions() -> Mapping[str, str]:
-    """Versions of the packages that an episode depends on, as this process has them."""
+    """Installed versions of the packages that an episode depends on, by name."""
     versions = {name: installed(name) for name in _EPISODE_PACKAGES}
     return {name: version for name, version in versions.items() if version is not None}
 
@@ -162,7 +162,7 @@ def unmet_lines() -> tuple[str, str] | None:
         return None
     if not unmet:
         return None
-    wrong = (f"{r} is {'missing' if v is None else f'wanted, {v} is installed'}" for r, v in unmet)
+    wrong = (f"{r} is {'missing' if v is None else f'required, {v} is installed'}" for r, v in unmet)
     return f"{'; '.join(wrong)}.", f"Type: {pip_command('install', *(str(r) for r, _ in unmet))}"
 
 

@@ -25,19 +25,20 @@ from workbench.review.differences import (
 from workbench.review.playback import Review
 from workbench.review.view import Opened, ReviewView
 
-TOLERANCE_NAMES = {length(way): way for way in TOLERANCES_METRES}
+TOLERANCE_NAMES = {length(metres): metres for metres in TOLERANCES_METRES}
 MAX_ROWS = 30
 
 
 class ReviewComparePanel(PagePart[ReviewView]):
-    """Compares the first recording with another; a press on a row goes to the first state at which its entry differs."""
+    """Compares the first recording with another. Each row is an entry; a press on it goes to the first state
+    at which the entry differs."""
 
     does = (CompareWith, SwapWithFirst, ChooseTolerance)
 
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
         self._wish, self._metres = 1, DEFAULT_TOLERANCE_METRES
-        """Last chosen recording, kept while fewer are open, and the tolerance."""
+        """Index of the recording that was chosen last, kept while fewer are open; and the tolerance."""
         self._other = choice(server, "A against", CompareWith, "index", {"B": 1}, 1)
         self._swap = server.gui.add_html("")
         self._tolerance = choice(
@@ -47,7 +48,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
             "metres",
             TOLERANCE_NAMES,
             DEFAULT_TOLERANCE_METRES,
-            hint="How far apart a body must be to count as different.",
+            hint="A body counts as different if its poses in the two recordings are further apart than this.",
         )
         self._html = server.gui.add_html("")
         self._differing: list[FirstDifference] = []
@@ -99,7 +100,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
             case CompareWith(index=index) if index >= len(self._review.view().opened):
-                raise Refused("It is not open any more.")
+                raise Refused("This recording is not open any more.")
             case CompareWith(index=index):
                 self._wish = index
             case ChooseTolerance(metres=metres):
@@ -110,7 +111,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
 
 def headline(found: Difference) -> str:
     if not found.compared:
-        return "Aligned like this, the two recordings do not overlap."
+        return "With this alignment, the two recordings do not overlap."
     if found.bodies is None:
         return "One of them has no scene; only numbers are compared."
     if found.bodies.position is None:
@@ -122,18 +123,18 @@ def headline(found: Difference) -> str:
 
 
 def notes(a: Opened, b: Opened, found: Difference) -> list[str]:
-    said = []
+    texts = []
     if a.episode.info.task != b.episode.info.task:
-        said.append("They are from different tasks.")
+        texts.append("They are from different tasks.")
     elif without := [name for name, one in (("A", a), ("B", b)) if one.episode.info.seed <= NO_SEED]:
-        said.append(f"{' and '.join(without)} {'has' if len(without) == 1 else 'have'} no seed.")
+        texts.append(f"{' and '.join(without)} {'has' if len(without) == 1 else 'have'} no seed.")
     elif not found.same_seed:
-        said.append("They have different seeds.")
+        texts.append("They have different seeds.")
     if a.length != b.length:
-        said.append(f"{a.length} and {b.length} steps; {found.compared} states are compared.")
+        texts.append(f"{a.length} and {b.length} steps; {found.compared} states are compared.")
     of_batch = dict.fromkeys(name for each in (a, b) for name in (*each.episode.batch, *each.episode.texts))
     if of_batch:
-        said.append(f"Not compared, because they are not per env: {', '.join(of_batch)}.")
+        texts.append(f"Not compared, because they are not per env: {', '.join(of_batch)}.")
     if abs(a.episode.info.control_dt - b.episode.info.control_dt) > 1e-9:
-        said.append("A step does not last equally long in both.")
-    return said
+        texts.append("Their control steps differ in duration.")
+    return texts

@@ -27,7 +27,7 @@ from workbench.review.scene_view import shown_together
 from workbench.review.view import ACTION, REWARD, TERMS, ReviewView, column_at, curves
 
 CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
-"""Height of each chart in pixels, from the top."""
+"""Height in pixels of each chart, in the order from top to bottom."""
 Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
 
@@ -78,7 +78,7 @@ class ReviewCurves(PagePart[ReviewView]):
         self._lines_drawn: object = None
         self._found: dict[str, dict[str, Lines]] = {}
         self._offered: dict[str, tuple[str, str]] = {}
-        """Entry and line of each choice; the line is empty if the entry has a single line."""
+        """(entry, line) of each choice; the line is empty if the entry has a single line."""
         self._wish = ""
         """Last chosen entry, kept while recordings without it are open."""
 
@@ -95,7 +95,7 @@ class ReviewCurves(PagePart[ReviewView]):
         self._draw_entry("also", also, view, shown)
         lines = (view.opened_serial, view.selected, view.anchors, len(view.opened))
         if lines != self._lines_drawn:
-            # These charts do not depend on the position, and a chart that is sent again is redrawn.
+            # These charts do not depend on the position. A browser would redraw a chart that is sent again.
             self._lines_drawn = lines
             self._draw_lines("terms", TERMS, view)
             self._draw_lines("action", ACTION, view)
@@ -110,7 +110,8 @@ class ReviewCurves(PagePart[ReviewView]):
                 self._wish = curve
 
     def _offer(self, view: ReviewView, shown: Sequence[int]) -> str:
-        """Chosen entry; empty if there is none."""
+        """Offer the entries of the shown recordings as choices. Returns the chosen one; empty if there is
+        none."""
         found = [self._found[view.opened[index].id] for index in shown]
         self._offered = {
             name if len(lines) == 1 else f"{name}: {line}": (name, "" if len(lines) == 1 else line)
@@ -172,7 +173,7 @@ class ReviewCurves(PagePart[ReviewView]):
             chosen: The line whose peaks are exact.
             at: The present position.
         """
-        # The chosen line first, since the steps are those of the first line's peaks.
+        # Put the chosen line first: the steps are those of the first line's peaks.
         ordered = sorted(drawn, key=lambda line: line is not chosen)
         if not ordered:
             self._charts[chart].hide()
@@ -204,17 +205,19 @@ def step_of(episode: Episode, state: int) -> StepResult:
 
 
 def known(number: str, state: int) -> str:
-    """The text of a number: NaN at state 0 is a dash, since no step led to it; later NaN comes from the task."""
+    """The text of a number, with a dash for NaN at state 0: no step led to that state. Any later NaN comes
+    from the task."""
     return "—" if number == "NaN" and state == 0 else number
 
 
 def compared(
     rows: Sequence[NumberRow], beside: Sequence[tuple[Sequence[NumberRow], int]]
 ) -> list[dict[str, Any]]:
-    """Rows of the table: those of the selected recording, then entries that only others have.
+    """Rows of the table: the entries of the selected recording, then the entries that only other recordings
+    have.
 
     Args:
-        beside: rows and their state for each recording with a column.
+        beside: (rows, state) of each recording that has a column.
     """
     moods = {row.name: row.mood for row in rows}
     for others, _ in beside:

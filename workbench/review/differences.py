@@ -44,14 +44,15 @@ class FirstDifference:
 class Difference:
     """The differences between two recordings.
 
-    Two episodes of one seed under two versions of a task are the same simulation up to some step; after it everything
-    differs slightly. So that step and the first body that differs are determined, for each quantity separately.
+    With the same seed, episodes of two versions of a task are the same simulation up to some step; after it
+    everything differs slightly. So the comparison finds the first step that differs, for each quantity
+    separately, and the first body that differs.
     """
 
     bodies: FirstDifference | None
     """First difference of bodies; None if one of the recordings has no scene."""
     body: str
-    """The body that differs first."""
+    """The body that differs first; empty if none differs."""
     apart: NDArray[np.float64]
     """(K,) distance in metres between the two poses of the body that differs most, from `begin` on."""
     begin: int
@@ -127,7 +128,8 @@ def source_changes(
     pairs = {name: (before.get(name, ""), after.get(name, "")) for name in dict.fromkeys([*before, *after])}
     gone, new_ones = next(iter(before), None), next(iter(after), None)
     if gone is not None and new_ones is not None and gone not in after and new_ones not in before:
-        # The task's own file comes first in both. If it has another name, without this all its lines would count as changed.
+        # The task's own file comes first in both. Compare it with its renamed version, or all its lines would
+        # count as changed.
         del pairs[gone], pairs[new_ones]
         pairs = {f"{gone} → {new_ones}": (before[gone], after[new_ones]), **pairs}
     for name, (old, new) in pairs.items():
@@ -172,8 +174,8 @@ def _bodies_difference(
 
 
 def distances(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-    """(...,) distance in metres between poses (..., 7), plus `ARM_METRES` times the angle; 0 if both lack the body, inf if
-    one does."""
+    """(...,) distance in metres between poses (..., 7), plus `ARM_METRES` times the angle in radians; 0 if
+    both recordings lack the body, inf if one does."""
     metres, radians = pose_distances(a, b)
     return metres + ARM_METRES * radians
 

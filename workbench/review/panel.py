@@ -49,8 +49,8 @@ class ReviewPanel(PagePart[ReviewView]):
         server: The page.
         review: The review of the page.
         on_go_live: Called with the id of the selected recording and the shown state, when the user continues live from
-            there, and again to cancel that.
-        going: Returns a text on what the transition to the live env waits for.
+            there, and again to cancel the transition.
+        going: Returns a text: what the transition to the live env waits for; empty if there is no transition.
     """
 
     does = (
@@ -82,7 +82,7 @@ class ReviewPanel(PagePart[ReviewView]):
         self._again = gui.add_html("")
         self._list = gui.add_html("")
         self._arrange = choice(
-            server, "Layout", ArrangeRecordings, "layout", (GHOSTS, GRID), GHOSTS, hint="The O key switches."
+            server, "Layout", ArrangeRecordings, "layout", (GHOSTS, GRID), GHOSTS, hint="Press O to switch."
         )
         self._align = choice(server, "Align at", AlignRecordings, "at", ("start",), "start")
         self._unaligned_note = gui.add_html("")
@@ -129,7 +129,8 @@ class ReviewPanel(PagePart[ReviewView]):
         self._again.content = tools_html([tool(TRY_AGAIN, OpenAgain())] if again else [])
         listed = (view.opened, view.selected, bool(view.loading))
         if self._listed != listed:
-            # Not at every position: with many recordings it would take most of a frame's time.
+            # Do not redraw the list at every position: with many recordings that takes most of a frame's
+            # time.
             self._listed = listed
             self._list.content = self._list_html(view)
         self._arrange.visible = 1 < len(view.opened) <= MAX_OVERLAID
@@ -164,7 +165,7 @@ def facts_html(chosen: Opened, changed: str) -> str:
     """Facts about a recording, as HTML.
 
     Args:
-        changed: which symbols of its task changed since the recording.
+        changed: symbols of the recording's task that changed since the recording, as text.
     """
     info = chosen.episode.info
     return render(

@@ -61,7 +61,7 @@ class _Stopped(Exception):
 
 
 class Review:
-    """Opened recordings with one position. All methods are thread-safe and return at once.
+    """Opened recordings with one position. All methods are thread-safe; all but `wait` return at once.
 
     Recordings are in memory (pictures encoded), so seeking only changes a number. While playing, the position is computed
     from the clock on request; there is no timer. A later opening, or `close`, cancels an earlier one.
@@ -79,8 +79,9 @@ class Review:
         """
         Args:
             library: finds recordings by their ids.
-            read: reads the recording of a row, sharing shapes with others, until it is stopped; raises OSError or
-                UnreadableRecording with a sentence. None for `read_recording`.
+            read: reads the recording of a row, sharing shapes with other recordings; stops when its last
+                argument returns True; raises OSError or UnreadableRecording with a sentence. None for
+                `read_recording`.
             make_scene: makes scenes of recordings without one; None leaves them without.
             clock: returns seconds.
             most_bytes: memory limit for the recordings of one opening; None for `MEMORY_SHARE`.
@@ -105,7 +106,8 @@ class Review:
         return self._state.view
 
     def wait(self, seen: int, timeout: float) -> int:
-        """Sleep until there were more changes than `seen`, at most `timeout` seconds; returns the number of changes."""
+        """Block until the number of changes differs from `seen`, at most `timeout` seconds; returns the
+        number."""
         deadline = time.monotonic() + timeout
         while True:
             changes, next_position = do(self._now)
@@ -171,7 +173,7 @@ class Review:
             self._changes.notify()
 
     def _wanted(self, event: Asked | Open | OpenFirst) -> None:
-        self._list()  # the page may draw a row before the loop has its event
+        self._list()  # the page may draw, and send, a row before the loop has handled `Listed`
         self._happened(event)
 
     def _list(self) -> None:
@@ -208,8 +210,9 @@ class Review:
             if opened and self._memory() - held > self._most_bytes:
                 left = len(rows) - done
                 problem = (
-                    f"{row.name} {f'and {left - 1} more were' if left > 1 else 'was'} not opened: those before take "
-                    f"{format_size(self._most_bytes)} of memory. Open fewer at once."
+                    f"{row.name} {f'and {left - 1} more were' if left > 1 else 'was'} not opened: "
+                    f"the recordings before take {format_size(self._most_bytes)} of memory. Open fewer at "
+                    "once."
                 )
                 break
             try:
@@ -241,8 +244,8 @@ class Review:
         """Make the scenes of recordings without one."""
 
         def tell(one: Opened, scene: str, making: bool = False, episode: Episode | None = None) -> None:
-            told = SceneTold(number, one.id, scene, making, episode)
-            post(lambda: self._happened(told))
+            event = SceneTold(number, one.id, scene, making, episode)
+            post(lambda: self._happened(event))
 
         def check() -> None:
             if job.stopped or {one.id for one in without} <= self._state.opening.closed:
@@ -254,7 +257,7 @@ class Review:
             if one in wanted:
                 tell(one, "its scene is made next", making=True)
             else:
-                tell(one, "This recording holds no scene to draw.")
+                tell(one, "This recording contains no scene to draw.")
         if make is None or not wanted:
             return
         scenes = make(
@@ -292,10 +295,13 @@ def _changed_files(files: Mapping[Path, FileStamp]) -> list[str]:
     for path, stamp in files.items():
         now = _size_and_time(path)
         if now is None and stamp.size_and_time is not None:
-            found.append(f"{path.name} was deleted since it was opened; what was read of it is still shown.")
+            found.append(
+                f"{path.name} was deleted since it was opened; the content that was read is still shown."
+            )
         elif now != stamp.size_and_time:
             found.append(
-                f"{path.name} has changed since it was opened; open {stamp.recording} again to see what is in it now."
+                f"{path.name} has changed since it was opened; open {stamp.recording} again to see its new "
+                "content."
             )
     return found
 

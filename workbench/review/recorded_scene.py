@@ -28,15 +28,16 @@ class SceneError(RuntimeError):
 class SceneProcess:
     """Makes scenes in a separate process, which ends with the call.
 
-    ManiSkill's own recordings contain the states of actors and joints, but neither meshes nor poses of links. So the env is
-    built, reset with the recorded seed, and set to each recorded state. A separate process is needed because its code may
-    be missing or broken, and because the server imports no simulator. Several episodes of one file share an env.
+    ManiSkill's own recordings contain the states of actors and joints, but neither meshes nor poses of links.
+    So the env is built, reset with the recorded seed, and set to each recorded state. A separate process is
+    needed because the env's code may be missing or broken, and because the server imports no simulator.
+    Several episodes of one file share an env.
     """
 
     def __init__(self, files: Sequence[Path] = (), imports: tuple[str, ...] = ()) -> None:
         """
         Args:
-            files: Task files in which the envs of recordings may be found.
+            files: Task files that may define the envs of recordings.
             imports: See `TaskOptions.imports`.
         """
         self._imports = imports
@@ -45,7 +46,8 @@ class SceneProcess:
     def __call__(
         self, episodes: Sequence[Episode], check: Callable[[], None], on_progress: Callable[[int, str], None]
     ) -> Iterator[tuple[Episode, tuple[str, ...]] | SceneError]:
-        """Yield each episode with its scene and a list of what could not be restored, or the reason why it gets none.
+        """Yield for each episode: a copy with its scene, and texts on what could not be restored; or the
+        reason why there is no scene.
 
         Args:
             check: called a few times a second; an exception in it ends the work.
@@ -74,10 +76,11 @@ class SceneProcess:
     ) -> SceneMade:
         info = episode.info
         if named := paths_in_arguments(info):
-            # Opening a row must not make an env read files that a recording names: native code may parse them.
+            # Opening a recording must not make an env read files that the recording names: native code may
+            # parse them.
             raise SceneError(
-                f"It names files for {info.task} to read ({', '.join(named[:3])}). Opening a recording does not read "
-                "them, so there are numbers and curves only."
+                f"This recording names files for {info.task} to read ({', '.join(named[:3])}). They are not "
+                "read for a review, so there are only numbers and curves."
             )
         kwargs = {name: value for name, value in info.env_kwargs.items() if name not in _NOT_PASSED_ON}
         question = MakeScene(

@@ -34,7 +34,8 @@ from workbench.review.state import MAX_OVERLAID
 from workbench.review.view import Opened, ReviewView
 
 GHOST_ALPHA = 0.45
-"""Alpha of a ghost. A lower one vanishes over a white table, a higher one hides the bodies behind."""
+"""Alpha of a ghost. With a lower alpha it vanishes over a white table, with a higher one it hides the bodies
+behind it."""
 MAX_NAMED = 16
 """Maximum number of recordings side by side with labels. A browser lays out labels in every frame: with sixty its frame
 rate halves (measured)."""
@@ -156,7 +157,7 @@ def bodies_at_rest(first: Opened, other: Opened) -> frozenset[str]:
 
 
 def tinted(material: Material, tone: str) -> Material:
-    """The material tinted with that colour, half transparent, without texture."""
+    """The material tinted with the colour `tone` (``#rrggbb``), half transparent, without texture."""
     tint = np.array([int(tone[i : i + 2], 16) / 255 for i in (1, 3, 5)]) ** 2.2
     own = np.array(material.base_color[:3])
     red, green, blue = (float(c) for c in 0.75 * tint + 0.25 * own)
@@ -193,7 +194,7 @@ class ReviewIn3D:
         self._frustums = CameraFrustums(server)
         self._scene: ReviewScene | None = None
         self._view = ReviewView()
-        """View for which the scene was drawn: another recording may have been opened since."""
+        """View that was drawn last. The review's present view may have other recordings."""
         self._scene_of: object = None
         self._looks: DrawStyle | None = None
         """Style with which the bodies were built."""
@@ -214,7 +215,7 @@ class ReviewIn3D:
             ghosts: Whether to overlay the recordings, if there are several.
             looks: Style of the bodies.
             cameras: Cameras of the selected recording.
-            pictures: Pictures in their frustums.
+            pictures: Pictures to draw in the frustums of the cameras.
         """
         wanted = (view.opened_serial, ghosts, len(view.opened))
         if wanted != self._scene_of:
@@ -304,7 +305,7 @@ class ReviewIn3D:
             return
         index = env_under_ray(scene.layout, np.array(event.ray_origin), np.array(event.ray_direction))
         if index is not None:
-            with suppress(Refused):  # the recording was closed since the drawing
+            with suppress(Refused):  # the recording was closed after the view was drawn
                 self._review.do(SelectRecording(id=view.opened[index].id))
 
 

@@ -22,8 +22,8 @@ MAX_OVERLAID = 4
 """Maximum number of overlaid recordings; more cannot be distinguished."""
 MAX_OPEN = 64
 FIRST_SHOWN_SECONDS = 0.4
-"""Time after which the recordings read so far are shown, while others are read; doubled each time, since each time a
-scene is built."""
+"""Time after which the recordings read so far are shown, while others are still read. It doubles each time,
+because showing recordings builds a scene."""
 _NEVER = datetime.datetime.min.replace(tzinfo=datetime.timezone.utc)
 First = Path | Literal["newest"]
 """The recording with this file, or the newest recording."""
@@ -56,11 +56,11 @@ class OpeningState:
     show_at: float = 0.0
     """Clock time in seconds at which the recordings read so far are shown."""
     pause: float = FIRST_SHOWN_SECONDS
-    """Seconds between the last two such times."""
+    """Seconds from the previous value of `show_at` to `show_at`."""
     shown: bool = False
-    """Whether some of them are on the page."""
+    """Whether recordings of this opening are already shown."""
     closed: frozenset[str] = frozenset()
-    """Ids that the user closed while others are read."""
+    """Ids of recordings that the user closed while others were still read."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class ReviewState:
     files: Mapping[Path, FileStamp] = field(default_factory=dict)
     """Files of the open recordings."""
     problems: tuple[str, ...] = ()
-    """Problems of the last opening, except those about files that changed since."""
+    """Problems of the last opening, without those about files that changed afterwards."""
 
 
 # --- events ------------------------------------------------------------------------------------------
@@ -341,7 +341,7 @@ def _asked(state: ReviewState, command: Command, now: float) -> ReviewState:
             kept = view.states[view.selected] if view.opened else None
             return _align(state, at, kept, now)
         case review.AlignRecordings():
-            raise Refused("The recordings cannot be aligned at that.")
+            raise Refused("The open recordings have no such event to align at.")
     raise Refused(f"Not possible in a review: {command.help()}.")
 
 
@@ -349,7 +349,7 @@ def _index_of(view: ReviewView, id: str) -> int:
     for index, one in enumerate(view.opened):
         if one.id == id:
             return index
-    raise Refused("It is not open any more.")
+    raise Refused("This recording is not open any more.")
 
 
 def _play_or_pause(state: ReviewState, now: float) -> ReviewState:
@@ -404,7 +404,7 @@ def _swap_with_first(state: ReviewState, index: int, now: float) -> ReviewState:
     """Swap two recordings; the position stays."""
     view = state.view
     if index >= len(view.opened):
-        raise Refused("It is not open any more.")
+        raise Refused("This recording is not open any more.")
     if view.loading:
         raise Refused("Recordings are still being opened.")
     order = list(range(len(view.opened)))
@@ -441,7 +441,7 @@ def _open_first(state: ReviewState, now: float) -> Change:
     if isinstance(first, Path):
         row = next((row for row in whole if first.name in [path.name for path in row.paths]), None)
     elif library.rows and library.reading is None:
-        state = replace(state, first=None)  # also if it cannot be read
+        state = replace(state, first=None)  # also if no recording can be read
         row = max(whole, key=lambda row: row.written or 0.0, default=None)
     else:
         return state, []
@@ -492,7 +492,7 @@ def _row_done(state: ReviewState, now: float) -> ReviewState:
 def _show(state: ReviewState, read: Sequence[Opened], now: float) -> ReviewState:
     """Show recordings that were read, except those closed meanwhile.
 
-    Selection and position are kept once something of this opening was shown.
+    If recordings of this opening are already shown, selection and position are kept.
     """
     opening, view = state.opening, state.view
     kept = [one for one in read if one.id not in opening.closed]

@@ -26,12 +26,13 @@ ACTION = "action"
 MAX_LINES = 12
 """Maximum number of columns of one entry; more cannot be distinguished."""
 _MAX_RUNS = 40
-"""Maximum number of events of one entry; an entry that changes at every step is not an event."""
+"""Maximum number of events of one entry. If there are more, only the first is kept: an entry that changes at
+every step would cover the strip."""
 
 
 @dataclass(frozen=True)
 class EpisodeEvent:
-    """An event: the first state of a run of states in which something is true."""
+    """An event: the first state of a run of states in which a condition is true."""
 
     state: int
     name: str
@@ -87,7 +88,7 @@ class ReviewView:
 
     opened: tuple[Opened, ...] = ()
     opened_serial: int = 0
-    """Increases when other recordings are open, or one of them has got its scene."""
+    """Increases when the open recordings change, and when one of them gets its scene."""
     selected: int = 0
     """Index into `opened` of the recording whose cameras and numbers are shown."""
     align: str = START
@@ -106,7 +107,8 @@ class ReviewView:
     loading: str = ""
     """Text: the recording that is being opened."""
     problems: tuple[str, ...] = ()
-    """A sentence for each recording that could not be opened, and for each file that changed since."""
+    """A sentence for each recording that could not be opened, and for each file that changed since it was
+    read."""
     changed_symbols: str = ""
     """Symbols of the selected recording's task that changed since the recording."""
     not_opened: tuple[str, ...] = ()
@@ -138,7 +140,14 @@ def state_at(position: int, anchor: int, length: int) -> int:
 def column_at(
     states: NDArray[np.integer], values: NDArray[np.float64], anchor: int, axis: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """One episode's numbers over the positions of `axis`; NaN where it has none."""
+    """(len(axis),) values of one episode at the positions of `axis`; NaN where the episode has no value.
+
+    Args:
+        states: (K,) states of the values.
+        values: (K,) values.
+        anchor: state of the episode at position 0.
+        axis: consecutive positions.
+    """
     line = np.full(len(axis), np.nan)
     if len(axis):
         places = states.astype(np.int64) - anchor - int(axis[0])
@@ -204,7 +213,7 @@ def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDA
 
 
 def outcome_text(episode: Episode) -> tuple[str, str]:
-    """Text: how the episode ended; and its colour: ``good``, ``bad``, ``warn`` or none."""
+    """(text, colour): how the episode ended, and ``good``, ``bad``, ``warn`` or empty."""
     success, fail = (_flag(episode.evaluate.get(name)) for name in ("success", "fail"))
     if fail is not None and len(fail) and fail[-1]:
         return "failed", "bad"
@@ -213,7 +222,7 @@ def outcome_text(episode: Episode) -> tuple[str, str]:
     if success[-1]:
         return "success", "good"
     if len(once := np.flatnonzero(success)):
-        return f"success lost (it was there at step {once[0]})", "warn"
+        return f"success lost (first reached at step {once[0]})", "warn"
     if is_stopped(episode.length, episode.info.max_episode_steps):
         return "stopped, no success yet", ""
     return "no success", "bad"

@@ -32,13 +32,13 @@ class ChooseFilmed(Command, frozen=True):
 
 
 class TakeOnlySuccesses(Command, frozen=True):
-    """Leave recordings that never reach success out of a dataset, or keep them."""
+    """Omit recordings that never reach success from a dataset, or include them."""
 
     on: bool
 
 
 class TakeOnlyCompatible(Command, frozen=True):
-    """Leave recordings that cannot be read, or lack data of the first one, out of a dataset, or keep them."""
+    """Omit recordings that cannot be read or lack data of the first one from a dataset, or stop at them."""
 
     on: bool
 
@@ -50,7 +50,7 @@ class TypeInstruction(Command, frozen=True):
 
 
 class MakeShared(Command, frozen=True):
-    """Make the chosen thing of the selected or open recordings."""
+    """Make the chosen files from the selected or open recordings."""
 
 
 class StopMaking(Command, frozen=True):

@@ -108,7 +108,7 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
 
     Raises:
         UnreadableRecording: a recording is damaged, and nothing can be made.
-        ValueError: no recording has the data; the message contains what each lacks.
+        ValueError: no recording has the data; the message says for each recording what is missing.
         OSError: a file cannot be written; the message contains the reason. Finished files stay.
         RuntimeError: this machine cannot render.
     """
@@ -134,7 +134,7 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
             damaged += broken
         except ValueError as error:
             unreadable = unreadable or bool(broken) or isinstance(error, UnreadableRecording)
-            # The recording does not lack pictures; they cannot be read.
+            # `error` may say that there are no pictures, although only their file is damaged.
             why = " ".join(broken) or str(error)
             not_made.append(why if source.stem in why else f"{source.stem}: {why}")
     if not paths:
@@ -171,8 +171,8 @@ def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: 
         for number, camera in enumerate(cameras):
             path = wanted.folder / file_name("film", name, camera)
             seen = (enlarged(picture) for picture in frames(episode, camera_of(episode, camera)))
-            told = _part(on_progress, number, len(cameras))
-            counting = _counted(seen, episode, f"{name}: {camera}", told)
+            part_done = _part(on_progress, number, len(cameras))
+            counting = _counted(seen, episode, f"{name}: {camera}", part_done)
             write_mp4(path, counting, fps, comment=_moved(episode))
             paths.append(path)
         return paths
@@ -212,7 +212,7 @@ def _dataset(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     if made.left_out:
         words += f"; {made.left_out} without success left out"
     if made.not_fitting:
-        words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
+        words += f"; {len(made.not_fitting)} left out (cannot be read, or lack data of the first one)"
     return Made((made.folder,), " ".join([f"{words}.", *made.notes]), tuple(made.not_fitting))
 
 
@@ -229,8 +229,8 @@ def _demonstrations(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     if made.left_out:
         words += f"; {made.left_out} without success left out"
     if made.not_fitting:
-        words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
-    words += ". Colour pictures are as recorded, from JPEG." if made.lossy else "."
+        words += f"; {len(made.not_fitting)} left out (cannot be read, or lack data of the first one)"
+    words += ". Colour pictures were recorded as JPEG, so they are not exact." if made.lossy else "."
     return Made((made.file,), words, tuple(made.not_fitting), incomplete=tuple(made.incomplete))
 
 
@@ -250,7 +250,7 @@ def _zip(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     with new_file(path) as temporary, zipfile.ZipFile(temporary, "w", strict_timestamps=False) as archive:
         for number, file in enumerate(files):
             on_progress(number / len(files), file.name)
-            # Stored, since the large parts, meshes and pictures, are already compressed.
+            # Stored without compression: the large parts, meshes and pictures, are already compressed.
             # plain_text, since an archive accepts only UTF-8 names.
             archive.write(file, plain_text(str(file.relative_to(root))), zipfile.ZIP_STORED)
     on_progress(1.0, "done")
@@ -356,22 +356,22 @@ class Making:
             shutil.rmtree(self._scratch, ignore_errors=True)
 
     async def _make(self, wanted: MakeRequest, download: bool) -> None:
-        came = await self._aside.run(lambda: self._run(wanted, download))
-        made = tuple(one for one in came if isinstance(one, Made))
-        problem = "".join(one for one in came if isinstance(one, str) and not self._stopped)
+        results = await self._aside.run(lambda: self._run(wanted, download))
+        made = tuple(one for one in results if isinstance(one, Made))
+        problem = "".join(one for one in results if isinstance(one, str) and not self._stopped)
         self._view = MakingView(problem=problem, made=(*made, *self._view.made))
 
     def _run(self, wanted: MakeRequest, download: bool) -> list[Made | str]:
-        """The results, and reasons of failures. Runs off the loop."""
-        came: list[Made | str] = []
+        """Run the job; returns the results, and a text for each failure. Runs off the loop."""
+        results: list[Made | str] = []
 
         def take(number: int, one: Made | str) -> None:
             if download and isinstance(one, Made):
                 one = replace(one, sizes=tuple(path.stat().st_size for path in one.paths))
-            came.append(one)
+            results.append(one)
 
-        def hear(news: tuple[float, str]) -> None:
-            post(lambda: self._hear(*news))
+        def hear(progress: tuple[float, str]) -> None:
+            post(lambda: self._hear(*progress))
 
         try:
             if download:
@@ -381,10 +381,10 @@ class Making:
             work = Work(_make, wanted, Made | str, tuple[float, str], "that makes it")
             Processes(1).run(work, Scheduler(range(1), take, hear, lambda: self._stopped))
         except OSError as error:
-            came.append(f"It could not be started: {error}.")
+            results.append(f"The export could not be started: {error}.")
         except PoolError as error:
-            came.append(sentence(str(error)))
-        return came
+            results.append(sentence(str(error)))
+        return results
 
     def _hear(self, done: float, doing: str) -> None:
         self._view = replace(self._view, done=done, doing=doing)
@@ -396,12 +396,12 @@ class _Stopped(BaseException):
 
 def _make(wanted: MakeRequest, queue: ItemQueue) -> None:
     """Entry point of the separate process."""
-    said_at = 0.0
+    sent_at = 0.0
 
     def on_progress(done: float, doing: str) -> None:
-        nonlocal said_at
-        if time.monotonic() - said_at >= PROGRESS_PERIOD_SECONDS:
-            said_at = time.monotonic()
+        nonlocal sent_at
+        if time.monotonic() - sent_at >= PROGRESS_PERIOD_SECONDS:
+            sent_at = time.monotonic()
             queue.send_update((done, doing))
 
     def look(number: int, frame: FrameType | None) -> None:
@@ -411,7 +411,7 @@ def _make(wanted: MakeRequest, queue: ItemQueue) -> None:
 
     if queue.next() is None:
         return
-    # By a signal, since encoding a film may run for long without progress and must be stoppable then.
+    # Check for a stop in a signal handler: encoding a film may run for long without a call of `on_progress`.
     signal.signal(signal.SIGALRM, look)
     signal.setitimer(signal.ITIMER_REAL, PROGRESS_PERIOD_SECONDS, PROGRESS_PERIOD_SECONDS)
     if wanted.what == "scene":

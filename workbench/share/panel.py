@@ -57,13 +57,14 @@ ALL_CAMERAS = "every camera"
 SHARED = {"the selected recordings": False, "the open recordings": True}
 SUCCESSES_HINT = "Leave out recordings that reach success at no step"
 FITTING_HINT = (
-    "Leave out recordings that cannot be read, or lack what the first one has; the result names them"
+    "Leave out recordings that cannot be read, or lack data of the first one; the result names them"
 )
 TASK_HINT = "In words, for policies that take a language instruction; empty: the task's id"
 MAX_RESULTS = 6
 """Maximum number of results in the list, newest first."""
 MAX_NAMED = 5
-"""Maximum number of recordings and files that are named before they are made; the others are counted."""
+"""Maximum number of recordings and of files that the panel names before *Make* is pressed; it counts the
+others."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,8 @@ class Chosen:
     selected: bool = False
     """Whether they are the recordings selected in the library."""
     in_view: bool = False
-    """Whether it is the only recording in the 3-D view; then a film of the view uses the page's viewpoint."""
+    """Whether there is one recording to share, and only this one is open. A film of the 3-D view then uses
+    the page's viewpoint."""
     successes: int | None = None
     """Number of recordings that reach success at some step; None if that is unknown for some of them."""
 
@@ -121,7 +123,7 @@ class SharePanel:
         self._drawn: object = None
         gui, first = server.gui, self._choices
         self._shared = choice(
-            server, "Share", ChooseShared, "opened", SHARED, first.opened, hint="Stays as you choose it"
+            server, "Share", ChooseShared, "opened", SHARED, first.opened, hint="Your choice is kept"
         )
         self._about = gui.add_html("")
         self._whats = choice(server, "Make", ChooseMade, "what", WHAT, first.what)
@@ -140,7 +142,11 @@ class SharePanel:
         self._made = gui.add_html("")
 
     def takes_opened(self, both: bool) -> bool:
-        """Whether to share the open recordings instead of the selected ones; `both`: there are both."""
+        """Whether to share the open recordings instead of the selected ones.
+
+        Args:
+            both: whether there are open recordings, and other ones are selected.
+        """
         self._shared.visible = both
         return both and self._choices.opened
 
@@ -247,7 +253,7 @@ def will_make(
             note = (
                 "It does not reach success."
                 if len(names) == 1
-                else "None of them reaches success: all are taken."
+                else "None of them reaches success: all are included."
             )
         elif only_successes and known is not None and known < len(names):
             of = f"of the {known} of these {len(names)} recordings that reach success"

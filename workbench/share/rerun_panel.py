@@ -76,7 +76,7 @@ class RerunPages:
                 first.
         """
         paths = tuple(Path(path).absolute() for path in recordings)
-        # The same for the same files, and unknown to others.
+        # The key is the same for the same files, and cannot be guessed.
         key = hashlib.blake2b(repr(paths).encode(), key=self._secret, digest_size=16).hexdigest()
         self._shown[key] = paths, moments
         return f"{_SHOW}{key}/"
@@ -104,7 +104,7 @@ def _stores(moments: Moments) -> Iterator[tuple[str, int]]:
         try:
             yield read_store_id(path), step
         except (ValueError, OSError) as error:
-            log.warning("rerun cannot be told to open %s at step %d: %s", path.name, step, error)
+            log.warning("rerun cannot open %s at step %d: %s", path.name, step, error)
 
 
 def _viewer_file(name: str, query: Mapping[str, str]) -> tuple[int, str, bytes] | FileReply:
@@ -164,7 +164,7 @@ class RerunView:
         """Set the ``.rrd`` files that the buttons open.
 
         Args:
-            chosen: number of recordings, of which some may have no ``.rrd`` file.
+            chosen: number of chosen recordings; some may have no ``.rrd`` file.
             moments: the shown step of each open recording.
         """
         self._paths, self._moments = tuple(paths), moments
@@ -246,6 +246,6 @@ class RerunView:
 
     @on_loop
     def end(self) -> None:
-        """Cancel opening, because the page is removed together with the panel."""
+        """Cancel an opening of rerun. Called when the page is removed, together with the panel."""
         self._jobs.close()
         self._panel = None

@@ -24,7 +24,7 @@ MAX_TRIANGLES = 80_000
 the size."""
 
 PAUSE_SECONDS = 1.0
-"""Time for which the last state is held."""
+"""Time for which the last state is held before the player repeats."""
 
 
 def write_scene_html(
@@ -35,9 +35,10 @@ def write_scene_html(
 ) -> None:
     """Write the animated scene to a new file at `path`.
 
-    viser's page can play messages of its server from a recording in the page itself: the scene is built and moved state by
-    state on a server without viewers, with pauses in between, and recorded. The player repeats without a pause, so the last
-    state is held; its clock includes that pause and is hidden, and our caption shows the episode's time and step.
+    viser's page can play messages of its server from a recording in the page itself: the scene is built and
+    moved state by state on a server without viewers, with pauses in between, and recorded. The player repeats
+    without a pause, so the recording holds the last state for `PAUSE_SECONDS`. The player's clock would
+    include this pause, so it is hidden, and our caption shows the episode's time and step.
 
     Args:
         path: file, which must not exist.

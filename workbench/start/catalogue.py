@@ -68,7 +68,7 @@ class Entry:
     blank: str = ""
     """Text in place of the picture."""
     lasting: str = ""
-    """The reference in the form of `recents.lasting`, which is equal for all rows of a task."""
+    """The reference as `task.reference.lasting` returns it: equal for all rows of a task."""
 
     def matches(self, words: list[str]) -> bool:
         """Whether each of these lower-case words occurs in the name or begins a word of the other texts."""
@@ -93,8 +93,8 @@ class CatalogueView:
 class Catalogue:
     """Lists recent tasks, task files of a folder, examples, recordings and registered ids.
 
-    The list is one value, which is replaced on the loop. It follows the disk while it is shown. A page chooses by number:
-    `entry` knows only rows that were listed, or found by a typed path.
+    The list is one value, which is replaced on the loop. It follows the disk while it is shown. A page
+    chooses a row by its number: `entry` returns only rows that are listed, or were found by a typed path.
 
     Args:
         folder: folder to search for task files.
@@ -128,7 +128,7 @@ class Catalogue:
 
     @on_loop
     def refresh(self) -> None:
-        """Search the folder and read the recent tasks again, and follow them from now on. Returns at once."""
+        """Search the folder and read the recent tasks now, and repeat that while the list is shown."""
         self.registered.start()
         if self._following is not None:
             self._following.cancel()  # a running search may already have passed changed files
@@ -207,7 +207,7 @@ class Catalogue:
     # --- off the loop --------------------------------------------------------------------------------
 
     def _search(self) -> CatalogueView:
-        """The list without numbers and registered tasks."""
+        """The list without the rows' numbers and without registered tasks."""
         found = find_task_files(self.folder, self._files.read)
         return CatalogueView(tuple(self._entries(found)), self._on_disk.folder, left_out=found.left_out)
 

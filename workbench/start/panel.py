@@ -118,7 +118,7 @@ class TaskList:
             "Search",
             LookForTasks,
             "words",
-            hint="Words in the name or the folder, all of which must be found; or the path of a file",
+            hint="Words, all of which must be in the name or the folder; or the path of a file",
             live=True,
             enter=OpenFoundTask(),
             longest=MAX_SEARCH_CHARACTERS,
@@ -140,7 +140,7 @@ class TaskList:
         self._html = server.gui.add_html("")
 
     def draw(self) -> None:
-        """Draw it if something has changed."""
+        """Draw the list if it has changed."""
         search, view, doing = self._search, self._chooser.catalogue.view(), self._chooser.doing()
         self._find.show(search.words)
         self._name_field.show(self._name)
@@ -155,7 +155,7 @@ class TaskList:
         match command:
             case OpenListedTask(number=number):
                 if self._chooser.catalogue.entry(number) is None:
-                    raise Refused("It is no longer in the list.")
+                    raise Refused("This task is no longer in the list.")
                 self._choose(number)
             case OpenFoundTask():
                 return self._open_found(self._search.words)
@@ -190,7 +190,7 @@ class TaskList:
             self._search = found
 
     async def _read(self, words: str) -> Search:
-        """Look up the words as a path on the disk."""
+        """Check whether the words are the path of a task file."""
         try:
             return Search(words, typed=await self._chooser.catalogue.typed(words))
         except NotAPath as error:
@@ -201,7 +201,7 @@ class TaskList:
         found = shown_rows(self._chooser.catalogue.view(), search)
         best = best_row([row for rows in found.values() for row in rows], self._chooser.is_open)
         if best is None:
-            raise Refused("Nothing in the list has these words.")
+            raise Refused("No task in the list contains these words.")
         self._choose(best.number)
 
     def _choose(self, number: int) -> None:
@@ -222,7 +222,8 @@ def shown_rows(view: CatalogueView, search: Search) -> dict[Section, list[Entry]
 
 
 def best_row(rows: Sequence[Entry], is_open: Callable[[Entry], bool]) -> Entry | None:
-    """Row that Enter opens: the first one that can be opened and is not open, else one that is open, else the first."""
+    """Row that Enter opens: the first whose file exists and that is not open yet; else the first whose file
+    exists; else the first; None without rows."""
     return min(rows, key=lambda row: (row.gone, is_open(row)), default=None)
 
 
@@ -305,7 +306,7 @@ def picture_route(catalogue: Catalogue) -> Callable[[str, Mapping[str, str]], tu
 
 
 class OpenDialog(PagePart[object]):
-    """The *Open...* dialog. Like every dialog of viser it is on all open pages."""
+    """The *Open...* dialog. Like every dialog of viser, it is shown on all open pages."""
 
     does = (OpenTaskList, *TaskList.does)
 

@@ -130,7 +130,7 @@ def _checked(task: RecentTask) -> RecentTask | None:
     ):
         return None
     try:
-        # The name of a module would lead to another file in another folder.
+        # A module name is looked up in the current folder too, so it may name another file in the next run.
         if split_reference(text) is not None or (task.file is not None and not text.startswith("/")):
             return None
         if len(msgspec.json.encode(task.env_kwargs)) > MAX_KWARGS_BYTES:

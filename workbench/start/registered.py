@@ -80,7 +80,7 @@ class RegisteredView:
     doing: str = ""
     """``listing the tasks``, ``drawing PickCube-v1``; empty if there is no work."""
     problem: str = ""
-    """Why there is no list, as sentences."""
+    """Why there is no list, or why no more pictures are made, as sentences."""
 
     @property
     def waiting(self) -> int:
@@ -133,7 +133,7 @@ class RegisteredTasks:
 
     async def _list_and_draw(self) -> None:
         try:
-            lacking = await self._disk.run(lambda: lines_if_lacking("A list of its tasks"))
+            lacking = await self._disk.run(lambda: lines_if_lacking("The list of ManiSkill's tasks"))
             if lacking is not None:
                 self._tell(problem=" ".join(lacking))
                 return
@@ -181,7 +181,7 @@ class RegisteredTasks:
                 await self._note_failure(env_id, str(failure))
                 continue
             except OSError as error:
-                self._tell(problem=f"Pictures of tasks cannot be kept: {error}.")
+                self._tell(problem=f"Pictures of tasks cannot be cached: {error}.")
                 return
             self._tell(pictures=self.view.pictures | {env_id})
             count += 1
@@ -189,10 +189,10 @@ class RegisteredTasks:
                 self._process.end()
 
     async def _ask(self, question: Question[Value]) -> Value:
-        """Ask the process a question.
+        """Ask the process a question; returns the answer.
 
         Raises:
-            JobFailed: there is no answer, or the timeout has passed.
+            JobFailed: the process fails, or does not answer in `ANSWER_SECONDS`.
         """
         try:
             async with asyncio.timeout(ANSWER_SECONDS):
@@ -271,7 +271,7 @@ def _write(file: Path, content: bytes) -> None:
 def _write_jpeg(file: Path, pixels: np.ndarray) -> None:
     """Write the centre of a picture at the size of cached ones. Raises ValueError if `pixels` is not a picture."""
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or not 0 < pixels.size < 1 << 26:
-        raise ValueError("it is no picture")
+        raise ValueError("the task's picture is not an RGB image")
     height, width = pixels.shape[:2]
     scale = max(WIDTH_PIXELS / width, HEIGHT_PIXELS / height)
     size = max(WIDTH_PIXELS, round(width * scale)), max(HEIGHT_PIXELS, round(height * scale))

@@ -172,7 +172,7 @@ def test_a_port_in_use_is_refused_if_given_and_replaced_if_not(monkeypatch: pyte
         other.bind(("127.0.0.1", 0))
         other.listen()
         taken = other.getsockname()[1]
-        with pytest.raises(ValueError, match=f"--debug-port {taken} cannot be listened on"):
+        with pytest.raises(ValueError, match=f"cannot listen on --debug-port {taken}"):
             port_for_debugger(taken)
         monkeypatch.setattr("workbench.machine.processes.debugger.DEFAULT_PORT", taken)
         assert port_for_debugger(None) not in (0, taken)

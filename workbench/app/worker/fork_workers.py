@@ -23,16 +23,17 @@ _STANDARD_FDS = (1, 2)
 _MAX_PRINTED_BYTES = 1 << 15
 """Maximum output of the imports that is kept: it must fit into a pipe that is not read yet."""
 _NUM_FDS = 6
-"""Number of file descriptors of a request: the socket that reports the worker's end, the three of `start.run`, and its
-stdout and stderr."""
+"""Number of file descriptors of a request: the socket on which the worker's exit is reported, the three of
+`start.run`, and the worker's stdout and stderr."""
 
 
 def main() -> None:
-    """Run the fork server: ``python -m workbench.app.worker.fork_workers SOCKET``. When its socket closes, it ends with its
-    workers.
+    """Run the fork server: ``python -m workbench.app.worker.fork_workers SOCKET``. When SOCKET closes, the
+    fork server and its workers end.
 
-    A fork takes some 30 ms; the imports take five seconds of one core. The fork server runs none of the author's code, and
-    has a single Python thread: a fork copies no other, and those of OpenBLAS restart by themselves.
+    A fork takes some 30 ms; the imports take five seconds of one core. The fork server runs none of the
+    author's code, and has a single Python thread: a fork copies only the thread that calls it. OpenBLAS
+    restarts its own threads.
     """
     control = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -158,7 +159,8 @@ class _ForkServer:
             os.write(standard, text)
         import numpy as np
 
-        # Without this all workers draw the same numbers. Torch starts with the same seed in every process anyway.
+        # Without this, all workers would draw the same random numbers. Torch starts with the same seed in
+        # every process anyway.
         random.seed()
         np.random.seed()
         sys.argv[:] = [str(Path(start.__file__))]

@@ -299,7 +299,7 @@ class Worker:
                 ),
             )
         self._task.when_loaded = read_process_state()
-        # No interrupt here: it would leave the page with another task than the worker's.
+        # No interrupt here: the page would show another task than the one that the worker runs.
         with self._interrupts.shielded():
             self._replace_task(opened, report, request, send)
             self._send_rules()
@@ -419,7 +419,8 @@ class Worker:
             self._chooser.use(s.action_source, s.policy, folder)
         except TaskError as error:
             self._task.drop_steps_if_interrupted(error)
-            # Before a task is loaded it would look like a failed load; the first step reports it.
+            # Before a task is loaded, this failure would look like a failed load. The first step reports it
+            # then.
             if self._task.opened is not None:
                 self._task.fail(error.problem)
             return False
@@ -501,7 +502,11 @@ class Worker:
             self._pause()
 
     def _all_solved(self, done: np.ndarray, before: np.ndarray) -> bool:
-        """Whether the last of the envs that are planned for has succeeded in this step."""
+        """Whether all planned envs have succeeded, the last of them in this step.
+
+        Args:
+            done, before: (N,) whether each env has succeeded after this step, and after the step before.
+        """
         planned = slice(None) if self._settings.solve_all else self._settings.selected_env
         return bool(done[planned].all() and not before[planned].all())
 
@@ -521,7 +526,8 @@ class Worker:
     ) -> StepResult:
         """Reset these envs; recorded ones one by one, so that a seed gives the same start in any batch.
 
-        Envs that are reset together share torch's generator: their numbers depend on all of them and on the first seed.
+        Envs that are reset together share torch's generator: their random numbers depend on all of them, and
+        on the first seed.
         """
         every = range(task.num_envs) if env_idx is None else env_idx
         alone = [env for env in every if env in self._steps.recorded] if len(every) > 1 else []
@@ -532,7 +538,7 @@ class Worker:
         )
         step = None
         if env_idx is None:
-            step = task.reset(seed)  # of all envs: only that can rebuild the scene
+            step = task.reset(seed)  # only a reset of all envs can rebuild the scene
         elif rest := [env for env in every if env not in alone]:
             step = task.reset([seeds[env] for env in rest], rest)
         for env in alone:
@@ -555,7 +561,8 @@ class Worker:
         self._send_status(None)
 
     def _throttled_status(self, text: Callable[..., str]) -> Callable[..., None]:
-        """A progress callback: sends `text` of its arguments as the status, at most every `_STATUS_PERIOD_SECONDS`."""
+        """A progress callback that sends ``text(*arguments)`` as the status, at most once in
+        `_STATUS_PERIOD_SECONDS`."""
         return throttled(lambda *done: self._send_status(None, text(*done)), _STATUS_PERIOD_SECONDS)
 
     def _send_step(
@@ -632,7 +639,7 @@ class Worker:
 
 
 def _led_there(request: Restore | EnterRecording) -> Mapping[int, NDArray[np.float32]]:
-    """(A,) last action before the state that an env is restored to, by env, where it is known."""
+    """By env: the last action (A,) before the restored state. Envs for which it is unknown are omitted."""
     if isinstance(request, Restore):
         return {env: way.actions[-1] for env, way in request.ways.items() if len(way.actions)}
     run = request.run
@@ -665,8 +672,8 @@ _DOING: dict[type, Doing] = {
 
 def work(connection: int, heartbeat: HeartbeatWriter) -> None:
     """Entry point of the worker process; `connection` is the file descriptor of its end of the socket pair."""
-    # Tensors have a few thousand numbers: threads only wait for each other (measured: 16 PickCube envs ran 2.8 times
-    # faster with one thread than with two).
+    # Tensors have only a few thousand numbers: several threads mostly wait for each other (measured: 16
+    # PickCube envs ran 2.8 times faster with one thread than with two).
     torch.set_num_threads(1)
     mark_camera_configs()
     treat_ctrl_c_as_error()

@@ -26,15 +26,16 @@ def main() -> None:
 def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: int) -> None:
     """Fork: the child becomes the worker, this process its keeper.
 
-    The first three are file descriptors (see `WorkerProcess`), `server` is the process id of the parent. Heavy modules are
-    imported last: by then a crash writes its stack, the server can request the stack by a signal, the kernel kills this
-    process first when memory is short, and the process ends with its server (`family`).
+    `connection`, `heartbeat_fd` and `stacks` are file descriptors (see `WorkerProcess`), `server` is the
+    process id of the parent. Before heavy modules are imported, this is set up: a crash writes its stack, the
+    server can request the stack by a signal, the kernel kills this process first when memory is short, and
+    the process ends with its server (`family`).
     """
     begin_family(server)
     if niceness:
         os.nice(niceness)
     if niceness >= LOWEST_NICENESS:
-        # Only what no other process wants. Some containers forbid it.
+        # Use only CPU time that no other process wants. Some containers forbid this policy.
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     # A server that a script started in the background ignores SIGINT, and we would inherit that.
@@ -74,7 +75,7 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
         try:
             sys.stdout.flush()
             sys.stderr.flush()
-        finally:  # the task may have closed them
+        finally:  # flushing raises if the task has closed the streams
             leave(code)
 
 

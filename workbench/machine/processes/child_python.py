@@ -85,7 +85,8 @@ def unchanged_environment() -> Iterator[None]:
 
 @contextmanager
 def quick_imports() -> Iterator[None]:
-    """Context for imports without garbage collection; exempts what was imported from later collections.
+    """Context for imports without garbage collection. Later collections skip the objects that the imports
+    made.
 
     Importing torch, ManiSkill and rerun takes a quarter less time: of a million objects made by imports, ten thousand are
     garbage. Without the exemption, BaseEnv's collections at every build and close take 0.25 s each, most of a reload of 16

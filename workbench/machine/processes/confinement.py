@@ -15,7 +15,8 @@ _ASK_VERSION = 1
 _PATH_BENEATH = 1
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1 << 0, 1 << 1, 1 << 2, 1 << 3
 _FILE_RIGHTS = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
-"""File rights that each version of Landlock adds; all except reading are given up."""
+"""File rights that each version of Landlock adds. `confine` takes all of them away, except where a path is
+allowed."""
 _FILE_ONLY_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE
 """Rights that apply to files that are not folders."""
 _TCP_RIGHTS = 0b11
@@ -41,8 +42,9 @@ def landlock_version() -> int:
 def confine(reads: Iterable[Path], most_memory: int, writes: Iterable[Path] = ()) -> None:
     """Restrict this process and its children: they can read only programs, libraries and files below `reads`.
 
-    They can write only below `writes`, open no TCP connection, signal no outside process, and gain no rights from programs
-    that they start.
+    They can write only below `writes`, open no TCP connection, signal no outside process, and gain no rights
+    from programs that they start. A kernel without Landlock enforces only the last of these, and the limits
+    on memory, file size and open files.
 
     Args:
         most_memory: maximum bytes that may be allocated.
@@ -68,7 +70,7 @@ def _restrict(reads: tuple[Path, ...], writes: tuple[Path, ...]) -> None:
     size = 8 * (3 if version >= 6 else 2 if version >= 4 else 1)
     ruleset = _call(_CREATE_RULESET, ctypes.byref(asked), size, 0)
     if ruleset < 0:
-        raise OSError(ctypes.get_errno(), "Landlock gives no ruleset")
+        raise OSError(ctypes.get_errno(), "Landlock refused to create a ruleset")
     try:
         read = _READ_FILE | _READ_DIR
         for path in (*_SYSTEM_PATHS, *_python()):
@@ -79,7 +81,7 @@ def _restrict(reads: tuple[Path, ...], writes: tuple[Path, ...]) -> None:
             _allow(ruleset, os.fspath(path), rights & ~_EXECUTE)
         _allow(ruleset, os.devnull, _READ_FILE | _WRITE_FILE)
         if _call(_RESTRICT_SELF, ruleset, 0) < 0:
-            raise OSError(ctypes.get_errno(), "Landlock does not restrict this process")
+            raise OSError(ctypes.get_errno(), "Landlock refused to restrict this process")
     finally:
         os.close(ruleset)
 
@@ -100,7 +102,7 @@ def _allow(ruleset: int, path: str, rights: int) -> None:
             rights &= _FILE_ONLY_RIGHTS
         rule = rights.to_bytes(8, sys.byteorder) + place.to_bytes(4, sys.byteorder, signed=True)
         if _call(_ADD_RULE, ruleset, _PATH_BENEATH, rule, 0) < 0:
-            raise OSError(ctypes.get_errno(), f"Landlock takes no rule for {path}")
+            raise OSError(ctypes.get_errno(), f"Landlock refused the rule for {path}")
     finally:
         os.close(place)
 

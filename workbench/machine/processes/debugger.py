@@ -120,7 +120,8 @@ def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., N
 
 
 def port_for_debugger(wanted: int | None) -> int:
-    """A free port of this machine: `wanted`; if that is None, `DEFAULT_PORT` or, if it is taken, any other.
+    """A free port of this machine: `wanted`. If `wanted` is None: `DEFAULT_PORT`, or any other port if that
+    one is taken.
 
     Raises:
         ValueError: debugpy is not installed, or `wanted` is taken or not a port.
@@ -138,7 +139,7 @@ def port_for_debugger(wanted: int | None) -> int:
                 reason = error
                 continue
             return probe.getsockname()[1]
-    raise ValueError(f"--debug-port {wanted} cannot be listened on: {reason.strerror}")
+    raise ValueError(f"cannot listen on --debug-port {wanted}: {reason.strerror}")
 
 
 def listening_text(port: int, waits: bool) -> str:

@@ -31,7 +31,7 @@ def children(pid: int) -> list[int]:
 
 
 def family(pid: int) -> list[int]:
-    """A process and all its descendants."""
+    """Process ids of a process and all its descendants."""
     members = {pid: None}
     waiting = [pid]
     while waiting:
@@ -50,8 +50,8 @@ def resident_memory(pid: int) -> int:
 
 
 def allocated_memory(pid: int) -> int:
-    """Resident bytes without mapped files; 0 if the process is gone. Mapped libraries are not counted, since the kernel may
-    drop hundreds of megabytes of them while something else is allocated."""
+    """Resident bytes without mapped files; 0 if the process is gone. Mapped libraries are not counted: the
+    kernel may drop hundreds of megabytes of them while the process allocates other memory."""
     try:
         _, resident, shared, *_ = _read(f"/proc/{pid}/statm").split()
         return (int(resident) - int(shared)) * _PAGE_BYTES
@@ -60,7 +60,7 @@ def allocated_memory(pid: int) -> int:
 
 
 def proportional_memory(pids: Iterable[int]) -> int:
-    """Bytes that these processes have in memory together (PSS): a page that they share counts once.
+    """Bytes that these processes have in memory together (PSS): a memory page that they share counts once.
 
     Takes milliseconds for each process of a gigabyte.
     """
@@ -186,7 +186,8 @@ class Keeper(Protocol):
 
 
 def end_family(keeper: Keeper) -> None:
-    """End a process that called `begin_family` and all that it started; returns when all have ended."""
+    """End a process that called `begin_family` and all that it started; returns when the process has ended.
+    If it does not react, it is killed, and processes that detached themselves may stay."""
     keeper.terminate()
     try:
         keeper.wait(timeout=2 * _END_TIMEOUT_SECONDS)
@@ -227,7 +228,8 @@ def _keep(worker: int) -> NoReturn:
 
 
 def _end_all() -> dict[int, int]:
-    """Kill all children, and the processes that thereby become children; returns exit statuses."""
+    """Kill all children, and the processes that thereby become children; returns wait statuses by process
+    id."""
     ended: dict[int, int] = {}
     deadline = time.monotonic() + _END_TIMEOUT_SECONDS
     while (ours := children(os.getpid())) and time.monotonic() < deadline:

@@ -17,7 +17,7 @@ def without_current_folder(path: Sequence[str], python_path: str) -> list[str]:
     """
     try:
         here = os.getcwd()
-    except FileNotFoundError:  # it was removed
+    except FileNotFoundError:  # the current folder was removed
         return list(path)
     named = {os.path.realpath(entry) for entry in python_path.split(os.pathsep) if entry}
     package = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.realpath(__file__)))))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 PICTURE_SECONDS = 180.0
 """Timeout of one picture. The first picture of a process takes seconds, since shaders are compiled."""
 _MAX_MESSAGE_BYTES = 2000
-"""Maximum size of a message: a pipe writes so much atomically."""
+"""Maximum size of a message: a write of this size to a pipe is atomic."""
 
 
 @dataclass
@@ -54,8 +54,9 @@ def end_limit() -> None:
 def limited(message: str) -> Iterator[None]:
     """Context for native work that may not return, such as waiting for a driver.
 
-    Python's own threads and signal handlers do not run meanwhile, so another process watches: it prints `message` to stderr
-    and kills this one. It takes 6 MB from the first use on, and 20 us each time.
+    Python's own threads and signal handlers do not run meanwhile, so another process watches: at the timeout
+    it prints `message` to stderr and kills this process. It takes 6 MB from the first use on; each use takes
+    20 us.
     """
     watcher = _watcher
     if watcher is None or watcher.within or watcher.pid != os.getpid():
@@ -95,7 +96,9 @@ def _start(watcher: _Watcher) -> None:
 
 
 def _watch(fd: int, pid: int, seconds: float) -> None:
-    """Read the message of each piece of work (a line) and its end (an empty line), until the process is gone or takes too long."""
+    """Read a line at the start of each piece of work (its message) and an empty line at its end, until the
+    process `pid` is gone. If a piece of work takes longer than `seconds`, print its message and kill the
+    process."""
     message, deadline, left = b"", None, b""
     while True:
         wait = None if deadline is None else max(0.0, deadline - time.monotonic())

@@ -76,9 +76,9 @@ def _poll(end: socket.socket) -> select.poll:
 
 
 def has_come(end: socket.socket, seconds: float | None = 0.0) -> bool:
-    """Wait up to `seconds` (None waits for ever) for data or the other end's closing. Any thread may call it.
+    """Wait up to `seconds` (None waits for ever) for data or EOF; returns whether there is any. Thread-safe.
 
-    False where another thread has closed `end`.
+    Returns False if another thread has closed `end`.
     """
     # Uses its own poll object: one that two threads use at once raises RuntimeError.
     return end.fileno() >= 0 and bool(_poll(end).poll(None if seconds is None else 1000 * seconds))
@@ -118,11 +118,11 @@ class MessageSocket:
     def send_bytes(self, raw: bytes) -> None:
         """Send a packed message. Raises as `send`."""
         head = _LENGTH.pack(len(raw))
-        for piece in (head + raw,) if len(raw) < _COPIED_BYTES else (head, raw):  # no copy of what is large
+        for piece in (head + raw,) if len(raw) < _COPIED_BYTES else (head, raw):  # do not copy large messages
             self.end.sendall(piece)
 
     def waits(self) -> bool:
-        """Whether bytes are waiting to be read; any thread may ask."""
+        """Whether bytes or EOF are waiting to be read. Thread-safe."""
         return has_come(self.end)
 
     def receive(self, timeout: float | None) -> Any:
