@@ -107,7 +107,7 @@ def fingerprint(visuals: tuple[Visual, ...]) -> str:
 
 
 class SharedShapes:
-    """Cache that stores shapes which look the same once, by a digest of everything visible. Not thread-safe.
+    """Cache that stores equal-looking shapes only once, by a digest of everything visible. Not thread-safe.
 
     A texture takes some megabytes: without the cache, sixty open recordings of one task would hold half a gigabyte.
     """
