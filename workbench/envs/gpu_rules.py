@@ -41,7 +41,7 @@ class Rule:
     otherwise: str
     """What happens if the task does not, in a sentence."""
     solve: bool
-    """Whether the rule needs planned episodes, which take minutes: off unless it is asked for (``--solve``)."""
+    """Whether the rule needs planned episodes, which take minutes: checked only with ``--solve``."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class DeclaredRule(Rule):
 
 
 def declared_rule(id: str, degree: Degree, hook: str, text: str, *, solve: bool = False) -> DeclaredRule:
-    """A rule whose text is at hand.
+    """Make a rule from its text.
 
     Args:
-        text: Markdown, indented like a docstring: a paragraph with `Rule.asks`, one with `Rule.otherwise`, then the sections
-            of the page.
+        text: Markdown, indented like a docstring: a paragraph with `Rule.asks`, a paragraph with
+            `Rule.otherwise`, then the sections of the page.
     """
     asks, otherwise, page = inspect.cleandoc(text).split("\n\n", 2)
     return DeclaredRule(
@@ -66,7 +66,7 @@ def declared_rule(id: str, degree: Degree, hook: str, text: str, *, solve: bool 
 
 
 def degrees_of(choice: Degree | None) -> dict[str, Degree]:
-    """The degree of each rule: `choice` for all, or each rule's own if it is None.
+    """The degree of each rule: `choice` for all rules; if it is None, each rule's default.
 
     Raises:
         ValueError: `choice` is no degree.
@@ -96,8 +96,8 @@ class Finding:
     count: int
     """Number of breaches."""
     first_step: int
-    """Control steps of the batch before the first breach; 0 in a reset before the first step, and in the reset and step
-    with which a page tries a version."""
+    """Control steps of the batch before the first breach. 0 for a breach in a reset before the first step,
+    and in the trial reset and step of a new version on a page."""
 
     @property
     def key(self) -> tuple[str, str | None, str, str]:
@@ -106,8 +106,9 @@ class Finding:
 
 
 # --- silenced in the source ------------------------------------------------------------------------------
-# ``# workbench: off[reward-rows] one env only, see the paper`` stands in the line of the finding, alone in the line above, or
-# in the ``def`` or ``class`` line around it. Without a reason it silences nothing.
+# ``# workbench: off[reward-rows] one env only, see the paper`` stands in the line of the finding, alone in
+# the line above it, or in the line of the ``def`` or ``class`` around it. Without a reason it silences
+# nothing.
 
 _COMMENT = re.compile(r"#\s*workbench:\s*off\[([\w\s,-]*)\]\s*(.*)")
 
@@ -121,7 +122,7 @@ class Silence:
     rules: frozenset[str]
     reason: str
     alone: bool
-    """Whether the line has nothing else."""
+    """Whether the line has only the comment."""
 
 
 def silences(text: str) -> tuple[Silence, ...]:
@@ -184,7 +185,7 @@ the same way."""
 
 
 def _gpu_rule(id: str, degree: Degree, hook: str, text: str) -> DeclaredRule:
-    """As `declared_rule`, with ``{watched}`` in the text replaced by the sentences that several pages share."""
+    """Like `declared_rule`; replaces ``{watched}`` in the text by the sentences that several pages share."""
     rule = declared_rule(id, degree, hook, text)
     return replace(rule, page=rule.page.replace("{watched}", _WATCHED))
 
@@ -338,8 +339,8 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             read is the initial one.
 
             ## Mend
-            Give a body its place with `builder.initial_pose`. Set what stays in `_after_reconfigure`, and
-            what each episode begins with in `_initialize_episode`.
+            Give a body its place with `builder.initial_pose`. In `_after_reconfigure` set what stays, and in
+            `_initialize_episode` what each episode begins with.
 
             ```python fragment
             def _after_reconfigure(self, options):
@@ -763,4 +764,4 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
         ),
     )
 }
-"""The rules of GPU simulation, by id. Envs look for breaches of them in whatever runs."""
+"""The rules of GPU simulation, by id. Envs check them in all code of the task that runs."""

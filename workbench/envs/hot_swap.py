@@ -79,7 +79,7 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
         What could not be undone (for example attributes that a hook made): name and reason.
 
     Raises:
-        Exception: raised by a hook; state is as before, attributes that the hook set are not.
+        Exception: raised by a hook. The state is restored; attributes that the hook added stay.
     """
     every = list(range(env.num_envs))
 
@@ -96,7 +96,7 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
 
 
 def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
-    """Call `do`, and undo what it did to the env; returns and raises as `rehearse_hooks`."""
+    """Call `do`, and undo what it did to the env. Returns and raises like `rehearse_hooks`."""
     every = list(range(env.num_envs))
     kept, px = take_snapshot(env), batched_system(env.scene)
     try:

@@ -43,7 +43,7 @@ class KeptControllers:
 
 
 def active_controllers(env: Any) -> list[BaseController]:
-    """The controllers in use, combined ones split; none without a robot."""
+    """The controllers in use, with combined controllers split into theirs; empty without a robot."""
     single: list[BaseController] = []
     for agent in agents(env):
         combined = isinstance(agent.controller, CombinedController)
@@ -95,8 +95,8 @@ def in_ascending_order(
         The options, and the seeds if there is one for each env of a partial reset.
 
     Raises:
-        TypeError, IndexError, ValueError: ``env_idx`` is a mask of another length, or names an env that does not exist, one
-            twice, or none.
+        TypeError, IndexError, ValueError: ``env_idx`` is a mask of the wrong length, or names an unknown env,
+            an env twice, or no env.
     """
     chosen = _chosen(env, options)
     if chosen is None:
@@ -135,8 +135,8 @@ def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
 def note_what_was_reset(env: Any, untouched: list[int]) -> Iterator[None]:
     """Add notes to an exception of a partial reset: which envs it was for, and the buffers that have fewer rows now.
 
-    A hook that replaces a buffer of N rows by one of ``len(env_idx)`` makes another hook, which is right, raise a torch
-    message about sizes.
+    If a hook replaces a buffer of N rows by one of ``len(env_idx)`` rows, torch raises a message about sizes
+    in another hook, which is correct.
     """
     if not untouched:
         yield
