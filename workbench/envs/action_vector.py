@@ -152,7 +152,8 @@ def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> 
         flat = np.concatenate(each, axis=1)
     else:
         flat = _rows(action, count, sum(of_robots.values()), "", of_robots, env.control_mode)
-    # The sum is a fast test, but may overflow: then every number is tested.
+    # Fast test: a finite sum means that all numbers are finite. Otherwise test each, since a sum may
+    # overflow.
     if not math.isfinite(np.add.reduce(flat, axis=None)) and not (finite := np.isfinite(flat)).all():
         row, column = np.argwhere(~finite)[0].tolist()
         name = [name for part in parts for name in part.names][column]
@@ -164,7 +165,7 @@ def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> 
 
 
 def _columns_of_robots(parts: tuple[ActionPart, ...]) -> dict[str | None, int]:
-    """Width of the action of each robot; that of a single robot under None."""
+    """Width of each robot's action, by robot; the key is None for a single robot."""
     found: dict[str | None, int] = {}
     for part in parts:
         found[part.robot] = found.get(part.robot, 0) + len(part.names)

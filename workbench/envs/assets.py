@@ -80,10 +80,10 @@ def assets_at(path: str | Path) -> list[str]:
 def refuse_downloads(task: str) -> Iterator[None]:
     """Context in which an asset that `task` lacks raises MissingAssets.
 
-    Some tasks declare no assets and fail on a missing file while they build. Where ManiSkill notices, it asks "download now?
-    (y|n)" on standard input, calls ``exit()`` on a no, and takes MS_SKIP_ASSET_DOWNLOAD_PROMPT for a yes. Here nothing is
-    asked or downloaded. An exception about a missing file that a download would provide becomes the cause of a
-    MissingAssets; other exceptions pass.
+    Some tasks declare no assets and fail on a missing file while they build. If ManiSkill notices that, it
+    asks "download now? (y|n)" on standard input, calls ``exit()`` after a no, and treats
+    MS_SKIP_ASSET_DOWNLOAD_PROMPT as a yes. Here nothing is asked or downloaded. An exception about a missing
+    file that a download would provide becomes the cause of a MissingAssets; other exceptions pass.
     """
 
     @wraps(download_asset.prompt_yes_no)

@@ -83,8 +83,8 @@ def find_renderer() -> Renderer | None:
 def _render_system(device: str) -> sapien.render.RenderSystem:
     """A render system on device ``cpu``, ``cuda`` or ``cuda:1``; RuntimeError if there is no such device.
 
-    SAPIEN refuses a device by its name while a material is alive that was made without a render system, for example by
-    a failed build: hence the garbage collection.
+    SAPIEN refuses a device name as long as a material exists that was made without a render system, for
+    example by a failed build: hence the garbage collection.
     """
     try:
         return sapien.render.RenderSystem(sapien.Device(device))
@@ -100,7 +100,8 @@ def why_no_ray_tracing() -> str | None:
 
 
 def _device_summary() -> str | None:
-    """The first supported device of a report of blocks ``GPU: name``, ``Supported: 1`` ..., or None."""
+    """Name of the first supported device in SAPIEN's report (blocks of ``GPU: name``, ``Supported: 1`` ...),
+    or None."""
     try:
         report = sapien.render.get_device_summary()
     except RuntimeError:  # no Vulkan driver
@@ -161,8 +162,8 @@ def give_brdf_table(camera: sapien.render.RenderCameraComponent) -> None:
 
     Otherwise SAPIEN computes the table for the first picture of the process, from 268 million samples: 5 to 19 s on a
     software driver. With this table the first picture takes 0.1 s, and is the same to the bit. The table is that of the
-    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN computes its
-    own at once, so it is kept.
+    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN computes the
+    table at once, so this function does nothing.
     """
     scene = camera.entity.scene
     if not scene.render_system.device.is_cuda():

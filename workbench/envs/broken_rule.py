@@ -38,7 +38,7 @@ Frame = tuple[FrameType, int, int]
 """A frame, with its last instruction and its line at the time of the call."""
 Occasion = Literal["step", "reset"]
 _Key = tuple[str, Hashable]
-"""A rule, and the line or thing at which it was broken."""
+"""Id of a rule, and the line or subject at which it was broken."""
 
 
 class BrokenRule(CoreRefusal, RuntimeError):
@@ -94,7 +94,7 @@ class _KeptFinding:
     occasion: Occasion
     """What the env was doing when the rule was last broken."""
     exact: bool
-    """False where the line is only probably the right one."""
+    """False if the line is only probably the line at fault."""
     confirmed: bool = True
     """False for a finding of the file's previous version that the present version has not repeated yet."""
 
@@ -251,7 +251,7 @@ def _at(row: Finding, place: Place) -> Finding:
 
 
 def broken_at(error: BrokenRule, frames: Sequence[Frame]) -> BrokenRule:
-    """The error, with `frames` (innermost first) as the innermost of its traceback."""
+    """The error, with `frames` (innermost first) as the innermost frames of its traceback."""
     trace = None
     for frame, instruction, line in frames:
         trace = TracebackType(trace, frame, instruction, line)

@@ -194,7 +194,7 @@ class CameraInfo:
 
     @property
     def key(self) -> CameraKey:
-        """Unique in its task."""
+        """Kind and name: unique in the task."""
         return self.kind, self.name
 
 
@@ -210,8 +210,9 @@ class Picture:
     rgb: NDArray[np.uint8] | None = None
     """(H, W, 3)"""
     depth: NDArray[np.float32] | None = None
-    """(H, W) metres along the optical axis; 0 where the ray met nothing. ManiSkill's own observation is
-    this in whole millimetres as int16, up to 32.767 m, and `step_pictures` leaves it so. All other depth is unlimited."""
+    """(H, W) metres along the optical axis; 0 where the ray met nothing. ManiSkill's own observation has
+    whole millimetres as int16, up to 32.767 m, and `step_pictures` does not convert it. All other depth is
+    unlimited."""
     segmentation: NDArray[np.int32] | None = None
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""
     position: NDArray[np.float32] | None = None

@@ -80,7 +80,8 @@ from workbench.envs.strict import StrictMixin
 _UNIT_TOLERANCE = 1e-3
 """Largest difference of a quaternion's length from 1."""
 SIM_BACKEND = "physx_cpu_batched"
-"""Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
+"""Name of this backend. It is not in ManiSkill's ``CPU_SIM_BACKENDS``, for which ManiSkill refuses more than
+one env."""
 
 
 _NO_WINDOW = (
@@ -385,7 +386,7 @@ class BatchedCpuMixin:
     device: torch.device
     _is_closed = False
     _nested = 0
-    """Steps and resets that are under way."""
+    """Number of steps and resets that are running."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("parallel_in_single_scene"):
@@ -397,7 +398,7 @@ class BatchedCpuMixin:
             _require_display()
         _refuse_frequencies(kwargs.get("sim_config"))
         wanted = kwargs.get("num_envs", 1)
-        # Check first: ManiSkill would make random generators for each env.
+        # Check before ManiSkill makes random generators for each env.
         require_scenes(wanted)
         with base_arguments(self, self._workbench_task, kwargs) as passed_on, AuthorCall():
             super().__init__(*args, **passed_on)
@@ -431,7 +432,7 @@ class BatchedCpuMixin:
 
     @property
     def gpu_sim_enabled(self) -> bool:
-        """True for ManiSkill's own code, so that it takes its batched path; see `asks_for_a_gpu`."""
+        """True, so that ManiSkill takes its batched code path; False for a caller that `asks_for_a_gpu`."""
         return self.scene.gpu_sim_enabled and not asks_for_a_gpu(sys._getframe(1))
 
     def render_human(self) -> Any:
@@ -467,7 +468,7 @@ class BatchedCpuMixin:
 
     @contextmanager
     def _in_turn(self, what: str) -> Iterator[None]:
-        """Context in which the env is stepped or reset."""
+        """Context of a step or a reset; refuses the call if `_MAX_NESTED_CALLS` are running already."""
         if self._nested >= _MAX_NESTED_CALLS:
             raise RefusedCall(
                 f"{what}() was called {_MAX_NESTED_CALLS} times within itself: a hook that it runs calls it again."

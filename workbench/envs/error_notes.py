@@ -34,7 +34,7 @@ class ErrorNote(str):
 
 
 def notes_of(error: BaseException) -> list[str]:
-    """The notes of an error, the core's and others."""
+    """All notes of an error, not only the core's."""
     return [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
 
 
@@ -52,15 +52,15 @@ class CoreRefusal(Exception):
 
 
 class RefusedCall(CoreRefusal, RuntimeError):
-    """Refused in this state, or for this object."""
+    """A call that the core refuses in the present state, or for this object."""
 
 
 class RefusedValue(CoreRefusal, ValueError):
-    """Refused because of the value."""
+    """A value that the core refuses."""
 
 
 class RefusedMember(CoreRefusal, NotImplementedError):
-    """Refused because the batched simulation does not have the member."""
+    """A member that the batched simulation does not have."""
 
 
 class WrongAction(ValueError):

@@ -1,4 +1,5 @@
-"""Splits what ``evaluate()`` returned into rows per env and other entries; checks what hooks return."""
+"""Splits the return value of ``evaluate()`` into rows per env and other entries; checks return values of
+hooks."""
 
 from __future__ import annotations
 
@@ -202,7 +203,7 @@ def type_text(value: Any) -> str:
 def _text(value: Any) -> tuple[str, bool]:
     """`value` as text, and whether the text is complete."""
     if isinstance(value, np.generic):
-        value = str(value)  # its repr names numpy, and Python's number would have more digits
+        value = str(value)  # the repr contains "np.", and a Python number would have more digits
     if isinstance(value, str):
         text = str.__str__(value)
     else:

@@ -1,4 +1,4 @@
-"""Finds rows of other envs that a partial reset changed on the task, and the line that did it."""
+"""Finds rows of other envs that a partial reset changed in a task's attributes, and the line at fault."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ _ITEM = re.compile(r"\[(\d+)\]")
 
 
 class KeptRows:
-    """Copy of what a task keeps for each env, to find rows that a partial reset changed for other envs.
+    """Copy of the values that a task keeps for each env, to find rows that a partial reset changed for other
+    envs.
 
     A partial reset must change the rows of ``env_idx`` only, in tensors, arrays, lists and Poses on the task,
     in dicts and in objects of its own. Nothing raises if it changes others: ``self.target =

@@ -48,7 +48,7 @@ class Keyword:
     optional: bool = False
     """``null`` is a value too."""
     fixed: str = ""
-    """Why it cannot be changed here; empty if it can."""
+    """Why the value cannot be changed here; empty if it can."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def _describe(name: str, parameter: inspect.Parameter, given: Any, registered: A
 
 
 def _plain(value: Any) -> Any:
-    """The value of a member of an Enum, as a command line gives it; anything else as it is."""
+    """The value of a member of an Enum, as a command line gives it; any other value unchanged."""
     return value.value if isinstance(value, enum.Enum) else value
 
 

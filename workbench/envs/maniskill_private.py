@@ -1,4 +1,4 @@
-"""All private names of ManiSkill and SAPIEN that the core uses, and what depends on each."""
+"""All private names of ManiSkill and SAPIEN that the core uses, and the features that depend on them."""
 
 from __future__ import annotations
 
@@ -256,7 +256,7 @@ def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
     goal = controller._target_pose = controller.compute_target_pose(before, action)
     solver, qpos = controller.kinematics, controller.articulation.get_qpos()
     solved = [solver.compute_ik(pose=goal[i : i + 1], q0=qpos[i : i + 1]) for i in range(len(qpos))]
-    # The arm stays if the pose cannot be reached, as in stock.
+    # As in stock ManiSkill, the arm does not move if the pose cannot be reached.
     target = torch.cat([start[i : i + 1] if row is None else row for i, row in enumerate(solved)])
     controller._target_qpos = target.to(start.dtype)
     if controller.config.interpolate:
@@ -364,7 +364,7 @@ def hook_of_base_env(env: Any, caller: FrameType) -> str:
 
 
 def allowed_on_the_cpu(caller: FrameType, laid_out: bool) -> bool:
-    """Whether ManiSkill is to see a GPU simulation that is not initialised yet.
+    """Whether the caller in ManiSkill must see a GPU simulation that is not initialised yet.
 
     ``before_gpu_init`` refuses setters after initialisation, but a stock CPU env allows them at any time. Meshes of
     articulations need link poses, which exist at any time.
@@ -396,7 +396,7 @@ def episode_seeds(env: BaseEnv) -> np.ndarray | None:
 
 
 def draws_its_own_seeds(env: BaseEnv) -> bool:
-    """Whether a reset without a seed draws one for each env (``enhanced_determinism``)."""
+    """Whether a reset without a seed draws a seed for each env (``enhanced_determinism``)."""
     return env._enhanced_determinism
 
 
@@ -646,8 +646,8 @@ def _listed(configs: Any) -> list[Any]:
 
 
 def mark_camera_configs() -> None:
-    """Make every ``CameraConfig`` keep where it was made (`camera_site`) and the target of its ``look_at`` (`camera_target`),
-    in tasks that are imported after this. Safe to call again."""
+    """Make every ``CameraConfig`` store the line that made it (`camera_site`) and the target of its
+    ``look_at`` (`camera_target`), in tasks that are imported after this call. Safe to call again."""
     stock = CameraConfig.__init__
     if hasattr(stock, "_workbench_stock"):
         return

@@ -57,7 +57,7 @@ class StepResult:
     evaluate: dict[str, NDArray]
     """The entries that ``evaluate()`` returned with a row for each env: booleans or real numbers, each (N, ...)."""
     poses: NDArray[np.float32]
-    """(N, B, 7) of every body: position in metres, quaternion wxyz, env's own frame."""
+    """(N, B, 7) pose of every body: position in metres, quaternion wxyz, env's own frame."""
     action: NDArray[np.float32] | None = None
     """(N, A) that led here; None right after a reset."""
     sound_obs: NDArray[np.bool_] | None = None

@@ -46,7 +46,7 @@ from workbench.envs.wrong_options import wrong_option
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options with which a task is made."""
+    """Options for building the envs of a task."""
 
     num_envs: int = 16
     backend: Backend = "auto"
@@ -83,7 +83,7 @@ class EnvOptions:
 def given_arguments(
     task: type[BaseEnv], env_kwargs: Mapping[str, Any], default_kwargs: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The keyword arguments with which the task class is made, without those of `EnvOptions`.
+    """Keyword arguments for the constructor of the task class, without those that are fields of `EnvOptions`.
 
     Args:
         env_kwargs: the user's arguments, in JSON.
@@ -120,7 +120,7 @@ def build_env(
 ) -> BaseEnv:
     """Make the task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` does; raises like `make_env`.
 
-    The class decides what the keyword arguments do not: the reward mode is then the first of
+    The class decides what the keyword arguments leave open. Without ``reward_mode`` it is the first of
     ``SUPPORTED_REWARD_MODES``, implemented or not.
     """
     if moved := maniskill_private.why_not(""):

@@ -69,7 +69,7 @@ def selected(shader: ShaderConfig, folder: Path | None = None) -> Iterator[None]
 
 
 def note_shader(camera: sapien.render.RenderCameraComponent) -> None:
-    """Remember the shader that is selected now for `made_again`; call it when the camera is made."""
+    """Store the selected shader for `made_again`; call it when the camera is made."""
     _made_with[camera] = _Selection.now()
 
 

@@ -1,4 +1,5 @@
-"""Cameras that draw the pictures of SAPIEN's minimal shader, without the work that adds nothing to them."""
+"""Cameras that draw the pictures of SAPIEN's minimal shader, without shader work that does not change
+them."""
 
 from __future__ import annotations
 
@@ -131,7 +132,7 @@ class _Fast:
 
 
 class FastCameras:
-    """A second camera for each exact camera of a scene, with the same size, which follows the exact one."""
+    """For each exact camera of a scene, a second camera of the same size that follows it."""
 
     def __init__(self, sub_scenes: Sequence[sapien.Scene]) -> None:
         self._sub_scenes = sub_scenes

@@ -252,7 +252,7 @@ def _add_hidden(component: Any, body: Any) -> None:
 
 
 def _lean_bodies(sub_scenes: Sequence[sapien.Scene]) -> list[list[tuple[Any, LeanBody]]]:
-    """Bodies of each env that are not simplified, each with a body with fewer textures to draw in its place."""
+    """Bodies of each env that are not simplified, each with the `LeanBody` to draw instead."""
     materials, found = LeanMaterials(), []
     for sub_scene in sub_scenes:
         light = [body for body in _bodies(sub_scene) if not _is_heavy(body)]
@@ -310,7 +310,7 @@ def _bodies(sub_scene: sapien.Scene) -> Iterator[Any]:
 
 
 def unknown_meshes(sub_scenes: Sequence[sapien.Scene]) -> list[Mesh]:
-    """The meshes of heavy bodies that were never simplified on this machine, which takes seconds for a robot."""
+    """Meshes of heavy bodies that were not simplified on this machine yet: that takes seconds for a robot."""
     found: dict[int, Mesh] = {}
     for sub_scene in sub_scenes:
         for body in heavy_bodies(sub_scene):

@@ -1,4 +1,4 @@
-"""Draws bodies without constant textures, each of which SAPIEN's shaders would look up for every pixel."""
+"""Draws bodies without constant metallic textures, which SAPIEN's shaders would look up for every pixel."""
 
 from __future__ import annotations
 

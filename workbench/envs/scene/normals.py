@@ -26,8 +26,8 @@ _SHARED_DEGREES = 20.0
 """Angle between normals of a coarse mesh's faces at a vertex below which they share one normal: a seventh fewer
 vertices, for a twentieth of the shading error."""
 _OWN_WEIGHT = 0.02
-"""Weight of a vertex's own normal relative to the normals of the surface around it: it decides only where they
-determine nothing."""
+"""Weight of a vertex's own normal relative to the normals of the surface around it: it matters only where
+they determine no normal."""
 
 
 def with_normals(mesh: Mesh) -> Mesh:
@@ -124,7 +124,8 @@ class ShadedSurface:
         near = np.asarray(self._tree.query(points, k=count)[1]).reshape(-1, count)
         candidates = self._normals[near]
         alike = np.einsum("skd,sd->sk", candidates, facing)
-        # The nearest point that faces the same way; on a folded face none does, and the most similar one is taken.
+        # Take the nearest point that faces the same way. On a folded face there is none: take the most
+        # similar.
         agrees = alike > _MIN_FACING_COSINE
         choice = np.where(agrees.any(axis=1), agrees.argmax(axis=1), alike.argmax(axis=1))
         every = np.arange(len(points))

@@ -18,8 +18,8 @@ from workbench.envs.simulation.cpu_system import batched_system
 
 _T = TypeVar("_T")
 _HIDDEN_METRES = 5e4
-"""Distance along each axis from an actor's true pose above which it is still hidden; ``Actor.hide_visual`` moves it by
-99999 m."""
+"""An actor that is farther than this from its true pose, along each axis, is still hidden:
+``Actor.hide_visual`` moves it by 99999 m."""
 
 
 def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
@@ -54,7 +54,7 @@ class SceneIndex:
     owners: tuple[str, ...]
     """(B,) name of the actor or articulation that the body belongs to."""
     hidden: tuple[bool, ...]
-    """(B,) whether the task hides it from its sensors."""
+    """(B,) whether the task hides the body from its sensors."""
     entities: NDArray[np.object_]
     """(N, B) the ``sapien.Entity`` of each body; None if the env lacks it."""
     states: dict[str, Any]

@@ -82,7 +82,7 @@ class SceneGeometry:
     body_kinds: tuple[BodyKind, ...]
     """(B,)"""
     body_hidden: tuple[bool, ...]
-    """(B,) whether the task hides it from sensors (goal markers: ``_hidden_objects``)."""
+    """(B,) whether the task hides the body from sensors (goal markers: ``_hidden_objects``)."""
     visuals: tuple[Visual, ...]
 
     @property
@@ -123,7 +123,7 @@ class SharedShapes:
         return replace(geometry, visuals=tuple(self._shared(geometry.visuals)))
 
     def shared(self, mesh: Mesh, material: Material) -> tuple[Mesh, Material]:
-        """An earlier mesh and material that look the same, or these."""
+        """An earlier mesh and material that look the same, else the given ones."""
         kept = self._kept.get((id(mesh), id(material)))
         if kept is None:
             none = np.zeros(0, np.int32)

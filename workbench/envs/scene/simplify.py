@@ -136,7 +136,7 @@ def rounded(mesh: Mesh) -> Mesh:
 def flat_rectangle(mesh: Mesh) -> Mesh | None:
     """`mesh` as two triangles, or None if it is not a flat rectangle. ManiSkill's floor is a grid of 100 x 100 squares.
 
-    Only rectangles along the axes of the mesh's own frame, one layer, with uv linear in position.
+    Finds only rectangles along the axes of the mesh's own frame, of one layer, with uv linear in position.
     """
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     extent = high - low

@@ -325,7 +325,7 @@ def _of_chosen(stock: Callable[..., Any], name: str) -> Callable[..., Any]:
 
 
 def _some(struct: Any, chosen: NDArray[np.int64]) -> Any:
-    """The struct with only these of its objects."""
+    """Copy of the struct with only these of its objects; the struct itself for all."""
     if len(chosen) == len(struct._objs):
         return struct
     some = copy.copy(struct)
@@ -544,7 +544,7 @@ def _system_of(owner: Any) -> tuple[BatchedCpuSystem | None, int]:
 
 
 def _may_write(system: BatchedCpuSystem, env: int, owner: Any, called: str, instead: str) -> bool:
-    """Report a setter of SAPIEN's; False if the env is not being reset, and others are."""
+    """Report a call of SAPIEN's own setter; False if other envs are being reset, and this env is not."""
     name = owner.name if isinstance(owner, physx.PhysxArticulation) else _entity(owner).name
     may_write = system.resetting is None or bool(system.resetting[env])
     is_left = "" if may_write else "; here the call is ignored, because this env is not being reset"

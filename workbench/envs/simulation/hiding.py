@@ -64,7 +64,8 @@ def why_not_hidden(thing: Any) -> str:
 
 
 def _where_it_is(stock: Any) -> Callable[..., Any]:
-    """Wrap stock's getter or setter of a pose, which in GPU simulation uses the stored pose of a hidden actor."""
+    """Wrap ManiSkill's getter or setter of a pose to use the present pose, not the stored pose of a hidden
+    actor."""
 
     @wraps(stock)
     def call(self: Any, *args: Any) -> Any:

@@ -57,7 +57,7 @@ class Stepper:
         """Envs that are neither stepped nor given drive targets."""
 
     def renew(self, env: int) -> None:
-        """Use the env's new system, after it was replaced in the list."""
+        """Use the env's new system; call it after the system was replaced in the list."""
         self.step_once[env] = _step_of(self._systems[env])
         self.forget()
 
@@ -267,7 +267,7 @@ class EnvThreads:
             return
         working: list[_Helper] = []
         with self._busy:
-            # An interrupted run (RecursionError, KeyboardInterrupt) drops its helpers, whose state is
+            # An interrupted run (RecursionError, KeyboardInterrupt) drops its helpers: their state is
             # unknown.
             every, self._helpers = self._helpers, []
             try:
@@ -279,8 +279,7 @@ class EnvThreads:
                 for index in todo:
                     job(index)
             finally:
-                # Also after an exception in this thread: the helpers still use objects that the caller will
-                # release.
+                # Also after an exception in this thread: the helpers still use objects of the caller.
                 errors = [helper.end() for helper in working]
             self._helpers = every
         for error in errors:

@@ -375,7 +375,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         """Report a breach if an env that is not in the mask `reset` (N,) differs from `before`."""
         version, states = before
         if version != self.layout_version:
-            return  # rows belong to other bodies
+            return  # the rows now belong to other bodies
         for mirror, was in zip(self._mirrors.all, states, strict=True):
             if mirror.group == "forces":
                 continue

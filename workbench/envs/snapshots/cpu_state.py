@@ -62,7 +62,7 @@ class CpuState:
     * *Forces* of ``set_qf``.
     * *Contacts*: after a restore PhysX's list is that of another moment, and ``is_grasping`` would be wrong.
       The counted impulses are part of this state, and answer queries until the next substep.
-    * *Static actors* are where they were built, unless the task has moved one.
+    * *Poses of static actors*, if the task has moved one.
     """
 
     contents: tuple[Contents, ...]

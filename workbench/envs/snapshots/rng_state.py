@@ -64,7 +64,7 @@ class RngReader:
         self._seen: dict[str, _ReadStates] = {}
 
     def read(self, purpose: str, generators: list[np.random.RandomState]) -> list[RngState]:
-        """``get_state()`` of each. `purpose` names the list of generators."""
+        """``get_state()`` of each generator; `purpose` is the name under which the list is cached."""
         seen = self._seen.get(purpose)
         if seen is not None and seen.settled and seen.generators == generators:
             if b"".join(seen.memory) == seen.copied:

@@ -37,7 +37,7 @@ class Memory(NamedTuple):
     episode_seeds: NDArray[np.int64]
     """(n,) from `maniskill_private.episode_seeds`."""
     rng: dict[str, list[RngState]]
-    """(n,) each: ManiSkill's generators of each env, by purpose."""
+    """By purpose (``episode``, ``main``): (n,) states of ManiSkill's generators, one per env."""
     task: TaskState
     shared_rng: SharedRng
 
@@ -45,9 +45,9 @@ class Memory(NamedTuple):
 class Snapshot(NamedTuple):
     """Everything that decides how the episodes of chosen envs continue. Copies only: it can be pickled, and outlives its env.
 
-    It holds PhysX's bodies, joints and drive targets (`cpu_state`), the tensors of the task and its controllers
-    (`task_state`), elapsed steps and random generators (`rng`), with a row per env. So one env's state can be restored in
-    place, into another env, or by name into an env that was built again.
+    It holds PhysX's bodies, joints and drive targets (`cpu_state`), the tensors of the task and its
+    controllers (`task_state`), elapsed steps and random generators (`rng_state`), with a row per env. So one
+    env's state can be restored in place, into another env, or by name into an env that was built again.
 
     *Two restores of a snapshot continue identically*, to the last bit: a restored env gets a new PhysX scene.
 
@@ -62,7 +62,7 @@ class Snapshot(NamedTuple):
     """
 
     num_envs: int
-    """N, of the env from which it was taken."""
+    """N of the env from which the snapshot was taken."""
     env_idx: tuple[int, ...]
     """(n,) the envs in the snapshot."""
     simulation: CpuState | GpuState
@@ -80,7 +80,7 @@ class RestoreReport:
 
     carried: tuple[str, ...]
     not_carried: dict[str, str]
-    """Name and reason; empty if a snapshot returns to where it was taken."""
+    """What was not restored: name and reason. Empty if a snapshot is restored where it was taken."""
 
 
 def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snapshot:

@@ -27,7 +27,7 @@ _ENTERED_TYPES = (
     *(torch.Tensor, np.ndarray, Pose, dict, list, tuple),
     *(torch.nn.Module, torch.Generator, np.random.Generator, np.random.RandomState, set, bytearray),
 )
-"""Types that may hold state; those of the last row cannot be copied, and are reported."""
+"""Types that may hold state; the types in the last row cannot be copied, and are reported."""
 _SKIPPED_PACKAGES = (
     *("mani_skill", "sapien", "gymnasium", "torch", "numpy", "trimesh", "transforms3d", "builtins"),
     *("_thread", "weakref", "functools", "pathlib", "workbench"),
@@ -176,8 +176,8 @@ def _is_ignored(cls: type, author: str) -> bool:
 def base_env_members() -> frozenset[str]:
     """The attributes that ManiSkill's BaseEnv sets on itself, read from its code: ``self.NAME = ...``.
 
-    These are options, spaces, sensors, last observation and generators: not state, or restored by name (elapsed steps,
-    generators). ``agent`` is entered.
+    These are options, spaces, sensors, last observation and generators. They are not state, or are restored
+    separately (elapsed steps, generators). ``agent`` is entered.
     """
     names: set[str] = set()
     for member in vars(BaseEnv).values():

@@ -1,4 +1,4 @@
-"""State that a task keeps between steps on itself, its robots and their controllers."""
+"""State that a task keeps between steps in its own attributes and those of its robots and controllers."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def note_constructed(env: BaseEnv) -> None:
 
 
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
-    """Copies of the task's state of the envs in `env_idx`, and of the whole batch."""
+    """Copies of the task's state: rows of the envs in `env_idx`, and values that hold for the whole batch."""
     walk = walk_task_values(env)
     scene = _scene_of(env)
     buffers: dict[str, Buffer] = {}
