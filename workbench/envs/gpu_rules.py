@@ -230,7 +230,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "rows-lost",
             "stop",
             "_initialize_episode",
-            """What a task keeps on itself still has a row for each env after a partial reset.
+            """The task's attributes still have a row for each env after a partial reset.
 
             The values of other envs are lost; the next use fails, or takes the wrong row.
 
@@ -272,10 +272,10 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             A physics step moves all envs at once: a GPU cannot step some of them. An env that is in the
             middle of its episode gets a step that its policy did not choose, and its count of steps does not
             include it. On the CPU each env has its own physics, and only the envs that are being reset are
-            stepped. With one env, where the habit comes from, nothing is wrong.
+            stepped. The habit comes from tasks with one env, where it is no mistake.
 
             ## Mend
-            Compute the settled pose and place the bodies there, slightly above what carries them.
+            Compute the settled pose and place the bodies there, slightly above the surface that carries them.
 
             ```python fragment
             def _initialize_episode(self, env_idx, options):
@@ -390,8 +390,8 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
 
             ## Why
             A CPU simulation of one env has members that GPU simulation lacks. A task that uses one of them
-            runs with one env and cannot be trained on a GPU. The workbench opens it with one env, and says
-            so.
+            runs with one env and cannot be trained on a GPU. The workbench opens the task with one env, and
+            says so.
 
             ## Mend
             Use what ManiSkill has for a batch: contact impulses between two bodies, or on one body.
@@ -410,7 +410,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "rows-rewritten",
             "warn",
             "_initialize_episode",
-            """_initialize_episode(env_idx) changes only the rows of env_idx in what a task keeps on itself.
+            """_initialize_episode(env_idx) changes only the rows of env_idx in the task's attributes.
 
             Other envs continue with another target, counter or best value than they began with.
 
@@ -746,7 +746,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             that names no leaf.
 
             ## Mend
-            Return a dict of tensors of shape (N, ...); repeat what is the same for all envs.
+            Return a dict of tensors of shape (N, ...); repeat a value that is the same for all envs.
 
             ```python fragment
             def _get_obs_extra(self, info):

@@ -165,10 +165,10 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
             ## How it is checked
             The rule reads the normalized or sparse reward, whichever the task is made with, in random
             rollouts of all seeds and in those of `--actions`. While you play, it flags an env with a reward
-            outside the range. It also reads the reward of states with success: of the states that
-            `reward-finite` makes, and what the reward hook returns when it is told that all envs succeed, if
-            that is one number. The result is *not known* if no success was seen, since success pays the
-            largest reward. It is *not applicable* for a plain dense reward.
+            outside the range. It also reads the reward of states with success: in the states that
+            `reward-finite` makes, and from a call of the reward hook with `success` set for all envs, if that
+            gives the same number in all states. The result is *not known* if no success was seen, since
+            success pays the largest reward. It is *not applicable* for a plain dense reward.
             """,
         ),
         declared_rule(
