@@ -133,7 +133,9 @@ def why_no_camera(settings: CameraSettings) -> str | None:
     """Why these settings are invalid, as a sentence without its full stop; None if they are valid."""
     numbers = (*settings.position, *settings.quaternion, settings.near, settings.far)
     if not all(abs(number) <= _MAX_DISTANCE_METRES for number in numbers):
-        return "the camera's pose, near and far must be finite numbers"
+        return (
+            f"the camera's pose, near and far must be finite numbers of at most {_MAX_DISTANCE_METRES:,.0f}"
+        )
     if abs(math.hypot(*settings.quaternion) - 1.0) > 1e-3:
         return "the camera's quaternion must be of unit length"
     if not 0 < settings.near < settings.far:

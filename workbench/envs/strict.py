@@ -93,7 +93,8 @@ class StrictMixin:
             cls = type(controller)
             self.broken_rules.report_breach(
                 "controller-targets",
-                f"{cls.__name__} lacks {' and '.join(flag for flag in TARGET_FLAGS if not hasattr(controller, flag))}.",
+                f"{cls.__name__} lacks {' and '.join(flag for flag in TARGET_FLAGS if not hasattr(controller, flag))}: "
+                "on the GPU each step raises AttributeError. Give the class both attributes.",
                 frames=None,
                 place=place_of_class(cls),
                 subject=cls,

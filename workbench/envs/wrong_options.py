@@ -146,7 +146,9 @@ def _instead(wrong: str, names: Collection[str]) -> str:
     near = difflib.get_close_matches(wrong, names, n=3, cutoff=0.6)
     if near:
         return f" Did you mean {' or '.join(near)}?"
-    return f" There are: {', '.join(sorted(names)[:_MAX_NAMES])}{', ...' if len(names) > _MAX_NAMES else ''}."
+    return (
+        f" Choose from: {', '.join(sorted(names)[:_MAX_NAMES])}{', ...' if len(names) > _MAX_NAMES else ''}."
+    )
 
 
 def _local(error: BaseException, function: Any, name: str) -> Any:

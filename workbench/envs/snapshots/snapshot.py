@@ -242,7 +242,7 @@ def _pairs(
 ) -> tuple[list[int], list[int]]:
     """The envs to restore, and the position of each one's source in the snapshot."""
     if env_idx is None and source is not None:
-        raise ValueError("source needs env_idx: the envs that get the state")
+        raise ValueError("source needs env_idx: name the envs that get the state")
     if env_idx is None and max(snapshot.env_idx) >= env.num_envs:
         raise IndexError(
             f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: name the envs to "
