@@ -37,7 +37,7 @@ class ActionPart:
     low: NDArray[np.float32]
     high: NDArray[np.float32]
     shape: tuple[int, ...]
-    """Shape of the controller's action in one env; in the flat action it is a row."""
+    """Shape of the controller's action for one env. The flat action contains it flattened."""
 
 
 @once_a_scene
@@ -59,7 +59,8 @@ def action_parts(env: BaseEnv) -> tuple[ActionPart, ...]:
             space: Any = part.single_action_space
             if not isinstance(space, spaces.Box):
                 raise RefusedCall(
-                    f"The action space of {type(part).__name__} is {space}: the workbench acts in a Box only.",
+                    f"The action space of {type(part).__name__} is {space}: the workbench supports Box "
+                    "spaces only.",
                     place=place_of_class(type(part)),
                 )
             prefix = "/".join(str(p) for p in (robot, name) if p is not None)
@@ -84,7 +85,7 @@ def width(parts: tuple[ActionPart, ...]) -> int:
 def action_of(
     parts: tuple[ActionPart, ...], num_envs: int, rows: Mapping[int, NDArray]
 ) -> NDArray[np.float32]:
-    """(N, A) with these rows (A,) by env, zeros elsewhere."""
+    """(N, A) action with these rows (A,), by env index; zeros for all other envs."""
     action = np.zeros((num_envs, width(parts)), np.float32)
     for env, row in rows.items():
         action[env] = row
@@ -104,7 +105,8 @@ def random_action(
 def hold_action(parts: tuple[ActionPart, ...], num_envs: int) -> NDArray[np.float32]:
     """(N, A) the action that leaves every joint where it is, as far as the controllers allow.
 
-    Zero does not: it opens a gripper by half, and in absolute joint control moves to the middle of the limits.
+    A zero action does not hold: it opens a gripper by half, and absolute joint control moves to the middle of
+    the limits.
 
     * Delta and velocity controllers: zero.
     * Absolute joint position: the present qpos, through the inverse of ManiSkill's ``clip_and_scale_action``.
@@ -124,7 +126,8 @@ def to_env_action(env: BaseEnv, parts: tuple[ActionPart, ...], flat: NDArray[np.
 
 
 def by_robot(parts: tuple[ActionPart, ...], action: torch.Tensor) -> Any:
-    """The argument of ``env.step`` for a flat action (N, A): the same, a dict of parts for several robots, None without a robot."""
+    """The argument of ``env.step`` for a flat action (N, A): a tensor, a dict of them for several robots,
+    None without a robot."""
     if not parts:
         return None
     split = torch.split(action, [len(p.names) for p in parts], dim=1)
@@ -149,7 +152,8 @@ def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> 
         flat = np.concatenate(each, axis=1)
     else:
         flat = _rows(action, count, sum(of_robots.values()), "", of_robots, env.control_mode)
-    # The sum is a fast test, but may overflow: then every number is tested.
+    # Fast test: a finite sum means that all numbers are finite. Otherwise test each, since a sum may
+    # overflow.
     if not math.isfinite(np.add.reduce(flat, axis=None)) and not (finite := np.isfinite(flat)).all():
         row, column = np.argwhere(~finite)[0].tolist()
         name = [name for part in parts for name in part.names][column]
@@ -161,7 +165,7 @@ def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> 
 
 
 def _columns_of_robots(parts: tuple[ActionPart, ...]) -> dict[str | None, int]:
-    """Width of the action of each robot; that of a single robot under None."""
+    """Width of each robot's action, by robot; the key is None for a single robot."""
     found: dict[str | None, int] = {}
     for part in parts:
         found[part.robot] = found.get(part.robot, 0) + len(part.names)
@@ -192,7 +196,14 @@ def _rows(
     of_robots: Mapping[str | None, int] | None = None,
     mode: Any = None,
 ) -> NDArray[np.float32]:
-    """(N, wide) of an array (wide,) or (N, wide)."""
+    """(N, wide) numbers of an action that is given as (wide,) or (N, wide).
+
+    Args:
+        of: text for messages that names the robot.
+
+    Raises:
+        WrongAction: the action is not an array of numbers, or has another shape.
+    """
     values = _numpy(given, of)
     if values.shape == (wide,):
         return np.broadcast_to(values, (count, wide))
@@ -204,11 +215,14 @@ def _rows(
         if None in of_robots:
             text += (
                 f", and the control mode {mode} takes {wide}. Choose the policy's own mode with "
-                "--env control_mode=..., or return as many"
+                f"--env control_mode=..., or return {wide} numbers"
             )
         else:
             robots = ", ".join(f"{robot} {each}" for robot, each in of_robots.items())
-            text += f", and the robots take {robots}. Return a dict of them, or all of them side by side"
+            text += (
+                f", and the robots take {robots}. Return a dict of their actions, or one array with all "
+                "actions side by side"
+            )
     raise WrongAction(text)
 
 
@@ -218,8 +232,8 @@ def _numpy(values: Any, of: str = "") -> NDArray[np.float32]:
             raise TypeError
         values = values.float().numpy(force=True) if isinstance(values, torch.Tensor) else values
         return np.asarray(values, dtype=np.float32)
-    except (TypeError, ValueError, RuntimeError) as error:  # text, an object, rows of several lengths
-        # Some libraries' policies return the action with a state.
+    except (TypeError, ValueError, RuntimeError) as error:  # text, an object, rows of different lengths
+        # The policies of some libraries return a tuple of action and state.
         what = (
             f"tuple of {', '.join(map(type_text, values))}" if isinstance(values, tuple) else describe(values)
         )

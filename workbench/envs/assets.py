@@ -52,7 +52,8 @@ def require_assets(task: str, asset_ids: Sequence[str], robot_uids: Any = None) 
 def robots_of(task: type, kwargs: Mapping[str, Any]) -> Any:
     """``robot_uids`` as the task class will see them: from `kwargs`, else its constructor's default.
 
-    None if the constructor does not name them: it may pass others to its parent's.
+    None if the constructor has no such parameter or no default: it may then pass any robot to its parent's
+    constructor.
     """
     if "robot_uids" in kwargs:
         return kwargs["robot_uids"]
@@ -79,10 +80,10 @@ def assets_at(path: str | Path) -> list[str]:
 def refuse_downloads(task: str) -> Iterator[None]:
     """Context in which an asset that `task` lacks raises MissingAssets.
 
-    Some tasks declare no assets and fail on a missing file while they build. Where ManiSkill notices, it asks "download now?
-    (y|n)" on standard input, calls ``exit()`` on a no, and takes MS_SKIP_ASSET_DOWNLOAD_PROMPT for a yes. Here nothing is
-    asked or downloaded. An exception about a missing file that a download would provide becomes the cause of a
-    MissingAssets; other exceptions pass.
+    Some tasks declare no assets and fail on a missing file while they build. If ManiSkill notices that, it
+    asks "download now? (y|n)" on standard input, calls ``exit()`` after a no, and treats
+    MS_SKIP_ASSET_DOWNLOAD_PROMPT as a yes. Here nothing is asked or downloaded. An exception about a missing
+    file that a download would provide becomes the cause of a MissingAssets; other exceptions pass.
     """
 
     @wraps(download_asset.prompt_yes_no)
@@ -168,8 +169,11 @@ def _no_robot_file(task: str, robot: type, path: Path | None) -> MissingAssets:
 def _how_to_name(path: Path | None) -> str:
     """Advice for a missing robot file. A relative path starts at the working directory."""
     if path is None or path.is_absolute():
-        return "Put it there, or name the file that you have."
-    return f"A relative path starts at the working directory: there is no {path.absolute()}. Give the absolute path."
+        return "Put the file there, or set the path of the file that you have."
+    return (
+        f"A relative path starts at the working directory: there is no {path.absolute()}. "
+        "Set an absolute path."
+    )
 
 
 def _named_by(error: Exception) -> list[str]:
@@ -184,7 +188,7 @@ def _named_by(error: Exception) -> list[str]:
     for path in paths:
         if Path(ASSET_DIR) in path.parents and not path.exists():
             names = [name for name in assets_at(path) if not assets.is_data_source_downloaded(name)]
-            # A folder with a missing file was fetched in part: fetch the innermost again.
+            # If all are downloaded, one was downloaded in part: name the innermost, to download it again.
             return names or assets_at(path)[-1:]
     return []
 

@@ -20,7 +20,7 @@ Backend = Literal["auto", "cpu", "gpu"]
 
 
 class BackendUnavailable(RuntimeError):
-    """The backend that was asked for does not work on this machine."""
+    """The requested backend does not work on this machine."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def gpu_library_path() -> Path:
 
 
 def why_no_gpu_simulation() -> str | None:
-    """The reason in one sentence, or None when GPU simulation can be used.
+    """Why GPU simulation cannot be used, as a clause; None if it can.
 
     PhysX's GPU library is looked for on disk: asking SAPIEN for it would fetch it from the network.
     """
@@ -59,7 +59,7 @@ def why_no_gpu_simulation() -> str | None:
 
 @lru_cache(maxsize=1)
 def find_renderer() -> Renderer | None:
-    """What SAPIEN renders with, or None when it finds no device.
+    """The device and backend that SAPIEN renders with; None if it finds no device.
 
     Cached: a process can have one render device only, and a second one under another name raises.
 
@@ -74,8 +74,8 @@ def find_renderer() -> Renderer | None:
         return Renderer("gpu" if device == "cuda" else "cpu", _device_summary() or "unknown device")
     if (name := _device_summary()) is not None:
         raise BackendUnavailable(
-            f"SAPIEN's renderer on {name} is held under another name by a material or texture that was made before any env: "
-            "make it while the scene is built, in _load_scene."
+            f"SAPIEN's renderer on {name} is held under another name by a material or texture that was made "
+            "before any env. Make it in _load_scene, while the scene is built."
         )
     return None
 
@@ -83,8 +83,8 @@ def find_renderer() -> Renderer | None:
 def _render_system(device: str) -> sapien.render.RenderSystem:
     """A render system on device ``cpu``, ``cuda`` or ``cuda:1``; RuntimeError if there is no such device.
 
-    SAPIEN refuses a device by its name while a material is alive that was made without a render system, for example by
-    a failed build: hence the garbage collection.
+    SAPIEN refuses a device name as long as a material exists that was made without a render system, for
+    example by a failed build: hence the garbage collection.
     """
     try:
         return sapien.render.RenderSystem(sapien.Device(device))
@@ -100,7 +100,8 @@ def why_no_ray_tracing() -> str | None:
 
 
 def _device_summary() -> str | None:
-    """The first supported device of a report of blocks ``GPU: name``, ``Supported: 1`` ..., or None."""
+    """Name of the first supported device in SAPIEN's report (blocks of ``GPU: name``, ``Supported: 1`` ...),
+    or None."""
     try:
         report = sapien.render.get_device_summary()
     except RuntimeError:  # no Vulkan driver
@@ -136,7 +137,7 @@ def unused_gpu_text(wanted: Backend) -> str | None:
         return None
     return (
         "The envs are simulated in a batch on the CPU, although there is a GPU: GPU simulation has passed its tests on no "
-        "machine so far. --backend gpu uses it."
+        "machine so far. To simulate on the GPU, add --backend gpu."
     )
 
 
@@ -161,8 +162,8 @@ def give_brdf_table(camera: sapien.render.RenderCameraComponent) -> None:
 
     Otherwise SAPIEN computes the table for the first picture of the process, from 268 million samples: 5 to 19 s on a
     software driver. With this table the first picture takes 0.1 s, and is the same to the bit. The table is that of the
-    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN computes its
-    own at once, so it is kept.
+    split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN computes the
+    table at once, so this function does nothing.
     """
     scene = camera.entity.scene
     if not scene.render_system.device.is_cuda():

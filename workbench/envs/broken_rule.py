@@ -27,20 +27,22 @@ MAX_PLACES = 64
 OWN_CODE = ("workbench.envs.", "workbench.pictures.")
 """Prefixes of the core's own modules."""
 _GENERAL_CODE = ("workbench.", "mani_skill.utils.", "mani_skill.envs.s")
-"""``mani_skill.envs.sapien_env`` and ``.scene`` among them: they write what a task passes."""
+"""Prefixes of modules that are never at fault, ``mani_skill.envs.sapien_env`` and ``.scene`` among them: they
+only write what a task passes."""
 _FRAMES_KEPT = 12
 _BASE_ENV, _OUTERMOST = "mani_skill.envs.sapien_env", ("step", "reset")
-"""Outermost frames that an error gets: the traceback has those above anyway."""
+"""Module and names of the outermost functions whose frames are kept: the traceback has the frames above them
+anyway."""
 
 Frame = tuple[FrameType, int, int]
-"""A frame with its last instruction and its line at the time."""
+"""A frame, with its last instruction and its line at the time of the call."""
 Occasion = Literal["step", "reset"]
 _Key = tuple[str, Hashable]
-"""A rule, and the line or thing at which it was broken."""
+"""Id of a rule, and the line or subject at which it was broken."""
 
 
 class BrokenRule(CoreRefusal, RuntimeError):
-    """The task broke a rule of GPU simulation that stops."""
+    """The task broke a rule of GPU simulation whose degree is *stop*."""
 
     def __init__(self, message: str, rule: str, place: Place | None = None) -> None:
         super().__init__(
@@ -90,11 +92,11 @@ def warn_of(finding: Finding) -> None:
 class _KeptFinding:
     finding: Finding
     occasion: Occasion
-    """When it was last broken."""
+    """What the env was doing when the rule was last broken."""
     exact: bool
-    """False where the line is only probably the right one."""
+    """False if the line is only probably the line at fault."""
     confirmed: bool = True
-    """False for a row of the previous version that the present one has not broken yet."""
+    """False for a finding of the file's previous version that the present version has not repeated yet."""
 
 
 class BrokenRules:
@@ -117,7 +119,7 @@ class BrokenRules:
         self._silenced: dict[_Key, tuple[Finding, Silence]] = {}
         self._now: Occasion = "reset"
         self.more = 0
-        """Breaches at places beyond `MAX_PLACES`."""
+        """Number of breaches at places beyond `MAX_PLACES`."""
         self.serial = 0
         """Increases with every change."""
         self.step: int = 0
@@ -146,9 +148,9 @@ class BrokenRules:
         """Raise or note a breach, by the rule's degree.
 
         Args:
-            frames: frames at fault, which become the innermost of the traceback; empty for those of the present call,
-                None where no line is at fault or only `place` is known.
-            subject: breaches with the same subject share a row; None: breaches at the same line do.
+            frames: frames at fault, which become the innermost of the traceback. An empty sequence means
+                the frames of the present call; None means that no line is at fault, or only `place` is known.
+            subject: breaches with the same subject share a row; None: breaches at the same line share a row.
         """
         degree = self._degrees[rule]
         if degree == "off":
@@ -208,7 +210,8 @@ class BrokenRules:
 
     @contextmanager
     def during(self, occasion: Occasion, confirms: bool = True) -> Iterator[None]:
-        """Context in which breaches belong to `occasion`; unconfirmed rows of it that do not break again are dropped.
+        """Context in which breaches belong to `occasion`; drops the occasion's unconfirmed rows that do not
+        break again.
 
         Args:
             confirms: whether every rule of this occasion could have been broken.
@@ -248,7 +251,7 @@ def _at(row: Finding, place: Place) -> Finding:
 
 
 def broken_at(error: BrokenRule, frames: Sequence[Frame]) -> BrokenRule:
-    """The error, with `frames` (innermost first) as the innermost of its traceback."""
+    """The error, with `frames` (innermost first) as the innermost frames of its traceback."""
     trace = None
     for frame, instruction, line in frames:
         trace = TracebackType(trace, frame, instruction, line)
@@ -256,7 +259,7 @@ def broken_at(error: BrokenRule, frames: Sequence[Frame]) -> BrokenRule:
 
 
 def frames_of_the_task(innermost: FrameType | None = None) -> tuple[Frame, ...]:
-    """The frames that led here, innermost first, from the first that is not the core's own."""
+    """The frames of the call stack, innermost first, without the core's own modules."""
     frame = sys._getframe(1) if innermost is None else innermost
     kept: list[Frame] = []
     while frame is not None and len(kept) < _FRAMES_KEPT:
@@ -315,7 +318,7 @@ _NOT_IN_A_RESET = {"__init__", "_load_scene", "_load_agent", "_after_reconfigure
 
 
 def find_assignment(task: type, path: str) -> Place | None:
-    """The line that assigns ``self.<path>``, by the task's source: in its reset first, then in other methods.
+    """The line of the task's source that assigns ``self.<path>``, preferably in ``_initialize_episode``.
 
     Args:
         path: ``target``, ``memory.best``, ``targets['left']``, ``goal.raw_pose``.
@@ -333,7 +336,8 @@ def find_assignment(task: type, path: str) -> Place | None:
 
 
 def find_entry(task: type, hook: str, name: str) -> Place | None:
-    """The line where a hook makes the entry `name` of what it returns, as a key or a keyword; else its ``def``."""
+    """The line in a hook with the entry `name` of its return value, as a key or a keyword; else the hook's
+    ``def``."""
     function = inspect.unwrap(getattr(task, hook))
     for node, line in _nodes(function):
         key = getattr(node, "value", None) if isinstance(node, ast.Constant) else getattr(node, "arg", None)
@@ -343,7 +347,7 @@ def find_entry(task: type, hook: str, name: str) -> Place | None:
 
 
 def files_of_task(task: type) -> set[str]:
-    """Source files of its methods, and of those that it inherits from classes below BaseEnv."""
+    """Source files of the task's methods, including those that it inherits from classes below BaseEnv."""
     return {function.__code__.co_filename for _, function in _methods(task)}
 
 

@@ -25,7 +25,7 @@ class CameraSettings:
     """Pose, lens, size and shader of one camera, as ManiSkill's ``CameraConfig`` has them."""
 
     position: tuple[float, float, float]
-    """Metres, in the frame of its mount, or the env's if it has none."""
+    """Metres, in the frame of the camera's mount; in the env's frame without a mount."""
     quaternion: tuple[float, float, float, float]
     """wxyz, of unit length, in the same frame. The camera looks along x, y is to its left, z is up."""
     fov: float | None
@@ -40,7 +40,7 @@ class CameraSettings:
     shader_pack: str
     """``minimal``, ``default``, ``rt`` ...; it decides the modalities."""
     distance: float | None = field(default=None, compare=False)
-    """Metres along its line of sight to its target; None without one. Does not change a picture."""
+    """Metres to the camera's target, along the line of sight; None without a target. Changes no picture."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,12 @@ class CallSite:
     line: int
     """First line of the call, counted from 1."""
     function: str
-    """Qualified name of the code that it is in, as Python has it: ``PushCubeEnv._default_sensor_configs``."""
+    """Python's qualified name of the calling function: ``PushCubeEnv._default_sensor_configs``."""
 
 
 SETTING_TOLERANCE = 1e-6
-"""Largest difference of equal cameras: metres, quaternion components, radians; relative for pixels, near and far. A
-config keeps its pose in single precision."""
+"""Largest difference between settings that count as equal: metres, quaternion components, radians; relative
+for values above 1. A config keeps its pose in single precision."""
 
 
 def differences(a: CameraSettings, b: CameraSettings, close: float = SETTING_TOLERANCE) -> tuple[str, ...]:
@@ -89,19 +89,20 @@ def setting_text(value: object) -> str:
 
 @dataclass(frozen=True)
 class MovedCamera:
-    """A camera whose placement in a recorded episode is not the file's, or is the file's again, from a state on."""
+    """A change of a camera in a recorded episode: to settings that differ from the task's file, or back to
+    it."""
 
     state: int
-    """State index from which on the placement holds; 0 is the start."""
+    """State index from which on the settings hold; 0 is the start."""
     kind: CameraKind
     name: str
     used: CameraSettings
     in_file: CameraSettings
-    """Equal to `used` where the camera was put back."""
+    """Settings in the task's file; equal to `used` if the camera was put back."""
 
 
 def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
-    """``base_camera: position (0.3, 0, 0.6), in the file (0.3, 0, 0.5)``; empty if none was moved."""
+    """Such as ``base_camera: position (0.3, 0, 0.6), in the file (0.3, 0, 0.5)``; empty if none was moved."""
     texts = []
     for one in moved:
         from_step = f" from step {one.state} on" if one.state else ""
@@ -121,7 +122,7 @@ def _value(settings: CameraSettings, what: str) -> object:
 
 NOT_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 MAX_SIDE_PIXELS = 4096
-"""Limit of pixels per side; one digit too many would use up the memory of all envs."""
+"""Maximum pixels per side. Without a limit, one digit too many would use up the memory."""
 
 
 _MAX_DISTANCE_METRES = 1e6
@@ -132,7 +133,9 @@ def why_no_camera(settings: CameraSettings) -> str | None:
     """Why these settings are invalid, as a sentence without its full stop; None if they are valid."""
     numbers = (*settings.position, *settings.quaternion, settings.near, settings.far)
     if not all(abs(number) <= _MAX_DISTANCE_METRES for number in numbers):
-        return "the camera's pose, near and far must be finite numbers"
+        return (
+            f"the camera's pose, near and far must be finite numbers of at most {_MAX_DISTANCE_METRES:,.0f}"
+        )
     if abs(math.hypot(*settings.quaternion) - 1.0) > 1e-3:
         return "the camera's quaternion must be of unit length"
     if not 0 < settings.near < settings.far:
@@ -179,21 +182,21 @@ class CameraInfo:
     mount: str | None
     """Name of the body that the camera is mounted on; None if it is fixed."""
     modalities: tuple[str, ...]
-    """Modalities of its shader, among ``rgb depth segmentation position normal albedo``."""
+    """Modalities of the camera's shader, among ``rgb depth segmentation position normal albedo``."""
     settings: CameraSettings | None = None
-    """Settings of the task's own config, even if the camera was moved since; env 0's where they differ. None if
-    `CameraSettings` cannot express it (a lens that differs between envs)."""
+    """Settings in the task's own config, even if the camera was moved since then; env 0's if the envs differ.
+    None if `CameraSettings` cannot express them (a lens that differs between envs)."""
     varies: bool = False
-    """Its pose differs between envs or from its config: the task's code moves it."""
+    """The camera's pose differs between envs or from its config: the task's code moves the camera."""
     site: CallSite | None = None
     """Where the config was made; None if not noted."""
     replaced_shader: str = ""
-    """The shader pack of its config where another one draws its pictures, since this machine does not trace rays; else
-    empty."""
+    """The shader pack of the camera's config, if another one draws its pictures because this machine cannot
+    trace rays; else empty."""
 
     @property
     def key(self) -> CameraKey:
-        """Unique in its task."""
+        """Kind and name: unique in the task."""
         return self.kind, self.name
 
 
@@ -209,8 +212,9 @@ class Picture:
     rgb: NDArray[np.uint8] | None = None
     """(H, W, 3)"""
     depth: NDArray[np.float32] | None = None
-    """(H, W) metres along the optical axis; 0 where the ray met nothing. ManiSkill's own observation is
-    this in whole millimetres as int16, up to 32.767 m, and `step_pictures` leaves it so. All other depth is unlimited."""
+    """(H, W) metres along the optical axis; 0 where the ray met nothing. ManiSkill's own observation has
+    whole millimetres as int16, up to 32.767 m, and `step_pictures` does not convert it. All other depth is
+    unlimited."""
     segmentation: NDArray[np.int32] | None = None
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""
     position: NDArray[np.float32] | None = None

@@ -80,7 +80,8 @@ from workbench.envs.strict import StrictMixin
 _UNIT_TOLERANCE = 1e-3
 """Largest difference of a quaternion's length from 1."""
 SIM_BACKEND = "physx_cpu_batched"
-"""Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
+"""Name of this backend. It is not in ManiSkill's ``CPU_SIM_BACKENDS``, for which ManiSkill refuses more than
+one env."""
 
 
 _NO_WINDOW = (
@@ -116,7 +117,8 @@ class CpuCameraGroup:
     ) -> None:
         """
         Args:
-            key: None for a camera that the task added to the scene; it is not a sensor, and always exact.
+            key: None for a camera that the task added to the scene directly, not as a sensor; its pictures
+                are always exact.
         """
         self._cameras, self._scene, self.key = cameras, scene, key
 
@@ -129,8 +131,9 @@ class CpuCameraGroup:
     def take_picture(self) -> None:
         if self.key is None:
             self._scene.px.refused_by_gpu(  # type: ignore[union-attr]
-                f"A picture is taken with '{self._cameras[0].name.partition('_')[2]}', which was added to the scene and is no "
-                "sensor: on the GPU this fails. Name it in _default_sensor_configs."
+                f"A picture is taken with the camera '{self._cameras[0].name.partition('_')[2]}', which the "
+                "task added to the scene directly: on the GPU this fails. Return it from "
+                "_default_sensor_configs."
             )
             for camera in self._cameras:
                 camera.take_picture()
@@ -207,10 +210,10 @@ class BatchedCpuScene(ManiSkillScene):
     def degree_of(
         self, camera: sapien.render.RenderCameraComponent, asked: PictureDegree | None = None
     ) -> PictureDegree:
-        """The degree of a picture for which `asked` (None: the scene's own) is requested.
+        """The degree at which a picture is drawn if `asked` (None: the scene's own) is requested.
 
-        Always exact where the camera's quaternion is not of unit length (``look_at`` straight down): SAPIEN turns and zooms
-        such a picture, so it is unknown what is out of view.
+        Always exact if the camera's quaternion is not of unit length (``look_at`` straight down): SAPIEN
+        turns and zooms such a picture, so it is unknown which bodies are out of view.
         """
         if (asked or self.pictures) == "exact" or abs(
             float(np.linalg.norm(camera.local_pose.q)) - 1
@@ -221,10 +224,11 @@ class BatchedCpuScene(ManiSkillScene):
     def prepare_fast(
         self, env: int, key: CameraKey, textures: Collection[str], places: Places = NOWHERE_ELSE
     ) -> None:
-        """Make the shapes and the camera of a fast picture, if they are missing, and move them to where this camera is now.
+        """Choose the shapes of a fast picture, and move the fast camera to the present pose of this camera;
+        makes both if they are missing.
 
         Args:
-            places: poses at which bodies of the env are drawn in place of their own.
+            places: poses at which bodies of the env are drawn instead of their simulated poses.
         """
         sensor = self.camera(key)
         components = camera_components(sensor)
@@ -235,7 +239,7 @@ class BatchedCpuScene(ManiSkillScene):
         cameras.follow(env, sensor.config, components[env], textures)
 
     def forget_fast_shapes(self) -> None:
-        """Discard the fast shapes; the next picture makes new ones, since the cameras have changed."""
+        """Discard the fast shapes, because the cameras have changed; the next picture makes new ones."""
         if self._fast is not None:
             self._fast[0].remove()
             self._fast = None
@@ -251,12 +255,13 @@ class BatchedCpuScene(ManiSkillScene):
         return (self.sensors if kind == "sensor" else self.human_render_cameras)[name]
 
     def create_actor_builder(self) -> Any:
-        # ManiSkill adds a plane once per builder, since all envs on a GPU share one physics scene. Here every env but
-        # the first would lack its ground.
+        # ManiSkill adds a plane once per builder, because all envs on a GPU share one physics scene. Without
+        # this flag, every env but the first would have no ground.
         return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
 
     def _sapien_add_camera(self, *args: Any, **kwargs: Any) -> Any:
-        # In GPU simulation a camera on a link gets a GPU pose index, which a CPU body does not have; it moves with its entity.
+        # In GPU simulation a camera on a link gets a GPU pose index, which a CPU body lacks. Here it moves
+        # with its entity.
         self.gpu_sim_enabled = False
         try:
             camera = super()._sapien_add_camera(*args, **kwargs)
@@ -278,7 +283,7 @@ class BatchedCpuScene(ManiSkillScene):
             chosen.append(("human", self.human_render_cameras))
         for kind, cameras in chosen:
             for name, sensor in cameras.items():
-                components = camera_components(sensor)  # none of a sensor that is no camera
+                components = camera_components(sensor)  # empty if the sensor is not a camera
                 if components and getattr(sensor.camera.camera_group, "key", None) is None:
                     group = CpuCameraGroup(components, self, (kind, name))
                     sensor.camera.camera_group = self.camera_groups[name] = group  # type: ignore
@@ -298,7 +303,8 @@ class BatchedCpuScene(ManiSkillScene):
 
     @property
     def _gpu_sim_initialized(self) -> bool:
-        """Read by ManiSkill; False where it allows something only before a GPU simulation runs, see `allowed_on_the_cpu`."""
+        """Read by ManiSkill. False where ManiSkill allows something only before a GPU simulation runs; see
+        `allowed_on_the_cpu`."""
         return not allowed_on_the_cpu(sys._getframe(1), self._system.laid_out)
 
     @_gpu_sim_initialized.setter
@@ -306,7 +312,7 @@ class BatchedCpuScene(ManiSkillScene):
         """Ignore the value that ManiSkill's constructor sets."""
 
     def _setup(self, enable_gpu: bool) -> None:
-        # As on a stock CPU env, what was set while the scene was built stays, except for the poses.
+        # As in a stock CPU env, values that were set while the scene was built stay, except for the poses.
         self._system.gpu_init()
         super()._setup(enable_gpu=False)
         self._gpu_apply_all()
@@ -314,7 +320,7 @@ class BatchedCpuScene(ManiSkillScene):
         self._system.keep_beginning()
 
     def get_human_render_camera_images(self, camera_name: str | None = None) -> dict[str, torch.Tensor]:
-        # ManiSkill refuses ray tracing where one group draws the cameras of all envs. Here each is drawn alone.
+        # ManiSkill refuses ray tracing if one camera group draws all envs. Here each camera draws alone.
         images = {}
         for name, camera in self.human_render_cameras.items():
             if camera_name in (None, name):
@@ -327,11 +333,11 @@ class BatchedCpuScene(ManiSkillScene):
     def _gpu_apply_all(self) -> None:
         if self._needs_fetch:
             self._system.refused_by_gpu(
-                "self.scene._gpu_apply_all() is called twice without self.scene._gpu_fetch_all() between: on the GPU this fails. "
-                "Fetch after every apply, and once before the end of _initialize_episode, after which ManiSkill applies. The "
-                f"first call{self._applied_at}."
+                "self.scene._gpu_apply_all() is called twice without self.scene._gpu_fetch_all() after the "
+                f"first call{self._applied_at}: on the GPU this fails. Fetch after every apply, and once "
+                "before the end of _initialize_episode, because ManiSkill applies after it."
             )
-        self._applied_at = in_brackets(place_of(frames_of_the_task())) or " was ManiSkill's own"
+        self._applied_at = in_brackets(place_of(frames_of_the_task())) or " (ManiSkill's own)"
         self._system.apply_changes()
         self._needs_fetch = True
 
@@ -352,10 +358,11 @@ class BatchedCpuScene(ManiSkillScene):
 class BatchedCpuMixin:
     """Mixin for batched CPU simulation; the first base of a task class.
 
-    ManiSkill 3.0.1 refuses ``num_envs > 1`` on the CPU in four places: the name of the simulation backend, one
-    ``is_cuda()``, the scene that ``_setup_scene`` builds, and the groups of cameras. This mixin answers those four; the
-    author's class and stock ``gym.make`` stay as they are. Each env has its own ``PhysxCpuSystem`` and ``RenderSystem``, so
-    no neighbour can reach it, and a picture of env i renders env i alone.
+    ManiSkill 3.0.1 refuses ``num_envs > 1`` on the CPU in four places: the name of the simulation backend,
+    one ``is_cuda()``, the scene that ``_setup_scene`` builds, and the groups of cameras. This mixin replaces
+    those four; the author's class and stock ``gym.make`` are not changed. Each env has its own
+    ``PhysxCpuSystem`` and ``RenderSystem``, so no other env can affect it, and a picture of env i renders env
+    i alone.
     """
 
     num_envs: int
@@ -379,7 +386,7 @@ class BatchedCpuMixin:
     device: torch.device
     _is_closed = False
     _nested = 0
-    """Steps and resets that are under way."""
+    """Number of steps and resets that are running."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("parallel_in_single_scene"):
@@ -391,7 +398,7 @@ class BatchedCpuMixin:
             _require_display()
         _refuse_frequencies(kwargs.get("sim_config"))
         wanted = kwargs.get("num_envs", 1)
-        # Check first: ManiSkill would make random generators for each env.
+        # Check before ManiSkill makes random generators for each env.
         require_scenes(wanted)
         with base_arguments(self, self._workbench_task, kwargs) as passed_on, AuthorCall():
             super().__init__(*args, **passed_on)
@@ -425,7 +432,7 @@ class BatchedCpuMixin:
 
     @property
     def gpu_sim_enabled(self) -> bool:
-        """True for ManiSkill's own code, so that it takes its batched path; see `asks_for_a_gpu`."""
+        """True, so that ManiSkill takes its batched code path; False for a caller that `asks_for_a_gpu`."""
         return self.scene.gpu_sim_enabled and not asks_for_a_gpu(sys._getframe(1))
 
     def render_human(self) -> Any:
@@ -454,13 +461,14 @@ class BatchedCpuMixin:
         before = self._elapsed_steps.clone()
         with self._in_turn("step"), AuthorCall():
             result = super().step(action)  # type: ignore[misc]
-        if resetting is not None:  # a hook of a reset steps the envs that are being reset
+        if resetting is not None:
+            # Called by a hook of a partial reset: only the envs that are being reset count the step.
             self._elapsed_steps[~resetting] = before[~resetting]
         return result
 
     @contextmanager
     def _in_turn(self, what: str) -> Iterator[None]:
-        """Context in which the env is stepped or reset."""
+        """Context of a step or a reset; refuses the call if `_MAX_NESTED_CALLS` are running already."""
         if self._nested >= _MAX_NESTED_CALLS:
             raise RefusedCall(
                 f"{what}() was called {_MAX_NESTED_CALLS} times within itself: a hook that it runs calls it again."
@@ -545,8 +553,8 @@ class BatchedCpuMixin:
 
     def drop_writes(self) -> None:
         """Discard writes to the simulation's tensors that were not applied."""
-        # Without this, every later reset would apply what a failed hook had written (a NaN, for example), and what it
-        # had applied but not fetched would make the next reset raise.
+        # Without this, every later reset would apply what a failed hook had written (a NaN, for example). If
+        # the hook had applied and not fetched, the next reset would raise.
         if scene_of(self) is not None and self.scene.px.laid_out:
             self.scene.px.drop_writes()
             self.scene._gpu_fetch_all()
@@ -585,10 +593,10 @@ def batched_class(
     on_finding: Callable[[Finding], None] = warn_of,
     pictures: PictureDegree = "exact",
 ) -> type[BaseEnv]:
-    """A subclass of `task` with the batched CPU simulation; `task` itself stays as it is.
+    """A subclass of `task` with the batched CPU simulation; `task` itself is not changed.
 
     Args:
-        rules: the degree of all rules of GPU simulation, or None for each rule's own; see `gpu_rules`.
+        rules: the degree of all rules of GPU simulation; None: each rule has its own degree, see `gpu_rules`.
         on_finding: called once for each place where a rule that does not stop the task is broken.
         pictures: degree of the pictures that the env itself draws.
     """
@@ -672,7 +680,7 @@ def _refuse_frequencies(config: Any) -> None:
     for name in ("sim_freq", "control_freq"):
         value = given.get(name, 1)
         if not isinstance(value, (int, float)) or value <= 0:
-            raise RefusedValue(f"sim_config: {name} is a number of Hz above 0, not {value!r}")
+            raise RefusedValue(f"sim_config: {name} must be a number of Hz above 0, not {value!r}")
 
 
 _drawing: dict[int, str] = {}
@@ -704,34 +712,37 @@ _SHARED_GENERATOR = (
 
 
 class ForgottenInit(CoreRefusal, RuntimeError):
-    """A constructor did not call its parent's; the first use would fail far away ("weak reference to 'NoneType'")."""
+    """A constructor did not call its parent's constructor. Without this check, the first use of the object
+    would fail elsewhere ("weak reference to 'NoneType'")."""
 
 
 def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None:
-    """After the constructor of `task`.
+    """Check that the constructor of `task`, which has run, has built the env with `num_envs` envs.
 
     Raises:
         ForgottenInit: ``BaseEnv.__init__`` was not called.
-        NeedsOneEnv: it was not called with the number of envs.
+        NeedsOneEnv: ``BaseEnv.__init__`` was called with another number of envs.
     """
     if scene_of(env) is None:
         cls, place = _culprit(task, BaseEnv, silent=True)
         raise ForgottenInit(
             f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so nothing was built"
-            f"{in_brackets(place)}. Call it there, after setting what the hooks need: ManiSkill builds the scene and resets in it.",
+            f"{in_brackets(place)}. Call it there, after setting what the hooks need: that call builds the "
+            "scene and resets the env.",
             place=place,
         )
     if env.num_envs != num_envs:
         cls, place = _culprit(task, BaseEnv, silent=False)
         raise NeedsOneEnv(
-            f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not pass num_envs on",
+            f"{num_envs} envs were requested and {env.num_envs} built: {cls.__name__}.__init__ does not pass "
+            "num_envs on",
             " Or pass its keyword arguments to super().__init__(*args, **kwargs).",
             place,
         )
 
 
 def refuse_unbuilt_agent(agent: Any) -> None:
-    """After ``_load_agent``.
+    """Check that ``_load_agent``, which has run, has loaded each robot.
 
     Raises:
         ForgottenInit: ``BaseAgent.__init__`` was not called.

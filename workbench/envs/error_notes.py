@@ -20,8 +20,8 @@ _MAX_CHARACTERS = 400
 class ErrorNote(str):
     """A fact about an error. Python prints it below the error.
 
-    ``before``: the note is about an earlier error. ``place``: the line at fault where the traceback has no line of the
-    author's.
+    ``before``: the note is about an earlier error. ``place``: the line at fault, if the traceback has no line
+    of the author's code.
     """
 
     before: bool
@@ -34,15 +34,15 @@ class ErrorNote(str):
 
 
 def notes_of(error: BaseException) -> list[str]:
-    """The notes of an error, the core's and others."""
+    """All notes of an error, not only the core's."""
     return [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
 
 
 class CoreRefusal(Exception):
-    """The batched core refuses what a task asks for.
+    """The batched core refuses a call or a value of a task.
 
-    The running `AuthorCall` remembers the refusal, since the task may catch it and fail later because of it. `place` is
-    the line at fault where the traceback does not show it.
+    The running `AuthorCall` remembers the refusal: the task may catch it, and later fail because of it.
+    `place` is the line at fault, if the traceback does not show it.
     """
 
     def __init__(self, *args: object, place: Place | None = None) -> None:
@@ -52,15 +52,15 @@ class CoreRefusal(Exception):
 
 
 class RefusedCall(CoreRefusal, RuntimeError):
-    """Refused in this state, or for this object."""
+    """A call that the core refuses in the present state, or for this object."""
 
 
 class RefusedValue(CoreRefusal, ValueError):
-    """Refused because of the value."""
+    """A value that the core refuses."""
 
 
 class RefusedMember(CoreRefusal, NotImplementedError):
-    """Refused because the batched simulation does not have it."""
+    """A member that the batched simulation does not have."""
 
 
 class WrongAction(ValueError):
@@ -72,8 +72,8 @@ class WrongAction(ValueError):
 
 
 class AuthorCall:
-    """Context around a call of the author's code; adds to an error that leaves it a note for each refusal of the core
-    that the task caught. Can be nested."""
+    """Context around a call of the author's code. An error that leaves the context gets a note for each
+    refusal of the core that the task caught. Can be nested."""
 
     def __enter__(self) -> None:
         self._first = len(_running.refusals)
@@ -93,7 +93,7 @@ class AuthorCall:
 
 
 class _Running(threading.local):
-    """The calls of this thread that run now."""
+    """Depth of this thread's running `AuthorCall`s, and the refusals during them."""
 
     def __init__(self) -> None:
         self.depth = 0
@@ -134,7 +134,11 @@ def _caught_note(refusal: CoreRefusal) -> ErrorNote | None:
     text = " ".join(str(refusal).split())
     text = text if len(text) <= _MAX_CHARACTERS else text[: _MAX_CHARACTERS - 1] + "…"
     where = "there" if at[:2] == caught[:2] else f"at {_text_of(caught)}"
-    return ErrorNote(f"Before this, {_text_of(at)} was refused, and caught {where}: {text}", at, before=True)
+    return ErrorNote(
+        f"Before this, the workbench refused {_text_of(at)}, and the task caught the error {where}: {text}",
+        at,
+        before=True,
+    )
 
 
 def _text_of(place: Place) -> str:

@@ -1,4 +1,5 @@
-"""Splits what ``evaluate()`` returned into rows per env and other entries; checks what hooks return."""
+"""Splits the return value of ``evaluate()`` into rows per env and other entries; checks return values of
+hooks."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ MAX_ENTRIES = 1000
 """Maximum number of leaves; the others are only counted."""
 _MAX_NAME_CHARACTERS = 200
 _MAX_READ_NUMBERS = 1 << 26
-"""Largest value that is read: a sparse tensor's shape may exceed the memory."""
+"""Largest tensor or list that is read: a sparse tensor, made dense, may exceed the memory."""
 _NOT_EVALUATED = ("elapsed_steps", "reconfigure")
 """ManiSkill's own entries of ``info``."""
 _REAL_KINDS = "biuf"
@@ -145,7 +146,7 @@ def _of_tensor(value: torch.Tensor) -> NDArray | None:
             value = value.float()  # numpy has no bfloat16
         found = value.numpy(force=True)
     except (RuntimeError, TypeError, NotImplementedError):
-        return None  # for example of the meta device
+        return None  # for example, a tensor on the meta device has no data
     return found.copy()
 
 
@@ -157,7 +158,7 @@ def _of_list(value: list[Any] | tuple[Any, ...]) -> NDArray | None:
         return None
     try:
         found = np.array(rows)
-    except (ValueError, TypeError, OverflowError):  # rows of several lengths
+    except (ValueError, TypeError, OverflowError):  # rows of different lengths
         return None
     return found if found.dtype.kind in _REAL_KINDS else None
 
@@ -202,7 +203,7 @@ def type_text(value: Any) -> str:
 def _text(value: Any) -> tuple[str, bool]:
     """`value` as text, and whether the text is complete."""
     if isinstance(value, np.generic):
-        value = str(value)  # its repr names numpy, and Python's number would have more digits
+        value = str(value)  # the repr contains "np.", and a Python number would have more digits
     if isinstance(value, str):
         text = str.__str__(value)
     else:
@@ -213,7 +214,8 @@ def _text(value: Any) -> tuple[str, bool]:
 
 
 def safe_repr(value: object) -> str:
-    """A repr of bounded length, also if the object's own raises."""
+    """The repr without memory addresses, shortened for collections. If the object's repr raises, a text that
+    says so."""
     try:
         if isinstance(value, (list, tuple, dict, set, frozenset)):
             text = _short.repr(value)
@@ -225,7 +227,7 @@ def safe_repr(value: object) -> str:
 
 
 def clean_text(text: str) -> str:
-    """`text` with what files and browsers refuse replaced."""
+    """`text` with U+FFFD for each character that files or browsers refuse."""
     return _UNPRINTABLE.sub("\ufffd", text)
 
 
@@ -249,8 +251,8 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
 
 
 def wrong_flags(evaluate: object) -> str | None:
-    """What is wrong if ``success`` or ``fail`` is a tensor that is not bool, or None. ManiSkill's step accepts it, its
-    wrappers do not."""
+    """What is wrong if ``success`` or ``fail`` is a tensor that is not bool, or None. ManiSkill's step
+    accepts such a tensor, its wrappers do not."""
     for name in FLAGS:
         value = evaluate.get(name) if isinstance(evaluate, Mapping) else None
         if isinstance(value, torch.Tensor) and value.dtype != torch.bool:
@@ -271,7 +273,7 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
 
 
 def no_reward(reward: object, num_envs: int) -> str | None:
-    """What is wrong with a reward, or None. To be drawn and recorded it must be a real number (or bool) for each env."""
+    """Why a reward cannot be drawn and recorded, or None. It must be a tensor (N,) of numbers or bools."""
     if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs) or reward.dtype.is_complex:
         return f"returned {describe(reward)}; {_floating(num_envs)}"
     return None
@@ -309,7 +311,7 @@ def without_rows(value: object, num_envs: int) -> Iterator[tuple[str, str]]:
 
 
 def describe(value: object) -> str:
-    """A value in a message: its type, with the shape of an array, or its text."""
+    """Text for a value in a message: the dtype and shape of an array, else the type and the repr."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"a {type_text(value)}"
     if value is None:

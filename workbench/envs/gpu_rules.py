@@ -41,7 +41,7 @@ class Rule:
     otherwise: str
     """What happens if the task does not, in a sentence."""
     solve: bool
-    """Whether the rule needs planned episodes, which take minutes: off unless it is asked for (``--solve``)."""
+    """Whether the rule needs planned episodes, which take minutes: checked only with ``--solve``."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class DeclaredRule(Rule):
 
 
 def declared_rule(id: str, degree: Degree, hook: str, text: str, *, solve: bool = False) -> DeclaredRule:
-    """A rule whose text is at hand.
+    """Make a rule from its text.
 
     Args:
-        text: Markdown, indented like a docstring: a paragraph with `Rule.asks`, one with `Rule.otherwise`, then the sections
-            of the page.
+        text: Markdown, indented like a docstring: a paragraph with `Rule.asks`, a paragraph with
+            `Rule.otherwise`, then the sections of the page.
     """
     asks, otherwise, page = inspect.cleandoc(text).split("\n\n", 2)
     return DeclaredRule(
@@ -66,7 +66,7 @@ def declared_rule(id: str, degree: Degree, hook: str, text: str, *, solve: bool 
 
 
 def degrees_of(choice: Degree | None) -> dict[str, Degree]:
-    """The degree of each rule: `choice` for all, or each rule's own if it is None.
+    """The degree of each rule: `choice` for all rules; if it is None, each rule's default.
 
     Raises:
         ValueError: `choice` is no degree.
@@ -96,8 +96,8 @@ class Finding:
     count: int
     """Number of breaches."""
     first_step: int
-    """Control steps of the batch before the first breach; 0 in a reset before the first step, and in the reset and step
-    with which a page tries a version."""
+    """Control steps of the batch before the first breach. 0 for a breach in a reset before the first step,
+    and in the trial reset and step of a new version on a page."""
 
     @property
     def key(self) -> tuple[str, str | None, str, str]:
@@ -106,8 +106,9 @@ class Finding:
 
 
 # --- silenced in the source ------------------------------------------------------------------------------
-# ``# workbench: off[reward-rows] one env only, see the paper`` stands in the line of the finding, alone in the line above, or
-# in the ``def`` or ``class`` line around it. Without a reason it silences nothing.
+# ``# workbench: off[reward-rows] one env only, see the paper`` stands in the line of the finding, alone in
+# the line above it, or in the line of the ``def`` or ``class`` around it. Without a reason it silences
+# nothing.
 
 _COMMENT = re.compile(r"#\s*workbench:\s*off\[([\w\s,-]*)\]\s*(.*)")
 
@@ -121,7 +122,7 @@ class Silence:
     rules: frozenset[str]
     reason: str
     alone: bool
-    """Whether the line has nothing else."""
+    """Whether the line has only the comment."""
 
 
 def silences(text: str) -> tuple[Silence, ...]:
@@ -184,7 +185,7 @@ the same way."""
 
 
 def _gpu_rule(id: str, degree: Degree, hook: str, text: str) -> DeclaredRule:
-    """As `declared_rule`, with ``{watched}`` in the text replaced by the sentences that several pages share."""
+    """Like `declared_rule`; replaces ``{watched}`` in the text by the sentences that several pages share."""
     rule = declared_rule(id, degree, hook, text)
     return replace(rule, page=rule.page.replace("{watched}", _WATCHED))
 
@@ -229,7 +230,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "rows-lost",
             "stop",
             "_initialize_episode",
-            """What a task keeps on itself still has a row for each env after a partial reset.
+            """The task's attributes still have a row for each env after a partial reset.
 
             The values of other envs are lost; the next use fails, or takes the wrong row.
 
@@ -271,10 +272,10 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             A physics step moves all envs at once: a GPU cannot step some of them. An env that is in the
             middle of its episode gets a step that its policy did not choose, and its count of steps does not
             include it. On the CPU each env has its own physics, and only the envs that are being reset are
-            stepped. With one env, where the habit comes from, nothing is wrong.
+            stepped. The habit comes from tasks with one env, where it is no mistake.
 
             ## Mend
-            Compute the settled pose and place the bodies there, slightly above what carries them.
+            Compute the settled pose and place the bodies there, slightly above the surface that carries them.
 
             ```python fragment
             def _initialize_episode(self, env_idx, options):
@@ -338,8 +339,8 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             read is the initial one.
 
             ## Mend
-            Give a body its place with `builder.initial_pose`. Set what stays in `_after_reconfigure`, and
-            what each episode begins with in `_initialize_episode`.
+            Give a body its place with `builder.initial_pose`. In `_after_reconfigure` set what stays, and in
+            `_initialize_episode` what each episode begins with.
 
             ```python fragment
             def _after_reconfigure(self, options):
@@ -389,8 +390,8 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
 
             ## Why
             A CPU simulation of one env has members that GPU simulation lacks. A task that uses one of them
-            runs with one env and cannot be trained on a GPU. The workbench opens it with one env, and says
-            so.
+            runs with one env and cannot be trained on a GPU. The workbench opens the task with one env, and
+            says so.
 
             ## Mend
             Use what ManiSkill has for a batch: contact impulses between two bodies, or on one body.
@@ -409,7 +410,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "rows-rewritten",
             "warn",
             "_initialize_episode",
-            """_initialize_episode(env_idx) changes only the rows of env_idx in what a task keeps on itself.
+            """_initialize_episode(env_idx) changes only the rows of env_idx in the task's attributes.
 
             Other envs continue with another target, counter or best value than they began with.
 
@@ -745,7 +746,7 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             that names no leaf.
 
             ## Mend
-            Return a dict of tensors of shape (N, ...); repeat what is the same for all envs.
+            Return a dict of tensors of shape (N, ...); repeat a value that is the same for all envs.
 
             ```python fragment
             def _get_obs_extra(self, info):
@@ -763,4 +764,4 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
         ),
     )
 }
-"""The rules of GPU simulation, by id. Envs look for breaches of them in whatever runs."""
+"""The rules of GPU simulation, by id. Envs check them in all code of the task that runs."""

@@ -38,8 +38,8 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
 
 
 def can_exchange_cameras(env: BaseEnv) -> bool:
-    """Whether `exchange_cameras` is possible: not in GPU simulation, whose camera groups cannot be undone, nor with a
-    ManiSkill that lacks a private name for it."""
+    """Whether `exchange_cameras` is possible. It is not in GPU simulation, whose camera groups cannot be
+    undone; nor if a sensor is not an ordinary camera; nor if ManiSkill lacks a private name that it needs."""
     if maniskill_private.why_not(maniskill_private.EXCHANGING):
         return False
     plain = all(
@@ -58,8 +58,8 @@ def exchange_cameras(env: BaseEnv) -> None:
     env.scene.forget_fast_shapes()  # type: ignore[attr-defined]  # always a batched scene
     for camera in maniskill_private.cameras(env).values():
         for component in maniskill_private.camera_components(camera):
-            # The entity stays, empty: with one fewer, SAPIEN would renumber the others in the scene of a restored
-            # snapshot (`cpu_state`), and segmentation pictures name bodies by number.
+            # Keep the empty entity. Without it, SAPIEN would renumber the other entities in the scene of a
+            # restored snapshot (`cpu_state`), and segmentation pictures name bodies by these numbers.
             component.entity.remove_component(component)
     maniskill_private.forget_cameras(env)
     with torch.random.fork_rng(devices=[]):
@@ -67,7 +67,7 @@ def exchange_cameras(env: BaseEnv) -> None:
 
 
 def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
-    """Call hooks of resets and steps as ManiSkill does, to see that they work, and undo what they did.
+    """Call hooks of resets and steps as ManiSkill does, to check that they work, and undo their effects.
 
     Their writes are not applied, so PhysX continues as before, to the last bit. If a hook applies or steps on its own, the
     state is restored from a snapshot.
@@ -79,7 +79,7 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
         What could not be undone (for example attributes that a hook made): name and reason.
 
     Raises:
-        Exception: raised by a hook; state is as before, attributes that the hook set are not.
+        Exception: raised by a hook. The state is restored; attributes that the hook added stay.
     """
     every = list(range(env.num_envs))
 
@@ -96,7 +96,7 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
 
 
 def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
-    """Call `do`, and undo what it did to the env; returns and raises as `rehearse_hooks`."""
+    """Call `do`, and undo what it did to the env. Returns and raises like `rehearse_hooks`."""
     every = list(range(env.num_envs))
     kept, px = take_snapshot(env), batched_system(env.scene)
     try:

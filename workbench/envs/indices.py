@@ -36,7 +36,7 @@ def envs_of_batch(env_idx: Any, num_envs: int) -> list[int]:
     """Env indices from `env_numbers`, checked: each exists and is named once.
 
     Raises:
-        IndexError, ValueError: `env_idx` names an env that does not exist, one twice, or none.
+        IndexError, ValueError: `env_idx` names an unknown env, an env twice, or no env.
     """
     chosen = env_numbers(env_idx)
     if not chosen:

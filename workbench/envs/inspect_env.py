@@ -23,14 +23,15 @@ from workbench.envs.state_columns import env_states, flat_names, split_flat
 from workbench.envs.task_env import TaskEnv, to_numpy
 
 MAX_VALUES = 64
-"""Maximum numbers of one array that are sent; a joint vector has fewer, a picture more."""
+"""Maximum number of values of one array that are sent; a joint vector has fewer, a picture more."""
 
 
 def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspection:
     """Read these sections of one env; what cannot be read is named in `Inspection.refused`.
 
-    The numbers come from where the task takes them: the last observation, ``get_state_dict()``, ManiSkill's batched
-    tensors. Costs about 1 ms a section for a Panda on a table, and does not change how the episode continues.
+    The numbers come from where the task takes them: the last observation, ``get_state_dict()``, ManiSkill's
+    batched tensors. Costs about 1 ms per section for a Panda on a table, and does not change how the episode
+    continues.
 
     Raises:
         IndexError: there is no such env.
@@ -124,7 +125,7 @@ def read_joints(task: TaskEnv, env: int) -> tuple[JointReadings, ...]:
 
 
 def read_contacts(task: TaskEnv, env: int) -> tuple[Touching, ...]:
-    """Pairs of bodies that touch in the last substep, strongest first.
+    """Pairs of bodies that touched in the last substep, strongest first.
 
     Raises:
         NotImplementedError: the env is simulated on the GPU.
@@ -132,7 +133,7 @@ def read_contacts(task: TaskEnv, env: int) -> tuple[Touching, ...]:
     pairs: dict[tuple[str, str], list[tuple[Contact, int]]] = {}
     for contact in list_contacts(task.env, env):
         first, second = contact.bodies
-        # Shapes that are only near have a contact too.
+        # PhysX also lists shapes that are near and do not touch.
         if not contact.impulses.any() and not (contact.separations <= 0).any():
             continue
         ordered = (first, second) if first <= second else (second, first)
@@ -197,7 +198,7 @@ class Contact:
     """
 
     bodies: tuple[str, str]
-    """Names as in `SceneIndex.names`; the ``sapien.Entity``'s name for what ManiSkill does not manage."""
+    """Names as in `SceneIndex.names`; the ``sapien.Entity``'s name for a body not managed by ManiSkill."""
     points: NDArray[np.float32]
     """(K, 3) metres."""
     normals: NDArray[np.float32]
@@ -225,10 +226,10 @@ def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
 
     Stock ManiSkill has this for a single env only (``scene.get_contacts()``). Only the chosen env is read.
 
-    (SAPIEN's own order is that of memory addresses: it differs from run to run of the same episode.)
+    Contacts are sorted because SAPIEN's order depends on memory addresses, and differs between equal runs.
 
-    After a reset or a restored snapshot the list is still that of the last substep, as in stock ManiSkill, until the
-    next step.
+    After a reset or after restoring a snapshot, the list still shows the last substep before it, until the
+    next step, as in stock ManiSkill.
 
     Args:
         env: a ManiSkill env, reset at least once, batched on the CPU or stock; wrappers are removed.

@@ -19,12 +19,12 @@ class Leaf:
     name: str
     """Path of keys: ``agent/qpos``."""
     shape: tuple[int, ...]
-    """Without the leading dimension N."""
+    """Shape without the leading dimension N."""
     dtype: str
     values: NDArray
-    """(K,) its first numbers, flattened; all of them unless it is as large as a picture."""
+    """(K,) the first numbers of the flattened array, at most `inspect_env.MAX_VALUES`."""
     low: float
-    """Minimum; NaN if it is empty or holds a NaN."""
+    """Minimum; NaN if the array is empty, contains a NaN or is not numeric."""
     high: float
 
 
@@ -35,15 +35,15 @@ class JointReadings:
     articulation: str
     names: tuple[str, ...]
     kinds: tuple[str, ...]
-    """(J,) as SAPIEN says: ``revolute``, ``revolute_unwrapped``, ``prismatic``."""
+    """(J,) SAPIEN's joint types: ``revolute``, ``revolute_unwrapped``, ``prismatic``."""
     position: NDArray[np.float32]
     """(J,)"""
     velocity: NDArray[np.float32]
-    """(J,) a second."""
+    """(J,) rad/s or m/s."""
     target: NDArray[np.float32]
-    """(J,) of the position drive; NaN for a joint without one (no stiffness)."""
+    """(J,) targets of the position drives; NaN for a joint without one (no stiffness)."""
     low: NDArray[np.float32]
-    """(J,) limits; infinite without one."""
+    """(J,) lower limits; infinite for a joint without one."""
     high: NDArray[np.float32]
 
 
@@ -70,12 +70,12 @@ class Inspection:
 
     env: int
     elapsed_steps: int
-    """Control steps of its episode."""
+    """Control steps since the env's reset."""
     observation: tuple[Leaf, ...] | None = None
     state: tuple[Leaf, ...] | None = None
     joints: tuple[JointReadings, ...] | None = None
     contacts: tuple[Touching, ...] | None = None
-    """Strongest first, of the last substep: after a reset, still of the one before it."""
+    """Contacts of the last substep, strongest first; after a reset, still those from before the reset."""
     refused: tuple[tuple[Section, str], ...] = ()
     """Sections that could not be read, each with the reason."""
     milliseconds: float = 0.0

@@ -1,4 +1,4 @@
-"""Finds rows of other envs that a partial reset changed on the task, and the line that did it."""
+"""Finds rows of other envs that a partial reset changed in a task's attributes, and the line at fault."""
 
 from __future__ import annotations
 
@@ -27,23 +27,24 @@ from workbench.envs.snapshots.task_state import is_per_env, version_of
 from workbench.machine.library_files import is_installed
 
 MAX_TRACED_LINES = 2000
-"""Maximum lines of the author's code after which values are compared, in one reset."""
+"""Maximum number of the author's lines in one reset after which values are compared."""
 _ROUNDING_TOLERANCE = 1e-5
 """Tolerance for values computed again from the same poses; rotations were seen to differ by 1e-7."""
 _ITEM = re.compile(r"\[(\d+)\]")
 
 
 class KeptRows:
-    """Copy of what a task keeps for each env, to find rows that a partial reset changed for other envs.
+    """Copy of the values that a task keeps for each env, to find rows that a partial reset changed for other
+    envs.
 
-    A partial reset must change the rows of ``env_idx`` only, in tensors, arrays, lists and Poses on the task, in dicts and in
-    objects of its own. Nothing raises when it does not: ``self.target = torch.rand((self.num_envs, 2))`` gives every env
-    another target in the middle of its episode. Values are compared, so a value computed again with the same result is no
-    fault.
+    A partial reset must change the rows of ``env_idx`` only, in tensors, arrays, lists and Poses on the task,
+    in dicts and in objects of its own. Nothing raises if it changes others: ``self.target =
+    torch.rand((self.num_envs, 2))`` gives every env another target in the middle of its episode. Values are
+    compared, so a value computed again with the same result is no fault.
 
     Args:
-        env: In the middle of an episode.
-        chosen: The envs that are about to be reset.
+        env: an env in the middle of an episode.
+        chosen: the envs that are about to be reset.
     """
 
     def __init__(self, env: BaseEnv, chosen: Sequence[int]) -> None:
@@ -54,8 +55,8 @@ class KeptRows:
         self.before = {path: _copy(value) for path, value in self._read(walk).items()}
 
     def changed_envs(self) -> dict[str, tuple[int, ...]]:
-        """Paths (without ``self.``) whose rows of other envs changed, each with these envs; no envs where only the rows of
-        the envs being reset are left."""
+        """Paths (without ``self.``) whose rows of other envs changed, each with these envs; with an empty
+        tuple if only rows for the envs being reset are left."""
         now = self._read(walk_task_values(self.env))
         found = {path: self._difference(before, now.get(path)) for path, before in self.before.items()}
         return {path: envs for path, envs in found.items() if envs is not None}
@@ -64,7 +65,7 @@ class KeptRows:
         """The paths whose rows of other envs changed.
 
         Args:
-            seen: values at the last call, updated here, so that a tensor is compared only if it was written since.
+            seen: values at the last call, updated here: only tensors that were written since are compared.
         """
         now = self._read(walk_task_values(self.env))
         for path, before in self.before.items():
@@ -93,7 +94,7 @@ class KeptRows:
                 return self._named([not _same(before[i], now[i]) for i in elsewhere])
             return () if len(now) == self._count else None
         if not isinstance(before, (torch.Tensor, np.ndarray)) or not isinstance(now, type(before)):
-            return None  # the name holds another type now
+            return None  # the attribute now has another type
         if now.shape == before.shape:
             return self._named(_differ(_array(before)[elsewhere], _array(now)[elsewhere]))
         if now.ndim and len(now) == self._count and now.shape[1:] == before.shape[1:]:
@@ -164,8 +165,8 @@ def _same(a: Any, b: Any) -> bool:
 class _Lines:
     """Compares the rows after each line of the author's code, and keeps the line after which they differ.
 
-    Done in the first partial resets of a class, and after one whose line was not found. If a debugger is already tracing,
-    `find_assignment` reads the line from the source instead.
+    Lines are traced in the first partial reset of a class, and again after a reset whose line was not found.
+    If a debugger is already tracing, `find_assignment` reads the line from the source instead.
     """
 
     def __init__(self, rows: KeptRows) -> None:
@@ -236,7 +237,7 @@ class ResetWatch:
     """Watches the partial resets of one env, from `start` to `report` or `stop`.
 
     Args:
-        rules: Receives the breaches.
+        rules: receives the breaches.
     """
 
     def __init__(self, rules: BrokenRules) -> None:
@@ -247,16 +248,16 @@ class ResetWatch:
         self._tries = 0
         """Remaining attempts of `_MAX_TRACED_RESETS`."""
         self._seeks = False
-        """Trace lines in the next reset."""
+        """Whether to trace lines in the next reset."""
         self.whole = False
-        """The task has its own ``reset``, which is watched as a whole."""
+        """Whether a task's own ``reset`` is being watched as a whole."""
 
     @property
     def looks(self) -> bool:
         return self._lines is not None
 
     def start(self, env: BaseEnv, task: type, chosen: Sequence[int]) -> None:
-        """Envs `chosen` are about to be reset."""
+        """Start watching; the envs `chosen` are about to be reset."""
         if self._task is not task:
             self._task, self._tries, self._seeks = task, _MAX_TRACED_RESETS, True
         self._chosen = tuple(chosen)
@@ -279,7 +280,7 @@ class ResetWatch:
         """Report what the reset changed, or has changed so far if it is not `over`.
 
         Raises:
-            BrokenRule: of a rule that stops.
+            BrokenRule: a rule whose degree is *stop* was broken.
         """
         lines = self._lines
         if lines is None:

@@ -41,13 +41,14 @@ class Keyword:
     value: str
     """Value in effect, in JSON; the ``repr`` of a value that JSON cannot hold."""
     default: str = ""
-    """The class's own value, in the same form; empty if it has none, or it is not known."""
+    """Value without the user's argument, in JSON: the registration's, else the class's (``null`` if it has
+    none); empty if JSON cannot hold it, and for `MODES`."""
     choices: tuple[str, ...] = ()
     """Allowed values of kind ``choice``, in JSON."""
     optional: bool = False
     """``null`` is a value too."""
     fixed: str = ""
-    """Why it cannot be changed here; empty if it can."""
+    """Why the value cannot be changed here; empty if it can."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def describe_keywords(
         cls: the author's class.
         given: the user's keywords.
         registered: the keywords of the registration.
-        stop: `BaseEnv`, whose parameters are no keywords of the task itself.
+        stop: `BaseEnv`; its parameters are not counted as the task's own keywords.
     """
     parameters = dict(parameters_of(cls, stop))
     effective = {**registered, **given}
@@ -126,7 +127,9 @@ def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
     now = as_json(value)
     texts = dict.fromkeys(text for one in choices if (text := as_json(one)) is not None)
     if now is None:
-        return Keyword(name, "json", _in_words(value), fixed="its value is an object of Python")
+        return Keyword(
+            name, "json", _in_words(value), fixed="its value is a Python object that JSON cannot hold"
+        )
     return Keyword(name, "choice", now, choices=tuple(dict.fromkeys((*texts, now)))[:MAX_CHOICES])
 
 
@@ -176,14 +179,16 @@ def _describe(name: str, parameter: inspect.Parameter, given: Any, registered: A
     optional = optional or default is None
     text, usual = as_json(_plain(value)), as_json(_plain(default))
     if text is None:
-        return Keyword(name, "json", _in_words(value), fixed="its value is an object of Python")
+        return Keyword(
+            name, "json", _in_words(value), fixed="its value is a Python object that JSON cannot hold"
+        )
     if choices and text not in choices and text != "null":
         choices = (*choices, text)
     return Keyword(name, kind, text, usual or "", choices[:MAX_CHOICES], optional)
 
 
 def _plain(value: Any) -> Any:
-    """The value of a member of an Enum, as a command line gives it; anything else as it is."""
+    """The value of a member of an Enum, as a command line gives it; any other value unchanged."""
     return value.value if isinstance(value, enum.Enum) else value
 
 
@@ -210,7 +215,8 @@ def _kind_of(annotation: Any, default: Any) -> tuple[KeywordKind, tuple[str, ...
 
 
 def as_json(value: Any) -> str | None:
-    """The value in JSON; None if JSON cannot hold it, or it would be read back as something else."""
+    """The value in JSON; None if JSON cannot hold it or reads it back as another value, or the text is too
+    long."""
     try:
         text = json.dumps(value, allow_nan=False)
         back = json.loads(text)
@@ -223,7 +229,7 @@ def as_json(value: Any) -> str | None:
 def _in_words(value: Any) -> str:
     try:
         return _short(repr(value))
-    except Exception:  # of the author's class
+    except Exception:  # raised by the author's __repr__
         return type(value).__name__
 
 
@@ -232,14 +238,14 @@ def _short(text: str) -> str:
 
 
 def constructor_arguments(cls: type, given: Mapping[str, Any], stop: type) -> dict[str, Any]:
-    """Arguments given in JSON, as the class takes them: several robots as a tuple, and members of an Enum.
+    """Convert arguments from JSON to what the class takes: a tuple for several robots, a member for an Enum.
 
     Args:
         stop: as in `describe_keywords`.
     """
     taken = dict(given)
     if isinstance(robots := taken.get("robot_uids"), list):
-        taken["robot_uids"] = tuple(robots)  # ManiSkill would take a list for the name of one robot
+        taken["robot_uids"] = tuple(robots)  # ManiSkill would treat a list as the name of one robot
     for name, parameter in parameters_of(cls, stop):
         kind = parameter.annotation
         if name in taken and isinstance(kind, type) and issubclass(kind, enum.Enum):
@@ -267,7 +273,7 @@ def read_value(keyword: Keyword, text: str) -> Any:
     """Parse the text that a person wrote for a keyword.
 
     Raises:
-        ValueError: the text is no value of this kind; the message has the keyword and what it takes.
+        ValueError: the text is not a value of this kind; the message names the keyword and what it takes.
     """
     text = text.strip()
     if len(text) > MAX_TEXT_CHARACTERS:

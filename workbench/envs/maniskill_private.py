@@ -1,4 +1,4 @@
-"""All private names of ManiSkill and SAPIEN that the core uses, and what depends on each."""
+"""All private names of ManiSkill and SAPIEN that the core uses, and the features that depend on them."""
 
 from __future__ import annotations
 
@@ -101,12 +101,16 @@ def moved_names() -> tuple[PrivateName, ...]:
 
 
 def why_not(feature: str) -> str:
-    """Why the installed ManiSkill does not allow this (`PLACING`, ...; empty: any task); empty if it does."""
+    """Why the installed ManiSkill does not allow a feature; empty if it does.
+
+    Args:
+        feature: `PLACING`, ...; empty for opening any task.
+    """
     return _with_advice(each for each in moved_names() if each.disables == feature)
 
 
 def version_notice() -> str:
-    """What the installed ManiSkill does not allow, all together; empty if nothing."""
+    """Notice of all features that the installed ManiSkill does not allow; empty if it allows all."""
     return _with_advice(moved_names())
 
 
@@ -140,9 +144,9 @@ _TARGETS_OF = "_workbench_targets_of"
 def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     """Let ManiSkill's structs find their rows in a batched CPU system.
 
-    Structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``, which raise for a CPU system. ManiSkill's
-    builders make the structs, so the cached properties that ask are replaced, once per process; a stock scene gets the
-    original code. Safe to call again.
+    Structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``, which raise for a CPU
+    system. ManiSkill's builders make the structs, so their cached properties of these indices are replaced,
+    once per process; for a stock scene they run the original code. Safe to call again.
 
     Args:
         batched_system: returns the system of a batched scene, None for any other scene.
@@ -180,12 +184,13 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
 
     @wraps(stock_get_contacts)
     def get_contacts(self: Any) -> Any:
-        # Nightly builds raise before they ask the system, whose message says what to call instead.
+        # Nightly builds raise before they call the system, whose own error says what to call instead.
         system = batched_system(self)
         return stock_get_contacts(self) if system is None else system.get_contacts()
 
     def find_rows(owner: type, name: str, things: str, find: str, dtype: torch.dtype) -> None:
-        """Replace the cached property `name`: in a batched CPU scene it gives the row of each of the struct's `things`."""
+        """Replace the cached property `name`: for a batched CPU scene it returns the row of each of `things`,
+        an attribute of the struct."""
         stock = owner.__dict__[name].func
 
         @wraps(stock)
@@ -237,10 +242,11 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
 def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
     """``PDEEPosController.set_action`` of a single CPU env, for every env.
 
-    ManiSkill has two inverse kinematics: on the CPU a solver that iterates until the pose is reached, for one env; on the
-    GPU one damped step along the Jacobian, for all. Their targets for one ``pd_ee_delta_pos`` action differ by 1.3 cm (mean of
-    30 random ones, 3.8 cm at most), and the second ignores the config's ``frame``. An env here must equal stock's, so the
-    first is called for each: 0.1 ms an env and control step.
+    ManiSkill has two inverse kinematics: on the CPU a solver that iterates until the pose is reached, for one
+    env; on the GPU one damped step along the Jacobian, for all. Their targets for one ``pd_ee_delta_pos``
+    action differ by 1.3 cm (mean of 30 random ones, 3.8 cm at most), and the second ignores the config's
+    ``frame``. An env here must equal a stock env, so the CPU solver is called for each env: 0.1 ms per env
+    and control step.
     """
     action = controller._preprocess_action(action)
     controller._step = 0
@@ -250,7 +256,7 @@ def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
     goal = controller._target_pose = controller.compute_target_pose(before, action)
     solver, qpos = controller.kinematics, controller.articulation.get_qpos()
     solved = [solver.compute_ik(pose=goal[i : i + 1], q0=qpos[i : i + 1]) for i in range(len(qpos))]
-    # The arm stays if the pose cannot be reached, as in stock.
+    # As in stock ManiSkill, the arm does not move if the pose cannot be reached.
     target = torch.cat([start[i : i + 1] if row is None else row for i, row in enumerate(solved)])
     controller._target_qpos = target.to(start.dtype)
     if controller.config.interpolate:
@@ -265,8 +271,9 @@ _BETWEEN_SUBSTEPS = ("_step_action", "_before_simulation_step", "_after_simulati
 def substeps_are_unwatched(env: Any, task: type) -> bool:
     """Whether only ManiSkill's own code runs between the substeps of a control step.
 
-    Those hooks do not touch the simulation: ``BaseEnv``'s are empty, and its controllers' ``before_simulation_step``
-    writes drive targets only where it interpolates. A hook of the task, its robot or its controllers may read state.
+    ManiSkill's own hooks do not touch the simulation: those of ``BaseEnv`` are empty, and its controllers
+    write drive targets in ``before_simulation_step`` only if they interpolate. A hook of the author's code
+    may read state.
 
     Args:
         task: the class of `env` without our mixin.
@@ -288,10 +295,11 @@ def substeps_are_unwatched(env: Any, task: type) -> bool:
 
 @cache
 def install_base_env_hooks() -> None:
-    """Let ``BaseEnv``'s constructor and ``_setup_scene`` ask an env of the batched CPU simulation, once per process.
+    """Replace ``BaseEnv``'s constructor and ``_setup_scene``, once per process: for an env of the batched CPU
+    simulation, they use the arguments of `base_arguments` and the env's ``_make_scene``.
 
-    Overriding them in a subclass does not work: a task's own versions call these, and would be skipped or get arguments
-    that they do not take.
+    Overriding them in a subclass does not work: a task's own versions, which call those of ``BaseEnv``, would
+    be skipped or get arguments that they do not take.
     """
     stock_init, stock_setup = BaseEnv.__init__, BaseEnv._setup_scene
 
@@ -319,7 +327,8 @@ _WORKBENCH_ARGUMENTS = ("num_envs", "render_backend", "reward_mode")
 def base_arguments(env: Any, task: type, kwargs: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Context in which ``BaseEnv``'s constructor simulates on the CPU, whatever the task's constructor passes on.
 
-    Yields the arguments for the task's constructor: `kwargs` without the workbench's own arguments that it does not take.
+    Yields the arguments for the task's constructor: `kwargs` without those of the workbench's arguments that
+    the constructor does not take.
     """
     taken = inspect.signature(task.__init__).parameters
     any_name = any(each.kind is each.VAR_KEYWORD for each in taken.values())
@@ -355,7 +364,7 @@ def hook_of_base_env(env: Any, caller: FrameType) -> str:
 
 
 def allowed_on_the_cpu(caller: FrameType, laid_out: bool) -> bool:
-    """Whether ManiSkill is to see a GPU simulation that is not initialised yet.
+    """Whether the caller in ManiSkill must see a GPU simulation that is not initialised yet.
 
     ``before_gpu_init`` refuses setters after initialisation, but a stock CPU env allows them at any time. Meshes of
     articulations need link poses, which exist at any time.
@@ -387,7 +396,7 @@ def episode_seeds(env: BaseEnv) -> np.ndarray | None:
 
 
 def draws_its_own_seeds(env: BaseEnv) -> bool:
-    """Whether a reset without a seed draws one for each env (``enhanced_determinism``)."""
+    """Whether a reset without a seed draws a seed for each env (``enhanced_determinism``)."""
     return env._enhanced_determinism
 
 
@@ -418,7 +427,7 @@ def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
 
 
 def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: Any) -> None:
-    """Set the episode seeds of these envs; their generators stay as they are."""
+    """Set the episode seeds of these envs; does not change their generators."""
     every = np.array(env._episode_seed, dtype=np.int64)
     every[env_idx] = seeds
     env._episode_seed = every
@@ -624,7 +633,8 @@ def camera_configs(env: Any) -> dict[CameraKey, Any]:
 
 
 def sensor_configs_of_hooks(env: Any) -> tuple[list[Any], list[Any]]:
-    """Configs that the task's and the robot's sensor hooks return now, including those that a namesake replaces."""
+    """Configs that the task's and the robot's sensor hooks return now. Configs with the same name are all
+    included."""
     of_robot = [] if env.agent is None else env.agent._sensor_configs
     return _listed(env._default_sensor_configs), _listed(of_robot)
 
@@ -636,8 +646,8 @@ def _listed(configs: Any) -> list[Any]:
 
 
 def mark_camera_configs() -> None:
-    """Make every ``CameraConfig`` keep where it was made (`camera_site`) and the target of its ``look_at`` (`camera_target`),
-    in tasks that are imported after this. Safe to call again."""
+    """Make every ``CameraConfig`` store the line that made it (`camera_site`) and the target of its
+    ``look_at`` (`camera_target`), in tasks that are imported after this call. Safe to call again."""
     stock = CameraConfig.__init__
     if hasattr(stock, "_workbench_stock"):
         return
@@ -694,7 +704,7 @@ def set_up_camera(env: Any, key: CameraKey, camera: Any, config: Any, components
     inner: RenderCamera = camera.camera
     if inner._render_cameras is not components:
         inner._render_cameras = components
-        # The scene makes the group again when it is next drawn for all envs.
+        # The scene makes the group again when it next draws the camera in all envs.
         inner.camera_group = None  # type: ignore[assignment]
         env.scene.camera_groups.pop(name, None)
     inner._cached_model_matrix = None  # type: ignore[assignment]

@@ -17,7 +17,7 @@ from workbench.envs.step_result import TERM_PREFIX, StepResult
 MAX_SPEED = 20.0
 """Maximum speed of a body in m/s, as a mean over a control step; robots move at a tenth of it."""
 UNDER_FLOOR_METRES = 0.2
-"""Depth in metres below the lowest point of all static bodies from which on a body is under the floor."""
+"""A body that is this far below the lowest point of all static bodies, in metres, is under the floor."""
 MAX_DROP_METRES = 0.5
 """Maximum drop in metres since the start of the episode, of a body that is not part of an articulation: more than the height
 of a block, less than that of a table."""
@@ -165,10 +165,10 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
             ## How it is checked
             The rule reads the normalized or sparse reward, whichever the task is made with, in random
             rollouts of all seeds and in those of `--actions`. While you play, it flags an env with a reward
-            outside the range. It also reads the reward of states with success: of the states that
-            `reward-finite` makes, and what the reward hook returns when it is told that all envs succeed, if
-            that is one number. The result is *not known* if no success was seen, since success pays the
-            largest reward. It is *not applicable* for a plain dense reward.
+            outside the range. It also reads the reward of states with success: in the states that
+            `reward-finite` makes, and from a call of the reward hook with `success` set for all envs, if that
+            gives the same number in all states. The result is *not known* if no success was seen, since
+            success pays the largest reward. It is *not applicable* for a plain dense reward.
             """,
         ),
         declared_rule(
@@ -198,7 +198,7 @@ OUTLIER_RULES: Mapping[str, DeclaredRule] = {
         ),
     )
 }
-"""The rules that an outlier breaks, by id."""
+"""The rules that outliers break, by id."""
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ class OutlierWatch:
         self._start = self._before[..., 2].copy()
 
     def begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
-        """These envs (N,) were reset or put back to a moment: the jump does not count as movement."""
+        """Note that these envs (N,) were reset or restored: their jump does not count as movement."""
         if step.poses.shape[:2] == self._present.shape:
             self._before[envs] = step.poses[envs, :, :3]
             self._start[envs] = step.poses[envs, :, 2]

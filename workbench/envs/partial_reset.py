@@ -43,7 +43,7 @@ class KeptControllers:
 
 
 def active_controllers(env: Any) -> list[BaseController]:
-    """The controllers in use, combined ones split; none without a robot."""
+    """The controllers in use, with each combined controller replaced by its parts; empty without a robot."""
     single: list[BaseController] = []
     for agent in agents(env):
         combined = isinstance(agent.controller, CombinedController)
@@ -95,8 +95,8 @@ def in_ascending_order(
         The options, and the seeds if there is one for each env of a partial reset.
 
     Raises:
-        TypeError, IndexError, ValueError: ``env_idx`` is a mask of another length, or names an env that does not exist, one
-            twice, or none.
+        TypeError, IndexError, ValueError: ``env_idx`` is a mask of the wrong length, or names an unknown env,
+            an env twice, or no env.
     """
     chosen = _chosen(env, options)
     if chosen is None:
@@ -107,7 +107,8 @@ def in_ascending_order(
     made = {**options, "env_idx": rows}
     states = options.get("reset_to_env_states", {})
     if "obs" in states:
-        # ManiSkill assigns observations to `env_idx` row by row, but the states, like `set_state`, lowest env first.
+        # ManiSkill assigns rows of observations in the order of `env_idx`, but rows of states lowest env
+        # first.
         made["reset_to_env_states"] = {**states, "obs": _rows(states["obs"], order)}
     return made, [int(seeds[k]) for k in order] if one_each else None
 
@@ -120,7 +121,7 @@ def _rows(value: Any, order: list[int]) -> Any:
 
 @contextmanager
 def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
-    """Context in which a reset of these envs, lowest first, starts their episodes from these seeds.
+    """Context in which a reset of these envs, in ascending order, starts their episodes from these seeds.
 
     ``BaseEnv.reset(seed=[...])`` takes the list as the seeds of the whole batch.
     """
@@ -135,8 +136,8 @@ def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
 def note_what_was_reset(env: Any, untouched: list[int]) -> Iterator[None]:
     """Add notes to an exception of a partial reset: which envs it was for, and the buffers that have fewer rows now.
 
-    A hook that replaces a buffer of N rows by one of ``len(env_idx)`` makes another hook, which is right, raise a torch
-    message about sizes.
+    If a hook replaces a buffer of N rows by one of ``len(env_idx)`` rows, another hook, which has no mistake,
+    fails with torch's message about sizes.
     """
     if not untouched:
         yield

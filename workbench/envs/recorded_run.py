@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """T actions of one env, and its T + 1 states as far as they were recorded.
+    """T actions of one env, and the T + 1 states of its episode as far as they were recorded.
 
     State 0 is the reset; action t leads to state t + 1.
     """
@@ -45,11 +45,11 @@ class RecordedRun:
         return len(self.action)
 
     def state(self, at: int) -> dict[str, NDArray]:
-        """(D,) of every actor and articulation in state `at`; empty if it was not recorded."""
+        """State (D,) of each actor and articulation at index `at`; empty if it was not recorded."""
         return {name: rows[at] for name, rows in self.env_states.items() if at < len(rows)}
 
     def until(self, state: int) -> RecordedRun:
-        """The run up to that state."""
+        """Copy of the run up to and including state index `state`."""
         return replace(
             self,
             action=self.action[:state],
@@ -74,8 +74,8 @@ def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray
         p, q = a[..., 3:], b[..., 3:]
         chord = np.minimum(np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1))
         radians = 4 * np.arcsin(np.clip(chord / 2, 0, 1))
-    found = (np.where(lacks[0] | lacks[1], np.inf, way) for way in (metres, radians))
-    metres, radians = (np.where(lacks[0] & lacks[1], 0.0, way) for way in found)
+    found = (np.where(lacks[0] | lacks[1], np.inf, distance) for distance in (metres, radians))
+    metres, radians = (np.where(lacks[0] & lacks[1], 0.0, distance) for distance in found)
     return metres, radians
 
 
@@ -100,7 +100,7 @@ RUN_KEYWORDS = frozenset({"num_envs", "sim_backend", "render_backend", "render_d
 
 
 def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Keywords of ``gym.make`` that make `env` again: those `given` and the modes it took, as far as JSON holds them.
+    """Keywords of ``gym.make`` that make `env` again: `given` and the env's modes, if JSON can hold them.
 
     ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. The replay chooses `RUN_KEYWORDS`.
     """

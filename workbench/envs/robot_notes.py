@@ -31,16 +31,16 @@ _LOADERS = tuple(
     for module, folder in ((sapien, "wrapper"), (mani_skill, "utils/building"))
 )
 _FILE_ARGUMENTS = ("urdf_file", "mjcf_file", "asset_path")
-"""Names of the robot's file in the loaders and in ``BaseAgent._load_articulation``."""
+"""Names of the variable with the robot's file, in the loaders and in ``BaseAgent._load_articulation``."""
 _ELEMENTS = ("origin_node", "node", "geom", "mesh", "texture", "material", "body")
-"""Names of an element of the file in the functions that read one."""
+"""Names of the variable with an element of the file, in the loaders' functions."""
 _LOOP_NAMES = ("mimic", "joint", "x", "link")
 """Names of loop variables, which are read only in the innermost frame: further out, they may be stale."""
 
 
 @contextmanager
 def note_robot_errors() -> Iterator[None]:
-    """Context in which an exception of a robot's loader or controller gets a note with the place at fault."""
+    """Context in which an exception of a robot's loader or controller gets a note with the line at fault."""
     try:
         yield
     except CoreRefusal:
@@ -64,7 +64,7 @@ def _note(error: BaseException) -> ErrorNote | None:
     frames = [frame for frame, _ in walk_tb(error.__traceback__)][::-1]
     robot = next((agent for frame in frames if (agent := _self(frame, BaseAgent)) is not None), None)
     if isinstance(robot, MultiAgent) and not robot.agents:
-        # ManiSkill's own error is an IndexError of its empty list of robots.
+        # ManiSkill's own error is an IndexError from an empty list of robots.
         return ErrorNote(
             'The task names no robot: give `robot_uids` a default in its __init__, such as "panda".'
         )
@@ -89,7 +89,7 @@ def _note(error: BaseException) -> ErrorNote | None:
     text += "".join(_missing_mesh(frames, path))
     if robot is not None:
         named = place_of_robot_file(type(robot)) or named
-        text += f". {type(robot).__name__} names it{in_brackets(named)}"
+        text += f". {type(robot).__name__} names this file{in_brackets(named)}"
     return ErrorNote(f"{text}.", named)
 
 
@@ -160,7 +160,7 @@ def _part_of(value: Any) -> _Part | None:
 
 def _line_of(error: BaseException, part: _Part | None, path: Path) -> int | None:
     """1-based line in the robot's file."""
-    if isinstance(error, SyntaxError | ExpatError):  # of XML
+    if isinstance(error, SyntaxError | ExpatError):  # raised by an XML parser
         position = getattr(error, "position", None)
         return position[0] if position else error.lineno
     if part is None or part.line is not None:

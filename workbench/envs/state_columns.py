@@ -27,13 +27,14 @@ _PICTURES = ("sensor_data", "sensor_param", "pointcloud")
 def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
     """The columns of the present moment, (N, ...) each; copies. About 0.1 ms for 16 PickCube envs.
 
-    ``state/actors/cube`` (N, 13) and ``state/articulations/panda`` (N, 13 + 2 * joints) as ``get_state_dict`` lays them
-    out, ``obs/agent/qpos`` (N, ...) by the task's names. Unlike in ManiSkill, what an env lacks is NaN (ManiSkill's
-    tensor has fewer rows, and ``RecordEpisode`` records no state); a flattened observation is split by its names, or is
-    one column ``obs/`` where they are not known; pictures are left out, since a recording has its own.
+    ``state/actors/cube`` (N, 13) and ``state/articulations/panda`` (N, 13 + 2 * joints) as ``get_state_dict``
+    lays them out, ``obs/agent/qpos`` (N, ...) by the task's names. Unlike in ManiSkill, the row of a body
+    that an env lacks is NaN (ManiSkill's tensor has fewer rows, and ``RecordEpisode`` records no state). A
+    flattened observation is split by its names, or is one column ``obs/`` if they are not known. Pictures are
+    left out: a recording stores them separately.
 
     Raises:
-        Exception: raised by a ``get_state_dict`` of the task's own.
+        Exception: raised by the task's own ``get_state_dict``.
     """
     return copy_states(task).columns()
 
@@ -65,7 +66,7 @@ class StateReading:
 
 
 def copy_states(task: TaskEnv) -> StateReading:
-    """Copy the present moment; ``columns()`` then does the slow part of `read_state_columns`. Raises as it does."""
+    """Copy the present moment; ``columns()`` then does the slow part. Raises like `read_state_columns`."""
     rows, asked = _read(task.env)
     values: dict[str, Any] = {STATE + name: value for name, value in asked.items()}
     values.update(_observed(task))
@@ -79,8 +80,9 @@ def copy_states(task: TaskEnv) -> StateReading:
 def env_states(env: BaseEnv) -> dict[str, Any]:
     """(N, D) by name: ``actors/cube``, ``articulations/panda``, and ``controller/...`` where a controller has a state.
 
-    Copies: tensors, or arrays on the CPU. Equal to ManiSkill's ``get_state_dict`` to the last bit (tested), which asks every
-    actor and articulation in turn (75 us for the four of PickCube). A task's own ``get_state_dict`` is called."""
+    Copies: tensors, or arrays on the CPU. Equal to ManiSkill's ``get_state_dict`` to the last bit (tested),
+    which reads each actor and articulation in turn (75 us for the four of PickCube). A task's own
+    ``get_state_dict`` is called."""
     rows, asked = _read(env)
     return asked if rows is None else {**rows.states(), **asked}
 
@@ -106,7 +108,7 @@ def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
 def _fetched(values: Mapping[str, Any], count: int, device: torch.device) -> dict[str, NDArray]:
     """Values on the host, in one copy per dtype: on a GPU each single fetch waits for the device."""
     if device.type == "cpu":
-        # On the CPU these are arrays, and copies already.
+        # On the CPU, arrays are copies already.
         return {
             name: value if isinstance(value, np.ndarray) else to_numpy(value)
             for name, value in values.items()
@@ -139,8 +141,9 @@ _layouts: WeakKeyDictionary[Any, tuple[type, int, list[tuple[str, tuple[int, ...
 def flat_names(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str]] | None:
     """Name, shape and dtype of each part of a flattened observation (N, D), or None if they are not known.
 
-    ManiSkill drops the names, so the env is observed once more without flattening. That runs the author's hooks, which
-    may count or draw: it is done once a version of the task, and what the task remembers is restored.
+    ManiSkill drops the names, so the env is observed once more without flattening. That runs the author's
+    hooks, which may count or draw random numbers. So it happens once per version of the task, and the task's
+    memory is restored afterwards.
     """
     env = task.env
     if not isinstance(flat, torch.Tensor) or flat.ndim != 2 or not env.obs_mode_struct.state:
@@ -156,7 +159,8 @@ def flat_names(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str
 def split_flat(
     names: list[tuple[str, tuple[int, ...], str]], numbers: NDArray
 ) -> Iterator[tuple[str, NDArray, str]]:
-    """Name, numbers (..., *shape) and dtype of each part, as `flat_names` has them, of a flattened observation (..., D)."""
+    """Split a flattened observation (..., D) by `names` from `flat_names`; yields name, numbers (..., *shape)
+    and dtype."""
     at = 0
     for name, shape, dtype in names:
         width = math.prod(shape)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 TERM_PREFIX = "reward_terms/"
 """Prefix of the entries of a `StepResult` that are terms of a dense reward.
 
-``compute_dense_reward`` puts them into ``info["reward_terms"]``, a dict of tensors (N,). The key is the workbench's own,
-since ManiSkill has none for reward terms; it passes ``info`` on unchanged, nested dicts included, so such a file also runs
-in stock ManiSkill. A term that is not one number per env is listed in the table of numbers, without a curve.
+``compute_dense_reward`` puts them into ``info["reward_terms"]``, a dict of tensors (N,). The key is the
+workbench's own, since ManiSkill has none for reward terms; it passes ``info`` on unchanged, nested dicts
+included, so the task's file also runs in stock ManiSkill. A term that is not one number per env is listed in
+the table of numbers, without a curve.
 """
 
 
@@ -26,7 +27,7 @@ class OtherEntry:
     texts: tuple[str, ...] = ()
     """Value as text, one for the batch or, with `per_env`, one for each env; empty if there are `numbers`."""
     numbers: NDArray | None = None
-    """(...) booleans or real numbers of the whole batch; None if it is no number."""
+    """(...) booleans or real numbers of the whole batch; None if it is not numeric or too large."""
     per_env: bool = False
     whole: bool = True
     """False if `texts` is shortened."""
@@ -56,7 +57,7 @@ class StepResult:
     evaluate: dict[str, NDArray]
     """The entries that ``evaluate()`` returned with a row for each env: booleans or real numbers, each (N, ...)."""
     poses: NDArray[np.float32]
-    """(N, B, 7) of every body: position in metres, quaternion wxyz, env's own frame."""
+    """(N, B, 7) pose of every body: position in metres, quaternion wxyz, env's own frame."""
     action: NDArray[np.float32] | None = None
     """(N, A) that led here; None right after a reset."""
     sound_obs: NDArray[np.bool_] | None = None

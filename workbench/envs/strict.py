@@ -43,15 +43,17 @@ _REWARD_HOOK = {
 class StrictMixin:
     """Mixin that checks the rules of GPU simulation; the first base of a batched task class.
 
-    The batched CPU core does what a stock CPU env does. Where a GPU behaves differently is reported at the author's line:
+    The batched CPU core does what a stock CPU env does. If a GPU would behave differently, this mixin reports
+    the author's line. It reports:
 
-    * state set and not applied, applied or read without a fetch after a step, links read before their articulation's new
-      qpos reached them (`strict_system`);
+    * state set but not applied; state applied or read without a fetch after a step; links read before their
+      articulation's new qpos reached them (`strict_system`);
     * what the GPU refuses: state touched while the scene is built, static actors moved, masses set later (`accessors`);
     * SAPIEN's own setters, which the GPU ignores (`accessors`);
     * in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or changed (here,
       and `kept_rows`);
-    * returns of ``evaluate``, the reward and the observation hooks without a row for each env (`evaluate_entries`).
+    * return values of ``evaluate``, the reward and the observation hooks that lack a row for each env
+      (`evaluate_entries`).
 
     Values are compared, so only actual differences are reported; ``tests/envs/test_strict.py`` lists the ManiSkill tasks
     that break a rule.
@@ -69,7 +71,7 @@ class StrictMixin:
 
     @cached_property
     def broken_rules(self) -> BrokenRules:
-        """Breaches so far. The object belongs to the env, and outlives its scene and class."""
+        """Breaches so far. The object belongs to the env: it stays when the env gets a new scene or class."""
         return BrokenRules(degrees_of(self._rule_choice), self._on_finding)
 
     def _make_scene(self) -> None:
@@ -91,7 +93,8 @@ class StrictMixin:
             cls = type(controller)
             self.broken_rules.report_breach(
                 "controller-targets",
-                f"{cls.__name__} lacks {' and '.join(flag for flag in TARGET_FLAGS if not hasattr(controller, flag))}.",
+                f"{cls.__name__} lacks {' and '.join(flag for flag in TARGET_FLAGS if not hasattr(controller, flag))}: "
+                "on the GPU each step raises AttributeError. Give the class both attributes.",
                 frames=None,
                 place=place_of_class(cls),
                 subject=cls,
@@ -187,13 +190,14 @@ class StrictMixin:
         finally:
             self._wrong_obs = None
         if self._watch.whole and not self._watch.looks:
-            # `evaluate` may store values of all envs, which is not the reset's fault: compare only what happens from here on.
+            # `evaluate` may store values for all envs, which is no mistake: compare only later changes.
             self._watch.go_on(self)  # type: ignore[arg-type]
         return obs
 
     @contextmanager
     def _noting_rows(self, info: Any, obs: Any = None) -> Iterator[None]:
-        """Add notes to the error of a hook: entries of ``evaluate`` and ``_get_obs_extra`` that have no row for each env."""
+        """If a hook raises, add notes to the error: the entries of ``evaluate`` and ``_get_obs_extra``
+        without a row per env."""
         try:
             yield
         except CoreRefusal:
@@ -203,7 +207,7 @@ class StrictMixin:
             ValueError,
             TypeError,
             IndexError,
-        ) as error:  # what torch and numpy raise for shapes
+        ) as error:  # what torch and numpy raise if shapes do not fit
             extra = obs.get("extra") if isinstance(obs, Mapping) else None
             for hook, returned in (("evaluate", info), ("_get_obs_extra", extra)):
                 for name, what in (

@@ -46,24 +46,25 @@ from workbench.envs.wrong_options import wrong_option
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options with which a task is made."""
+    """Options for building the envs of a task."""
 
     num_envs: int = 16
     backend: Backend = "auto"
     """``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: see `choose_backend`."""
     render: bool = True
-    """False makes no render system: no pictures, and no use of a graphics driver."""
+    """False: no render system is made, so there are no pictures, and no graphics driver is used."""
     threads: int | None = None
     """Threads that step the envs on the CPU; None for one on each core that the process may use."""
     pictures: PictureDegree = "exact"
     """Degree of the pictures that the env itself draws: observations and ``render``."""
     rules: Degree | None = None
-    """The degree of all rules of GPU simulation (on the CPU); None for each rule's own, see `gpu_rules`."""
+    """The degree of all rules of GPU simulation (on the CPU); None: each rule has its own degree, see
+    `gpu_rules`."""
     on_finding: Callable[[Finding], None] = warn_of
     """Called once for each place where a rule that does not stop the task is broken."""
     kwargs: Mapping[str, Any] = field(default_factory=dict)
-    """Further keyword arguments of the task class: ``obs_mode``, ``robot_uids``, ``control_mode`` ... A
-    ``render_backend`` among them replaces the one that is found."""
+    """Further keyword arguments of the task class: ``obs_mode``, ``robot_uids``, ``control_mode`` ... If they
+    include ``render_backend``, no renderer is searched for."""
 
     def __post_init__(self) -> None:
         if self.num_envs < 1:
@@ -82,11 +83,11 @@ class EnvOptions:
 def given_arguments(
     task: type[BaseEnv], env_kwargs: Mapping[str, Any], default_kwargs: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The keyword arguments with which the task class is made, without those of `EnvOptions`.
+    """Keyword arguments for the constructor of the task class, without those that are fields of `EnvOptions`.
 
     Args:
         env_kwargs: the user's arguments, in JSON.
-        default_kwargs: the arguments of the registration, which the user's replace.
+        default_kwargs: the arguments of the registration; the user's arguments take precedence.
     """
     return {**default_kwargs, **constructor_arguments(task, env_kwargs, BaseEnv)}
 
@@ -119,7 +120,7 @@ def build_env(
 ) -> BaseEnv:
     """Make the task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` does; raises like `make_env`.
 
-    The class decides what the keyword arguments do not: the reward mode is then the first of
+    The class decides what the keyword arguments leave open. Without ``reward_mode`` it is the first of
     ``SUPPORTED_REWARD_MODES``, implemented or not.
     """
     if moved := maniskill_private.why_not(""):
@@ -151,8 +152,8 @@ def build_env(
 
 
 _NO_FAST_PICTURES = (
-    'Fast pictures are for renderers in software: a GPU draws exact ones sooner. Leave out pictures="fast"; on the '
-    "command line, --fast-pictures."
+    'Fast pictures are for software renderers: a GPU draws exact pictures faster. Leave out pictures="fast" '
+    "(on the command line: --fast-pictures)."
 )
 
 
@@ -186,8 +187,8 @@ class TaskEnv:
         Args:
             env: an unwrapped ManiSkill env (see `make_env`).
             max_episode_steps: the time limit that ``gym.make``'s wrapper would apply.
-            check: called with what ``evaluate`` and the reward returned, before either is converted;
-                raises if the task broke its contract.
+            check: called with ``info`` and the reward (None after a reset), before they are converted to
+                arrays; raises if the task returned something wrong.
             obs: the last observation of an env that already runs, as its ``obs_mode`` gives it.
         """
         self.env = env
@@ -217,10 +218,10 @@ class TaskEnv:
     ) -> StepResult:
         """Start new episodes in all envs, or in those of `env_idx`.
 
-        A reset of all envs is ManiSkill's own ``reset(seed=[...])``. For a subset ManiSkill seeds torch with the seed of env
-        0, so a seed given for env 3 has no effect. Here a partial reset draws from the seed of the lowest env:
-        ``reset(seed=7, env_idx=[3])`` starts the episode of a single stock env's ``reset(seed=7)``. The order of envs and
-        their seeds makes no difference.
+        A reset of all envs is ManiSkill's own ``reset(seed=[...])``. For a subset ManiSkill seeds torch with
+        the seed of env 0, so a seed given for env 3 has no effect. Here a partial reset draws from the seed
+        of the lowest env: ``reset(seed=7, env_idx=[3])`` starts the same episode as ``reset(seed=7)`` of a
+        single stock env. Listing the envs, with their seeds, in another order makes no difference.
 
         Args:
             seed: one seed (the i-th env that is reset gets ``seed + i``), or one for each env that is reset; None
@@ -241,7 +242,7 @@ class TaskEnv:
     def _partial_reset(
         self, chosen: list[int], seeds: list[int] | None, further: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
-        # Not only in the CPU mixin: GPU simulation has ManiSkill's own reset.
+        # The CPU mixin does this too, but an env in GPU simulation has only ManiSkill's own reset.
         options, seeds = in_ascending_order({**further, "env_idx": chosen}, seeds, self.env)
         if seeds is None:
             return self.env.reset(options=options)
@@ -249,9 +250,9 @@ class TaskEnv:
             return self.env.reset(options=options)
 
     def step(self, action: NDArray[np.float32] | None) -> StepResult:
-        """One control step of all envs with a flat action (N, A), or None to leave the targets alone.
+        """Make one control step with a flat action (N, A); None leaves the controllers' targets unchanged.
 
-        A task without a controller gets no action.
+        A task without a controller ignores the action.
         """
         action = action if self.parts else None
         env_action = None if action is None else actions.to_env_action(self.env, self.parts, action)
@@ -261,7 +262,8 @@ class TaskEnv:
         return self.result(info, reward, action, terminated)
 
     def snapshot(self, env_idx: Sequence[int] | None = None) -> Snapshot:
-        """Everything that decides how the episodes of these envs (None: of all) continue; see `snapshot`."""
+        """Copy of everything that decides how the episodes of these envs (None: of all) continue; see
+        `take_snapshot`."""
         return take_snapshot(self.env, env_idx)
 
     def restore(
@@ -322,9 +324,10 @@ class TaskEnv:
         truncated: Any = None,
         look: bool = True,
     ) -> StepResult:
-        """The result of a step or (without an action) of a reset, even one that was made on `env` directly.
+        """The result of the last step or reset, even if it was made on `env` directly.
 
         Args:
+            action: (N, A) of the step; None after a reset, or after a step without an action.
             terminated, truncated: None to take them from `info` and the time limit.
             look: whether to compute `StepResult.sound_obs`.
         """
@@ -355,7 +358,7 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
         return None
     seeds = [seed + i for i in range(count)] if isinstance(seed, int) else [int(s) for s in seed]
     if len(seeds) != count:
-        raise ValueError(f"{len(seeds)} seeds for {count} envs")
+        raise ValueError(f"{len(seeds)} seeds for {count} envs: give one for each env, or a single number")
     return seeds
 
 
@@ -363,7 +366,7 @@ def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
     """`StepResult.sound_obs`; a value that is not a batch of floats counts as finite."""
     sound = np.ones(num_envs, bool)
     for name, value in flat_entries(obs):
-        # Skip pictures: they are large, and the simulator's own.
+        # Skip pictures: they are large, and come from the renderer, not from the task.
         if name.startswith("sensor_data/") or not isinstance(value, torch.Tensor):
             continue
         if value.is_floating_point() and value.ndim and len(value) == num_envs:
@@ -372,7 +375,7 @@ def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
 
 
 def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
-    """(N, ...), a copy; a single value (of a task written for one env) is repeated."""
+    """(N, ...) copy of `value`; a single value (from a task written for one env) is repeated for each env."""
     array = np.array(value.numpy(force=True) if isinstance(value, torch.Tensor) else value, dtype)
     if num_envs == array.size == 1:
         return array.reshape(1)

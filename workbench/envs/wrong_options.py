@@ -29,11 +29,11 @@ _OBS_PARTS = (
 _CORE_FOLDER = f"{Path(__file__).parent}{os.sep}"
 """The folder of the core, which wraps constructors."""
 _MAX_NAMES = 12
-"""Maximum names that a message lists where none is similar."""
+"""Maximum number of names that a message lists if no name is similar."""
 
 
 class WrongOption(CoreRefusal, ValueError):
-    """ManiSkill refused a keyword argument that the caller gave, not what the task does."""
+    """ManiSkill refused a keyword argument from the caller. The task's code is not at fault."""
 
 
 def wrong_option(task: type[BaseEnv], given: Mapping[str, Any], error: BaseException) -> WrongOption | None:
@@ -51,14 +51,14 @@ def wrong_option(task: type[BaseEnv], given: Mapping[str, Any], error: BaseExcep
     if isinstance(first, TypeError) and (
         raised_in.co_name == "__init__" or raised_in.co_filename.startswith(_CORE_FOLDER)
     ):
-        # An unknown name fails in the frame of the call.
+        # Python raises for an unknown keyword in the frame that makes the call: a constructor, or the core.
         known, popped = {name for name, _ in parameters_of(task, object)}, _taken_by_name(task)
         for name in given:
             if name not in known and name not in popped:
                 return WrongOption(
                     f"{task.__name__} takes no keyword argument {name!r}.{_instead(name, known)}"
                 )
-    if not is_installed(raised_in.co_filename):  # the task's own error about a value of its own
+    if not is_installed(raised_in.co_filename):  # raised by the task's own code
         return None
     cameras = _local(first, update_camera_configs_from_dict, "camera_configs")
     agent = _local(first, BaseAgent.set_control_mode, "self")
@@ -146,7 +146,9 @@ def _instead(wrong: str, names: Collection[str]) -> str:
     near = difflib.get_close_matches(wrong, names, n=3, cutoff=0.6)
     if near:
         return f" Did you mean {' or '.join(near)}?"
-    return f" There are: {', '.join(sorted(names)[:_MAX_NAMES])}{', ...' if len(names) > _MAX_NAMES else ''}."
+    return (
+        f" Choose from: {', '.join(sorted(names)[:_MAX_NAMES])}{', ...' if len(names) > _MAX_NAMES else ''}."
+    )
 
 
 def _local(error: BaseException, function: Any, name: str) -> Any:

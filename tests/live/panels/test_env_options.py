@@ -33,7 +33,7 @@ OWN = (
     Keyword("name", "str", '"a"', '"a"'),
     Keyword("way", "choice", '"left"', '"left"', ('"left"', '"right"'), optional=True),
     Keyword("where", "json", "[0, 1]", "[0, 1]"),
-    Keyword("made", "json", "<object>", fixed="its value is an object of Python"),
+    Keyword("made", "json", "<object>", fixed="its value is a Python object that JSON cannot hold"),
 )
 MADE = HowMade("panda", (ROBOT, CONTROL), OWN)
 

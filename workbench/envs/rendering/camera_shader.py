@@ -1,4 +1,5 @@
-"""Selects the shader of a camera, keeps it when the camera changes scenes, and replaces one that this machine cannot draw."""
+"""Selects the shader of a camera, keeps it when the camera changes scenes, and replaces a shader that this
+machine cannot draw."""
 
 from __future__ import annotations
 
@@ -68,7 +69,7 @@ def selected(shader: ShaderConfig, folder: Path | None = None) -> Iterator[None]
 
 
 def note_shader(camera: sapien.render.RenderCameraComponent) -> None:
-    """Remember the shader that is selected now for `made_again`; call it when the camera is made."""
+    """Store the selected shader for `made_again`; call it when the camera is made."""
     _made_with[camera] = _Selection.now()
 
 
@@ -128,7 +129,7 @@ def is_ray_traced(shader_pack: str) -> bool:
 
 @cache
 def install_drawable_cameras(is_batched: Callable[[Any], bool]) -> None:
-    """Let ManiSkill make cameras of batched CPU scenes with `drawable` configs; installed once per process."""
+    """Make ManiSkill build cameras of batched CPU scenes from `drawable` configs, once per process."""
     stock = Camera.__init__
 
     @wraps(stock)

@@ -33,8 +33,9 @@ def drawing(key: CameraKey, site: CallSite | None = None) -> Iterator[None]:
     """
     camera = _named(key, site)
     late = (
-        f"{camera} was not ready after {PICTURE_SECONDS:g} s, so this process is ended. Draw it smaller, or see with "
-        "`workbench doctor` which driver draws; --env render_backend=none draws nothing."
+        f"{camera} was not ready after {PICTURE_SECONDS:g} s, so this process is ended. Make the picture "
+        "smaller, or run `workbench doctor` to see which driver draws. With --env render_backend=none "
+        "nothing is drawn."
     )
     with limited(late):
         try:
@@ -46,11 +47,12 @@ def drawing(key: CameraKey, site: CallSite | None = None) -> Iterator[None]:
 
 
 def read_texture(component: Any, texture: str, key: CameraKey, site: CallSite | None = None) -> NDArray[Any]:
-    """(H, W, C) of the last picture of a camera component. Raises as `drawing`."""
+    """(H, W, C) one texture of a camera component's last picture. Raises like `drawing`, also for an unknown
+    texture."""
     with drawing(key, site):
         if texture not in (has := component.get_picture_names()):
             raise CannotDraw(
-                f"{_named(key, site)} has no texture {texture!r}. Its shader gives {', '.join(has)}.",
+                f"{_named(key, site)} has no texture {texture!r}. Its shader draws {', '.join(has)}.",
                 key,
                 _place(site),
             )

@@ -1,4 +1,5 @@
-"""Cameras that draw the pictures of SAPIEN's minimal shader, without the work that adds nothing to them."""
+"""Cameras that draw the pictures of SAPIEN's minimal shader, without shader work that does not change
+them."""
 
 from __future__ import annotations
 
@@ -23,8 +24,9 @@ ALL = frozenset({"Color", "PositionSegmentation", "GbufferDepth"})
 Edits = tuple[tuple[str, str], ...]
 """Replacements in a shader's text: (old, new); each old passage occurs once."""
 
-# No environment map, which would add black: it looks up two cube maps for each pixel, and a third in the last pass, which
-# then only copies. w of a position is 1. The transposed inverse equals the cofactors, apart from its scale.
+# These edits leave out the environment map, which would add black: it costs two cube map look-ups per pixel,
+# and a third in the last pass, which otherwise only copies. They also use that w of a position is 1, and that
+# the transposed inverse equals the cofactor matrix up to scale.
 _VERTICES: Edits = (
     ("mat3(transpose(inverse(modelView)))", "sign(determinant(m)) * mat3(cross(m[1], m[2]), cross(m[2], m[0]), cross(m[0], m[1]))"),
     ("  mat3 normalMatrix", "  mat3 m = mat3(modelView);\n  mat3 normalMatrix"),
@@ -108,7 +110,7 @@ def shader_folder(textures: frozenset[str]) -> Path | None:
             if read_private(file, folder / parent) != text.encode():
                 write_private(file, text.encode(), folder / parent)
     except (OSError, ValueError):
-        return None  # another SAPIEN, or a full disk: the minimal shader itself draws
+        return None  # another SAPIEN, or a full disk: the minimal shader is used unchanged
     return folder / "pack"
 
 
@@ -130,7 +132,7 @@ class _Fast:
 
 
 class FastCameras:
-    """A second camera for each exact camera of a scene, with the same size, which follows the exact one."""
+    """For each exact camera of a scene, a second camera of the same size that follows it."""
 
     def __init__(self, sub_scenes: Sequence[sapien.Scene]) -> None:
         self._sub_scenes = sub_scenes
@@ -142,7 +144,8 @@ class FastCameras:
     ) -> None:
         """Move the fast camera for these textures to where `exact` is; call it before ``update_render``.
 
-        There is no fast camera for other shaders and textures than the minimal one's, nor with an environment map.
+        Makes no fast camera if the shader is not the minimal one, a texture is not in `ALL`, or there is an
+        environment map.
 
         Args:
             config: ManiSkill's config of the camera.
@@ -166,7 +169,7 @@ class FastCameras:
     def camera_for(
         self, exact: sapien.render.RenderCameraComponent, textures: Collection[str]
     ) -> sapien.render.RenderCameraComponent:
-        """The camera with which to draw these textures; `exact` itself where no fast one follows it."""
+        """The camera with which to draw these textures; `exact` itself if it has no fast camera for them."""
         fast = self._made.get((id(exact), _smallest(textures)))
         return exact if fast is None else fast.component
 

@@ -45,18 +45,19 @@ _TOLERANCE_UNIT_METRES = 1e-4
 meshes."""
 
 _MIN_LEAN_PIXELS = 256 * 256
-"""Pixels of a picture below which fewer textures save less than the check whether the author changed the material
-costs."""
+"""In a picture with fewer pixels, leaving out textures saves less time than checking whether the author
+changed the material."""
 _SAME_POSE_TOLERANCES = 1e-5, 1e-4
 """Tolerances in metres and (roughly) radians: a body that moved less, as seen from a camera, counts as not moved."""
 
 Bodies = tuple[tuple[sapien.render.RenderBodyComponent, sapien.render.RenderBodyComponent | None], ...]
-"""For each body of an env that is drawn differently: its exact component, and what is drawn instead (None for nothing)."""
+"""For each body of an env that is drawn differently: its exact component, and the component to draw instead
+(None for nothing)."""
 
 
 @contextmanager
 def shown(bodies: Bodies) -> Iterator[None]:
-    """Context in which the simplified shapes are drawn in place of the exact ones, hidden where those are hidden."""
+    """Context in which simplified shapes are drawn instead of the exact ones, with the same visibility."""
     was = [exact.visibility for exact, _ in bodies]
     try:
         for (exact, fast), visibility in zip(bodies, was, strict=True):
@@ -115,7 +116,8 @@ class FastShapes:
         Args:
             key: name of the camera.
             camera: the camera's component in each env.
-            places: poses at which bodies of this env are drawn in place of their own; its cameras were moved with them.
+            places: poses at which bodies of this env are drawn instead of their simulated poses; the cameras
+                on these bodies are at `places` already.
         """
         if key not in self._tolerances:
             self._tolerances[key] = self._tolerances_of(camera)
@@ -208,7 +210,7 @@ class FastShapes:
         return self._corners[by]
 
     def _nearest(self, body: Any, pose: sapien.Pose, planes: Planes) -> float:
-        """Metres to the nearest vertex of a triangle that is in view; infinite where none is.
+        """Metres from the camera to the nearest vertex of a triangle in view; infinite if none is in view.
 
         Args:
             pose: pose of the body, in the camera's frame.
@@ -250,7 +252,7 @@ def _add_hidden(component: Any, body: Any) -> None:
 
 
 def _lean_bodies(sub_scenes: Sequence[sapien.Scene]) -> list[list[tuple[Any, LeanBody]]]:
-    """Bodies of each env that are not simplified, each with a body with fewer textures to draw in its place."""
+    """Bodies of each env that are not simplified, each with the `LeanBody` to draw instead."""
     materials, found = LeanMaterials(), []
     for sub_scene in sub_scenes:
         light = [body for body in _bodies(sub_scene) if not _is_heavy(body)]
@@ -308,7 +310,7 @@ def _bodies(sub_scene: sapien.Scene) -> Iterator[Any]:
 
 
 def unknown_meshes(sub_scenes: Sequence[sapien.Scene]) -> list[Mesh]:
-    """The meshes of heavy bodies that were never simplified on this machine, which takes seconds for a robot."""
+    """Meshes of heavy bodies that were not simplified on this machine yet: that takes seconds for a robot."""
     found: dict[int, Mesh] = {}
     for sub_scene in sub_scenes:
         for body in heavy_bodies(sub_scene):
@@ -376,7 +378,7 @@ class _Chosen:
         return self._corners[id(mesh)][1]
 
     def mesh(self, part: _Part, tolerance: float) -> Mesh:
-        """The simplified mesh of a part of a body that may be off by `tolerance` metres."""
+        """The mesh of a part of a body, simplified with an error of at most `tolerance` metres."""
         largest = max(map(abs, part.scale))
         if largest == 0 or not _is_mesh(part.shape):
             return part.exact
@@ -456,7 +458,7 @@ def _tolerance(camera: sapien.render.RenderCameraComponent, distance: float) -> 
 
 
 def _pixel(camera: sapien.render.RenderCameraComponent) -> float:
-    """Radians of a pixel in the middle of the picture."""
+    """Angle that a pixel in the middle of the picture covers, in radians."""
     k = camera.get_intrinsic_matrix()
     return 1.0 / float(max(k[0, 0], k[1, 1]))
 

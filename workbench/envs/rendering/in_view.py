@@ -72,7 +72,7 @@ def box_corners(points: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def cut_to_view(mesh: Mesh, planes: Planes) -> Mesh:
-    """`mesh` without the triangles that are entirely outside one of the planes, which are in its frame."""
+    """`mesh` without the triangles that are entirely outside one of the planes (in the mesh's frame)."""
     outside = (mesh.vertices @ planes[:, :3].T + planes[:, 3] < 0) @ (1 << np.arange(len(planes)))
     of_faces = outside[mesh.faces]
     kept = mesh.faces[(of_faces[:, 0] & of_faces[:, 1] & of_faces[:, 2]) == 0]

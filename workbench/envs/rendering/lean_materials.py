@@ -1,4 +1,4 @@
-"""Draws bodies without constant textures, each of which SAPIEN's shaders would look up for every pixel."""
+"""Draws bodies without constant metallic textures, which SAPIEN's shaders would look up for every pixel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ _VALUES = (
 _TEXTURES = ("base_color", "emission", "normal", "roughness", "metallic", "transmission")
 _KNOWN_FORMATS = ("R8G8B8A8Unorm", "R8Unorm")
 _MAX_READ_TEXELS = 1 << 24
-"""Maximum texels that are read in a scene: a million take 10 to 20 ms, and a furnished house has hundreds of millions."""
+"""Maximum texels that are read per scene: a million takes 10 to 20 ms, and a furnished house has hundreds of
+millions."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,9 @@ class LeanMaterials:
         """Number of texels read so far."""
 
     def lean_copy(self, body: Any) -> LeanBody | None:
-        """A lean copy of a body; None if no texture is constant, or not all of its meshes are from files: SAPIEN shares the
-        materials of other meshes with their copies, and makes the tangents of normal maps only from files."""
+        """A copy of a body without constant metallic textures; None if no metallic texture is constant, or a
+        mesh is not from a file: SAPIEN shares the materials of such meshes with their copies, and makes the
+        tangents of normal maps only from files."""
         parts = [part for shape in body.render_shapes for part in shape.parts]
         if all(self._metallic(part.material) is None for part in parts):
             return None
@@ -97,8 +99,8 @@ class LeanMaterials:
 
 
 def _constant(texture: Any) -> float | None:
-    """The number that a texture has everywhere, in red and blue: SAPIEN reads red from a picture, and blue from a glTF
-    file's texture, which holds the roughness in green."""
+    """The value 0..1 that red and blue have in all texels; None if they differ. SAPIEN reads the metallic
+    value from red of a picture, and from blue of a glTF file's texture, which has the roughness in green."""
     if texture.is_srgb or texture.format not in _KNOWN_FORMATS:
         return None
     pixels = np.asarray(texture.download())

@@ -58,7 +58,7 @@ _MAX_CACHE_BYTES = 512 << 20
 class Level:
     mesh: Mesh
     error: float
-    """Distance from the level within which 99 % of the exact surface are, in the mesh's own units."""
+    """Distance from the level within which 99 % of the exact surface lie, in the mesh's own units."""
 
 
 def content_hash(mesh: Mesh) -> str:
@@ -118,8 +118,9 @@ def reduced_mesh(mesh: Mesh, max_faces: int) -> Mesh:
 def from_afar(mesh: Mesh, error: float) -> Mesh:
     """`mesh` with few triangles, such that 99 % of its surface is within `error` of them; cached on disk.
 
-    For objects a few pixels large: unlike in `levels_of`, vertices are first joined on a coarse grid, without which hundreds
-    of loose pieces keep their triangles. Simple and textured meshes stay exact. The first call for a mesh takes some 0.2 s.
+    For objects a few pixels large: unlike in `levels_of`, vertices may be joined on a coarse grid, because
+    hundreds of loose pieces would keep their triangles. Simple and textured meshes stay exact. The first call
+    for a mesh takes some 0.2 s.
     """
     if len(mesh.faces) <= _SIMPLE_FACES or mesh.uvs is not None or error <= 0:
         return mesh
@@ -135,7 +136,7 @@ def from_afar(mesh: Mesh, error: float) -> Mesh:
 
 
 def _few_faces(mesh: Mesh, error: float) -> Mesh:
-    """The coarsest mesh that is near enough; `mesh` itself where none is."""
+    """The coarsest mesh whose `deviation` is at most `error`; `mesh` itself if there is none."""
     for faces in (count for count in _AFAR_FACES if count < 0.8 * len(mesh.faces)):
         for coarser in (
             collapse_mesh(mesh, faces),
@@ -158,7 +159,7 @@ def are_known(mesh: Mesh) -> bool:
 
 
 def within(mesh: Mesh, error: float) -> Mesh:
-    """The coarsest level that is nowhere farther than `error` from `mesh`; `mesh` itself where there is none."""
+    """The coarsest level whose `Level.error` is at most `error`; `mesh` itself if there is none."""
     good = [level.mesh for level in levels_of(mesh) if level.error <= error]
     return good[-1] if good else mesh
 
@@ -186,7 +187,7 @@ def _made(mesh: Mesh) -> Iterator[Level]:
                 coarser, error = by_pieces, other
         if len(coarser.faces) >= 0.9 * len(finer.faces) or error > _USELESS_ERROR * extent:
             break
-        # A level counts as no nearer than the finer one before it.
+        # The error of a level is at least that of the finer level before it.
         finer, worst = coarser, max(worst, error)
         yield Level(_shaded(coarser, surface), worst)
 
@@ -262,7 +263,7 @@ def _write(name: str, levels: tuple[Level, ...]) -> None:
         write_private(f"{name}.npz", content.getvalue(), _folder())
         _make_room()
     except OSError:
-        pass  # a full disk or a folder of another user: the next process makes them again
+        pass  # a full disk or a folder of another user: the next process makes the levels again
 
 
 def _make_room() -> None:

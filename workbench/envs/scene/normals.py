@@ -16,18 +16,18 @@ _CREASE_COSINE = float(np.cos(np.deg2rad(40.0)))
 """Cosine of the angle (40 degrees) below which neighbouring faces are shaded as one smooth surface."""
 _EXACT_POINTS = 2_000, 10, 20_000
 """Points sampled on an exact surface by area, in addition to one on each triangle: a constant, a number per triangle,
-and the limit of both."""
+and the limit of their sum."""
 _COARSE_POINTS = 2_000
 """Points sampled on a coarse surface by area, in addition to some on each triangle."""
 _NEIGHBOURS = 8
-"""Number of nearest points of the exact surface, from which one that faces the same way is chosen."""
+"""Number of nearest points on the exact surface that are searched for one that faces the same way."""
 _MIN_FACING_COSINE = 0.3
 _SHARED_DEGREES = 20.0
 """Angle between normals of a coarse mesh's faces at a vertex below which they share one normal: a seventh fewer
 vertices, for a twentieth of the shading error."""
 _OWN_WEIGHT = 0.02
-"""Weight of a vertex's own normal relative to the normals of the surface around it: it decides only where they
-determine nothing."""
+"""Weight of a vertex's own normal relative to the normals of the surface around it: it matters only where
+they determine no normal."""
 
 
 def with_normals(mesh: Mesh) -> Mesh:
@@ -124,15 +124,16 @@ class ShadedSurface:
         near = np.asarray(self._tree.query(points, k=count)[1]).reshape(-1, count)
         candidates = self._normals[near]
         alike = np.einsum("skd,sd->sk", candidates, facing)
-        # The nearest point that faces the same way; on a folded face none does, and the most similar one is taken.
+        # Take the nearest point that faces the same way. On a folded face there is none: take the most
+        # similar.
         agrees = alike > _MIN_FACING_COSINE
         choice = np.where(agrees.any(axis=1), agrees.argmax(axis=1), alike.argmax(axis=1))
         every = np.arange(len(points))
         return candidates[every, choice], alike[every, choice] > 0
 
     def shade(self, coarse: Mesh) -> Mesh:
-        """`coarse` with the normals that shade its triangles most like this surface; it must have normals, and vertices with
-        nearly the same normal are shared.
+        """Copy of `coarse`, which must have normals, with the normals that shade its triangles most like this
+        surface. Vertices with nearly the same normal are merged.
 
         The normals minimise the squared difference between the interpolated normal of a triangle and the normal of the surface,
         over points sampled by area. So a vertex at the end of a large flat face takes the normal of the face, although the

@@ -173,7 +173,7 @@ class _Source:
     key: Hashable
     part: Any
     dimensions: tuple[float, float, float]
-    """Factors of the vertices; SAPIEN keeps primitives as unit shapes."""
+    """Scale factors of the vertices: SAPIEN stores primitives as unit shapes."""
     keep: bool
     """Whether to keep the reduced mesh for the next scene."""
 
@@ -287,7 +287,8 @@ def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
 
 
 def exact_part(shape: Any, part: Any, index: int) -> tuple[Mesh, tuple[float, float, float]]:
-    """A part of a render shape with all its triangles, and the scale that it is drawn with on its local pose.
+    """The mesh of a part of a render shape with all its triangles, and the scale to apply before the shape's
+    local pose.
 
     Meshes of files are cached for the life of the process.
     """

@@ -18,8 +18,8 @@ from workbench.envs.simulation.cpu_system import batched_system
 
 _T = TypeVar("_T")
 _HIDDEN_METRES = 5e4
-"""Distance along each axis from an actor's true pose above which it is still hidden; ``Actor.hide_visual`` moves it by
-99999 m."""
+"""An actor that is farther than this from its true pose, along each axis, is still hidden:
+``Actor.hide_visual`` moves it by 99999 m."""
 
 
 def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
@@ -54,7 +54,7 @@ class SceneIndex:
     owners: tuple[str, ...]
     """(B,) name of the actor or articulation that the body belongs to."""
     hidden: tuple[bool, ...]
-    """(B,) whether the task hides it from its sensors."""
+    """(B,) whether the task hides the body from its sensors."""
     entities: NDArray[np.object_]
     """(N, B) the ``sapien.Entity`` of each body; None if the env lacks it."""
     states: dict[str, Any]
@@ -184,7 +184,8 @@ def read_poses(env: Any) -> NDArray[np.float32]:
 
 @once_a_scene
 def joints_of_scene(env: Any) -> tuple[tuple[str, Any], ...]:
-    """Name and articulation of each that every env has with the same number of active joints, so that joints compare."""
+    """Name and articulation of each articulation that every env has, with the same number of active joints in
+    each: only their joints can be compared between envs."""
     found = []
     for name, articulation in env.scene.articulations.items():
         count = len(articulation.active_joints)
@@ -214,8 +215,8 @@ def read_joints(env: Any) -> NDArray[np.float32] | None:
 
 
 def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-    """For each Actor that GPU simulation moved away to hide it: slots (M,) and true poses (M, 7) of its entities, without
-    entities that something else has moved since."""
+    """For each Actor that GPU simulation moved away to hide it: slots (M,) and true poses (M, 7) of its
+    entities. Leaves out entities that were moved again since then."""
     for actor, slots in scene_index(env).actors:
         if (kept := maniskill_private.pose_before_hiding(actor)) is not None:
             now = rows_of(env.scene.px.cuda_rigid_body_data, maniskill_private.data_rows_of(actor).long())[
@@ -226,7 +227,7 @@ def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float
 
 
 def present_states(env: Any) -> dict[str, Any]:
-    """(N, D) of each of `SceneIndex.states` of a batched env, laid out as by ``get_state()``; NaN in envs without it.
+    """State (N, D) of each of `SceneIndex.states`, laid out as by ``get_state()``; NaN for an env without it.
 
     Copies: tensors, or arrays on the CPU.
     """
@@ -237,6 +238,7 @@ class StateRows(NamedTuple):
     """Copies of the tensors (one call for each) from which the states of a moment are made."""
 
     still: list[int]
+    """Columns B of `data` for kinematic bodies, whose velocity is set to zero."""
     places: dict[str, tuple[Any, int | None, Any, int]]
     data: Any
     """(N, B, 13)"""

@@ -82,7 +82,7 @@ class SceneGeometry:
     body_kinds: tuple[BodyKind, ...]
     """(B,)"""
     body_hidden: tuple[bool, ...]
-    """(B,) whether the task hides it from sensors (goal markers: ``_hidden_objects``)."""
+    """(B,) whether the task hides the body from sensors (goal markers: ``_hidden_objects``)."""
     visuals: tuple[Visual, ...]
 
     @property
@@ -107,7 +107,7 @@ def fingerprint(visuals: tuple[Visual, ...]) -> str:
 
 
 class SharedShapes:
-    """Cache that stores shapes which look the same once, by a digest of everything visible. Not thread-safe.
+    """Cache that stores equal-looking shapes only once, by a digest of everything visible. Not thread-safe.
 
     A texture takes some megabytes: without the cache, sixty open recordings of one task would hold half a gigabyte.
     """
@@ -123,7 +123,7 @@ class SharedShapes:
         return replace(geometry, visuals=tuple(self._shared(geometry.visuals)))
 
     def shared(self, mesh: Mesh, material: Material) -> tuple[Mesh, Material]:
-        """An earlier mesh and material that look the same, or these."""
+        """An earlier mesh and material that look the same, else the given ones."""
         kept = self._kept.get((id(mesh), id(material)))
         if kept is None:
             none = np.zeros(0, np.int32)

@@ -24,7 +24,8 @@ _WELD_CELLS = 1_000_000
 _MAX_PIECES = 200
 _MIN_FACES = 24
 _SLOW_GROWTH, _USUAL_GROWTH = 3, 7
-"""Growth of the collapse threshold (the method's ``agg``): the slower, the more cheap edges go before costly ones."""
+"""Growth of the collapse threshold (the method's ``agg``): the slower, the more cheap edges collapse before
+costly ones."""
 
 
 def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
@@ -35,8 +36,8 @@ def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     every triangle its own three vertices. So vertices at one place are welded first (with a texture only where the uv agrees),
     and normals are computed again, sharp at edges and smooth elsewhere.
 
-    A mesh of many loose pieces may keep up to twice as many triangles, and a textured one more, since edges of its texture
-    pieces stay.
+    A mesh of many loose pieces may keep up to twice as many triangles, and a textured mesh more, because the
+    borders of the pieces of its texture stay.
     """
     reduced = collapse_mesh(mesh, max_faces)
     if reduced is mesh:
@@ -47,7 +48,7 @@ def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
 
 
 def collapse_mesh(mesh: Mesh, max_faces: int) -> Mesh:
-    """`reduce_mesh`, with normals of its own faces."""
+    """Like `reduce_mesh`, with normals computed from the faces of the result."""
     if len(mesh.faces) <= max_faces or not np.ptp(mesh.vertices, axis=0).any():
         return mesh
     cells = _WELD_CELLS if mesh.uvs is not None or len(mesh.faces) <= _DENSE_FACES else _CLUSTER_CELLS
@@ -67,8 +68,8 @@ def collapse_mesh(mesh: Mesh, max_faces: int) -> Mesh:
 
 
 def coarsen_mesh(mesh: Mesh, max_faces: int, by_pieces: bool = False) -> Mesh:
-    """`mesh` with about `max_faces` triangles, or more if that many cannot keep the shape; slower than `reduce_mesh`,
-    nearer to the surface, and with normals of its own faces.
+    """`mesh` with about `max_faces` triangles, or more if so few cannot keep the shape. Slower than
+    `reduce_mesh` and nearer to the surface; the normals are computed from the faces of the result.
 
     Args:
         by_pieces: collapse each connected piece by itself, so that small pieces are not lost.
@@ -83,8 +84,8 @@ def coarsen_mesh(mesh: Mesh, max_faces: int, by_pieces: bool = False) -> Mesh:
 
 
 def cluster_mesh(mesh: Mesh, max_faces: int, cells: int) -> Mesh:
-    """`mesh`, without texture, with about `max_faces` triangles after the vertices in each cell of a grid are merged, and
-    with normals of its own faces.
+    """`mesh`, without texture, with about `max_faces` triangles: merges the vertices in each cell of a grid.
+    The normals are computed from the faces of the result.
 
     Loose pieces grow together, and details smaller than a cell are lost: for objects that are seen from afar.
 
@@ -135,7 +136,7 @@ def rounded(mesh: Mesh) -> Mesh:
 def flat_rectangle(mesh: Mesh) -> Mesh | None:
     """`mesh` as two triangles, or None if it is not a flat rectangle. ManiSkill's floor is a grid of 100 x 100 squares.
 
-    Only rectangles along the axes of the mesh's own frame, one layer, with uv linear in position.
+    Finds only rectangles along the axes of the mesh's own frame, of one layer, with uv linear in position.
     """
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     extent = high - low
@@ -215,7 +216,7 @@ def _collapse(
         spike = distance > 0.04
         new_points[spike] = points[nearest[spike]]
         return (new_points * extent).astype(np.float32), new_faces, None
-    # The edge of a piece of texture is a border of the welded mesh; moved, it would open a gap.
+    # The edge of a piece of texture is a border of the welded mesh: moving it would open a gap.
     collapses = fast_simplification.simplify(
         points,
         triangles,
@@ -225,7 +226,7 @@ def _collapse(
         preserve_border=True,
     )[-1]
     new_points, new_faces, new_index = fast_simplification.replay_simplification(points, triangles, collapses)
-    # The uv of the old vertex nearest to the new one.
+    # Each new vertex takes the uv of the nearest old vertex.
     order = np.argsort(-np.linalg.norm(points - new_points[new_index], axis=1), kind="stable")
     new_uvs = np.zeros((len(new_points), 2), dtype=np.float32)
     new_uvs[new_index[order]] = uvs[order]
@@ -235,8 +236,8 @@ def _collapse(
 def _collapse_whole(
     points: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    # Losing a flat lid costs a quadric nothing unless its border is kept. So borders go only if it is the only way to get
-    # few enough faces.
+    # The quadric error of losing a flat lid is zero, unless the lid's border is kept. So borders may collapse
+    # only if there are too many faces otherwise.
     new_points, new_faces = points, faces
     for growth, keep_borders in ((_SLOW_GROWTH, True), (_SLOW_GROWTH, False), (_USUAL_GROWTH, False)):
         new_points, new_faces = fast_simplification.simplify(
@@ -252,7 +253,8 @@ def _collapse_pieces(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Collapse each connected piece by itself, with a share of the triangles by its area.
 
-    Losing a flat disc costs a quadric nothing: collapsed together with a round housing, its lid would go first.
+    The quadric error of losing a flat disc is zero: in a collapse of a whole round housing, its lid would
+    vanish first.
     """
     count = len(points)
     edges = coo_matrix(

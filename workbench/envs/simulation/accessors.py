@@ -124,9 +124,9 @@ def _report_early(system: BatchedCpuSystem, struct: Any, done: str) -> None:
     name = getattr(struct, "articulation", None) or struct
     system.report(
         "state-while-built",
-        f"The state of '{name.name}' is {done} while the scene is built: on the GPU this fails, there are no tensors of state "
-        "yet. Do it in _after_reconfigure(self, options) for what stays, in _initialize_episode for what each episode "
-        "begins with.",
+        f"The state of '{name.name}' is {done} while the scene is built: on the GPU this fails, because "
+        "there are no tensors of state yet. Do it in _after_reconfigure(self, options) for a value that "
+        "stays, or in _initialize_episode for a value with which each episode begins.",
     )
 
 
@@ -178,8 +178,8 @@ def _put_directly(
     assert each.write is not None
     if system.laid_out and _is_static(struct, each):
         system.refused_by_gpu(
-            f"'{struct.name}' is static and moved: on the GPU a static actor cannot be moved once the scene is built. Give it "
-            "its initial_pose before build_static(), or build it with build_kinematic()."
+            f"'{struct.name}' is a static actor and is moved: on the GPU this fails once the scene is built. "
+            "Set its initial_pose before build_static(), or build it with build_kinematic()."
         )
         if system.held_back:
             return
@@ -269,9 +269,9 @@ def _rows(struct: Any, value: Any, name: str, chosen: NDArray[np.int64]) -> NDAr
             f"The {name.replace('_', ' ')} of '{struct.name}' is set with {len(numbers)} rows, and {wanted} "
             f"{'is' if wanted == 1 else 'are'} wanted: on the GPU this fails. "
             + (
-                "Here the first is taken."
+                "Here the first row is used."
                 if every == 1
-                else "Give one for each env of env_idx, len(env_idx)."
+                else "Give len(env_idx) rows, one for each env of env_idx."
             )
         )
         return numbers[:1] if every == 1 else numbers[chosen]
@@ -315,9 +315,9 @@ def _of_chosen(stock: Callable[..., Any], name: str) -> Callable[..., Any]:
             return stock(self, *args, **kwargs)
         if name not in _WORK_ON_THE_GPU:
             system.refused_by_gpu(
-                f"{name} of '{getattr(self, 'name', None) or type(self).__name__}' is set once the simulation runs: on the GPU "
-                "this fails. Set it where it is built, in _load_scene or _load_agent; with reconfiguration_freq=1 they run "
-                "before each episode."
+                f"{name} of '{getattr(self, 'name', None) or type(self).__name__}' is set after the scene "
+                "was built: on the GPU this fails. Set it in _load_scene or _load_agent; with "
+                "reconfiguration_freq=1 they run before each episode."
             )
         return None if system.held_back else stock(_some(self, _chosen(self)), *args, **kwargs)
 
@@ -325,7 +325,7 @@ def _of_chosen(stock: Callable[..., Any], name: str) -> Callable[..., Any]:
 
 
 def _some(struct: Any, chosen: NDArray[np.int64]) -> Any:
-    """The struct with only these of its objects."""
+    """Copy of the struct with only these of its objects; the struct itself for all."""
     if len(chosen) == len(struct._objs):
         return struct
     some = copy.copy(struct)
@@ -418,8 +418,8 @@ _OF_CAMERAS = (
 
 
 def _of_chosen_cameras(stock: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a method of cameras to apply only to the envs that are being reset; the matrices that ManiSkill caches are
-    computed again."""
+    """Wrap a method of cameras to apply only to the envs that are being reset. Clears the matrices that
+    ManiSkill caches."""
 
     @wraps(stock)
     def call(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -435,7 +435,8 @@ def _of_chosen_cameras(stock: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _with_link_poses(stock: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a method that reads link poses: while the scene is built, they are right only once the root pose is set again."""
+    """Wrap a method that reads link poses: while the scene is built, they are wrong until the root pose is
+    set again."""
 
     @wraps(stock)
     def call(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -479,7 +480,7 @@ GUARDED: dict[type, dict[str, str]] = {
         "add_force_torque": "Actor.apply_force()",
     },
 }
-"""Properties (and their ``set_...``) and methods of SAPIEN, each with what to use instead."""
+"""Properties (and their ``set_...``) and methods of SAPIEN, each with ManiSkill's method to use instead."""
 
 _systems: weakref.WeakSet[BatchedCpuSystem] = weakref.WeakSet()
 """Systems of batched scenes; their scenes are read at each call, since a restored snapshot gives an env another scene."""
@@ -488,10 +489,11 @@ _systems: weakref.WeakSet[BatchedCpuSystem] = weakref.WeakSet()
 def guard_scenes(system: BatchedCpuSystem) -> None:
     """Watch SAPIEN's own setters of state in the scenes of `system`, once it is laid out.
 
-    ``actor._objs[0].set_pose(...)`` moves a body on a stock CPU env and does nothing in GPU simulation. Here it moves the
-    body, except in a partial reset, if the env is not being reset: a stock env would not run this reset at all. All scenes
-    of a process share SAPIEN's classes, so the setters are replaced once. They stay unchanged for objects of other scenes,
-    before a scene is complete, and when the core calls them.
+    ``actor._objs[0].set_pose(...)`` moves a body on a stock CPU env and does nothing in GPU simulation. Here
+    it moves the body, unless a partial reset is under way and the body's env is not being reset: a stock env
+    would not run this reset at all. All scenes of a process share SAPIEN's classes, so the setters are
+    replaced once. They work as before for objects of other scenes, before a scene is complete, and when the
+    core calls them.
     """
     _install()
     _systems.add(system)
@@ -542,10 +544,10 @@ def _system_of(owner: Any) -> tuple[BatchedCpuSystem | None, int]:
 
 
 def _may_write(system: BatchedCpuSystem, env: int, owner: Any, called: str, instead: str) -> bool:
-    """Report a setter of SAPIEN's; False if the env is not being reset, and others are."""
+    """Report a call of SAPIEN's own setter; False if other envs are being reset, and this env is not."""
     name = owner.name if isinstance(owner, physx.PhysxArticulation) else _entity(owner).name
     may_write = system.resetting is None or bool(system.resetting[env])
-    is_left = "" if may_write else "; the env is not being reset, and left alone here"
+    is_left = "" if may_write else "; here the call is ignored, because this env is not being reset"
     system.report(
         "behind-the-tensors",
         f"{called} on '{name}' (env {env}) goes behind the tensors: on the GPU it does nothing{is_left}. Use {instead} "

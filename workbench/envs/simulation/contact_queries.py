@@ -35,8 +35,8 @@ class ImpulseQuery:
     """Net contact impulses of bodies, or of pairs: on the first body by the second."""
 
     held: Sequence[Any]
-    """The bodies or pairs, kept alive: pybind11 keeps the one Python object of a body only while it is used, and `rows` has
-    ids."""
+    """The bodies or pairs, kept alive: `rows` has their ids, and pybind11 gives a body a new Python object,
+    with another id, once the last reference is gone."""
     cuda_impulses: CpuArray
     """(len(held), 3) newton seconds of the last substep."""
     rows: Mapping[_Key, Sequence[tuple[int, int]]]
@@ -47,10 +47,11 @@ class ImpulseQuery:
 class ContactReader:
     """Answers queries about the last substep of the systems; `invalidate` after each substep.
 
-    Reading the points of a PhysX contact takes microseconds in Python. So the lists are walked at most once a step, for any
-    number of queries, and points are read only of contacts that a query counts. (PickCube, 64 envs: ``is_grasping`` takes
-    1,200 us of a control step, of which 850 are ManiSkill's own; 1,900 us if every contact of the cube is read.) Sums have
-    the order and precision of ``mani_skill.utils.sapien_utils.compute_total_impulse``, so that numbers equal stock ManiSkill's.
+    Reading the points of a PhysX contact takes microseconds in Python. So the lists are walked at most once a
+    step, for any number of queries, and points are read only for contacts that a query counts. (PickCube, 64
+    envs: ``is_grasping`` takes 1,200 us of a control step, of which 850 are ManiSkill's own; 1,900 us if
+    every contact of the cube is read.) Sums have the order and precision of
+    ``mani_skill.utils.sapien_utils.compute_total_impulse``, so that numbers equal stock ManiSkill's.
     """
 
     systems: Sequence[physx.PhysxCpuSystem]
@@ -91,12 +92,13 @@ class ContactReader:
     def carry(self, system: int, contacts: list[tuple[tuple[int, int], NDArray[np.float32]]]) -> None:
         """Use these contacts, as returned by `counted`, for one system until its next substep.
 
-        PhysX's own list is that of its last substep, before the state was restored.
+        PhysX's own list is that of the last substep before the state was restored.
         """
         self._carried[system] = contacts
         self._cache = None
 
     def answer(self, query: ImpulseQuery) -> None:
+        """Sum the impulses that the query counts into `ImpulseQuery.cuda_impulses`."""
         total, rows = np.zeros((len(query.held), 3)), query.rows
         for pair, impulse in self.counted():
             first, second = pair

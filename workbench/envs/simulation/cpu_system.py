@@ -20,8 +20,8 @@ from workbench.envs.simulation.state_layout import StateLayout, check_layout, la
 from workbench.envs.simulation.stepping import Stepper
 
 _TOO_EARLY = (
-    "The simulation is not initialised yet, so there are no tensors of state in _load_agent and _load_scene, on the GPU or "
-    "here. Use them in _after_reconfigure or _initialize_episode."
+    "The simulation is not initialised yet: on the GPU and here, there are no tensors of state in "
+    "_load_agent and _load_scene. Use the tensors in _after_reconfigure or _initialize_episode."
 )
 TENSORS: Mapping[str, tuple[Group, ...]] = {
     "cuda_rigid_body_data": ("bodies", "links"),
@@ -42,7 +42,8 @@ _WRITING_MEMBERS = {"unpack"}
 
 
 def _applies(mirror: Callable[[Mirrors], Mirror]) -> Callable[..., None]:
-    """A ``gpu_apply_*`` method for one mirror. It applies what differs from the last fetch, whatever the index buffer names."""
+    """A ``gpu_apply_*`` method for one mirror. It applies all numbers that differ from the last fetch, and
+    ignores the index buffer."""
 
     def apply(self: BatchedCpuSystem, index_buffer: Any = None) -> None:
         self._apply(mirror(self._mirrors))
@@ -69,8 +70,9 @@ class BatchedCpuSystem:
     * A fetch is ``PhysxCpuSystem.pack()`` and ``sapien.Scene.pack_poses()`` of each env (about 3 us) and one gather over all
       envs; a Python getter takes 2 us *per body*.
     * ManiSkill's setters write through (`wrote`), and its getters return the current state (`refresh`), as on a stock CPU
-      env: a task that neither applies nor fetches behaves as it does there.
-    * An apply writes only what else differs from the last fetch: a partial reset wakes no body of another env.
+      env: a task that neither applies nor fetches behaves as on a stock CPU env.
+    * An apply writes only the other numbers that differ from the last fetch: a partial reset wakes no body of
+      another env.
     * Link velocities, joint accelerations and joint forces are fetched only when they are read, which few tasks do.
 
     Shapes: R bodies (dynamic and kinematic actors, then links, env after env), A articulations,
@@ -95,13 +97,13 @@ class BatchedCpuSystem:
         self.held_back = False
         """Whether setters write only to the tensors, see `holding_back`."""
         self.resetting: torch.Tensor | None = None
-        """(N,) bool during a partial reset: the envs being reset, which alone are stepped."""
+        """(N,) bool during a partial reset: the envs being reset. Only these are stepped."""
         self.static_moves = 0
         """Number of poses that were set on static actors."""
         self._version = 0
-        """Increases when the simulation may differ from what was fetched."""
+        """Increases when the simulation may differ from the last fetch."""
         self._beginning: list[bytes] = []
-        """Packed state of each env as it was built."""
+        """Packed state of each env right after it was built."""
         self.layout_version = 0
         """Increases when rows are assigned to other bodies."""
         self._read_at: dict[str, int] = {}
@@ -155,7 +157,7 @@ class BatchedCpuSystem:
             system.set_scene_collision_id(id)
 
     def step(self) -> None:
-        """One substep of every env; during a partial reset, of those that are being reset."""
+        """Make one substep in every env; during a partial reset, only in the envs that are being reset."""
         self._apply_targets()
         if self.resetting is None:
             if self.stepper.step():
@@ -188,7 +190,8 @@ class BatchedCpuSystem:
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
-        """Context in which `substeps` calls of `step` may be merged; a read of state does the pending ones at once."""
+        """Context in which `substeps` calls of `step` may be merged; a read of state does the pending
+        substeps first."""
         with self.stepper.merging(substeps):
             yield
         self.catch_up()
@@ -199,7 +202,7 @@ class BatchedCpuSystem:
             self._stepped()
 
     def step_start(self) -> None:
-        """One substep; `step_finish` has nothing to wait for."""
+        """Make one substep and wait for it."""
         self.step()
 
     def step_finish(self) -> None:
@@ -269,8 +272,8 @@ class BatchedCpuSystem:
     def _lay_out_again(self) -> None:
         """Lay out the scene again, after bodies were added or removed."""
         self.refused_by_gpu(
-            "Bodies are built or removed once the simulation runs: on the GPU this fails. Build them in _load_scene; with "
-            "reconfiguration_freq=1 it runs before each episode."
+            "Bodies are built or removed after the scene was built: on the GPU this fails. Build them in "
+            "_load_scene; with reconfiguration_freq=1 it runs before each episode."
         )
         self._apply_targets()
         self._moved(MOVING)
@@ -278,13 +281,13 @@ class BatchedCpuSystem:
         self.keep_beginning()
 
     def keep_beginning(self) -> None:
-        """Store the present state, which `heal` restores."""
+        """Store the present state as the one that `heal` restores."""
         self._beginning = [*self.packs()]
 
     def heal(self, envs: Sequence[int]) -> None:
-        """Restore bodies and articulations with NaN or infinite state in these envs to where they were built.
+        """Restore bodies and articulations with NaN or infinity in these envs to their state after the build.
 
-        PhysX keeps a NaN for ever, and a reset corrects only what the task sets.
+        PhysX never gets rid of a NaN, and a reset corrects only the state that the task sets.
         """
         numbers = self._pack()
         if np.isfinite(numbers).all():
@@ -337,8 +340,8 @@ class BatchedCpuSystem:
             return self._of_one_env(name)
         if hasattr(physx.PhysxGpuSystem, name):
             raise RefusedMember(
-                f"{name} is a member of SAPIEN's GPU system that the batched CPU simulation does not have: here every env "
-                "has its own physics, at its own origin."
+                f"scene.px.{name} is a member of SAPIEN's GPU system that the batched CPU simulation does "
+                "not have: here every env has its own physics, at its own origin."
             )
         raise AttributeError(f"the batched CPU system has no '{name}'")
 
@@ -351,7 +354,8 @@ class BatchedCpuSystem:
         place = place_of(frames_of_the_task())
         if len(self.systems) > 1:
             raise NeedsOneEnv(
-                f"scene.px.{name} belongs to a single CPU simulation, and there are {len(self.systems)} here",
+                f"scene.px.{name} exists in the CPU simulation of a single env only, and there are "
+                f"{len(self.systems)} envs",
                 _INSTEAD.get(name, ""),
                 place,
             )
@@ -376,7 +380,7 @@ class BatchedCpuSystem:
         """Report that the task breaks a rule."""
 
     def refused_by_gpu(self, message: str) -> None:
-        """Report that the task does what GPU simulation refuses."""
+        """Report that the task makes a call that GPU simulation refuses."""
         self.report("refused-by-gpu", message)
 
     def about_to_write(self, struct: Any, group: Group, rows: NDArray[np.int64]) -> None:
@@ -397,7 +401,7 @@ class BatchedCpuSystem:
             self._lay_out_again()
 
     def _fetch(self, group: Group) -> None:
-        """Read `group` from the simulation, overwriting what was not applied."""
+        """Read `group` from the simulation; overwrites writes that were not applied."""
         self._follow_structure()
         if group == "targets":
             self._apply_targets()
@@ -415,7 +419,8 @@ class BatchedCpuSystem:
                 mirror.refresh()
 
     def tensor(self, name: str) -> CpuArray:
-        """One of `TENSORS`, up to date with the simulation (within a setter: as it was last read)."""
+        """One of `TENSORS`, up to date with the simulation. While a setter of ManiSkill's runs, it is not
+        updated."""
         for group in () if self.is_writing else TENSORS[name]:
             self.refresh(group)
         return self._tensors[name]
@@ -496,7 +501,7 @@ class BatchedCpuSystem:
             packs = self.stepper.pose_packs()
             lengths = [len(pack) // 4 for pack in packs]
             if lengths != self._pose_lengths:
-                # Entities change after the layout: cameras are added, and a task may remove what is drawn.
+                # Entities change after the layout: cameras are added, and a task may remove visual entities.
                 self._link_pose_at = link_poses_at(layout, self.scenes)
                 self._pose_lengths = lengths
             self._posed = np.frombuffer(b"".join(packs), dtype=np.float32)
@@ -537,7 +542,7 @@ class BatchedCpuSystem:
         return self._laid_out.articulations[index]
 
     def packs(self) -> list[bytes]:
-        """``PhysxCpuSystem.pack()`` of every env, now."""
+        """``PhysxCpuSystem.pack()`` of every env's present state; does pending substeps and writes first."""
         if self._layout is not None:
             self._follow_structure()
         self.catch_up()
@@ -559,7 +564,7 @@ class BatchedCpuSystem:
             write: writes through SAPIEN's objects; called with a mask of the rows to write.
 
         Raises:
-            ValueError: as `Mirror.may_write`; the tensor is unchanged.
+            ValueError: raised by `Mirror.may_write`; the tensor is unchanged.
         """
         if self.held_back:
             return
@@ -569,7 +574,7 @@ class BatchedCpuSystem:
             each = zip(at[0].tolist(), values, strict=True)
             whole = np.array([mirror.may_write(value, row) for row, value in each], dtype=bool)
         own = self._mirrors
-        # Links follow: their poses change, and the root's as PhysX rounds it.
+        # The poses of the links change too, and PhysX rounds the root pose.
         follow: tuple[Group, ...] = ("links",) if mirror in (own.qpos, own.links) else ()
         self._moved(follow, {*mirror.envs[at[0]].tolist()})
         write(whole)
@@ -592,7 +597,7 @@ class BatchedCpuSystem:
                     self._put(targets)
 
     def _apply(self, mirror: Mirror) -> None:
-        """Write to the simulation what differs from the last fetch."""
+        """Write the numbers that differ from the last fetch to the simulation."""
         self._put(mirror)
 
     def _put(self, mirror: Mirror) -> None:
@@ -634,7 +639,7 @@ class BatchedCpuSystem:
         self._apply_forces(self._torque, "torque")
 
     def drop_writes(self) -> None:
-        """Discard what was written to the tensors and not applied."""
+        """Discard writes to the tensors that were not applied."""
         for mirror in () if self._found is None else self._found.all:
             mirror.drop()
 
@@ -680,6 +685,6 @@ def _array(values: NDArray[np.float32]) -> CpuArray:
 def batched_system(scene: Any) -> BatchedCpuSystem | None:
     """The batched CPU system of a ManiSkillScene, or None for any other scene.
 
-    isinstance cannot tell: it takes a `BatchedCpuSystem` for a ``PhysxGpuSystem``.
+    isinstance does not work: a `BatchedCpuSystem` passes as a ``PhysxGpuSystem``.
     """
     return scene.px if issubclass(type(scene.px), BatchedCpuSystem) else None

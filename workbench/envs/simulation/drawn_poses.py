@@ -1,4 +1,4 @@
-"""Draws bodies at other poses than their own, without moving them."""
+"""Draws bodies at poses other than their simulated poses, without moving them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callabl
     """Context in which entities and their cameras are drawn at `places`; the entities stay where they are.
 
     Yields a function that moves the drawn bodies: call it after ``update_render``, which resets them to their entities.
-    Cameras are moved before ``update_render``.
+    The cameras are moved when the context begins.
 
     Args:
         components: cameras that may be on one of the entities.

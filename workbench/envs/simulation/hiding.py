@@ -14,16 +14,17 @@ from workbench.envs.error_notes import RefusedCall
 from workbench.envs.simulation.cpu_system import batched_system
 
 _VISIBILITY_ATTRIBUTE = "_workbench_visibility"
-"""Attribute of a hidden actor: its render bodies and how visible they were."""
+"""Attribute of a hidden actor: the actor's render bodies, each with its visibility before it was hidden."""
 
 
 @cache
 def install_hiding() -> None:
-    """Let ``Actor.hide_visual`` and ``show_visual`` set the visibility in batched CPU scenes, once per process.
+    """Make ``Actor.hide_visual`` and ``show_visual`` set the visibility in batched CPU scenes; applied once
+    per process.
 
-    Stock does so on the CPU too. In GPU simulation it moves an actor 99999 m away and stores its pose. If another struct, the
-    actor that it was merged into, then moves or reads it, poses are wrong and the actor is visible again (ManiSkill #1447).
-    Other scenes get the stock code.
+    Stock ManiSkill does so on the CPU too. In GPU simulation it moves an actor 99999 m away and stores its
+    pose. If another struct (an actor that it was merged into) then moves or reads the actor, poses are wrong
+    and the actor is visible again (ManiSkill #1447). In all other scenes the stock code runs.
     """
     stock: property = Actor.__dict__["pose"]
     Actor.pose = property(  # type: ignore[assignment]
@@ -63,7 +64,8 @@ def why_not_hidden(thing: Any) -> str:
 
 
 def _where_it_is(stock: Any) -> Callable[..., Any]:
-    """Wrap stock's getter or setter of a pose, which in GPU simulation uses the stored pose of a hidden actor."""
+    """Wrap ManiSkill's getter or setter of a pose to use the present pose, not the stored pose of a hidden
+    actor."""
 
     @wraps(stock)
     def call(self: Any, *args: Any) -> Any:
@@ -99,7 +101,7 @@ def _show(actor: Any) -> None:
 
 
 def shown_visibility(actors: Iterable[Any], body: Any) -> float:
-    """Visibility of a render body where it is shown: a transparent one of 0.3 keeps it.
+    """Visibility of a render body when it is not hidden, such as 0.3 for a transparent body.
 
     Args:
         actors: actors that may hide the body.

@@ -13,13 +13,14 @@ from workbench.envs.error_notes import RefusedValue
 from workbench.envs.simulation.state_layout import BODY, StateLayout
 
 Group = Literal["bodies", "links", "joints", "targets", "forces"]
-"""Tensors that are fetched and applied together."""
+"""Name of a group of tensors that are fetched and applied together."""
 GROUPS: tuple[Group, ...] = get_args(Group)
 Floats = NDArray[np.float32]
 Source = tuple[Any, Callable[[], Floats]]
 """Index into a tensor, and the function that reads those numbers from the simulation."""
 _MOVED_TOLERANCE = 1e-4
-"""Tolerance in metres, radians, or these per second. PhysX rounds an articulation's root pose by about 1e-7 when it is set."""
+"""Tolerance in metres and radians, and in m/s and rad/s. PhysX rounds an articulation's root pose by about
+1e-7 when it is set."""
 
 
 class Mirror:
@@ -44,7 +45,7 @@ class Mirror:
             whole: (R, W) the tensor, and the last known values of the simulation.
             names, envs: (R,) body name and env of each row.
             rows: (K,) rows of this mirror; None for all.
-            sources: sources that a fetch reads; the first has the present rows.
+            sources: sources that a fetch reads; `behind` compares with the first.
             owners: (K,) SAPIEN's objects, for `put`.
             put: called with an owner, its row (W,) and a mask of the numbers to set.
         """
@@ -63,7 +64,7 @@ class Mirror:
         return differ(self.now[self.at], self.seen[self.at])
 
     def changed(self) -> NDArray[np.int64]:
-        """Indices of those of the K rows that differ."""
+        """Indices, among the K rows, of the rows with a number that `differs`."""
         return np.flatnonzero(self.differs().any(axis=1))
 
     def fetch(self) -> None:
@@ -79,7 +80,7 @@ class Mirror:
             self.now[at] = np.where(written, self.now[at], self.seen[at])
 
     def drop(self) -> None:
-        """Discard what was written and not applied."""
+        """Discard numbers that were written and not applied."""
         self.now[self.at] = self.seen[self.at]
 
     def behind(self) -> NDArray[np.bool_]:
@@ -88,10 +89,10 @@ class Mirror:
         return np.abs(self.now[at] - read()) > _MOVED_TOLERANCE
 
     def apply(self) -> None:
-        """Write what differs to the simulation.
+        """Write the numbers that differ to the simulation.
 
         Raises:
-            ValueError: as `may_write`.
+            ValueError: raised by `may_write`.
         """
         now, seen, differs = self.now[self.at], self.seen[self.at], self.differs()
         for i in np.flatnonzero(differs.any(axis=1)).tolist():
@@ -104,12 +105,13 @@ class Mirror:
     def may_write(self, values: Floats, row: int) -> bool:
         """Whether to write these numbers of a row to the simulation.
 
-        PhysX does not check: a NaN pose spreads to everything that it touches and may crash the process. In an env that holds
-        NaN already, everything computed from it is NaN: there such numbers are skipped until a reset repairs the env.
+        PhysX does not check them: a NaN pose spreads to every body that it touches and may crash the process.
+        If the env's state already contains a NaN, all numbers computed from it are NaN: they are skipped
+        until a reset repairs the env.
 
         Raises:
-            ValueError: a number is NaN or infinite, and the env is sound. Writes that were not applied are discarded, or
-                every later apply would raise again.
+            ValueError: a number is NaN or infinite, and all known state of the env is finite. Writes that
+                were not applied are discarded, or every later apply would raise again.
         """
         if np.isfinite(values).all():
             return True
@@ -117,7 +119,7 @@ class Mirror:
         if self.sound(env):
             self.drop()
             raise RefusedValue(
-                f"{self.names[row]} of env {env}: the state to be set holds NaN or infinity: {values}"
+                f"{self.names[row]} of env {env}: the state to be set contains NaN or infinity: {values}"
             )
         return False
 
@@ -133,10 +135,10 @@ def differ(a: Floats, b: Floats) -> NDArray[np.bool_]:
 class DriveTargets(Mirror):
     """Position or velocity targets of the joints of every articulation.
 
-    Setting a target wakes a sleeping articulation even if the value stays, and ManiSkill's CPU controllers set targets at
-    every control step. So targets that were set since the last apply are written, changed or not: otherwise, a robot at rest
-    would fall asleep here but not in stock. That is 1200 calls per control step for 64 Pandas, so each env's thread makes
-    them, just before its step.
+    Setting a target wakes a sleeping articulation even if the value stays, and ManiSkill's CPU controllers
+    set targets at every control step. So targets that were set since the last apply are written even if they
+    have not changed, or a robot at rest would fall asleep here but not in stock ManiSkill. These are 1200
+    calls per control step for 64 Pandas, so the thread that steps an env makes them, just before the step.
     """
 
     def __init__(
@@ -149,7 +151,8 @@ class DriveTargets(Mirror):
         """
         Args:
             setters: for each articulation and active joint, the function that sets the target in PhysX.
-            later: takes a function that writes the targets of one env before its next step.
+            later: called with a function that writes the targets of one env; calls that function before the
+                env's next step.
         """
         super().__init__("targets", *mirror, sources=sources)
         self._set = np.zeros(len(self.now), dtype=bool)
@@ -168,10 +171,10 @@ class DriveTargets(Mirror):
         self._set[:] = self.pending = False
 
     def apply(self) -> None:
-        """Schedule the targets that were set.
+        """Schedule a write of the targets that were set.
 
         Raises:
-            ValueError: as `may_write`.
+            ValueError: raised by `may_write`.
         """
         chosen = np.flatnonzero(self._set | self.differs().any(axis=1)).tolist()
         if not np.isfinite(self.now).all():
@@ -209,7 +212,7 @@ class Mirrors:
             pack: returns the present packs of all envs, then a zero; see `StateLayout`.
             link_poses: returns the poses (L, 7) of all links.
             setter: returns SAPIEN's method of this name that sets a drive target of a joint.
-            later: as for `DriveTargets`.
+            later: see `DriveTargets`.
         """
         data, joints = _twin((len(layout.entities), BODY)), layout.qpos_at.shape
         rigid = data, layout.names, layout.env_of_row
@@ -254,9 +257,9 @@ class Mirrors:
             *(self.bodies, self.links, self.qpos, self.qvel, self.qf),
             *(self.targets, self.velocity_targets),
         )
-        """Mirrors that together hold each number once; `roots` and `root_velocities` are part of `links`."""
+        """Mirrors that together contain each number once; `links` includes `roots` and `root_velocities`."""
         self.of = {group: [mirror for mirror in self.all if mirror.group == group] for group in GROUPS}
-        """Mirrors that are fetched together."""
+        """Mirrors of each group."""
         for mirror in (*self.all, self.roots, self.root_velocities):
             mirror.sound = self._is_sound
 

@@ -42,6 +42,7 @@ class StateLayout:
     root_rows: NDArray[np.int64]
     dofs: NDArray[np.int64]
     body_at: NDArray[np.int64]
+    """Positions of the numbers in the concatenated packs, here and in the next five fields."""
     root_at: NDArray[np.int64]
     qpos_at: NDArray[np.int64]
     qvel_at: NDArray[np.int64]
@@ -55,7 +56,9 @@ class StateLayout:
     articulation_names: list[str]
     """(A,) name of each articulation, the same in every env."""
     row_of: dict[int, int]
+    """Row of each body and link, by the ``id`` of its component."""
     index_of: dict[int, int]
+    """Index of each articulation, by its ``id``."""
     size: int
     """Count of numbers in the packs of all envs."""
     parts: list[list[slice]]

@@ -34,7 +34,8 @@ class StateProperty:
     group: Group
     mirror: MirrorName
     columns: slice
-    """Columns of the mirror's tensor; for a property of a single joint, the column of that joint."""
+    """Columns of the mirror's tensor; not used for a property of a joint, whose column is its
+    ``active_index``."""
     read: Callable[[Any, int], Any]
     """Reads the numbers of the struct's i-th object from SAPIEN."""
     write: Callable[[Any, int, Floats], None] | None = None
@@ -48,7 +49,7 @@ class StateProperty:
         return struct._data_index
 
     def at(self, struct: Any, rows: NDArray[np.int64], chosen: NDArray[np.int64]) -> Any:
-        """Index of the numbers of the objects `chosen`, which are in `rows`."""
+        """Index into the mirror's tensor for the objects `chosen`, whose rows are `rows`."""
         if isinstance(struct, ArticulationJoint):
             return rows, struct.active_index.numpy()[chosen]
         return rows, self.columns

@@ -57,7 +57,7 @@ class Stepper:
         """Envs that are neither stepped nor given drive targets."""
 
     def renew(self, env: int) -> None:
-        """Use the env's new system, after it was replaced in the list."""
+        """Use the env's new system; call it after the system was replaced in the list."""
         self.step_once[env] = _step_of(self._systems[env])
         self.forget()
 
@@ -67,7 +67,7 @@ class Stepper:
         return self._owed > 0
 
     def step(self) -> bool:
-        """One substep of every env; False if it is deferred to the last substep of the control step."""
+        """Make one substep in every env; False if it is deferred to the last substep of the control step."""
         self._owed += 1
         if self._owed < self._in_a_row:
             return False
@@ -76,7 +76,7 @@ class Stepper:
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
-        """Context in which `substeps` calls of `step` are done together, at the last one or when state is read."""
+        """Context that does `substeps` calls of `step` together, at the last call or when state is read."""
         self._in_a_row = substeps
         try:
             yield
@@ -84,7 +84,8 @@ class Stepper:
             self._in_a_row = 1
 
     def write_before_step(self, write: Callable[[int], None]) -> None:
-        """Call ``write(env)`` for each env before its next substep, in its thread, or before it is packed."""
+        """Call ``write(env)`` for each env before the env's next substep, in the thread that steps it, or
+        before a pack."""
         self._writes.append(write)
 
     def write_now(self) -> None:
@@ -129,7 +130,7 @@ class Stepper:
             self._packs[env] = self._pose_packs[env] = None
 
     def packs(self) -> list[bytes]:
-        """``pack()`` of every system, now."""
+        """``pack()`` of the present state of every system."""
         self.write_now()
         made = [
             system.pack() if pack is None else pack
@@ -139,7 +140,7 @@ class Stepper:
         return made
 
     def pose_packs(self) -> list[bytes]:
-        """``pack_poses()`` of every scene, now."""
+        """``pack_poses()`` of the present state of every scene."""
         made = [
             scene.pack_poses() if pack is None else pack
             for scene, pack in zip(self._scenes, self._pose_packs, strict=True)
@@ -216,7 +217,7 @@ def _find() -> NativeStep | str:
         step = library[STEP]
         type_info = ctypes.addressof(ctypes.c_char.in_dll(library, TYPE_INFO))
     except (OSError, AttributeError, ValueError) as error:
-        return f"{version} does not export what a step without the interpreter lock needs: {error}"
+        return f"{version} does not export the names that a step without the interpreter lock needs: {error}"
     step.argtypes, step.restype = [ctypes.c_void_p], None
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
@@ -266,7 +267,8 @@ class EnvThreads:
             return
         working: list[_Helper] = []
         with self._busy:
-            # An interrupted run (RecursionError, KeyboardInterrupt) leaves no helpers: it is unknown what they wait for.
+            # An interrupted run (RecursionError, KeyboardInterrupt) drops its helpers: their state is
+            # unknown.
             every, self._helpers = self._helpers, []
             try:
                 while len(every) < helpers:
@@ -277,7 +279,7 @@ class EnvThreads:
                 for index in todo:
                     job(index)
             finally:
-                # Also after an exception here: the helpers still use what the caller will release.
+                # Also after an exception in this thread: the helpers still use objects of the caller.
                 errors = [helper.end() for helper in working]
             self._helpers = every
         for error in errors:
@@ -309,7 +311,7 @@ class _Helper:
         while True:
             self._go.acquire()
             job = self._job
-            assert job is not None, "begin() gives the job before it lets the thread go"
+            assert job is not None, "begin() sets the job before it releases the thread"
             try:
                 for index in self._todo:
                     job(index)

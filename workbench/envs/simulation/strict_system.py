@@ -25,7 +25,7 @@ _OWN_CODE = (*OWN_CODE, "mani_skill.")
 
 @dataclass(frozen=True)
 class _Write:
-    """A write to rows of a group that may still be applied."""
+    """A write to rows of a group; it was not applied yet."""
 
     group: Group
     rows: NDArray[np.int64] | None
@@ -37,8 +37,8 @@ class _Write:
 class Writes:
     """Writes that the task neither applied nor overwrote by a fetch, each with the frames that led to it.
 
-    A write that a GPU loses is noticed at the next fetch, and reported at the line that wrote. A task may also take a whole
-    tensor and write to it unseen; then the line that took the tensor is reported.
+    A write that a GPU loses is noticed at the next fetch, and reported at the line of the write. A task may
+    also take a whole tensor and write to it without a setter; then the line that took the tensor is reported.
     """
 
     def __init__(self) -> None:
@@ -65,7 +65,8 @@ class Writes:
             self._kept = [write for write in self._kept if write.group != group]
 
     def frames(self, group: Group, rows: NDArray[np.int64]) -> tuple[Frame, ...]:
-        """Frames of the last write to one of these rows, or read of the whole tensor; empty if unknown."""
+        """Frames of the last write to one of these rows, else of the last read of the whole tensor; empty if
+        unknown."""
         for write in reversed(self._kept):
             if write.group == group and write.rows is not None and np.isin(rows, write.rows).any():
                 return write.frames
@@ -81,11 +82,12 @@ MAX_NAMED_ENVS = MAX_NAMED_BODIES = 8
 class StrictCpuSystem(BatchedCpuSystem):
     """A `BatchedCpuSystem` that reports breaches of the rules of GPU simulation.
 
-    On the GPU a setter writes to a tensor. ``gpu_apply_*`` copies the tensor to the simulation and ``gpu_fetch_*`` copies the
-    simulation to the tensor, for all envs and without a message. So a pose that was set and not applied is lost at the next
-    fetch, an apply after a step without a fetch moves every body of every env back, and a read before the fetch returns the
-    past. `BatchedCpuSystem` does what a stock CPU env does; this class tracks what a GPU would hold, reports where that
-    differs, and changes no bit. It compares values, not calls: setting a pose to its present value is no breach.
+    On the GPU a setter writes to a tensor. ``gpu_apply_*`` copies the tensor to the simulation and
+    ``gpu_fetch_*`` copies the simulation to the tensor, for all envs and without a message. So a pose that
+    was set and not applied is lost at the next fetch; an apply after a step, without a fetch between, moves
+    every body of every env back; and a read before the fetch returns old state. `BatchedCpuSystem` does what
+    a stock CPU env does. This class tracks the values that a GPU would have, reports where they differ, and
+    changes no bit. It compares values, not calls: setting a pose to its present value is no breach.
     """
 
     rules: BrokenRules
@@ -96,8 +98,8 @@ class StrictCpuSystem(BatchedCpuSystem):
     def __init__(self, scenes: Sequence[sapien.Scene], *args: Any, **kwargs: Any) -> None:
         self._writes = Writes()
         self._held: dict[int, Floats] = {}
-        """What a GPU's simulation would hold, for each tensor that was written or handed out after its last apply or
-        fetch; by the ``id`` of the tensor's array."""
+        """Values that a GPU's simulation would have, for each tensor that was written or handed out since its
+        last apply or fetch; by the ``id`` of the tensor's array."""
         self._stale: set[Group] = set()
         """Groups that moved since they were fetched."""
         self._moved_unfetched: dict[Group, str] = {}
@@ -107,11 +109,13 @@ class StrictCpuSystem(BatchedCpuSystem):
         self.being_reset: torch.Tensor | None = None
         """(N,) bool while ``_initialize_episode`` runs for some envs only."""
         self.reported_elsewhere: set[str] = set()
-        """Names already reported for other envs in the present partial reset."""
+        """Names of bodies whose write in other envs was already reported in the present partial reset."""
         self._outdated: set[int] = set()
-        """Articulations whose links in a GPU's tensor are older than a write of qpos or root pose."""
+        """Indices of articulations whose link poses in a GPU's tensor would be older than a write of qpos or
+        root pose."""
         self._not_updated: set[int] = set()
-        """Articulations applied since a GPU would last have computed link poses."""
+        """Indices of articulations whose qpos or root pose was applied after a GPU would last have computed
+        link poses."""
         super().__init__(scenes, *args, **kwargs)
 
     def gpu_init(self) -> None:
@@ -121,7 +125,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             kept.clear()
 
     def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
-        # Called by the core for every joint in every control step, so without the guard of `accessors`.
+        # The core calls the method for every joint in every control step, so skip the guard of `accessors`.
         function = getattr(type(joint), method)
         return partial(getattr(function, "__wrapped__", function), joint)
 
@@ -170,9 +174,10 @@ class StrictCpuSystem(BatchedCpuSystem):
             name = own.qpos.names[min(old)]
             self.rules.report_breach(
                 "link-before-update",
-                f"The pose of link '{link.name}' is read after the qpos or pose of '{name}' was set: on the GPU it is still "
-                "where it was. Call self.scene._gpu_apply_all(), self.scene.px.gpu_update_articulation_kinematics() and "
-                "self.scene._gpu_fetch_all() before (under `if self.gpu_sim_enabled:`).",
+                f"The pose of link '{link.name}' is read after the qpos or pose of '{name}' was set: on the "
+                "GPU the link still has its old pose. Before the read, call self.scene._gpu_apply_all(), "
+                "self.scene.px.gpu_update_articulation_kinematics() and self.scene._gpu_fetch_all() (under "
+                "`if self.gpu_sim_enabled:`).",
             )
 
     def report(self, rule: str, message: str) -> None:
@@ -181,7 +186,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     # --- what a GPU would hold ---------------------------------------------------------------------------
 
     def _hold(self, group: Group) -> None:
-        """Copy a group's tensors, which are about to be written, as what a GPU's simulation would hold."""
+        """Copy a group's tensors before a write: these are the values that a GPU's simulation would have."""
         for mirror in self._mirrors.of[group]:
             if id(mirror.now) not in self._held:
                 self._held[id(mirror.now)] = mirror.now.copy()
@@ -208,7 +213,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         super().refresh(group)
         for mirror, was in before:
             held = self._held.get(id(mirror.now))
-            if held is not None:  # where nothing was written, a GPU holds what moved
+            if held is not None:  # a number that was not written has the moved value on a GPU too
                 held[...] = np.where(differ(was, held), held, mirror.now)
             if group in self._stale and group not in self._moved_unfetched:
                 moved = differ(mirror.now[mirror.at], was[mirror.at]).any(axis=1)
@@ -249,7 +254,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._not_updated.clear()
 
     def _refuse_loss(self, mirror: Mirror) -> None:
-        """Report a breach if a fetch on a GPU would overwrite what was set."""
+        """Report a breach if a fetch on a GPU would overwrite values that were set."""
         lost = self._unapplied(mirror)
         if not lost.any():
             return
@@ -319,7 +324,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             self.rules.report_breach(
                 "stepped-in-reset",
                 f"The simulation is stepped in a reset while {envs_named(others)} are not being reset: on the GPU their "
-                "episodes advance as well. (With one env, as --num-envs 1 opens it, there are no others.)",
+                "episodes advance as well. (With --num-envs 1 there are no other envs.)",
             )
         super().step()
 
@@ -370,7 +375,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         """Report a breach if an env that is not in the mask `reset` (N,) differs from `before`."""
         version, states = before
         if version != self.layout_version:
-            return  # rows belong to other bodies
+            return  # the rows now belong to other bodies
         for mirror, was in zip(self._mirrors.all, states, strict=True):
             if mirror.group == "forces":
                 continue

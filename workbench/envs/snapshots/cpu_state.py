@@ -56,13 +56,13 @@ class CpuState:
 
     * *Names*: bytes of two envs mean the same only if the envs have the same parts, which `Contents` lists. Where the
       parts differ, the bytes are assembled from the target's and the source's.
-    * *Sleep*: writing a pose wakes a body, which then moves by micrometres. Bodies that slept are put to sleep again. Every
-      body is asked (2 us each), since a velocity in the pack does not mean that it is awake (cubes of StackCube sleep with
-      some velocity left).
+    * *Sleep*: writing a pose wakes a body, which then moves by micrometres. Bodies that slept are put to
+      sleep again. Each body is queried (2 us each), because a velocity in the pack does not mean that the
+      body is awake (cubes of StackCube sleep with some velocity left).
     * *Forces* of ``set_qf``.
-    * *Contacts*: after a restore PhysX's list is that of another moment, and ``is_grasping`` would answer for that. The
-      counted impulses are kept, and answer queries until the next substep.
-    * *Static actors* are where they were built, unless the task has moved one.
+    * *Contacts*: after a restore PhysX's list is that of another moment, and ``is_grasping`` would be wrong.
+      The counted impulses are part of this state, and answer queries until the next substep.
+    * *Poses of static actors*, if the task has moved one.
     """
 
     contents: tuple[Contents, ...]
@@ -70,13 +70,13 @@ class CpuState:
     packed: tuple[bytes, ...]
     """(n,) as ``PhysxCpuSystem.pack()`` gives it."""
     asleep: tuple[tuple[bool, ...], ...]
-    """(n,) one for each of its `contents`."""
+    """(n,) for each env: whether each of its `contents` sleeps."""
     qf: NDArray[np.float32]
-    """(A, D) joint forces of their articulations, env after env, padded with zeros."""
+    """(A, D) joint forces of the articulations of all n envs, env after env, padded with zeros."""
     touching: tuple[tuple[int, str, str], ...]
     """(T,) contacts that a query counts: index among the n envs, and the names of two bodies."""
     impulses: NDArray[np.float32]
-    """(T, 3) N s on the first body of each."""
+    """(T, 3) newton seconds on the first body of each contact."""
     statics: tuple[dict[str, tuple[float, ...]], ...]
     """(n,) poses (7,) of static actors, by name; empty where none was ever moved."""
 
@@ -86,7 +86,7 @@ class CpuState:
         return slice(first, first + _articulations(self.contents[k]))
 
     def essence(self, k: int) -> tuple[Any, ...]:
-        """Equal for equal states of env k in PhysX."""
+        """A value that is equal for equal PhysX states of env k."""
         rows = self.articulations(k)
         return self.contents[k], self.packed[k], self.asleep[k], self.qf[rows].tobytes(), self.statics[k]
 
@@ -115,8 +115,8 @@ class CpuStatePlan:
     held: list[Any]
     """Objects whose ids are used, kept alive: ids are reused once an object is gone."""
     settled: list[dict[int, tuple[bytes, bytes]]]
-    """For each env, by offset in its packed bytes: a root pose, and the pose to set so that it reads back as the
-    former."""
+    """For each env, by offset in its packed bytes: a root pose, and the pose to set so that PhysX
+    returns that root pose."""
 
 
 @once_a_scene
@@ -203,7 +203,7 @@ def write_cpu_state(
     """Put env ``positions[j]`` of `state` into env ``env_idx[j]``, and fetch the tensors. Other envs are not touched.
 
     Returns:
-        Names of what was carried, and of what was not with the reason.
+        Names of the carried parts, and of the parts that were not carried, with the reason.
     """
     carried: dict[str, None] = {}
     missed: dict[str, str] = {}
@@ -212,8 +212,8 @@ def write_cpu_state(
     own = px.packs()
     for i in env_idx:
         for _, _, component in plan.sleepers[i]:
-            # Without this, the time until the body sleeps depends on what it touched before: a cube that was in a hand fell
-            # asleep one substep later than one that was not.
+            # Without this, the time until the body sleeps depends on its earlier contacts: a cube that had
+            # been in a hand fell asleep one substep later than another cube.
             component.put_to_sleep()
     if fresh_physics:
         for i in renew_physics(env.scene, env_idx):
@@ -318,12 +318,12 @@ def _write_joint_forces(
     px.gpu_apply_articulation_qf()
     if fresh_physics and qf.any():
         for row in (row for i in sources for row in plan.articulations[i]):
-            if qf[row].any():  # a new scene has none, even if the tensor did not change
+            if qf[row].any():  # a new scene has no joint forces, even if the tensor did not change
                 px.articulation(row).set_qf(qf[row, : px.articulation(row).dof])
 
 
 def _asked_for(plan: CpuStatePlan, env: int, packed: bytes) -> bytes:
-    """The bytes to write so that `packed` is read back: with the roots that `_settle_roots` found."""
+    """The bytes to write so that `packed` is read back: with the root poses that `_settle_roots` found."""
     for at, (wanted, asked) in plan.settled[env].items():
         if packed[at : at + len(wanted)] == wanted:
             packed = packed[:at] + asked + packed[at + len(wanted) :]
@@ -333,8 +333,9 @@ def _asked_for(plan: CpuStatePlan, env: int, packed: bytes) -> bytes:
 def _settle_roots(px: BatchedCpuSystem, plan: CpuStatePlan, env: int, packed: bytes) -> None:
     """Make articulations' root poses read back as packed.
 
-    PhysX stores a root by its centre of mass, and returns a pose with another last bit, which adds up over snapshots of
-    snapshots. So the pose is set with the opposite error. The result is cached, since most roots do not move.
+    PhysX stores a root by its centre of mass, and returns a pose with another last bit; the error adds up
+    over snapshots of snapshots. So the pose is set with the opposite error. The result is cached, because
+    most roots do not move.
     """
     numbers = np.frombuffer(packed, dtype=np.float32)
     at = sum(part.size for part in plan.contents[env] if part.joints is None)
@@ -368,7 +369,8 @@ def _joined(
     carried: dict[str, None],
     missed: dict[str, str],
 ) -> tuple[bytes, list[int | None]]:
-    """Bytes for an env that is not built like env k of `state`, and the source's index of each of its parts."""
+    """Packed bytes for an env that is built differently from env k of `state`; and for each part of the env,
+    the index of the same part in env k, or None."""
     numbers = np.frombuffer(own, dtype=np.float32).copy()
     parts, theirs = state.contents[k], np.frombuffer(state.packed[k], dtype=np.float32)
     starts = np.cumsum([0, *(part.size for part in parts)])
@@ -380,7 +382,7 @@ def _joined(
         if source is None:
             missed[str(part)] = "it is not in the snapshot; left unchanged"
         elif parts[source].joints != part.joints:
-            missed[str(part)] = "its joints differ from those of the snapshot: left as it is"
+            missed[str(part)] = "its joints differ from those in the snapshot; left unchanged"
             source = None
         else:
             numbers[at : at + part.size] = theirs[starts[source] : starts[source] + part.size]
@@ -433,7 +435,8 @@ def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
     try:
         for i in sorted(set(env_idx) - set(left)):
             old = px.systems[i]
-            # A new system takes gravity and solver from the process's default, which may be another env's.
+            # A new system takes gravity and solver from the process's default config, which may be that of
+            # another env.
             physx.set_scene_config(old.config)
             system = physx.PhysxCpuSystem()
             system.timestep = old.timestep

@@ -21,7 +21,7 @@ class PackedSnapshot:
 
     body: bytes
     keys: tuple[int, ...] | None
-    """Numbers of its parts; None if they equal those of the previous snapshot."""
+    """Numbers of the snapshot's parts; None if they are those of the previous snapshot."""
     new_parts: dict[int, bytes]
     """Parts that were not sent yet, by number."""
 
@@ -55,9 +55,9 @@ class SnapshotPacker:
     with pickle's persistent ids. Parts are compared by identity first, then by bytes. The server keeps both and imports
     neither torch nor ManiSkill; a worker unpickles them joined as a plain `Snapshot`.
 
-    PickCube-v1, random actions, two cores (``tests/benchmarks/history_cost.py``): for 16 envs the body of a step has 8.8 KB
-    where the pickled snapshot has 107, for 64 envs 32 KB and 380. Packing takes 0.3 and 0.4 ms, the snapshot itself 0.6 and
-    0.9 ms. A reset of one env adds 5 KB.
+    PickCube-v1, random actions, two cores (``tests/benchmarks/history_cost.py``): for 16 envs the body of a
+    step has 8.8 KB and the whole pickled snapshot 107 KB; for 64 envs 32 KB and 380 KB. Packing takes 0.3 and
+    0.4 ms, taking the snapshot 0.6 and 0.9 ms. A reset of one env adds 5 KB.
     """
 
     _kept: dict[Any, _SentPart] = field(default_factory=dict)
@@ -120,7 +120,7 @@ def unpack_snapshot(body: bytes, parts: Sequence[bytes]) -> Snapshot:
     """The snapshot from which `SnapshotPacker.pack` made this body.
 
     Args:
-        parts: the bytes of its parts, in the order of `PackedSnapshot.keys`.
+        parts: the bytes of the snapshot's parts, in the order of `PackedSnapshot.keys`.
     """
     unpickler = pickle.Unpickler(io.BytesIO(body))
     whole = [pickle.loads(part) for part in parts]

@@ -12,8 +12,9 @@ import torch
 
 _KEY = 624
 _WORDS = ctypes.c_char * 16
-"""Words 1 to 4 of the key in numpy's ``mt19937_state``, which is the key and the position, in words of 4 bytes. A draw
-advances the position; the last draw of a key regenerates all words. Word 0 is the same for every seed."""
+"""Words 1 to 4 of the key in numpy's ``mt19937_state``: 624 words of 4 bytes, then the position in the key. A
+draw advances the position; the last draw of a key regenerates all words. Word 0 is the same for every
+seed."""
 _POSITION = ctypes.c_char * 4
 _HAS_GAUSS = 3
 """Index in ``RandomState.get_state()`` of the flag for a cached normal number."""
@@ -52,18 +53,18 @@ class _ReadStates:
 class RngReader:
     """Reads the generators of one env object, and caches the result.
 
-    ``RandomState.get_state`` takes 55 us per generator, for 64 envs a third of a control step. So a generator is read only
-    if its position or some words of its key changed, which are compared in memory (0.2 us; numpy publishes
-    ``BitGenerator.ctypes.state_address``, and whole keys of many envs do not fit into a core's cache). One exception: numpy
-    caches every second normal number, and taking it changes none of these bytes. While one is cached, all generators are
-    read.
+    ``RandomState.get_state`` takes 55 us per generator, for 64 envs a third of a control step. So a generator
+    is read only if its position or words 1 to 4 of its key changed. These bytes are compared in memory (0.2
+    us, at numpy's public ``BitGenerator.ctypes.state_address``; the whole keys of many envs do not fit into a
+    core's cache). One exception: numpy caches every second normal number, and drawing it changes none of
+    these bytes. While one is cached, all generators are read.
     """
 
     def __init__(self) -> None:
         self._seen: dict[str, _ReadStates] = {}
 
     def read(self, purpose: str, generators: list[np.random.RandomState]) -> list[RngState]:
-        """``get_state()`` of each. `purpose` names the list of generators."""
+        """``get_state()`` of each generator; `purpose` is the name under which the list is cached."""
         seen = self._seen.get(purpose)
         if seen is not None and seen.settled and seen.generators == generators:
             if b"".join(seen.memory) == seen.copied:
@@ -89,7 +90,8 @@ class RngReader:
         env_idx: list[int],
         states: list[RngState],
     ) -> None:
-        """Restore the generators of some envs, in place: ManiSkill has several references to the first env's."""
+        """Restore the generators of some envs, in place: ManiSkill has several references to the first env's
+        generator."""
         now = list(self.read(purpose, generators))
         for i, state in zip(env_idx, states, strict=True):
             if now[i] is not state:

@@ -37,7 +37,7 @@ class Memory(NamedTuple):
     episode_seeds: NDArray[np.int64]
     """(n,) from `maniskill_private.episode_seeds`."""
     rng: dict[str, list[RngState]]
-    """(n,) each: ManiSkill's generators of each env, by purpose."""
+    """By purpose (``episode``, ``main``): (n,) states of ManiSkill's generators, one per env."""
     task: TaskState
     shared_rng: SharedRng
 
@@ -45,9 +45,9 @@ class Memory(NamedTuple):
 class Snapshot(NamedTuple):
     """Everything that decides how the episodes of chosen envs continue. Copies only: it can be pickled, and outlives its env.
 
-    It holds PhysX's bodies, joints and drive targets (`cpu_state`), the tensors of the task and its controllers
-    (`task_state`), elapsed steps and random generators (`rng`), with a row per env. So one env's state can be restored in
-    place, into another env, or by name into an env that was built again.
+    It holds PhysX's bodies, joints and drive targets (`cpu_state`), the tensors of the task and its
+    controllers (`task_state`), elapsed steps and random generators (`rng_state`), with a row per env. So one
+    env's state can be restored in place, into another env, or by name into an env that was built again.
 
     *Two restores of a snapshot continue identically*, to the last bit: a restored env gets a new PhysX scene.
 
@@ -62,9 +62,9 @@ class Snapshot(NamedTuple):
     """
 
     num_envs: int
-    """N, of the env from which it was taken."""
+    """N of the env from which the snapshot was taken."""
     env_idx: tuple[int, ...]
-    """(n,) the envs that it holds."""
+    """(n,) the envs in the snapshot."""
     simulation: CpuState | GpuState
     memory: Memory
 
@@ -80,7 +80,7 @@ class RestoreReport:
 
     carried: tuple[str, ...]
     not_carried: dict[str, str]
-    """Name and reason; empty if a snapshot returns to where it was taken."""
+    """What was not restored: name and reason. Empty if a snapshot is restored where it was taken."""
 
 
 def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snapshot:
@@ -90,8 +90,8 @@ def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snaps
         env: a ManiSkill env, batched on the CPU or on the GPU, reset at least once; wrappers are removed.
 
     Raises:
-        IndexError, ValueError: `env_idx` names an env that does not exist, one twice, or none.
-        NotImplementedError: a stock CPU env.
+        IndexError, ValueError: `env_idx` names an unknown env, an env twice, or no env.
+        NotImplementedError: `env` is a stock CPU env.
     """
     env = maniskill_private.open_env(env)
     chosen = [*range(env.num_envs)] if env_idx is None else envs_of_batch(env_idx, env.num_envs)
@@ -111,7 +111,7 @@ def restore_snapshot(
     source: int | Sequence[int] | None = None,
     fresh_physics: bool = True,
 ) -> RestoreReport:
-    """Put the state of envs of a snapshot into envs of `env`; its other envs are not touched.
+    """Restore the state of a snapshot's envs into envs of `env`; other envs of `env` are not touched.
 
     ``restore_snapshot(env, s)`` restores every env; ``restore_snapshot(env, s, [7], source=3)`` puts env 3's state into
     env 7; ``restore_snapshot(env, s, range(env.num_envs), source=3)`` into all.
@@ -119,15 +119,15 @@ def restore_snapshot(
     The env may be another, made again or of an edited task. Then actors and articulations are matched by name,
     articulations also by the names of their joints, and attributes of the task by name and shape. What the task keeps for a
     whole batch (counters, a controller's step) is restored only if all envs are. The process's random generators are
-    restored only if, in addition, each env gets its own state back and the snapshot is of as many envs.
+    restored only if, in addition, each env gets its own state back and the snapshot's env had as many envs.
 
     Afterwards the tensors, poses and contact queries are those of the restored moment. ``env._last_obs`` is not: call
     ``env.get_obs(env.get_info())``, or use `TaskEnv.restore`, which does.
 
     Args:
         env_idx: the envs to restore; None for those of the snapshot.
-        source: the snapshot's envs whose state they get: one for all, or one each. None: each its own; or if the snapshot
-            has a single env, that one.
+        source: the snapshot's env whose state all of them get, or one env for each. None: each gets its own
+            state; if the snapshot has a single env, all get the state of that env.
         fresh_physics: give the envs a new PhysX scene, so that they continue identically, to the last bit.
             Without it, a restore is several times as fast, and later contacts may be solved in another order
             (`renew_physics`).
@@ -158,7 +158,7 @@ def restore_snapshot(
 
 
 def begin_anew(env: Any, env_idx: list[int]) -> None:
-    """Make the present an exact point of these envs: a new PhysX scene, in a state that it returns as written.
+    """Make the present an exact point of these envs, in new PhysX scenes whose state reads back as written.
 
     From an exact point, a snapshot and the same actions give the same bits as the uninterrupted run.
 
@@ -193,7 +193,8 @@ def take_memory(env: BaseEnv, env_idx: list[int]) -> Memory:
 
 @contextmanager
 def remembering(env: BaseEnv) -> Iterator[None]:
-    """Context that restores the task's memory at its end: hooks may count and draw, and must not do so twice in a step."""
+    """Context that restores the task's memory at its end: a hook may count or draw random numbers, which must
+    not happen twice in a step."""
     every = list(range(env.num_envs))
     memory = take_memory(env, every)
     try:
@@ -208,7 +209,7 @@ def restore_memory(
     """Put entry ``positions[k]`` of `memory` into env ``env_idx[k]``; returns what was carried and what was not.
 
     Args:
-        whole: all envs return to where they were, so restore the process's random generators too.
+        whole: each env gets its own state back: restore the process's random generators too.
     """
     steps = env.elapsed_steps
     steps[env_idx] = steps.new_tensor(memory.elapsed_steps[positions])
@@ -241,7 +242,7 @@ def _pairs(
 ) -> tuple[list[int], list[int]]:
     """The envs to restore, and the position of each one's source in the snapshot."""
     if env_idx is None and source is not None:
-        raise ValueError("source needs env_idx: the envs that get the state")
+        raise ValueError("source needs env_idx: name the envs that get the state")
     if env_idx is None and max(snapshot.env_idx) >= env.num_envs:
         raise IndexError(
             f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: name the envs to "
@@ -255,7 +256,9 @@ def _pairs(
         if np.ndim(source) == 0:
             sources *= len(targets)
     if len(sources) != len(targets):
-        raise ValueError(f"{len(sources)} sources for {len(targets)} envs")
+        raise ValueError(
+            f"{len(sources)} sources for {len(targets)} envs: give one for each, or a single number"
+        )
     position = {i: k for k, i in enumerate(snapshot.env_idx)}
     missing = sorted(set(sources) - set(position))
     if missing:
@@ -272,10 +275,10 @@ def _pairs(
 def step_only(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iterator[None]:
     """Context in which control steps move these envs only.
 
-    The task's hooks run for all envs or for none, but on the CPU PhysX has a scene per env, and the others are not stepped.
-    What hooks did to them (a step counted, targets, a buffer) is restored from `others`; their physics only where it was
-    written to, since writing even the present state wakes sleeping bodies. In GPU simulation all envs step, and the others
-    are restored.
+    The task's hooks run for all envs or for none, but on the CPU PhysX has a scene per env, and the others
+    are not stepped. What hooks changed in the others (a counted step, targets, a buffer) is restored from
+    `others`. The physics of an env is restored only if a hook wrote to it: writing even the present state
+    wakes sleeping bodies. In GPU simulation all envs step, and the others are restored.
 
     Args:
         others: a snapshot of all other envs, restored at the end; None if their state does not matter.
@@ -321,9 +324,9 @@ class GpuState:
     """
 
     states: dict[str, NDArray[np.float32]]
-    """(n, 13) of each actor: position, quaternion wxyz, linear and angular velocity; (n, 13 + 5 D) of each articulation:
-    the same of the root, then qpos, qvel, and `_JOINT_TENSORS`. By the names of `SceneIndex.states`; NaN where an env
-    lacks it."""
+    """(n, 13) of each actor: position, quaternion wxyz, linear and angular velocity; (n, 13 + 5 D) of each
+    articulation: the same of the root, then qpos, qvel, and `_JOINT_TENSORS`. By the names of
+    `SceneIndex.states`; NaN for an env that lacks the actor or articulation."""
 
 
 def read_gpu_state(env: Any, env_idx: list[int]) -> GpuState:
@@ -341,7 +344,8 @@ def read_gpu_state(env: Any, env_idx: list[int]) -> GpuState:
 def write_gpu_state(
     env: Any, env_idx: list[int], state: GpuState, positions: list[int]
 ) -> tuple[dict[str, None], dict[str, str]]:
-    """Put env ``positions[j]`` of `state` into env ``env_idx[j]``, apply and fetch; returns as `write_cpu_state`."""
+    """Put env ``positions[j]`` of `state` into env ``env_idx[j]``, apply and fetch; returns like
+    `write_cpu_state`."""
     carried: dict[str, None] = {}
     missed: dict[str, str] = {}
     position, structs = dict(zip(env_idx, positions, strict=True)), scene_index(env).states

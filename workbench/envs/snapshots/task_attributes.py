@@ -27,7 +27,7 @@ _ENTERED_TYPES = (
     *(torch.Tensor, np.ndarray, Pose, dict, list, tuple),
     *(torch.nn.Module, torch.Generator, np.random.Generator, np.random.RandomState, set, bytearray),
 )
-"""Types that may hold state; those of the last row cannot be copied, and are reported."""
+"""Types that may hold state; the types in the last row cannot be copied, and are reported."""
 _SKIPPED_PACKAGES = (
     *("mani_skill", "sapien", "gymnasium", "torch", "numpy", "trimesh", "transforms3d", "builtins"),
     *("_thread", "weakref", "functools", "pathlib", "workbench"),
@@ -65,8 +65,9 @@ class Walk:
 def walk_task_values(env: BaseEnv) -> Walk:
     """Find everything that a task may remember.
 
-    Searched are the env, its agents and their controllers, through dicts, lists, tuples, dataclasses, Poses and objects of
-    classes in the task's module. Not entered: objects of ManiSkill, SAPIEN, gymnasium or torch, and BaseEnv's members.
+    Searches the env, its agents and their controllers, through dicts, lists, tuples, dataclasses, Poses and
+    objects of classes in the task's module. Skips objects of ManiSkill, SAPIEN, gymnasium or torch, and
+    BaseEnv's members.
     """
     walk = Walk(env, task_class(env).__module__)
     walk.entered[id(env)] = env
@@ -101,7 +102,7 @@ def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth:
     if depth > _MAX_DEPTH:
         walk.omitted[path] = f"more than {_MAX_DEPTH} containers deep"
     elif isinstance(value, Pose):
-        # A Pose is frozen, so another takes its place; torch may still use the old one.
+        # A Pose is frozen, so a new one replaces it.
         _enter(walk, value.raw_pose, f"{path}.raw_pose", lambda raw: put(Pose(raw)), depth + 1)
     elif isinstance(value, dict):
         for key, item in list(value.items()):
@@ -162,7 +163,8 @@ def _has_members(cls: type, author: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def _is_ignored(cls: type, author: str) -> bool:
-    """Whether an object is skipped without a report: one of an upstream package, or code."""
+    """Whether objects of this class are skipped without a report: upstream packages' objects and
+    callables."""
     if issubclass(cls, _ENTERED_TYPES) or _has_members(cls, author):
         return False
     return cls.__module__.split(".")[0] in _SKIPPED_PACKAGES or any(
@@ -174,8 +176,8 @@ def _is_ignored(cls: type, author: str) -> bool:
 def base_env_members() -> frozenset[str]:
     """The attributes that ManiSkill's BaseEnv sets on itself, read from its code: ``self.NAME = ...``.
 
-    These are options, spaces, sensors, last observation and generators: not state, or restored by name (elapsed steps,
-    generators). ``agent`` is entered.
+    These are options, spaces, sensors, last observation and generators. They are not state, or are restored
+    separately (elapsed steps, generators). ``agent`` is entered.
     """
     names: set[str] = set()
     for member in vars(BaseEnv).values():

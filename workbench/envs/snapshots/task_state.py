@@ -1,4 +1,4 @@
-"""State that a task keeps between steps on itself, its robots and their controllers."""
+"""State that a task keeps between steps in its own attributes and those of its robots and controllers."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class TaskState(NamedTuple):
     since the scene was built (`note_scene`) belongs to the scene: it is not copied, and a restore gives it the value that it
     was built with. In GPU simulation nothing is noted, and everything counts as state.
 
-    *New tensors*: a value is restored as a new tensor, since something else may use the old one (a controller's target is
-    often the caller's action). Two attributes that were one tensor stay one. What cannot be carried is named, with the
-    reason.
+    *New tensors*: a value is restored as a new tensor, since something else may use the old one (a
+    controller's target is often the caller's action). Two attributes that shared one tensor still share one.
+    Values that cannot be carried are listed with the reason.
     """
 
     buffers: dict[str, Buffer]
@@ -88,7 +88,7 @@ def _scene_of(env: BaseEnv) -> _Scene:
 
 
 def note_scene(env: BaseEnv) -> None:
-    """Mark what the task holds now, right after its scene was built, as part of the scene."""
+    """Mark the task's present values, right after its scene was built, as part of the scene."""
     _scene_of(env).add(env, walk_task_values(env).leaves)
 
 
@@ -102,7 +102,7 @@ def note_constructed(env: BaseEnv) -> None:
 
 
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
-    """Copies of the task's state of the envs in `env_idx`, and of the whole batch."""
+    """Copies of the task's state: rows of the envs in `env_idx`, and values that hold for the whole batch."""
     walk = walk_task_values(env)
     scene = _scene_of(env)
     buffers: dict[str, Buffer] = {}
@@ -136,11 +136,10 @@ def write_task_state(
 ) -> tuple[dict[str, None], dict[str, str]]:
     """Put row ``positions[k]`` of every buffer into env ``env_idx[k]``.
 
-    Values of the whole batch are restored only if all envs are, each to its own state or all to that of one, since the
-    envs are then at one moment.
+    A value that holds for the whole batch is restored only if all envs are.
 
     Returns:
-        Paths that were carried, and paths that were not with the reason.
+        Paths that were carried, and paths that were not carried, with the reason.
     """
     walk = walk_task_values(env)
     scene = _scene_of(env)
@@ -177,7 +176,7 @@ def write_task_state(
                 leaf.put(_whole_value(kept, env))
                 carried[leaf.path] = None
             elif not _equal(kept.values, value):
-                missed[leaf.path] = "it holds for the whole batch, and not all envs were put back"
+                missed[leaf.path] = "it holds for the whole batch, and not all envs were restored"
             continue
         new = _with_rows(value, kept, env, env_idx, chosen, all_envs)
         if isinstance(new, str):
