@@ -130,7 +130,9 @@ def test_changes_are_reverted_one_by_one_even_after_a_discarded_plan(
     )
     session.do(RevertCameraChange())
     view = wait_until(
-        session, in_studio(lambda s: "Before it: base_camera" in s.edit_state.message), "the change before it"
+        session,
+        in_studio(lambda s: "The edit before it: base_camera" in s.edit_state.message),
+        "the change before it",
     )
     # It can be reverted immediately.
     assert view.of(StudioView).edit_state.stage == "checked"
