@@ -139,7 +139,7 @@ def test_many_formats_of_one_pose_are_read(text: str) -> None:
         ("", "nothing to read"),
         ('{"a": ', "begins like JSON"),
         ("!!python/object/apply:os.system ['true']", "no YAML"),
-        ('{"camera_matrix": [[1,0,0],[0,1,0],[0,0,1]]}', "no pose is in it"),
+        ('{"camera_matrix": [[1,0,0],[0,1,0],[0,0,1]]}', "the text has no pose"),
         ("a: " + "[" * 5000, "no YAML"),
         ("a: &a [*a]", "alias"),
         ("9" * 300_000, "characters"),
