@@ -30,7 +30,7 @@ class CameraEdit(Changes):
         uid = key[1]
         if key not in self.hook_cameras.cameras:
             raise RefusedEdit(
-                f"the files make no {key[0]} camera {uid!r}: other code makes it, or they were edited since"
+                f"your files make no {key[0]} camera {uid!r}: other code makes it, or the files were edited since the load"
             )
         run = self.hook_cameras.cameras[key]
         if run.site is not None:
@@ -65,7 +65,7 @@ class CameraEdit(Changes):
         files = {file.path: file for file, _ in self.replacements}
         if not files:
             raise RefusedEdit(
-                "the change is smaller than the precision of the written numbers (0.1 mm, 0.01 degree)"
+                "the change is smaller than the precision of the numbers that are written (0.1 mm, 0.01 degree)"
             )
         made: list[FileChange] = []
         for file in sorted(files.values(), key=lambda file: (file is not first, file.path)):
@@ -101,7 +101,7 @@ def planning(
     settings: CameraSettings | None = None,
     more: Sequence[str] = (),
 ) -> Iterator[CameraEdit]:
-    """A `CameraEdit`; a RefusedEdit within the context gets the camera of `settings` as text to copy."""
+    """Context with a `CameraEdit`; a RefusedEdit raised in it gets the camera of `settings` as text to copy."""
     try:
         yield CameraEdit(sources, run)
     except RefusedEdit as refused:
@@ -110,7 +110,7 @@ def planning(
 
 
 def check_camera(settings: CameraSettings) -> None:
-    """Raises RefusedEdit if `settings` are not valid for a camera."""
+    """Raise RefusedEdit if `settings` are not valid for a camera."""
     why = why_no_camera(settings)
     if why is not None:
         raise RefusedEdit(why)

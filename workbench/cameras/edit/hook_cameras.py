@@ -28,9 +28,9 @@ class HookCamera:
     """One camera that a hook made."""
 
     made: CameraSettings | None
-    """Settings of its ``CameraConfig`` call; None if the call was not recorded or has other settings."""
+    """Settings of its ``CameraConfig`` call; None if the call was not recorded, or `CameraSettings` cannot describe it."""
     settings: CameraSettings | None
-    """Settings of the config that the hook returned."""
+    """Settings of the config that the hook returned; None if `CameraSettings` cannot describe it."""
     mount: str
     """Text that identifies the body that the camera is mounted on."""
     site: CallSite | None
