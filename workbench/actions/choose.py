@@ -53,10 +53,10 @@ class ActionChooser:
         self._task_folder: Path | None = None
         self._rng = np.random.default_rng(0)
         self._sliders: NDArray[np.float32] | None = None
-        """(N, A) slider values, used for dimensions that are not joint targets (deltas, velocities); NaN for no value."""
+        """(N, A) slider values, not read for joint targets (only for deltas, velocities); NaN without one."""
         self._targets: NDArray[np.float32] | None = None
-        """(N, A) the last action of each env, or the slider value set after it, used for joint targets; NaN from a reset
-        until the first action."""
+        """(N, A) the last action of each env, or the slider value set after it, used for joint targets; NaN
+        from a reset until the first action."""
 
     @property
     def name(self) -> str:
@@ -108,8 +108,8 @@ class ActionChooser:
         return actions.hold_action(task.parts, task.num_envs)
 
     def slider_action(self, task: TaskEnv) -> NDArray[np.float32]:
-        """(N, A) action from the sliders: joint targets keep their last value; other dimensions without a slider value hold
-        still."""
+        """(N, A) action from the sliders: joint targets keep their last value; other dimensions without a
+        slider value hold still."""
         low, high = actions.bounds(task.parts)
         action = actions.hold_action(task.parts, task.num_envs)
         is_target = actions.is_target(task.parts)
@@ -121,7 +121,7 @@ class ActionChooser:
     def tell(
         self, task: TaskEnv, env_idx: Sequence[int], dimensions: Sequence[int], values: Sequence[float]
     ) -> None:
-        """Set `dimensions` of these envs' actions to the slider `values`; empty `dimensions` make the envs hold still."""
+        """Set `dimensions` of these envs' actions to slider `values`; without any, the envs hold still."""
         shape = task.num_envs, actions.width(task.parts)
         if self._sliders is None or self._targets is None:
             self._sliders = np.full(shape, np.nan, np.float32)
@@ -138,8 +138,8 @@ class ActionChooser:
     def begin(
         self, env_idx: Sequence[int] | None, led: Mapping[int, NDArray[np.float32]] | None = None
     ) -> None:
-        """Forget the joint targets of these envs (all if None), which were reset or restored. `led` has the action (A,) that
-        led to the restored state, by env."""
+        """Forget the joint targets of these envs (all if None), which were reset or restored. `led` has the
+        action (A,) that led to the restored state, by env."""
         if self._targets is None:
             return
         self._targets[slice(None) if env_idx is None else list(env_idx)] = np.nan
@@ -177,8 +177,8 @@ def _same_for_all(action: NDArray[Any], task: TaskEnv) -> NDArray[np.float32]:
 class RecordActionChooser:
     """Chooses the actions of a headless recording; an env without an episode holds still.
 
-    Each episode has its own generator, seeded with the episode's seed, so that the episodes are the same with any number of
-    envs and processes.
+    Each episode has its own generator, seeded with the episode's seed, so that the episodes are the same with
+    any number of envs and processes.
     """
 
     def __init__(self, chooser: ActionChooser | None, planned: PlannedActions | None = None) -> None:
@@ -234,16 +234,17 @@ class RecordActionChooser:
                 continue
             if given.action.shape[1] != action.shape[1]:
                 raise ValueError(
-                    f"the file's actions have {given.action.shape[1]} dimensions, but the task's have {action.shape[1]} "
-                    f"({', '.join(name for part in task.parts for name in part.names)}): use the file's control mode and robot"
+                    f"the file's actions have {given.action.shape[1]} dimensions, but the task's have "
+                    f"{action.shape[1]} ({', '.join(name for part in task.parts for name in part.names)}): "
+                    "use the file's control mode and robot"
                 )
             action[env] = given.action[step]
         return action
 
 
 class PlannedActions:
-    """Plans the actions of a batch's episodes, each independently of the others, and records the returns of the
-    rollouts."""
+    """Plans the actions of a batch's episodes, each independently of the others, and records the returns of
+    the rollouts."""
 
     def __init__(
         self, loaded: LoadedTask, task: TaskEnv, env_kwargs: Mapping[str, Any], plan: PlanOptions
@@ -315,8 +316,8 @@ STEPS_WITHOUT_LIMIT = 200
 
 
 def find_actions(name: str, task: str) -> tuple[Sequence[RecordedRun], dict[str, Any]]:
-    """The runs of an actions file, and the keyword arguments that the env needs to replay them; both empty for a policy,
-    `SOLVE`, or one of `KINDS`.
+    """The runs of an actions file, and the keyword arguments that the env needs to replay them; both empty
+    for a policy, `SOLVE`, or one of `KINDS`.
 
     Args:
         name: as in `RecordArguments.actions`.
@@ -408,12 +409,14 @@ SUFFIXES = (".npy", ".npz", ".h5")
 
 
 def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
-    """Read a file of actions: a run for each episode, and the keyword arguments that the env needs, such as the control mode.
+    """Read a file of actions: a run for each episode, and the keyword arguments that the env needs, such as
+    the control mode.
 
-    ``.npy``: (T, A) for all episodes, or (E, T, A), one (T, A) for each. ``.npz``: an array (T, A) for each episode. ``.h5``:
-    trajectories of ManiSkill, or a recording of the workbench; their runs also have a seed and env states, which correct a
-    replay if the same actions lead to another state (another machine or version, or a GPU batch that was seeded as a whole).
-    An episode of a file does not stop at success or at the time limit, as in ManiSkill's ``replay_trajectory``.
+    ``.npy``: (T, A) for all episodes, or (E, T, A), one (T, A) for each. ``.npz``: an array (T, A) for each
+    episode. ``.h5``: trajectories of ManiSkill, or a recording of the workbench; their runs also have a seed
+    and env states, which correct a replay if the same actions lead to another state (another machine or
+    version, or a GPU batch that was seeded as a whole). An episode of a file does not stop at success or at
+    the time limit, as in ManiSkill's ``replay_trajectory``.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -444,8 +447,8 @@ def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
 
 
 def _arrays(path: Path) -> list[NDArray]:
-    """The arrays of a NumPy file. `np.load` is not used: it allocates the size that a header claims before it checks the
-    file's size."""
+    """The arrays of a NumPy file. `np.load` is not used: it allocates the size that a header claims before it
+    checks the file's size."""
     with open_regular_file(path, MAX_BYTES) as file:
         if path.suffix == ".npy":
             return [_array(file, path.stat().st_size)]

@@ -268,8 +268,8 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
     stop: list[StudioEffect] = []
     if scene_changed:
         studio, stop = outdated(studio), [STOP_REPORTS]
-    # Send dropped placements too: one may have been in transit to the worker during the load. Send edited cameras too:
-    # after a revert the version may count as the same, and the worker's camera would not move.
+    # Send dropped placements too: one may have been in transit to the worker during the load. Send edited
+    # cameras too: after a revert the version may count as the same, and the worker's camera would not move.
     to_send = dict.fromkeys((*placements.placed, *dropped, *sorted(own & in_file.keys())))
     studio, sent = _send(studio, *to_send)
     studio, planned = plan_in_copy(studio, run)

@@ -33,10 +33,11 @@ Floats = NDArray[np.float64]
 FORMAT = "workbench-cameras"
 MAX_CHARACTERS = 100_000
 MAX_YAML_CHARACTERS = 20_000
-"""Limit for YAML: a calibration has about two thousand, and Python's YAML parser takes 20 ms for a thousand."""
-# ManiSkill's `intrinsic_cv` counts pixels from the outer edge of the first pixel (the middle of a picture is W / 2), OpenCV's
-# calibration counts from the first pixel's centre. Files name every convention, since an ``extrinsic`` without one may be any
-# of four matrices.
+"""Limit for YAML: a calibration has about 2,000, and Python's YAML parser takes 20 ms for 1,000
+characters."""
+# ManiSkill's `intrinsic_cv` counts pixels from the outer edge of the first pixel (the middle of a picture is
+# W / 2), OpenCV's calibration counts from the first pixel's centre. Files name every convention, since an
+# ``extrinsic`` without one may be any of four matrices.
 PIXELS = "pixels from the outer edge of the top left pixel; OpenCV's own calibration gives half a pixel less"
 CONVENTIONS = {
     "length": "metres",
@@ -230,8 +231,8 @@ def find_poses(text: str) -> tuple[FoundPose, ...]:
             raise ValueError("the text is nested too deeply to be a calibration") from None
     if not found:
         raise ValueError(
-            "the text has no pose: expected a matrix of 4 x 4 or 3 x 4 numbers, or a rotation with a translation "
-            "(rvec and tvec, or R and t)"
+            "the text has no pose: expected a matrix of 4 x 4 or 3 x 4 numbers, or a rotation with a "
+            "translation (rvec and tvec, or R and t)"
         )
     return tuple(found)
 

@@ -259,7 +259,7 @@ class SetCameraUp(Command, frozen=True):
 
 
 class ChooseLensForm(Command, frozen=True):
-    """Describe the lens of the chosen camera by a field of view, or by the intrinsic matrix that gives the same picture."""
+    """Describe the chosen camera's lens by a field of view, or by the equivalent intrinsic matrix."""
 
     form: LensForm
 

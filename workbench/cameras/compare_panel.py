@@ -36,7 +36,7 @@ PICTURE_PIXELS = 256
 
 
 class CameraCompare(PagePart[SessionView]):
-    """The Compare folder, in the present container: the current placement next to the file's, or next to one kept as A."""
+    """The Compare folder: the current placement next to the file's, or next to one kept as A."""
 
     does = (ChooseCompared, KeepPlacement, ComparePlacements, ReturnToKept)
 
@@ -86,7 +86,8 @@ class CameraCompare(PagePart[SessionView]):
         other = self._kept_of(camera) if self._other == "kept" else in_file
         if other is None:
             raise Refused(
-                "The file's placement of this camera has not changed since the page was opened: compare with another one."
+                "The file's placement of this camera has not changed since the page was opened: "
+                "compare with another one."
             )
         self._asked = (camera.key, now, other, NAMES[self._other])
         self._pair.asked(self._session.view().of(StudioView).results.compared)

@@ -197,7 +197,7 @@ def _plan_found(studio: Studio, found: PlanFound, run: Run) -> Change:
 
 
 def _drop(studio: Studio, run: Run) -> Change:
-    """Drop the plan and show the newest written edit again; if a written edit is shown already, drop all of them."""
+    """Drop the plan and show the newest written edit again; if one is shown already, drop all of them."""
     done = () if studio.edits.shown.stage in IN_FILE else studio.edits.done
     shown = done[-1] if done else EditState()
     studio = with_edits(studio, done=done, shown=shown, copied=None, just_copied="")
@@ -210,7 +210,7 @@ def edit_loaded(studio: Studio, task: TaskDescription) -> tuple[Studio, frozense
     """Compare the running version with the written or reverted edit.
 
     Returns:
-        The studio, and the cameras that the edit changed; no cameras if the version is not the one after the edit.
+        The studio, and the cameras that the edit changed; none if this is not the version after the edit.
     """
     request, edit = studio.edits.shown.request, studio.edits.shown.edit
     if request is None or edit is None or not _is_in(studio.edits, task, edit):

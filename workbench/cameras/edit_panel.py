@@ -152,8 +152,8 @@ WITH_CHOSEN = (
 ADD = tool("Add sensor", AddCamera(kind="sensor")), tool("Add human view", AddCamera(kind="human"))
 NAME_HINT = "Letters, digits, - and _. If this is empty, a new camera gets a free name."
 WHERE = (
-    "A new sensor looks at the task's objects from where you look; a new human view is placed at your viewpoint. The new "
-    "camera's picture appears before anything is saved."
+    "A new sensor looks at the task's objects from where you look; a new human view is placed at your "
+    "viewpoint. The new camera's picture appears before anything is saved."
 )
 NEW = CameraSettings(
     position=(0.0, 0.0, 0.0),
@@ -285,7 +285,7 @@ class WriteToFile(PagePart[SessionView]):
         # Hidden while "Save" is shown: a second press must not write a diff that the user has not read.
         can_plan = can_place and (edit_state.stage != "planned" or stale or of_members)
         wants_plan = can_plan and chosen is not None and chosen.moved and edit_state.stage != "written"
-        # Disabled, not hidden: if it appeared with the first movement, it would push the controls below it away.
+        # Disabled, not hidden: a button that appears with the first movement would push the others away.
         plan = tool("Show the change", PlanCameraChange(), off=not wants_plan, tone="main")
         self._plan.visible, self._plan.content = can_plan, tools_html([plan])
         for change, here in ((self._change, not of_members), (self._member_change, of_members)):
@@ -323,9 +323,10 @@ def free_name(studio: StudioView, kind: CameraKind, like: str) -> str:
 
 # --- initial pose of a new sensor -------------------------------------------------------------------
 
-# A user who adds a camera looks at a whole table, or at a grid of sixteen envs, from metres away: in a picture of 128 x 128,
-# a cube would be four pixels wide. So the direction of the page's view is kept, and the eye moves along it to where the
-# objects of all envs fill the picture. If the page's viewpoint is already near there, it is the eye.
+# A user who adds a camera looks at a whole table, or at a grid of sixteen envs, from metres away: in a
+# picture of 128 x 128, a cube would be four pixels wide. So the direction of the page's view is kept, and the
+# eye moves along it to where the objects of all envs fill the picture. If the page's viewpoint is already
+# near there, it is the eye.
 
 MARGIN_METRES = 0.1
 """Margin around the origins of the objects."""
@@ -368,8 +369,8 @@ def first_place(
 
 
 def distance_to(settings: CameraSettings, places: NDArray[np.float64]) -> float | None:
-    """Distance in metres along the line of sight to the point nearest to the median of `places` (K, 3); None without places,
-    or if that is less than `MIN_TARGET_METRES`."""
+    """Distance in metres along the line of sight to the point nearest to the median of `places` (K, 3); None
+    without places, or if that is less than `MIN_TARGET_METRES`."""
     if not len(places):
         return None
     pose = pose_of(settings)

@@ -89,7 +89,8 @@ def plan(task: TaskDescription, info: CameraInfo | None, request: EditRequest, r
 
 
 def _owner_text(task: TaskDescription, info: CameraInfo) -> str:
-    """Reason why neither the task's file nor a copy of it contains this camera; empty if one of the two may contain it."""
+    """Reason why neither the task's file nor a copy of it contains this camera; empty if one of the two may
+    contain it."""
     own = {Path(file).resolve() for file in (task.file, *task.source_files) if file is not None}
     if info.site is None or Path(info.site.file).resolve() in own:
         return ""
@@ -110,7 +111,8 @@ def _override_edit(
     owner_text: str,
     run: RunHooks,
 ) -> SourceEdit:
-    """The edit that adds a hook to the task's own class to replace an inherited camera; refused with the hook as snippet."""
+    """The edit that adds a hook to the task's own class to replace an inherited camera. If the edit is
+    refused, the RefusedEdit has the hook as snippet, if there is one."""
     if request.settings is None or request.what == "remove":
         raise RefusedEdit(owner_text)
     (kind, _), (_, uid), site = request.key, request.result, info.site
@@ -124,7 +126,10 @@ def _override_edit(
     if request.what != "edit" or task.file is None or task.file not in texts:
         raise RefusedEdit(owner_text, whole)
     if info.varies:
-        reason = f"{owner_text}; the task's own code also moves the camera, so one pose in the file would not place it"
+        reason = (
+            f"{owner_text}; the task's own code also moves the camera, so one pose in the file would not "
+            "place it"
+        )
         raise RefusedEdit(reason, whole)
     return members.plan_override(
         texts, task.file, task.class_name, kind, uid, request.settings, site, run, task.parse_cameras, more

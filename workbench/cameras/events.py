@@ -23,8 +23,8 @@ from workbench.task.description import TaskDescription
 
 Triple = tuple[float, float, float]
 Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]
-"""One env in which a camera is measured: the env; the poses (B, 7) of its bodies, None for the present ones; the moment of
-the history, None unless the camera is measured over steps."""
+"""A case in which a camera is measured: the env; the poses (B, 7) of its bodies, None for the present ones;
+the moment of the history, None unless the camera is measured over steps."""
 
 Lane = Literal["live", "background", "preview", "new camera"]
 """Each lane has one job at a time; a new one replaces it. ``live`` uses the worker that plays, ``background`` the background
@@ -42,7 +42,7 @@ class CameraChosen:
 
 @dataclass(frozen=True)
 class CameraPlaced:
-    """Place a camera, live. If placements arrive faster than the worker handles them, only the newest is applied."""
+    """Place a camera, live. If placements arrive too fast for the worker, only the newest is applied."""
 
     key: CameraKey
     settings: CameraSettings
@@ -89,7 +89,8 @@ class ComparisonWanted:
 
 @dataclass(frozen=True)
 class SheetWanted:
-    """Draw the selected camera's pictures of all envs, one by one; the worst env first if a report covers these envs."""
+    """Draw the selected camera's pictures of all envs, one by one; the worst env first if a report covers
+    these envs."""
 
 
 @dataclass(frozen=True)
@@ -197,6 +198,8 @@ class FileNotChanged:
 
 @dataclass(frozen=True)
 class TaskCopied:
+    """The task's file was copied, or could not be copied."""
+
     file: Path | None
     """The copy; None on failure."""
     state: EditState

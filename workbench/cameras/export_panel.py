@@ -68,8 +68,8 @@ UNITS_HINT = "Units of the pasted calibration. Shown and downloaded poses, and o
 class CameraExport(PagePart[SessionView]):
     """The folder "Matrices and files", in the present container.
 
-    A matrix does not state its direction and the convention of the camera's axes: both are chosen here, for shown and for
-    pasted matrices.
+    A matrix does not state its direction and the convention of the camera's axes: both are chosen here, for
+    shown and for pasted matrices.
     """
 
     does = (
@@ -169,7 +169,8 @@ class CameraExport(PagePart[SessionView]):
         self._session.happen(CameraPlaced(camera.key, frames.with_pose(now, pose)))
         client.add_notification(
             "Placed",
-            "The pose was applied, but no lens: enter the text's intrinsic matrix, if it has one, under Lens and image.",
+            "The pose was applied, but no lens: enter the text's intrinsic matrix, if it has one, under Lens "
+            "and image.",
             color="green",
             auto_close_seconds=8.0,
         )

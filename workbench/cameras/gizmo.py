@@ -33,7 +33,7 @@ from workbench.page.widgets.notices import refusals_told
 from workbench.pictures.camera_conventions import axes_of, intrinsic_of, target_of, vertical_fov
 
 RELEASE_TIMEOUT_SECONDS = 60.0
-"""Time without movement after which a gizmo that was never released (its page was closed) counts as free."""
+"""Time without movement after which a gizmo counts as released, without an event (its page was closed)."""
 GIZMO_PIXELS = 76.0
 TARGET_PIXELS = 44.0
 """Sizes of the gizmos on the screen."""
@@ -57,10 +57,10 @@ class _Taken:
 class CameraGizmo:
     """A gizmo to move and rotate the chosen camera, or two gizmos for its eye and its target, in the view of one page.
 
-    viser's gizmo uses its own axes and cannot snap. To rotate about the world's axes, the gizmo is aligned with them when a
-    drag begins, and its rotation since then is applied to the camera. With snap steps, the camera jumps while the gizmo follows
-    the pointer, and the gizmo returns to the camera on release. During a drag the server never writes the gizmo's pose, which
-    would pull the gizmo away from the pointer.
+    viser's gizmo uses its own axes and cannot snap. To rotate about the world's axes, the gizmo is aligned
+    with them when a drag begins, and its rotation since then is applied to the camera. With snap steps, the
+    camera jumps while the gizmo follows the pointer, and the gizmo returns to the camera on release. During a
+    drag the server never writes the gizmo's pose, which would pull the gizmo away from the pointer.
 
     Args:
         snap: returns the chosen snap steps.
@@ -249,8 +249,8 @@ class LookThrough:
             self._asked.append(client.client_id)
 
     def draw(self, camera: StudioCamera | None) -> None:
-        """Move the pages that look through the camera along with it; if another camera is chosen, return them to their own
-        view."""
+        """Move the pages that look through the camera along with it; if another camera is chosen, return them
+        to their own view."""
         clients = self._server.get_clients()
         while self._asked:
             if (client := clients.get(self._asked.popleft())) is not None:

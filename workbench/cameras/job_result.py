@@ -62,7 +62,7 @@ class JobResult:
         self._drawn: object = None
 
     def asked(self, now: object) -> None:
-        """Store that a job was requested here; `now` is the result that the job's will replace."""
+        """Store that a job was requested here; `now` is the result that the new one will replace."""
         JobResult._asked_last = self
         self._new.asked(now)
 

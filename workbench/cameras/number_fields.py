@@ -72,9 +72,10 @@ class CameraNumbers:
     """Two folders in the present container: pose, and lens and picture.
 
     All forms of the pose show the same camera and can change it; one of the three forms of the orientation is shown at a
-    time. With the pose handle, the target moves along with a new position; with the eye and target handles, each of the two
-    changes alone. The numbers of a mounted camera are in the frame of its link. The lens is a field of view or an intrinsic
-    matrix, which exclude each other in ManiSkill's config; changing the form keeps the picture.
+    time. With the pose handle, the target moves along with a new position; with the eye and target handles,
+    each of the two changes alone. The numbers of a mounted camera are in the frame of its link. The lens is a
+    field of view or an intrinsic matrix, which exclude each other in ManiSkill's config; changing the form
+    keeps the picture.
 
     Args:
         look_at: returns whether eye and target are placed separately, instead of a pose.
@@ -130,7 +131,7 @@ class CameraNumbers:
                     to,
                     SetCameraTarget,
                     XYZ,
-                    "A point on the line of sight, in metres. A new point rotates the camera and does not move it.",
+                    "A point on the line of sight, in metres. A new point rotates the camera in place.",
                 ),
             )
             for separately, at, to in ((False, "Position", "Looks at"), (True, "Eye", "Target"))
@@ -152,8 +153,8 @@ class CameraNumbers:
             "Degrees",
             SetCameraAngle,
             ANGLES,
-            "R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF and ROS. Yaw turns the camera to the left, a positive pitch "
-            "looks down, roll turns it clockwise.",
+            "R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF and ROS. Yaw turns the camera to the left, a "
+            "positive pitch looks down, roll turns it clockwise.",
             step=1.0,
         )
         self._wxyz = Field(

@@ -108,7 +108,7 @@ class _Camera:
     stale: bool = False
     """Whether its pictures are marked as pictures of another moment."""
     failed: str = ""
-    """Reason why the camera cannot be drawn."""
+    """Reason why the camera cannot be drawn; empty if it can."""
     hidden: tuple[str, ...] = ()
     """Names of objects that the task hides from the camera."""
 
@@ -137,7 +137,8 @@ class CamerasPanel:
         self._server, self._clock = server, clock
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._ticked: dict[tuple[CameraKind, str, str], bool] = {}
-        """Whether each modality of each camera is ticked; entries of removed cameras are kept, since they may come back."""
+        """Whether each modality of each camera is ticked; entries of removed cameras are kept, since they may
+        come back."""
         self._cameras_serial = -1
         self._due = DrawThrottle(PICTURE_PERIOD_SECONDS, clock)
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task has loaded."))
@@ -230,7 +231,7 @@ class CamerasPanel:
                 given = {"kind": info.kind, "name": info.name, "modality": modality}
                 on = self._ticked.setdefault((*info.key, modality), first and modality == "rgb")
                 ticks[modality] = tick(self._server, modality, ShowPictures, "on", on, given=given)
-                # The image is created with its first picture; the empty folder keeps its place above the caption.
+                # The image is created with its first picture: the folder keeps its place above the caption.
                 images[modality] = CameraImage(self._server, gui.add_folder(None), self._clock)
                 captions[modality] = gui.add_html("")
         camera = _Camera(info, ticks, captions, folder, about, images)
@@ -261,8 +262,8 @@ class CamerasPanel:
         return tuple(modality for modality in camera.ticks if self._ticked[(*camera.info.key, modality)])
 
     def _wanted_of(self, key: CameraKey, camera: _Camera, seen: ShownCameras) -> tuple[str, ...]:
-        """The ticked modalities; for the camera in the Studio also `rgb` and the Studio's modality, unless the Studio draws a
-        preview."""
+        """The ticked modalities; for the camera in the Studio also `rgb` and the Studio's modality, unless
+        the Studio draws a preview."""
         wanted = self._wanted(camera)
         if seen.preview or key != seen.placed:
             return wanted
@@ -298,7 +299,8 @@ class CamerasPanel:
 class StudioPicture:
     """The chosen camera's picture in the present container, in any modality; overlays go into `folder`.
 
-    Depth and segmentation are offered because they show first that a far plane is too near, or that a gripper hides the cube.
+    Depth and segmentation are offered because they show first that a far plane is too near, or that a gripper
+    hides the cube.
     """
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
@@ -396,8 +398,8 @@ MARK_METRES = 0.05
 class CameraPick:
     """Pixel picks: an overlay on the picture, the result, and a mark at the point in the 3D view.
 
-    viser's images do not report the position of a press, so a pane of our own HTML lies over the picture (``.wb-pane`` in
-    page.css). Construct a `CameraPick` in the picture's container, directly after the picture.
+    viser's images do not report the position of a press, so a pane of our own HTML lies over the picture
+    (``.wb-pane`` in page.css). Construct a `CameraPick` in the picture's container, right after the picture.
     """
 
     def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:

@@ -65,7 +65,8 @@ class Frame:
     def from_view(
         self, settings: CameraSettings, pose: ArrayLike, distance: float | None = None
     ) -> CameraSettings:
-        """`settings` moved to this pose (7,) in the view, with the present distance to the target, or `distance` metres."""
+        """`settings` moved to this pose (7,) in the view, with the present distance to the target, or
+        `distance` metres."""
         there = np.array(pose, np.float64)
         there[:3] -= self.offset
         moved = with_pose(settings, there if self.mount is None else relative_to(self.mount, there))
@@ -189,7 +190,8 @@ PAUSE_SECONDS = 1.2
 class Placing:
     """Places the chosen camera for gizmo, keys, number fields and "move to my view".
 
-    It checks that the camera can be placed, knows the frame of the camera's numbers, and makes one movement one undo step.
+    It checks that the camera can be placed, knows the frame of the camera's numbers, and makes one movement
+    one undo step.
     """
 
     def __init__(self, session: LiveSession) -> None:
@@ -232,7 +234,7 @@ class Placing:
         """Apply `change` to the chosen camera; `control` as in `place`.
 
         Args:
-            change: returns the new settings; raises ValueError with a message for the user if they are impossible.
+            change: returns the new settings; raises ValueError, with a message for the user, if not possible.
 
         Raises:
             Refused: no camera is chosen, or it cannot have these settings.

@@ -61,7 +61,7 @@ def with_results(studio: Studio, **values: object) -> Studio:
 
 
 def outdated(studio: Studio) -> Studio:
-    """Mark the report as one of an earlier version, and drop the compared pictures, the picked pixel and the sheet."""
+    """Mark the report as outdated, and drop the compared pictures, the picked pixel and the sheet."""
     results = replace(studio.results, outdated=True, compared=None, picked=None, sheet=())
     return replace(studio, results=results)
 
@@ -204,7 +204,7 @@ class CameraReports:
         reports: list[CameraReport] = []
 
         async def measure() -> None:
-            """Measure the seeds that have no report yet: a job of higher rank may have interrupted this one."""
+            """Measure the seeds without a report: a job of higher rank may have interrupted this one."""
             num_envs = await self._background.ensure(job, _for_measuring(wanted.load))
 
             for seed in range(begun := len(reports), wanted.seeds):

@@ -161,7 +161,7 @@ class CameraReportPanel(PagePart[SessionView]):
         self._report.draw(studio.progress, report, other, html)
 
     def _report_html(self, studio: StudioView, camera: StudioCamera, report: CameraReport, new: bool) -> str:
-        """The table of objects, the depth histogram and suggested planes, as HTML; `new`: whether to scroll it into view."""
+        """HTML of the object table, the depth histogram and suggested planes; `new`: scroll it into view."""
         results, depth, lens = studio.results, report.depth, camera.now or camera.info
         moments = [
             {

@@ -73,7 +73,7 @@ class Studio:
     was_chosen: bool = False
     """Whether the user has chosen a camera, or "none"."""
     is_open: bool = False
-    """Whether a page has opened the studio; from then on, a camera is selected if the user has chosen nothing."""
+    """Whether a page has opened the studio; from then on, a camera is selected before the user chooses."""
     select_when_loaded: CameraKey | None = None
     """The camera that was selected in the previous session."""
     problem: str = ""
@@ -149,8 +149,8 @@ def shown_step(run: Run) -> StepResult | None:
 
 
 def mount_pose(run: Run, info: CameraInfo) -> NDArray[np.float32] | None:
-    """(7,) pose of the camera's mount in the selected env's frame, at the shown moment; None without a mount, or if the step
-    does not have this body."""
+    """(7,) pose of the camera's mount in the selected env's frame, at the shown moment; None without a mount,
+    or if the step does not have this body."""
     step, env = shown_step(run), run.env
     if info.mount is None or run.task is None or step is None:
         return None
@@ -177,8 +177,8 @@ def selected_camera(studio: Studio, run: Run) -> StudioCamera | None:
 
 
 def settings_in_file(placements: Placements, run: Run) -> dict[CameraKey, CameraSettings]:
-    """Settings of the running version's cameras, as in the file. A camera without a target in the file keeps its present
-    target distance, or gets `usual_distance`.
+    """Settings of the running version's cameras, as in the file. A camera without a target in the file keeps
+    its present target distance, or gets `usual_distance`.
 
     Args:
         placements: placements before the version was loaded.

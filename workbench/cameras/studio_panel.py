@@ -87,12 +87,12 @@ HANDLES = (
     "pose: move or rotate the camera; the target moves with the camera.\n"
     "eye and target: move the eye, while the camera keeps looking at the target; or move the target."
 )
-AXES = "The axes along which the handles move and rotate the camera. Camera axes: red is forward, green left, blue up."
+AXES = "The axes of the handles. The camera's own: red is forward, green left, blue up."
 SNAP = "Dragging moves and rotates the camera in steps of this size."
 SIZE = "Size of the preview above. The size of the camera's own pictures stays the same."
 VARIES = (
-    "The camera's pose differs between envs, or the task moves the camera. A placement here applies to all envs until the "
-    "task moves the camera again."
+    "The camera's pose differs between envs, or the task moves the camera. A placement here applies to all "
+    "envs until the task moves the camera again."
 )
 IN_ITS_EYE = "Your view is at the camera's position. Move the view to see the handles."
 
@@ -159,8 +159,8 @@ class StudioPanel(PagePart[SessionView]):
         with self._picture.folder:
             self._pick = CameraPick(server, session)
         self._gizmos: dict[int, CameraGizmo] = {}
-        """The handles in the view of each page that has this tab open, by client id. A page with another tab open has none:
-        there, a drag that should move the view would move the camera."""
+        """The handles in the view of each page that has this tab open, by client id. A page with another tab
+        open has none: there, a drag that should move the view would move the camera."""
 
     def unfold(self) -> None:
         """Handle the opening of the tab; the task may not be loaded yet."""
@@ -174,9 +174,9 @@ class StudioPanel(PagePart[SessionView]):
     # --- in the view -------------------------------------------------------------------------------------
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> dict[CameraKey, PlacedFrustum]:
-        """Draw the gizmos at the chosen camera; returns its frustum by its key, empty if no camera can be placed.
+        """Draw the gizmos at the chosen camera; returns its frustum by key, empty if it cannot be placed.
 
-        The frustum is at the camera's present pose: at the pose of its newest picture, it would lag behind the pointer.
+        The frustum is at the camera's present pose: that of its newest picture would lag behind the pointer.
 
         Args:
             offset: (3,) position of the selected env in the view, metres.
@@ -213,7 +213,8 @@ class StudioPanel(PagePart[SessionView]):
             self._gizmos[page].draw(camera)
 
     def _is_in_eye(self, pose: Floats) -> bool:
-        """Whether a page's viewpoint is within 0.1 m of the camera's pose (7,): the frustum's picture would fill that view."""
+        """Whether a page's viewpoint is within 0.1 m of the camera's pose (7,): the frustum's picture would
+        fill that view."""
         near = (
             float(np.linalg.norm(c.camera.position - pose[:3])) for c in self._server.get_clients().values()
         )
@@ -301,7 +302,7 @@ class StudioPanel(PagePart[SessionView]):
         )
 
     def _handles_of(self, scale: float) -> str:
-        """Buttons for the gizmos (pose or eye and target, axes, snap steps) and the size of the preview, as HTML."""
+        """HTML of the buttons for the gizmos (pose or eye and target, axes, snap) and the preview's size."""
         rows = [
             _choice(
                 "Handles",

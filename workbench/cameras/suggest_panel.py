@@ -1,4 +1,4 @@
-"""Suggests placements of a camera: objects to see, bounds of the eye, and the best results with pictures."""
+"""Suggests placements of a camera: objects to see, the search box, and the best results with pictures."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from workbench.pictures.camera_report import OfferedPlacement
 from workbench.task.description import TaskDescription
 
 BOX_METRES, MOUNTED_BOX_METRES = 0.3, 0.1
-"""Distance from the eye to each side of the initial box; smaller for a mounted camera, which its body has to carry."""
+"""Distance from the eye to each side of the initial box; a mounted camera must stay near its body."""
 MAX_LINKS = 12
-"""Maximum number of links of an articulation for which each link is offered separately."""
+"""Maximum number of links of an object whose links are offered too; with more, only the object is offered."""
 FIRST_ROBOT_LINKS = 4
 """Number of a robot's links that are offered at first, those of its hand; the others are offered on demand."""
 PICTURE_PIXELS = 160
@@ -71,8 +71,8 @@ class VisibleObject:
 class CameraSuggest(PagePart[SessionView]):
     """The folder "Suggest a placement", in the present container, and the search box in the 3D view.
 
-    The search box is given by two corners, in the env's frame or in the frame of the body that carries the camera. It is
-    centred on the eye and follows the camera until the user edits it.
+    The search box is given by two corners, in the env's frame or in the frame of the body that carries the
+    camera. It is centred on the eye and follows the camera until the user edits it.
     """
 
     does = (

@@ -35,7 +35,7 @@ class EditRequest:
     key: CameraKey
     """The camera that is changed, copied, renamed, removed or added."""
     settings: CameraSettings | None = None
-    """New settings (for a removal, the present ones); None for the camera's placement at the time of the request."""
+    """New settings (for a removal, the present ones); None for the placement at the time of the request."""
     name: str = ""
     """The new name."""
     about: str = ""
@@ -76,7 +76,7 @@ class EditState:
     message: str = ""
     """One or two sentences: what happened, and what to do next."""
     can_copy: bool = False
-    """Whether the edit was refused because this file must not be edited, and `CopyTask` is offered instead."""
+    """Whether the edit was refused because this file must not be edited, so that `CopyTask` is offered."""
     picture: Picture | None = None
     """Preview of a new camera, once it is drawn."""
     drawing: bool = False
@@ -121,7 +121,7 @@ class MeasuredMoment:
 
 @dataclass(frozen=True)
 class StudioResults:
-    """Results of reports so far."""
+    """The newest results of the jobs: report, suggestions, compared pictures, picked pixel and sheet."""
 
     report: CameraReport | None = None
     """The newest report."""
@@ -143,7 +143,7 @@ class StudioResults:
     """The camera as placed, and with the settings of `ComparisonWanted`."""
     picked: PickedPixel | None = None
     sheet: tuple[Picture, ...] = ()
-    """The selected camera's picture in every env, worst first if there is a report over them."""
+    """The selected camera's picture in every env, the worst env first if a report covers these envs."""
     problem: str = ""
     """Why the last job failed, as a sentence."""
 
@@ -163,7 +163,7 @@ class StudioView:
     was_chosen: bool = False
     """Whether the user has chosen a camera, or "none"."""
     undo: str | None = None
-    """Text: the change that `UndoCamera` would undo (``moved base_camera``); None if there is nothing to undo."""
+    """Text: the change that `UndoCamera` would undo (``moved base_camera``); None if there is none."""
     redo: str | None = None
     edit_state: EditState = EditState()
     copies_to: Path = Path()

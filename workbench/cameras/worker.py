@@ -138,13 +138,15 @@ class WorkerCameras:
         # Called for every `Settings` message, whether or not it changes the cameras.
         before, of_degree = self._watched, self._degree
         self._watched, self._degree = (env, cameras), degree
-        # From exact to auto, finished and pending pictures stay valid: if redrawn, they would be fast ones for a moment.
+        # From exact to auto, finished and pending pictures stay valid: if redrawn, they would be fast ones
+        # for a moment.
         stay = degree == of_degree or (of_degree == "exact" and degree == "auto")
         if before != (env, cameras) or not stay:
             self.update_watched()
 
     def place(self, request: PlaceCamera) -> None:
-        # Not placed at once: if it interrupted the current picture, a drag faster than the renderer would never show one.
+        # Not placed at once: if it interrupted the current picture, a drag faster than the renderer would
+        # never show one.
         self._to_place.pop(request.key, None)
         self._to_place[request.key] = request
 
@@ -187,8 +189,8 @@ class WorkerCameras:
         """
         self.settle()  # the same scene is about to be drawn
         with blamed("restore", opened.loaded, opened.env):
-            # All envs: the task's state for the whole batch and the process's random generators are restored only with all.
-            # No step follows, so the physics needs no fresh scene.
+            # Restore all envs: only then are the task's batch-wide state and the process's random generators
+            # restored too. No step follows, so the physics needs no fresh scene.
             opened.env.restore(pickle.loads(request.snapshot), fresh_physics=False)
             columns = read_state_columns(opened.env)
         wanted = recorded_pictures(opened.description.cameras) if request.pictures else ()
@@ -205,7 +207,8 @@ class WorkerCameras:
     # --- changes of the scene ------------------------------------------------------------------------
 
     def update_watched(self) -> None:
-        """Watch the requested cameras that the version has; call it when the request or the version may have changed."""
+        """Watch the requested cameras that the version has; call it when request or version may have
+        changed."""
         self.settle()
         opened = self._task.opened
         if opened is None:
@@ -333,7 +336,7 @@ class WorkerCameras:
         return "fast" if self._has_fast(env.env.scene) else "exact"
 
     def _has_fast(self, scene: Any) -> bool:
-        """Whether fast pictures can be drawn now; starts to make missing meshes."""
+        """Whether fast pictures can be drawn now; for a new scene, starts to simplify the missing meshes."""
         if scene is not self._fast_scene:
             self._fast_scene, meshes = scene, list[Mesh]()
             # A GPU draws exact pictures just as fast.
@@ -418,7 +421,7 @@ def _observe_again(opened: OpenedTask) -> None:
 
 
 REPORT_PIXELS = 128
-"""Maximum shorter side of a measured picture: an object that vanishes at this size is hardly visible anyway."""
+"""Maximum shorter side of a measured picture: what vanishes at this size is hardly visible anyway."""
 MAX_SCALE = 4.0
 _PROGRESS_PERIOD_SECONDS = 0.2
 
@@ -529,7 +532,8 @@ def run_cameras(opened: OpenedTask, question: RunCameras) -> HookCameras:
 def _with_classes_of(
     env: Any, before: LoadedTask, after: LoadedTask, texts: Mapping[str, str]
 ) -> Iterator[None]:
-    """Context in which the env and its robots have the new text's classes, and the attributes that their constructors set."""
+    """Context in which the env and its robots have the new text's classes, and the attributes that their
+    constructors set."""
     agents = [] if env.agent is None else getattr(env.agent, "agents", [env.agent])
     classes = [(agent, type(agent)) for agent in agents]
     task, kept = maniskill_private.task_class(env), [(owner, dict(vars(owner))) for owner in (env, *agents)]

@@ -33,7 +33,7 @@ _AXES: dict[str, Floats] = {
     "opengl": np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
 }
 VERTICAL_SINE = 1e-6
-"""A camera whose angle to the vertical has a smaller sine looks straight down or up: "upright" is undefined there."""
+"""Sine of the angle to the vertical below which a camera looks straight down or up: it has no "upright"."""
 ROTATION_TOLERANCE = 1e-3
 """Largest deviation of a matrix from a rotation: calibrations are printed with four digits."""
 
@@ -48,8 +48,8 @@ class LookAt:
     """Any point on the optical axis in front of the eye."""
     roll: float = 0.0
     """Radians about the line of sight; positive turns the camera clockwise as seen from behind it. At 0 the
-    camera is upright. If it looks straight down, the top of the picture at 0 is towards +x, straight up towards -x: an
-    upright camera at smaller x than its target ends like this when it is tilted."""
+    camera is upright. If it looks straight down, the top of the picture at 0 is towards +x, straight up
+    towards -x: an upright camera at smaller x than its target ends like this when it is tilted."""
 
 
 # --- rotations ---------------------------------------------------------------------------------------------------
@@ -108,8 +108,8 @@ def nearest_rotation(matrix: ArrayLike) -> Floats:
         )
     if scales[0] - scales[2] <= ROTATION_TOLERANCE * scales[0] and abs(scales[0] - 1) > ROTATION_TOLERANCE:
         raise ValueError(
-            f"the matrix is no rotation: it also scales by {scales.mean():.4g}. Divide its 3 x 3 part by this number, and "
-            "check that the translation is in metres"
+            f"the matrix is no rotation: it also scales by {scales.mean():.4g}. Divide its 3 x 3 part by "
+            "this number, and check that the translation is in metres"
         )
     if np.abs(scales - 1).max() > ROTATION_TOLERANCE:
         lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(m, axis=1))
@@ -127,7 +127,7 @@ def axes_of(quaternion: ArrayLike) -> tuple[Floats, Floats, Floats]:
 
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> float:
-    """Angle in radians of the rotation between two orientations (4,) wxyz; q and -q are the same orientation."""
+    """Radians of the rotation between two orientations (4,) wxyz; q and -q are the same orientation."""
     # Computed from the vector part, which keeps its precision for small angles.
     w, *vector = qmult(normalised(a), qconjugate(normalised(b)))
     return 2 * math.atan2(math.hypot(*vector), abs(w))
@@ -180,8 +180,8 @@ def pose_of(settings: CameraSettings) -> Floats:
 
 
 def pose_in_env(settings: CameraSettings, mount: ArrayLike | None) -> Floats:
-    """(7,) pose of the camera in the env's frame; `mount` (7,) is the pose of the body that carries it, None for a fixed
-    camera."""
+    """(7,) pose of the camera in the env's frame; `mount` (7,) is the pose of the body that carries it, None
+    for a fixed camera."""
     return pose_of(settings) if mount is None else compose(mount, pose_of(settings))
 
 
@@ -198,7 +198,7 @@ def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Floats:
 
 
 def target_of(settings: CameraSettings) -> Floats:
-    """(3,) the target of a camera, in the frame of its mount; one metre ahead if the settings have no target distance."""
+    """(3,) the target of a camera, in the frame of its mount; one metre ahead without a target distance."""
     return settings.position + (settings.distance or 1.0) * axes_of(settings.quaternion)[0]
 
 
@@ -221,8 +221,8 @@ def relative_to(mount: ArrayLike, world: ArrayLike) -> Floats:
 
 
 def pose_from_look_at(look_at: LookAt) -> Floats:
-    """(7,) pose from eye, target and roll. Equals ManiSkill's ``look_at``, except straight down and up, where ManiSkill's
-    quaternion is not of unit length.
+    """(7,) pose from eye, target and roll. Equals ManiSkill's ``look_at``, except straight down and up, where
+    ManiSkill's quaternion is not of unit length.
 
     Raises:
         ValueError: eye and target are one point.

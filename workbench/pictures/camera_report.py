@@ -21,7 +21,7 @@ LARGE_ENOUGH_PIXELS = 100.0
 
 @dataclass(frozen=True)
 class ObjectToSee:
-    """An object of the task, or a robot. A search can name an object or its links, but only links of a robot."""
+    """An object of the task, or a robot. A search can name objects and links, but not a whole robot."""
 
     name: str
     """Name of an actor or an articulation."""
@@ -41,6 +41,7 @@ class ObjectSummary:
     seen: float
     """Share of these envs in which at least one pixel of the object is in the picture."""
     median_pixels: float
+    """Median of the visible pixels in these envs."""
     cut: float
     """Share of these envs in which the border of the picture cuts the object."""
     hidden: float
@@ -77,19 +78,21 @@ class ObjectSeen:
 
     @property
     def hidden_share(self) -> NDArray[np.float32]:
-        """(E,) share of the object that the robot covers; NaN where the object is not visible even without the robot."""
+        """(E,) share of the object that the robot covers; NaN where the object is not visible even without
+        the robot."""
         return _share_lost(self.pixels, self.unhindered)
 
     @property
     def covered_share(self) -> NDArray[np.float32]:
-        """(E,) share of the object that other things than the robot cover; NaN where it is out of the picture."""
+        """(E,) share of the object that things other than the robot cover; NaN outside of the picture."""
         return _share_lost(self.unhindered, self.alone)
 
     def marks(self) -> NDArray[np.float32]:
-        """(E,) mark from 0 (not seen) to 1 (whole, uncovered and large enough); NaN where the object is absent.
+        """(E,) mark from 0 (not seen) to 1 (whole, uncovered, large enough); NaN where the object is absent.
 
-        Product of the share that nothing covers, one half if the border cuts the object, and for small objects the square root
-        of their share of `LARGE_ENOUGH_PIXELS` (a ratio of lengths: twice as far away is half as good).
+        Product of the share that nothing covers, one half if the border cuts the object, and for small
+        objects the square root of their share of `LARGE_ENOUGH_PIXELS` (a ratio of lengths: twice as far away
+        is half as good).
         """
         size = np.sqrt(np.clip(self.alone / LARGE_ENOUGH_PIXELS, 0, 1))
         open_share = np.clip(self.pixels / np.maximum(self.alone, 1e-6), 0, 1)
@@ -136,8 +139,8 @@ class DepthReport:
 
     @property
     def suggested_far(self) -> float | None:
-        """Metres: 1.5 times the depth of the farthest object seen, rounded up; farther things become background. None if no
-        object was seen."""
+        """Metres: 1.5 times the depth of the farthest object seen, rounded up; farther things become
+        background. None if no object was seen."""
         farthest = _least(-self.farthest_object)
         return None if farthest is None else _rounded(-farthest * 1.5, up=True)
 
@@ -150,7 +153,8 @@ class CameraReport:
     size: tuple[int, int]
     """Width and height of the camera's own picture."""
     measured_size: tuple[int, int]
-    """Width and height of the measured pictures. If they are smaller, objects smaller than one of their pixels are missed."""
+    """Width and height of the measured pictures. If they are smaller, objects smaller than one of their
+    pixels are missed."""
     envs: tuple[int, ...]
     """(E,) an env may occur several times: at several moments, or with several seeds."""
     objects: tuple[ObjectSeen, ...]
@@ -175,7 +179,7 @@ class CameraReport:
         return np.where(np.isinf(worst), np.nan, worst).astype(np.float32)
 
     def worst_first(self, wanted: Collection[str] | None = None) -> tuple[int, ...]:
-        """Indices in `envs`, the worst mark first; equal marks in the order of `envs`, envs with nothing to see last."""
+        """Indices in `envs`, worst mark first; equal marks in the order of `envs`, NaN last."""
         return tuple(
             int(i) for i in np.argsort(np.nan_to_num(self.env_marks(wanted), nan=2.0), kind="stable")
         )
@@ -202,12 +206,13 @@ class SearchSpace:
     objects: tuple[str, ...]
     """Names of actors, articulations and single links (``cabinet/handle``) that must be seen."""
     low: tuple[float, float, float]
-    """Lower corner of the box for the eye, in metres, in the frame of the mount, or in the env's frame without a mount."""
+    """Lower corner of the box for the eye, in metres, in the frame of the mount, or in the env's frame
+    without a mount."""
     high: tuple[float, float, float]
     """Upper corner of the box."""
     lens: CameraSettings
-    """Settings of the camera. The pose is used only on a mount, where its orientation decides which way is up in the
-    picture."""
+    """Settings of the camera. The pose is used only on a mount, where its orientation decides which way is up
+    in the picture."""
     kind: CameraKind = "sensor"
     candidates: int = 100
     """Placements that the first round draws."""
@@ -224,7 +229,8 @@ class SearchSpace:
         box = np.array([self.low, self.high], np.float64)
         if not np.isfinite(box).all() or (box[0] > box[1]).any():
             raise ValueError(
-                f"the lower corner {self.low} of the search box must be finite and not above the upper corner {self.high}"
+                f"the search box's lower corner {self.low} must be finite and not above its upper corner "
+                f"{self.high}"
             )
         if not self.objects:
             raise ValueError("name at least one object that must be seen")

@@ -48,13 +48,15 @@ FREE_METRES = 0.1
 ROBOT_DISTANCE_METRES = 0.2
 """Least distance of an eye from the origin of every robot link, in the searched envs."""
 MOUNT_DISTANCE_METRES = 0.05
-"""Least distance of an eye on a mount from the origin of every robot link; a mounted camera is meant to be near a link."""
+"""Least distance of an eye on a mount from the origin of every robot link; a mounted camera is meant to be
+near a link."""
 SUFFICIENT_SCORE = 0.995
 """Score at which no further round is sampled."""
 ROUNDS = 2
 """Number of rounds of samples around the best candidates."""
 MAX_EYE_ATTEMPTS = 50
-"""Maximum attempts to sample an eye clear of the robot. After them any eye is used, so a box within the robot is searched too."""
+"""Maximum attempts to sample an eye clear of the robot. After them any eye is used, so a box within the robot
+is searched too."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
 
@@ -69,11 +71,12 @@ def suggest_cameras(
 ) -> tuple[OfferedPlacement, ...]:
     """Search for placements in envs that are already reset; returns the best first. The envs stay unchanged.
 
-    Returned placements keep a distance from each other, since five neighbours would be one suggestion. There are fewer than
-    `SearchSpace.best` if no more are found, or if the search is cancelled. The same seed gives the same result.
+    Returned placements keep a distance from each other, since five neighbours would be one suggestion. There
+    are fewer than `SearchSpace.best` if no more are found, or if the search is cancelled. The same seed gives
+    the same result.
 
     Args:
-        progress: called after each measured view with the number so far and the maximum number; keep it cheap.
+        progress: called after each measured view with the number so far and the maximum; keep it cheap.
         cancelled: called before each measured view; True ends the search.
 
     Raises:
@@ -88,8 +91,8 @@ def suggest_cameras(
 def score_of(report: CameraReport, objects: Sequence[str]) -> float:
     """Score of a placement: the mean of the average env's mark and the worst env's, 0 to 1.
 
-    An env's mark is the mark of its worst object (`ObjectSeen.marks`), which is reduced by up to a fifth near the border,
-    and further if something is right in front of the lens.
+    An env's mark is the mark of its worst object (`ObjectSeen.marks`), which is reduced by up to a fifth near
+    the border, and further if something is right in front of the lens.
     """
     marks = []
     for thing in report.wanted_objects(objects):

@@ -187,8 +187,9 @@ def _of_env(value: Any, env_index: int) -> float:
 def settings_of(config: Any) -> CameraSettings | None:
     """A ``CameraConfig`` as plain numbers; if poses differ between envs, the pose of the first env.
 
-    The quaternion is normalised (``look_at`` straight down gives one that is not of unit length). `distance` is the distance
-    to the target if ``look_at`` made the pose. None if the lens, near or far differs between envs, or the pose is invalid.
+    The quaternion is normalised (``look_at`` straight down gives one that is not of unit length). `distance`
+    is the distance to the target if ``look_at`` made the pose. None if the lens, near or far differs between
+    envs, or the pose is invalid.
     """
     pose = rows_of_pose(config)[0].astype(np.float64)
     length = float(np.linalg.norm(pose[3:]))

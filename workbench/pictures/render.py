@@ -221,7 +221,7 @@ def begin_pictures(
 
 
 def _degree_of(scene: Any, component: Any, asked: PictureDegree | None = None) -> PictureDegree:
-    """Degree in which a picture is drawn if `asked` is requested; always exact unless the env is a batch on the CPU."""
+    """Degree in which a picture is drawn if `asked` is requested; exact unless the env is a CPU batch."""
     return scene.degree_of(component, asked) if isinstance(scene, BatchedCpuScene) else "exact"
 
 
@@ -281,7 +281,7 @@ def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[Camera
 
 @contextmanager
 def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
-    """Context in which the task's hidden objects are drawn in this env if `shown`, and are not drawn otherwise.
+    """Context in which the task's hidden objects are drawn in this env if `shown`, else are not drawn.
 
     ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by visibility, in GPU
     simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back for
@@ -391,8 +391,8 @@ def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Requ
     """Pictures of the requested cameras, of the last observed state, env by env.
 
     A picture takes 25 to 50 ms on a software renderer, so pictures in the observation are reused: they are the same
-    (tested), with depth and segmentation as ManiSkill's int16 millimetres and ids. Only other pictures, depth beyond
-    32.767 m, and shaders with more precision than millimetres are rendered. Raises as `take_pictures`.
+    (tested), with depth and segmentation as ManiSkill's int16 millimetres and ids. Only other pictures, depth
+    beyond 32.767 m, and shaders with more precision than millimetres are rendered. Raises as `take_pictures`.
     """
     if not requests:
         return []

@@ -72,7 +72,8 @@ def append_camera(
         new = f"[\n{indent}    {inner},\n{indent}    {text(indent + '    ')},\n{indent}]"
         return [Replacement(start, end, new)]
     raise RefusedEdit(
-        f"the value returned at line {file.line(value)} is neither a CameraConfig(...) nor a list or dict of them"
+        f"the value returned at line {file.line(value)} is neither a CameraConfig(...) nor a list or dict "
+        "of them"
     )
 
 

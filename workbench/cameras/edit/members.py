@@ -173,12 +173,12 @@ def plan_override(
         owner, where = (class_name, file) if own else edit.hook_cameras.owners.get(hook, ("", ""))
         if where in sources:
             raise RefusedEdit(
-                f"{uid} is made by {parent}, and the {hook} of {owner} ({edit.project.file(where).name}) returns it: "
-                "replace it there by the text below"
+                f"{uid} is made by {parent}, and the {hook} of {owner} ({edit.project.file(where).name}) "
+                "returns it: replace it there by the text below"
             )
         edit.note(
-            f"{uid} is made by {parent}, from which {class_name} inherits: {class_name} gets its own {hook}, which returns "
-            f"the cameras of {parent} with {uid} replaced"
+            f"{uid} is made by {parent}, from which {class_name} inherits: {class_name} gets its own {hook}, "
+            f"which returns the cameras of {parent} with {uid} replaced"
         )
         edit.add_imports(
             source, needed_imports(settings) | {parse: f"from mani_skill.sensors.camera import {parse}"}
@@ -215,7 +215,7 @@ def _is_in_hook(call: CameraCall) -> bool:
 
 
 def _look_at_name(edit: CameraEdit, file: SourceFile, kind: CameraKind) -> str:
-    """The name by which a camera in this file, preferably of this kind, calls look_at; empty if no camera does."""
+    """Name by which a camera in this file, preferably of this kind, calls look_at; empty if none does."""
     for key in sorted(edit.hook_cameras.cameras, key=lambda key: key[0] != kind):
         trace = edit.hook_cameras.cameras[key].trace
         pose = None if trace is None else trace.parts.get("pose")
@@ -231,7 +231,7 @@ def _look_at_name(edit: CameraEdit, file: SourceFile, kind: CameraKind) -> str:
 
 
 def _renaming(call: CameraCall, new_uid: str) -> list[Replacement]:
-    """Edits that rename the camera, only at its call: a constant with the same value may name other things too."""
+    """Edits that rename the camera, only at its call: an equal constant may name other things too."""
     file, key, uid = call.file, call.key, call.arguments.get("uid")
     found: list[Replacement] = []
     if isinstance(key, ast.keyword):

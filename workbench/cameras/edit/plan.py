@@ -29,8 +29,9 @@ def plan_edit(
 ) -> SourceEdit:
     """Plan the edit that changes a camera from `before`, its settings in the running env, to `after`. Nothing is written.
 
-    It runs the files, finds the ``CameraConfig(...)`` call of the camera and changes the arguments that differ. Then it runs
-    the new text, and checks that this camera has the new settings and that no other camera changed.
+    It runs the files, finds the ``CameraConfig(...)`` call of the camera and changes the arguments that
+    differ. Then it runs the new text, and checks that this camera has the new settings and that no other
+    camera changed.
 
     Args:
         sources: the author's files on disk, by path.
@@ -71,9 +72,7 @@ def _plan(
         if why:
             raise RefusedEdit(f"{why} ({call.where})")
     if call.hook is None:
-        edit.note(
-            f"the camera is made outside of a hook ({call.where}): other code that uses it gets the change too"
-        )
+        edit.note(f"the camera is made outside of a hook ({call.where}): other code that uses it changes too")
     _write_fields(edit, call, fields, after)
     for name in FIELDS:
         if name in call.trace.parts:
@@ -170,7 +169,7 @@ def _write_lens(changes: Changes, call: CameraCall, after: CameraSettings) -> li
 def _check_asked(
     found: CameraSettings | None, fields: list[str], made: CameraSettings, after: CameraSettings
 ) -> CameraSettings:
-    """Check that the edited camera has the `fields` of `after` and all other fields of `made`; returns its settings."""
+    """Check that the edited camera has the `fields` of `after` and the others of `made`; returns `found`."""
     if found is None:
         raise RefusedEdit("the settings of the edited camera cannot be read")
     as_requested = not set(changed_fields(made, found)) - set(fields)

@@ -65,12 +65,12 @@ def _is_vector(part: TracedValue, length: int) -> bool:
 
 
 def write_pose(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
-    """Edit `pose` to the pose of `after`: in the form in which it is written if possible, else with a quaternion.
+    """Edit `pose` to the pose of `after`: in its written form if possible, else with a quaternion.
 
-    A ``look_at`` stays one while the camera is level and does not look along `up`. Its target is kept if the camera still
-    looks at it; if not, the target is put on the new line of sight, at the distance of `after`, or at the old distance.
-    Straight down or up, ManiSkill's ``look_at`` returns no unit quaternion (its `left` is the zero vector there), so those
-    poses get a quaternion.
+    A ``look_at`` stays one while the camera is level and does not look along `up`. Its target is kept if the
+    camera still looks at it; if not, the target is put on the new line of sight, at the distance of `after`,
+    or at the old distance. Straight down or up, ManiSkill's ``look_at`` returns no unit quaternion (its
+    `left` is the zero vector there), so those poses get a quaternion.
     """
     if pose.function == "look_at":
         if not _look_at(changes, pose, after):
@@ -155,7 +155,7 @@ def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool
 
 
 def look_at_text(name: str, settings: CameraSettings) -> str | None:
-    """A new camera's pose as a call of the look_at function `name`; None if look_at cannot express the pose."""
+    """A new camera's pose as a call of the look_at function `name`; None if look_at cannot express it."""
     forward = rotation_matrix(settings.quaternion)[:, 0]
     if abs(_cosine(forward.tolist(), (0.0, 0.0, 1.0))) > math.cos(1e-3):
         return None
@@ -169,7 +169,7 @@ def look_at_text(name: str, settings: CameraSettings) -> str | None:
 
 
 def _as_quaternion(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
-    """Replace a look_at by a pose with a quaternion; keeps the author's expression for the position."""
+    """Replace a look_at with a pose that has a quaternion; keeps the author's expression for the position."""
     file, node = changes.find(pose.at)
     assert isinstance(node, ast.Call)
     height = float(rotation_matrix(after.quaternion)[2, 0])
@@ -223,7 +223,8 @@ def pose_call(changes: Changes, file: SourceFile) -> str:
 def look_at(
     eye: Sequence[float], target: Sequence[float], up: Sequence[float] = (0, 0, 1)
 ) -> NDArray[np.float64] | None:
-    """The orientation of ManiSkill's ``look_at`` as a quaternion (wxyz); None straight along `up`, where it has none."""
+    """The orientation of ManiSkill's ``look_at`` as a quaternion (wxyz); None along `up`, where it has
+    none."""
     # ManiSkill computes in float32, whose rounding rotates the picture if the eye is nearly above its target.
     seen = np.asarray(target, np.float32).astype(float), np.asarray(eye, np.float32).astype(float)
     forward, upward = np.subtract(*seen), np.asarray(up, float)
