@@ -269,7 +269,7 @@ class PlannedActions:
         """The source's name in a recording."""
 
     def begin(self, env: int, seed: int) -> None:
-        """Begin an episode in this env, with candidates from this seed."""
+        """Begin an episode in this env, with candidates that are sampled from this seed."""
         self._planner.reset([env], seed)
         self._logs[env] = EpisodeLog(seed, self._planner.horizon)
 

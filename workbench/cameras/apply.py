@@ -313,7 +313,7 @@ class StudioJobs:
     ) -> None:
         """
         Args:
-            asker, background: ask the worker that plays, and the background process.
+            asker, background: ask questions of the worker that plays, and of the background process.
             on_change: called when `progress` has changed.
             happen: handles the resulting events.
         """

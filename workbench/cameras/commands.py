@@ -32,7 +32,7 @@ class UndoCamera(Command, frozen=True):
 
 
 class RedoCamera(Command, frozen=True):
-    """Redo the camera change."""
+    """Redo the last undone camera change."""
 
     key = "ctrl+shift+z"
     context = "live"
@@ -332,13 +332,13 @@ class ChooseMeasured(Command, frozen=True):
 
 
 class ChooseMeasuredSteps(Command, frozen=True):
-    """Choose the maximum number of steps of the episode that a camera is measured over."""
+    """Choose over how many steps of the episode, at most, a camera is measured."""
 
     steps: Annotated[int, msgspec.Meta(ge=1, le=MAX_MEASURED)]
 
 
 class ChooseMeasuredResets(Command, frozen=True):
-    """Choose how many fresh resets a camera is measured over."""
+    """Choose over how many fresh resets a camera is measured."""
 
     resets: Annotated[int, msgspec.Meta(ge=1, le=MAX_MEASURED)]
 

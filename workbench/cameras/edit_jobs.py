@@ -302,7 +302,7 @@ def edit_failed_to_load(studio: Studio) -> Studio:
     undone = shown.stage == "undone"
     hint = "the camera's change is in it; revert the change if it is the cause"
     if undone:
-        hint = "the camera's change was reverted"
+        hint = "the camera's change was reverted, so something else is the cause"
     does = "does" if len(shown.edit.changes) == 1 else "do"
     message = f"{shown.edit.names} {does} not load: {hint}."
     return _with_stage(studio, message, shown.stage, loading=not undone)

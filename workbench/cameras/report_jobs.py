@@ -191,7 +191,7 @@ class CameraReports:
     ) -> None:
         """
         Args:
-            asker, background: ask the worker that plays, and the background process.
+            asker, background: ask questions of the worker that plays, and of the background process.
             happen: handles the resulting events.
         """
         self._live, self._background, self._happen = asker, background, happen

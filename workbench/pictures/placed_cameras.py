@@ -124,7 +124,7 @@ def _config(config: Any, settings: CameraSettings) -> Any:
     shaders = PREBUILT_SHADER_CONFIGS
     if settings.shader_pack != config.shader_pack and settings.shader_pack not in shaders:
         raise ValueError(
-            f"there is no shader pack {settings.shader_pack!r}; there are {', '.join(sorted(shaders))}"
+            f"there is no shader pack {settings.shader_pack!r}; choose from {', '.join(sorted(shaders))}"
         )
     placed = copy.copy(config)
     placed.pose = Pose.create(_pose(settings))
