@@ -208,7 +208,7 @@ def test_a_camera_is_measured_over_the_chosen_set(panels: Panels) -> None:
         assert session.asked[-1] == wanted
     session.shown = running(1)
     panels.press("Pictures of all envs")
-    assert len(session.asked) == 3 and "Choose the camera" in panels.client.notices[-1]
+    assert len(session.asked) == 3 and "Choose a camera" in panels.client.notices[-1]
 
 
 class Writing:

@@ -38,4 +38,4 @@ def test_a_camera_or_none_can_be_chosen_from_the_list(live_page: Live) -> None:
     live_page.do(ChooseCamera(name="gone · sensor"))
     assert live_page.client.notices == ["There is no camera gone · sensor."]
     live_page.do(MoveCameraToView())
-    assert live_page.client.notices[1:] == ["Choose a camera that can be placed first."]
+    assert live_page.client.notices[1:] == ["First choose a camera that can be placed."]

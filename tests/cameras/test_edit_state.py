@@ -130,7 +130,9 @@ def test_changes_are_reverted_one_by_one_even_after_a_discarded_plan(
     )
     session.do(RevertCameraChange())
     view = wait_until(
-        session, in_studio(lambda s: "Before it: base_camera" in s.edit_state.message), "the change before it"
+        session,
+        in_studio(lambda s: "The edit before it: base_camera" in s.edit_state.message),
+        "the change before it",
     )
     # It can be reverted immediately.
     assert view.of(StudioView).edit_state.stage == "checked"
@@ -220,7 +222,7 @@ def test_a_change_that_breaks_loading_is_reported_and_can_be_reverted(
     planned(session)
     session.do(SaveCameraChange())
     view = wait_until(session, in_studio(lambda s: "does not load" in s.edit_state.message), "the failure")
-    assert "revert the change if that is the reason" in view.of(StudioView).edit_state.message
+    assert "revert the change if it is the cause" in view.of(StudioView).edit_state.message
     assert view.problem is not None and "too narrow" in view.problem.message
     assert settings_in_file(session, BASE).fov == 1.0, "the previous version must keep running"
     session.do(RevertCameraChange())

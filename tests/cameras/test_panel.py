@@ -72,7 +72,7 @@ def test_ticked_pictures_are_requested_and_stay_ticked_while_their_camera_is_gon
     panel.draw(seen(3, (camera("base"),)))
     assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("segmentation",)),)
     panels.do(ShowPictures(kind="sensor", name="base", modality="albedo", on=True))
-    assert panels.client.notices == ["No camera base gives albedo."]
+    assert panels.client.notices == ["There is no sensor camera base with the modality albedo."]
 
 
 def test_pictures_of_another_moment_are_marked(panels: Panels) -> None:

@@ -1,4 +1,4 @@
-"""Chooses actions: random, zero, hold, from sliders, a policy, a plan, or a file."""
+"""Chooses actions: random, zero, hold, or from sliders, a policy, a plan or a file."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class ActionChooser:
     """Chooses the action of every control step for the page's batch.
 
     Random actions and the seeds of new episodes come from one generator for the whole batch, so that a reset with the
-    session's seed repeats everything after it. What env 3 does then depends on the number of envs.
+    session's seed repeats everything after it. So the actions of one env depend on the number of envs.
     """
 
     def __init__(self, folder: CurrentFolder) -> None:
         """
         Args:
-            folder: folder in which relative policies are found.
+            folder: folder from which a relative path of a policy is resolved.
         """
         self._folder = folder
         self._source: ActionSource = "random"
@@ -53,9 +53,10 @@ class ActionChooser:
         self._task_folder: Path | None = None
         self._rng = np.random.default_rng(0)
         self._sliders: NDArray[np.float32] | None = None
-        """(N, A) slider values of deltas, velocities and the like; NaN elsewhere."""
+        """(N, A) slider values, not read for joint targets (only for deltas, velocities); NaN without one."""
         self._targets: NDArray[np.float32] | None = None
-        """(N, A) the last action of each env, or a later slider value; NaN from a reset to the first action."""
+        """(N, A) the last action of each env, or the slider value set after it, used for joint targets; NaN
+        from a reset until the first action."""
 
     @property
     def name(self) -> str:
@@ -63,7 +64,7 @@ class ActionChooser:
         return {"hold": "hold still", "policy": f"policy {self._policy_name}"}.get(self._source, self._source)
 
     def seed(self, seed: int) -> None:
-        """Restart the random numbers."""
+        """Restart the random generator from this seed."""
         self._rng = np.random.default_rng(seed)
 
     def fresh_seeds(self, count: int) -> list[int]:
@@ -74,7 +75,7 @@ class ActionChooser:
         """Set the source of the actions.
 
         Args:
-            policy: as in `load_policy`; None or empty fails only at the next action.
+            policy: as in `load_policy`; None or an empty name raises only at the next action.
             task_folder: as in `load_policy`.
 
         Raises:
@@ -88,7 +89,7 @@ class ActionChooser:
             pass
 
     def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
-        """(N, A), within the bounds unless a policy gives it.
+        """(N, A) action of the next control step; within the bounds, unless a policy returns it.
 
         Raises:
             TaskError: the policy raised, returned no action, or cannot be imported. The next call imports it again.
@@ -107,28 +108,28 @@ class ActionChooser:
         return actions.hold_action(task.parts, task.num_envs)
 
     def slider_action(self, task: TaskEnv) -> NDArray[np.float32]:
-        """(N, A) action that the sliders set: joint targets keep their value; other dimensions without a slider value hold
-        still."""
+        """(N, A) action from the sliders: joint targets keep their last value; other dimensions without a
+        slider value hold still."""
         low, high = actions.bounds(task.parts)
         action = actions.hold_action(task.parts, task.num_envs)
         is_target = actions.is_target(task.parts)
-        for told, where in ((self._targets, is_target), (self._sliders, ~is_target)):
-            if told is not None:
-                action = np.where(where & ~np.isnan(told), told, action)
+        for values, where in ((self._targets, is_target), (self._sliders, ~is_target)):
+            if values is not None:
+                action = np.where(where & ~np.isnan(values), values, action)
         return np.clip(action, low, high).astype(np.float32)
 
     def tell(
         self, task: TaskEnv, env_idx: Sequence[int], dimensions: Sequence[int], values: Sequence[float]
     ) -> None:
-        """Set dimensions of these envs' actions to slider values; without values the envs hold still."""
+        """Set `dimensions` of these envs' actions to slider `values`; without any, the envs hold still."""
         shape = task.num_envs, actions.width(task.parts)
         if self._sliders is None or self._targets is None:
             self._sliders = np.full(shape, np.nan, np.float32)
             self._targets = np.full(shape, np.nan, np.float32)
         if not dimensions:
             self._sliders[list(env_idx)] = self._targets[list(env_idx)] = np.nan
-        for told in (self._sliders, self._targets):
-            told[np.ix_(env_idx, dimensions)] = values
+        for array in (self._sliders, self._targets):
+            array[np.ix_(env_idx, dimensions)] = values
 
     def acted(self, action: NDArray[np.float32]) -> None:
         """Record the action of a control step, from any source."""
@@ -137,8 +138,8 @@ class ActionChooser:
     def begin(
         self, env_idx: Sequence[int] | None, led: Mapping[int, NDArray[np.float32]] | None = None
     ) -> None:
-        """Forget the targets of these envs (all if None): they were reset, or restored to the state after the actions `led`,
-        by env."""
+        """Forget the joint targets of these envs (all if None), which were reset or restored. `led` has the
+        action (A,) that led to the restored state, by env."""
         if self._targets is None:
             return
         self._targets[slice(None) if env_idx is None else list(env_idx)] = np.nan
@@ -176,8 +177,8 @@ def _same_for_all(action: NDArray[Any], task: TaskEnv) -> NDArray[np.float32]:
 class RecordActionChooser:
     """Chooses the actions of a headless recording; an env without an episode holds still.
 
-    Each episode has its own generator, seeded with its seed, so that the episodes are the same with any number of envs and
-    processes.
+    Each episode has its own generator, seeded with the episode's seed, so that the episodes are the same with
+    any number of envs and processes.
     """
 
     def __init__(self, chooser: ActionChooser | None, planned: PlannedActions | None = None) -> None:
@@ -191,7 +192,11 @@ class RecordActionChooser:
         self._given: dict[int, RecordedRun] = {}
 
     def begin(self, env: int, seed: int, given: RecordedRun | None) -> str:
-        """Begin an episode in this env; returns the name of its source of actions for the recording."""
+        """Begin an episode in this env; returns the name of its source of actions for the recording.
+
+        Args:
+            given: run of a file, whose actions are replayed; None for another source.
+        """
         self._rng[env] = np.random.default_rng(seed)
         self._given.pop(env, None)
         if given is not None:
@@ -211,13 +216,13 @@ class RecordActionChooser:
 
         Raises:
             TaskError: the policy raised, or returned no action; or the task raised in a rollout.
-            ValueError: the file's actions have another size.
+            ValueError: the file's actions have the wrong number of dimensions.
         """
         if self._planned is not None:
             return self._planned.next_action(list(steps))
         action = actions.hold_action(task.parts, task.num_envs)
         if self._chooser is not None:
-            # For the whole batch, as a policy expects.
+            # Choose for the whole batch: a policy expects the observation of all envs.
             chosen = self._chooser.next_action(task)
             for env in steps:
                 action[env] = chosen[env]
@@ -229,16 +234,17 @@ class RecordActionChooser:
                 continue
             if given.action.shape[1] != action.shape[1]:
                 raise ValueError(
-                    f"the file's actions have {given.action.shape[1]} dimensions, and this task's {action.shape[1]} "
-                    f"({', '.join(name for part in task.parts for name in part.names)}): another control mode or robot?"
+                    f"the file's actions have {given.action.shape[1]} dimensions, but the task's have "
+                    f"{action.shape[1]} ({', '.join(name for part in task.parts for name in part.names)}): "
+                    "use the file's control mode and robot"
                 )
             action[env] = given.action[step]
         return action
 
 
 class PlannedActions:
-    """Plans the actions of a batch's episodes, each as if it were planned alone, and records the returns of the
-    rollouts."""
+    """Plans the actions of a batch's episodes, each independently of the others, and records the returns of
+    the rollouts."""
 
     def __init__(
         self, loaded: LoadedTask, task: TaskEnv, env_kwargs: Mapping[str, Any], plan: PlanOptions
@@ -263,7 +269,7 @@ class PlannedActions:
         """The source's name in a recording."""
 
     def begin(self, env: int, seed: int) -> None:
-        """Begin an episode in this env, with candidates from this seed."""
+        """Begin an episode in this env, with candidates that are sampled from this seed."""
         self._planner.reset([env], seed)
         self._logs[env] = EpisodeLog(seed, self._planner.horizon)
 
@@ -310,14 +316,15 @@ STEPS_WITHOUT_LIMIT = 200
 
 
 def find_actions(name: str, task: str) -> tuple[Sequence[RecordedRun], dict[str, Any]]:
-    """The runs of a file, and the env's keyword arguments that it needs; both empty for a policy, `SOLVE`, or one of `KINDS`.
+    """The runs of an actions file, and the keyword arguments that the env needs to replay them; both empty
+    for a policy, `SOLVE`, or one of `KINDS`.
 
     Args:
         name: as in `RecordArguments.actions`.
         task: as in `RecordArguments.task`; a policy may be in its folder.
 
     Raises:
-        FileNotFoundError, ValueError: as `read_actions` does; or it names no policy (`NoPolicy`).
+        FileNotFoundError, ValueError: as in `read_actions`; or `name` names no policy (`NoPolicy`).
     """
     if Path(name).suffix in SUFFIXES:
         return read_actions(Path(name))
@@ -383,7 +390,7 @@ def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Need
         place = find_module(name)
         if place is None or place.file is None or "site-packages" in place.file.parts:
             continue
-        # The whole top package, since its packages may import anything in it.
+        # The whole top-level package: its subpackages may import any part of it.
         top = name.partition(".")[0]
         root = next((parent for parent in place.file.parents if parent.name == top), None)
         if root is None:
@@ -402,16 +409,18 @@ SUFFIXES = (".npy", ".npz", ".h5")
 
 
 def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
-    """Read a file of actions: a run for each episode, and the env's keyword arguments that it needs, such as its control mode.
+    """Read a file of actions: a run for each episode, and the keyword arguments that the env needs, such as
+    the control mode.
 
-    ``.npy``: (T, A) for every episode, or (E, T, A), one for each. ``.npz``: an array (T, A) for each episode. ``.h5``:
-    trajectories of ManiSkill, or a recording of the workbench; their runs also have a seed and env states, which correct a
-    replay if the same actions lead to another state (another machine or version, a batch that was seeded as one on a GPU).
-    An episode of a file does not stop at success or at the time limit, as in ManiSkill's ``replay_trajectory``.
+    ``.npy``: (T, A) for all episodes, or (E, T, A), one (T, A) for each. ``.npz``: an array (T, A) for each
+    episode. ``.h5``: trajectories of ManiSkill, or a recording of the workbench; their runs also have a seed
+    and env states, which correct a replay if the same actions lead to another state (another machine or
+    version, or a GPU batch that was seeded as a whole). An episode of a file does not stop at success or at
+    the time limit, as in ManiSkill's ``replay_trajectory``.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it holds no actions; the message describes its content.
+        ValueError: the file holds no actions; the message describes its content.
     """
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
@@ -438,13 +447,14 @@ def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
 
 
 def _arrays(path: Path) -> list[NDArray]:
-    """The arrays of a NumPy file. Not `np.load`, which allocates what a header claims before it checks the file's size."""
+    """The arrays of a NumPy file. `np.load` is not used: it allocates the size that a header claims before it
+    checks the file's size."""
     with open_regular_file(path, MAX_BYTES) as file:
         if path.suffix == ".npy":
             return [_array(file, path.stat().st_size)]
         with zipfile.ZipFile(file) as archive:
             if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
-                raise ValueError("unpacked it is too large for a file of actions")
+                raise ValueError("its unpacked arrays are larger than 1 GiB")
             found = []
             for member in archive.infolist():
                 with archive.open(member) as opened:
@@ -455,14 +465,14 @@ def _arrays(path: Path) -> list[NDArray]:
 def _array(file: IO[bytes], size: int) -> NDArray:
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"it has NumPy's format {version}")
+        raise ValueError(f"version {version} of NumPy's format is not supported; save it as (1, 0) or (2, 0)")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read(file)
     if dtype.hasobject:
-        raise ValueError("it holds Python objects")
+        raise ValueError("it holds Python objects, not numbers")
     length = math.prod(shape) * dtype.itemsize
     if length > size:
-        raise ValueError(f"its header claims {length} bytes of {dtype}, but it has {size}")
+        raise ValueError(f"its header claims {length} bytes of {dtype}, but the file has {size}")
     content = file.read(length)
     return np.frombuffer(content, dtype, math.prod(shape)).reshape(shape, order="F" if fortran else "C")
 

@@ -33,7 +33,7 @@ Policy = Callable[[Any], Any]
 envs, or a dict for several robots."""
 
 _warned: set[Path] = set()
-"""Files with a library's name that a warning has named already."""
+"""Files with a library's name for which the warning was printed."""
 
 
 class NoPolicy(ValueError):
@@ -41,13 +41,14 @@ class NoPolicy(ValueError):
 
 
 def find_policy(reference: str, task_folder: Path | None = None) -> tuple[str | Path, str]:
-    """The module or file, and the function, of `reference`. Imports nothing.
+    """The module name or file path, and the function name, in `reference`. Imports nothing.
 
     Args:
         task_folder: the task's folder, searched for a relative file after the current folder.
 
     Raises:
-        NoPolicy: the reference has another form, or the file does not exist.
+        NoPolicy: the reference is not of the form ``module:function`` or ``file.py:function``, or the file
+            does not exist.
     """
     if not reference.strip():
         raise NoPolicy("name a policy: module:function or file.py:function")
@@ -64,7 +65,7 @@ def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
         task_folder: as in `find_policy`.
 
     Raises:
-        NoPolicy: the reference has another form, or names nothing callable.
+        NoPolicy: as in `find_policy`; or there is no such package, or no such callable in the module.
         Exception: raised by the policy's module during its import.
     """
     named, attribute = find_policy(reference, task_folder)
@@ -99,7 +100,7 @@ def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
 
 
 def _hint(name: str, attribute: str, task_folder: Path | None) -> str:
-    """Advice for a file that has a library's name."""
+    """End of the message for a missing function: how to name a file that a library's module hides."""
     for folder in (Path.cwd(), task_folder or Path.cwd()):
         file = folder / f"{name}.py"
         if file.is_file() and is_library(name):
@@ -114,19 +115,19 @@ class _PolicyLoader(importlib.machinery.SourceFileLoader):
         return read_regular_file(path, MAX_SOURCE_BYTES)
 
     def path_stats(self, path: str) -> Mapping[str, Any]:
-        # Python's bytecode cache compares size and whole seconds, so it would miss a second save.
+        # The bytecode cache compares the size and whole seconds: it would miss a second save within a second.
         raise OSError("no bytecode is kept")
 
 
 def policy_problem(
     error: BaseException, reference: str, task_folder: Path | None = None, policy: Policy | None = None
 ) -> Problem:
-    """The problem of a policy, at a line of its module or of a module in the same folder.
+    """The problem of a policy, at a line of its module or of another file of the author's that it calls.
 
     Args:
         task_folder: as in `load_policy`.
-        policy: the function, if it was imported: its ``def`` is the place if the traceback has no line of the author's,
-            such as for a wrong return value.
+        policy: the function, if it was imported. If the traceback has no line of the author's, such as for a
+            wrong return value, the problem is at the function's ``def``.
     """
     if isinstance(error, NoPolicy):
         return Problem("policy", str(error), None, None, None, "")
@@ -178,9 +179,9 @@ _MAX_FILE_BYTES = 256 * 1024
 
 
 def list_policies(here: Path, task_folder: Path | None) -> tuple[str, ...]:
-    """Functions that may be policies, as ``file.py:function``: functions with one required parameter, in the files of a folder
-    and of the task's folder. Parses the files without importing them. Functions whose parameter is called obs or observation
-    come first.
+    """Functions that may be policies, as ``file.py:function``: functions with one required parameter, in the
+    files of `here` and of the task's folder. Parses the files without importing them. Functions whose
+    parameter's name begins with ``obs`` come first.
 
     Args:
         here: the folder where the command was started.
@@ -206,7 +207,7 @@ def _python_files(folder: Path) -> list[Path]:
 
 
 def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
-    """Names of public functions with one required parameter, and whether the parameter is named like an observation."""
+    """Names of public functions with one required parameter, and whether it is named ``obs...``."""
     try:
         tree = parse_python(read_regular_file(file, _MAX_FILE_BYTES))
     except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
@@ -236,7 +237,7 @@ class PolicyFile:
         self._files: list[Path] = []
 
     def follow(self, reference: str | None, task_folder: Path | None) -> None:
-        """Watch the file of a ``file.py:function`` from now on; other references are not watched.
+        """Watch only the file of this ``file.py:function`` from now on; nothing for a ``module:function``.
 
         Args:
             task_folder: as in `find_policy`.

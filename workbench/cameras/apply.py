@@ -1,4 +1,4 @@
-"""Applies events to the camera studio, and defines the jobs that follow."""
+"""Applies events to the camera studio, and runs the jobs that follow."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def _do_command(studio: Studio, command: Command, run: Run, now: Now) -> Change:
             return _send(replace(studio, placements=placements.redo(), problem=""), placements.undone[-1].key)
         case ResetCamera():
             if studio.selected is None:
-                raise Refused("Choose the camera first.")
+                raise Refused("Choose a camera first.")
             return _put_back(studio, (studio.selected,), now)
         case PutMovedCamerasBack():
             return _put_back(studio, tuple(placements.placed), now)
@@ -186,7 +186,7 @@ def _select(studio: Studio, key: CameraKey | None, run: Run) -> Change:
 def _place(studio: Studio, placed: CameraPlaced, run: Run, now: Now) -> Change:
     key = placed.key
     if why_not := refusal(run, key) or why_no_camera(placed.settings):
-        return replace(studio, problem=f"{key[1]} is left where it is: {why_not}."), []
+        return replace(studio, problem=f"{key[1]} was not moved: {why_not}."), []
     after = studio.placements.place(key, placed.settings, now.monotonic, placed.control, placed.pause)
     return _moved(replace(studio, problem=""), after, key)
 
@@ -207,7 +207,7 @@ def _put_back(studio: Studio, keys: tuple[CameraKey, ...], now: Now) -> Change:
     effects: list[StudioEffect] = []
     for key in keys:
         if (file := studio.placements.in_file.get(key)) is not None:
-            label = f"put {key[1]} back to the file"
+            label = f"reset {key[1]} to the file"
             after = studio.placements.place(key, file, now.monotonic, label=label)
             studio, sent = _moved(studio, after, key)
             effects += sent
@@ -243,7 +243,7 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
     """Handle a loaded version: update cameras and placements, and compare it with a written edit.
 
     Args:
-        scene_changed: whether reports are of another version.
+        scene_changed: whether the version changed more than the cameras, so that reports are outdated.
     """
     if run.task is None:
         return studio, []
@@ -268,8 +268,8 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
     stop: list[StudioEffect] = []
     if scene_changed:
         studio, stop = outdated(studio), [STOP_REPORTS]
-    # Also dropped ones: their placement may have been in transit during the load. And edited ones: after an edit is
-    # reverted the version may count as the same, so the worker's camera would not move.
+    # Send dropped placements too: one may have been in transit to the worker during the load. Send edited
+    # cameras too: after a revert the version may count as the same, and the worker's camera would not move.
     to_send = dict.fromkeys((*placements.placed, *dropped, *sorted(own & in_file.keys())))
     studio, sent = _send(studio, *to_send)
     studio, planned = plan_in_copy(studio, run)
@@ -313,7 +313,7 @@ class StudioJobs:
     ) -> None:
         """
         Args:
-            asker, background: ask the worker that plays, and the background process.
+            asker, background: ask questions of the worker that plays, and of the background process.
             on_change: called when `progress` has changed.
             happen: handles the resulting events.
         """
@@ -353,7 +353,7 @@ class StudioJobs:
                 what = f"taking pictures of all envs with {name}"
                 lanes["live"].start(what, lambda job: reports.draw_envs(job, effect))
             case Pick():
-                lanes["live"].start("refining", lambda job: reports.pick(job, effect))
+                lanes["live"].start("probing a pixel", lambda job: reports.pick(job, effect))
             case DrawNewCamera():
                 lanes["new camera"].start("a new camera", lambda job: self._file.draw(job, effect))
             case FindPlan() | ChangeFile() | CopyToFolder():
@@ -363,6 +363,6 @@ class StudioJobs:
         self._happen(PreviewDrawn(await self._asker.ask(question)))
 
     def close(self) -> None:
-        """Cancel all jobs, and wait for a running edit. Called on another thread than the loop."""
+        """Cancel all jobs, and wait for a running edit. Must not be called on the loop's thread."""
         do(lambda: [lane.close() for lane in self._lanes.values()])
         self._file.close()

@@ -33,9 +33,11 @@ Floats = NDArray[np.float64]
 FORMAT = "workbench-cameras"
 MAX_CHARACTERS = 100_000
 MAX_YAML_CHARACTERS = 20_000
-"""Limit for YAML: a calibration has about two thousand, and Python's YAML parser takes 20 ms for a thousand."""
-# `intrinsic_cv` of ManiSkill counts pixels from the outer edge of the first pixel (the middle of a picture is W / 2),
-# OpenCV's calibration from its centre. Files name every convention, since ``extrinsic`` alone may be one of four matrices.
+"""Limit for YAML: a calibration has about 2,000, and Python's YAML parser takes 20 ms for 1,000
+characters."""
+# ManiSkill's `intrinsic_cv` counts pixels from the outer edge of the first pixel (the middle of a picture is
+# W / 2), OpenCV's calibration counts from the first pixel's centre. Files name every convention, since an
+# ``extrinsic`` without one may be any of four matrices.
 PIXELS = "pixels from the outer edge of the top left pixel; OpenCV's own calibration gives half a pixel less"
 CONVENTIONS = {
     "length": "metres",
@@ -56,7 +58,7 @@ class CameraToExport:
     mount: str | None = None
     """Body that the camera is mounted on; None if it is fixed."""
     mount_pose: ArrayLike | None = None
-    """(7,) pose of that body in the env's frame."""
+    """(7,) pose of the `mount` in the env's frame."""
 
     @property
     def pose_in_env(self) -> Floats:
@@ -129,7 +131,7 @@ def cameras_as_opencv_yaml(cameras: Sequence[CameraToExport]) -> str:
         s, pose = camera.settings, camera.pose_in_env
         lines += [f"{key}:", f"   image_width: {s.width}", f"   image_height: {s.height}"]
         if camera.mount:
-            lines += [f"   # Rides on {_one_line(camera.mount)}: its pose is that of one moment."]
+            lines += [f"   # Mounted on {_one_line(camera.mount)}: the camera's pose is that of one moment."]
         lines += _opencv_matrix("camera_matrix", intrinsic_of(s))
         lines += _opencv_matrix("distortion_coefficients", np.zeros((1, 5)))
         lines += ["   # World to camera: x right, y down, z forward."]
@@ -212,7 +214,7 @@ def find_poses(text: str) -> tuple[FoundPose, ...]:
     any depth. `camera_pose` checks that a candidate is a rotation.
 
     Raises:
-        ValueError: nothing is found, or the text cannot be read; the message includes what was expected.
+        ValueError: nothing is found, or the text cannot be read; the message says what was expected.
     """
     if len(text) > MAX_CHARACTERS:
         raise ValueError(f"the text has {len(text)} characters; a camera's pose takes a few hundred")
@@ -229,8 +231,8 @@ def find_poses(text: str) -> tuple[FoundPose, ...]:
             raise ValueError("the text is nested too deeply to be a calibration") from None
     if not found:
         raise ValueError(
-            "no pose is in it: looked for a matrix of 4 x 4 or 3 x 4 numbers, and for a rotation with a translation "
-            "(rvec and tvec, or R and t)"
+            "the text has no pose: expected a matrix of 4 x 4 or 3 x 4 numbers, or a rotation with a "
+            "translation (rvec and tvec, or R and t)"
         )
     return tuple(found)
 
@@ -292,25 +294,29 @@ def _parsed(text: str) -> Any:
             return json.loads(text)
         except (ValueError, RecursionError) as error:
             if text[0] == "{":
-                raise ValueError(f"it begins like JSON but is not valid: {error}") from None
+                raise ValueError(f"the text begins like JSON but is not valid: {error}") from None
     bare = _WORDS.sub(" ", text)
     if not re.sub(r"[\s,;|()\[\]]", "", _NUMBER.sub("", bare)):
         return _pasted([float(number) for number in _NUMBER.findall(bare)])
     if len(text) > MAX_YAML_CHARACTERS:
-        raise ValueError(f"as YAML {len(text)} characters are too many; a calibration has some two thousand")
+        raise ValueError(
+            f"{len(text)} characters are too many for YAML; paste only the calibration, some two thousand"
+        )
     # OpenCV's first line has a colon where YAML has a space.
     try:
         tree = yaml.load(re.sub(r"\A%YAML.*\n", "", text), Loader=_CalibrationLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ValueError(f"it is no YAML, and no matrix of bare numbers: {_one_line(str(error))}") from None
+        raise ValueError(
+            f"the text is neither YAML nor a matrix of numbers: {_one_line(str(error))}"
+        ) from None
     if not isinstance(tree, (Mapping, list)):
-        raise ValueError("it is no JSON, no YAML with named values, and no matrix of bare numbers")
+        raise ValueError("the text is neither JSON, nor YAML with named values, nor a matrix of numbers")
     return tree
 
 
 def _pasted(numbers: list[float]) -> list[list[float]]:
     if len(numbers) not in (12, 16):
-        raise ValueError(f"a pose has 4 x 4 or 3 x 4 numbers; here are {len(numbers)}")
+        raise ValueError(f"a pose has 4 x 4 or 3 x 4 numbers; the text has {len(numbers)}")
     return [numbers[i : i + 4] for i in range(0, len(numbers), 4)]
 
 

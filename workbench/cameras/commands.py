@@ -32,7 +32,7 @@ class UndoCamera(Command, frozen=True):
 
 
 class RedoCamera(Command, frozen=True):
-    """Redo the camera change."""
+    """Redo the last undone camera change."""
 
     key = "ctrl+shift+z"
     context = "live"
@@ -178,7 +178,7 @@ class PickPixel(Command, frozen=True):
 
 
 class ShowMeasuredMoment(Command, frozen=True):
-    """Show a state that the camera was measured in."""
+    """Go to a moment at which the camera was measured."""
 
     number: int
 
@@ -190,7 +190,7 @@ class UseSuggestedPlane(Command, frozen=True):
 
 
 class ToggleWantedObject(Command, frozen=True):
-    """Add an object to, or remove it from, those that a suggested placement must see."""
+    """Require that suggested placements see this object, or no longer require it."""
 
     name: str
 
@@ -259,7 +259,7 @@ class SetCameraUp(Command, frozen=True):
 
 
 class ChooseLensForm(Command, frozen=True):
-    """Give the lens of the chosen camera as a field of view, or as an intrinsic matrix of the same picture."""
+    """Describe the chosen camera's lens by a field of view, or by the equivalent intrinsic matrix."""
 
     form: LensForm
 
@@ -332,13 +332,13 @@ class ChooseMeasured(Command, frozen=True):
 
 
 class ChooseMeasuredSteps(Command, frozen=True):
-    """Choose the maximum number of steps of the episode that a camera is measured over."""
+    """Choose over how many steps of the episode, at most, a camera is measured."""
 
     steps: Annotated[int, msgspec.Meta(ge=1, le=MAX_MEASURED)]
 
 
 class ChooseMeasuredResets(Command, frozen=True):
-    """Choose how many fresh resets a camera is measured over."""
+    """Choose over how many fresh resets a camera is measured."""
 
     resets: Annotated[int, msgspec.Meta(ge=1, le=MAX_MEASURED)]
 
@@ -362,7 +362,7 @@ class ChooseCompared(Command, frozen=True):
 
 
 class KeepPlacement(Command, frozen=True):
-    """Keep the chosen camera's placement as A, to compare it later or return to it."""
+    """Keep the chosen camera's placement as A, to compare with it or return to it later."""
 
 
 class ComparePlacements(Command, frozen=True):
@@ -433,7 +433,7 @@ class DownloadCamera(Command, frozen=True):
 
 
 class PasteCalibration(Command, frozen=True):
-    """Paste the calibration by which to place the chosen camera."""
+    """Paste a calibration for the chosen camera."""
 
     text: Annotated[str, msgspec.Meta(max_length=20_000)]
 
@@ -472,7 +472,7 @@ MAX_CAMERA_NAME_CHARACTERS = 64
 
 
 class NameCamera(Command, frozen=True):
-    """Name the camera that is added, copied or renamed next."""
+    """Set the new name for the next camera that is added, copied or renamed."""
 
     name: Annotated[str, msgspec.Meta(max_length=MAX_CAMERA_NAME_CHARACTERS)]
 

@@ -36,7 +36,7 @@ PICTURE_PIXELS = 256
 
 
 class CameraCompare(PagePart[SessionView]):
-    """The folder in the present container: the current placement next to the file's, or next to one kept as A."""
+    """The Compare folder: the current placement next to the file's, or next to one kept as A."""
 
     does = (ChooseCompared, KeepPlacement, ComparePlacements, ReturnToKept)
 
@@ -85,7 +85,10 @@ class CameraCompare(PagePart[SessionView]):
         in_file = camera.info.settings if self._other == "file" else self._before.get(camera.key)
         other = self._kept_of(camera) if self._other == "kept" else in_file
         if other is None:
-            raise Refused("The file's placement of this camera has not changed since the page was opened.")
+            raise Refused(
+                "The file's placement of this camera has not changed since the page was opened: "
+                "compare with another one."
+            )
         self._asked = (camera.key, now, other, NAMES[self._other])
         self._pair.asked(self._session.view().of(StudioView).results.compared)
         self._session.happen(ComparisonWanted(other))
@@ -127,8 +130,8 @@ class CameraCompare(PagePart[SessionView]):
                 data_address(picture.rgb, PICTURE_PIXELS) for picture in both if picture.rgb is not None
             ],
             captions=(
-                "now" if asked is None or asked[1] == camera.now else "as it was then",
-                "the other" if asked is None else asked[3],
+                "now" if asked is None or asked[1] == camera.now else "when compared",
+                "other placement" if asked is None else asked[3],
             ),
             env=both[0].env,
             differences=[] if asked is None else what_differs(asked[2], asked[1]),
@@ -137,22 +140,22 @@ class CameraCompare(PagePart[SessionView]):
 
 def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:
     """The differences of `new` from `old`, each in a few words."""
-    said = []
+    texts = []
     moved = float(np.linalg.norm(np.subtract(new.position, old.position)))
     if moved > 1e-6:
-        said.append(f"moved {1000 * moved:.1f} mm" if moved < 0.1 else f"moved {moved:.3f} m")
+        texts.append(f"moved {1000 * moved:.1f} mm" if moved < 0.1 else f"moved {moved:.3f} m")
     turned = math.degrees(angle_between(old.quaternion, new.quaternion))
     if turned > 1e-4:
-        said.append(f"turned {turned:.2f}°")
+        texts.append(f"turned {turned:.2f}°")
     if old.fov is not None and new.fov is not None and abs(old.fov - new.fov) > 1e-9:
-        said.append(f"fov {math.degrees(old.fov):.1f}° → {math.degrees(new.fov):.1f}°")
+        texts.append(f"fov {math.degrees(old.fov):.1f}° → {math.degrees(new.fov):.1f}°")
     elif old.fov != new.fov or old.intrinsic != new.intrinsic:
-        said.append("another lens")
+        texts.append("lens changed")
     if (old.width, old.height) != (new.width, new.height):
-        said.append(f"{old.width} × {old.height} → {new.width} × {new.height}")
+        texts.append(f"{old.width} × {old.height} → {new.width} × {new.height}")
     for name, was, now in (("near", old.near, new.near), ("far", old.far, new.far)):
         if was != now:
-            said.append(f"{name} {was:g} → {now:g} m")
+            texts.append(f"{name} {was:g} → {now:g} m")
     if old.shader_pack != new.shader_pack:
-        said.append(f"shader {old.shader_pack} → {new.shader_pack}")
-    return said
+        texts.append(f"shader {old.shader_pack} → {new.shader_pack}")
+    return texts

@@ -95,7 +95,7 @@ def apply_to_edits(studio: Studio, event: object, run: Run) -> Change:
         case FileNotChanged(reason=reason):
             shown, done = studio.edits.before
             stage = "refused" if shown.stage == "planned" else shown.stage
-            shown = replace(shown, stage=stage, message=f"Not done: {reason}.")
+            shown = replace(shown, stage=stage, message=f"The file was not changed: {reason}.")
             return _ended(with_edits(studio, shown=shown, done=done), run)
         case TaskCopied(file=file, state=state):
             # Keep the request until the copy is loaded.
@@ -104,11 +104,13 @@ def apply_to_edits(studio: Studio, event: object, run: Run) -> Change:
                 copied=file,
                 shown=replace(state, request=studio.edits.shown.request),
                 just_copied="" if file is None else f"This is your copy of the task, {file}.",
-                done=studio.edits.done if file is None else (),  # they are of the other file
+                done=studio.edits.done if file is None else (),  # those edits are in the original file
             )
             return _ended(studio, run)
         case EditFailed(error=error):
-            problem = f"The workbench itself failed at this, and nothing was done: {error}"
+            problem = (
+                f"A bug of the workbench ended the edit ({error}). Check the file; the Log has the traceback."
+            )
             return _ended(replace(studio, problem=problem), run)
         case StudioClosed():
             return with_edits(studio, closed=True, waiting=()), []
@@ -156,7 +158,7 @@ def _begin(studio: Studio, asked: EditAsked, run: Run) -> Change:
     match asked:
         case EditWanted(request=request) if task is not None:
             left = shown.request if shown.stage == "planned" else None
-            # Clear the answer to another request, but not a written edit, whose version is still loading.
+            # Clear the result of the previous request, but keep a written edit while its version is loading.
             shown = shown if shown.loading else EditState(request=request)
             find = FindPlan(request, task, info_of(run, request.key), run.running_load())
             return with_edits(studio, shown=shown, left=left, busy=True), [find]
@@ -195,7 +197,7 @@ def _plan_found(studio: Studio, found: PlanFound, run: Run) -> Change:
 
 
 def _drop(studio: Studio, run: Run) -> Change:
-    """Drop the plan and show the newest written edit again; if that is shown already, drop all written edits."""
+    """Drop the plan and show the newest written edit again; if one is shown already, drop all of them."""
     done = () if studio.edits.shown.stage in IN_FILE else studio.edits.done
     shown = done[-1] if done else EditState()
     studio = with_edits(studio, done=done, shown=shown, copied=None, just_copied="")
@@ -205,10 +207,10 @@ def _drop(studio: Studio, run: Run) -> Change:
 
 
 def edit_loaded(studio: Studio, task: TaskDescription) -> tuple[Studio, frozenset[CameraKey]]:
-    """Compare the running version with the written edit.
+    """Compare the running version with the written or reverted edit.
 
     Returns:
-        The studio, and the cameras that the edit changed, if this is the version with it.
+        The studio, and the cameras that the edit changed; none if this is not the version after the edit.
     """
     request, edit = studio.edits.shown.request, studio.edits.shown.edit
     if request is None or edit is None or not _is_in(studio.edits, task, edit):
@@ -224,7 +226,7 @@ def edit_loaded(studio: Studio, task: TaskDescription) -> tuple[Studio, frozense
         if not done:
             return _with_stage(studio, message, "undone"), changed
         # Show the previous edit, which can be reverted next.
-        shown = replace(done[-1], message=f"{message} Before it: {done[-1].message}")
+        shown = replace(done[-1], message=f"{message} The edit before it: {done[-1].message}")
         return with_edits(studio, shown=shown), changed
     if wrong := mismatch(request, infos, edit.settings):
         more = "Revert the change, or look for what else in the task places this camera."
@@ -235,7 +237,7 @@ def edit_loaded(studio: Studio, task: TaskDescription) -> tuple[Studio, frozense
 
 
 def _is_in(edits: Edits, task: TaskDescription, edit: SourceEdit) -> bool:
-    """Whether this is the expected version, with the edit or without it."""
+    """Whether this is the expected version: with a written edit, or without a reverted one."""
     written = edits.shown.stage == "written"
     return edits.shown.loading and all(
         task.source.get(change.file) == plain_line_ends(change.new_text if written else change.old_text)
@@ -255,7 +257,7 @@ def plan_in_copy(studio: Studio, run: Run) -> Change:
 def _with_placements(
     studio: Studio, request: EditRequest, in_file: CameraSettings | None
 ) -> tuple[Studio, bool]:
-    """Update the placements after an edit was made or reverted, and keep those that the file does not have.
+    """Update the placements after an edit was written or reverted, and keep those that are not in the file.
 
     Args:
         in_file: the camera's settings in the loaded version; None if there is no such camera.
@@ -298,9 +300,9 @@ def edit_failed_to_load(studio: Studio) -> Studio:
     if not shown.loading or shown.edit is None:
         return studio
     undone = shown.stage == "undone"
-    hint = "the camera's change is in it; revert the change if that is the reason"
+    hint = "the camera's change is in it; revert the change if it is the cause"
     if undone:
-        hint = "the camera's change was reverted"
+        hint = "the camera's change was reverted, so something else is the cause"
     does = "does" if len(shown.edit.changes) == 1 else "do"
     message = f"{shown.edit.names} {does} not load: {hint}."
     return _with_stage(studio, message, shown.stage, loading=not undone)
@@ -368,7 +370,7 @@ class FileEdits:
             return result_of(self._asker.ask(RunCameras(load.task, texts)), check)
         except _Stopped:
             raise RefusedEdit(
-                "the task did not answer, or another version came meanwhile; ask again"
+                "the task did not answer in time, or another version was loaded meanwhile; try again"
             ) from None
         except JobFailed as failure:
             raise RefusedEdit(str(failure)) from failure
@@ -404,11 +406,11 @@ class FileEdits:
             self._happen(NewCameraDrawn(wanted.request, picture))
 
     def stop_question(self) -> None:
-        """Cancel the present question: the worker has ended, or another version is loading."""
+        """Cancel the present question, because the worker has ended or another version is loading."""
         self._stopped.set()
 
     def close(self) -> None:
-        """Wait for a running edit. Called on another thread than the loop."""
+        """Wait for a running edit. Must not be called on the loop's thread."""
         do(self._close)
         self._aside.close()
 

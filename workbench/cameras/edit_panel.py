@@ -78,7 +78,7 @@ class CameraChange:
             and drawn.picture is None
             and edit_state.picture is not None
         ):
-            # The picture of a plan arrives later and pushes the buttons out of view.
+            # The picture of a plan arrives later and pushes the buttons out of view: scroll to them again.
             self.arrival.asked(drawn)
         new = self.arrival.just_came(edit_state if stage != "none" else None)
         if self._drawn is None or self._drawn[0] is not edit_state or self._drawn[1:] != (stale, new):
@@ -106,8 +106,8 @@ def edit_html(edit_state: EditState, stale: bool, folder: Path, new: bool = Fals
     """The stage of a change, as HTML.
 
     Args:
-        folder: For a copy of the task.
-        new: Whether to scroll its buttons into view.
+        folder: Folder for a copy of the task.
+        new: Whether to scroll the buttons into view.
     """
     edit, planned = edit_state.edit, edit_state.stage == "planned"
     seen = edit_state.picture.rgb if planned and edit_state.picture is not None else None
@@ -116,7 +116,9 @@ def edit_html(edit_state: EditState, stale: bool, folder: Path, new: bool = Fals
     tools = tools_of(edit_state, stale, folder)
     return render(
         "camera_writing",
-        message="The camera has moved since: show the change again." if stale else edit_state.message,
+        message="The camera was moved after this change was planned: show the change again."
+        if stale
+        else edit_state.message,
         mood="warn" if stale else MOODS.get(edit_state.stage, "plain"),
         about=edit_state.request.about if planned and edit_state.request is not None else "",
         picture="" if seen is None else data_address(seen, PREVIEW_PIXELS),
@@ -148,10 +150,10 @@ WITH_CHOSEN = (
     tool("Remove", RemoveCamera()),
 )
 ADD = tool("Add sensor", AddCamera(kind="sensor")), tool("Add human view", AddCamera(kind="human"))
-NAME_HINT = "Letters, digits, - and _. A new camera gets a name if this is empty."
+NAME_HINT = "Letters, digits, - and _. If this is empty, a new camera gets a free name."
 WHERE = (
-    "A new sensor looks at the task's objects from where you look; a human view is placed at your viewpoint. Its picture "
-    "follows in a moment, before anything is saved."
+    "A new sensor looks at the task's objects from where you look; a new human view is placed at your "
+    "viewpoint. The new camera's picture appears before anything is saved."
 )
 NEW = CameraSettings(
     position=(0.0, 0.0, 0.0),
@@ -222,7 +224,7 @@ class WriteToFile(PagePart[SessionView]):
             case AddCamera(kind=kind):
                 self._add(kind, visitor.client)
             case _ if studio.chosen is None:
-                raise Refused("Choose the camera first.")
+                raise Refused("Choose a camera first.")
             case PlanCameraChange() if studio.chosen.refused:
                 raise Refused(sentence(studio.chosen.refused))
             case PlanCameraChange():
@@ -238,7 +240,7 @@ class WriteToFile(PagePart[SessionView]):
                 self._ask(EditRequest("remove", studio.chosen.key))
 
     def _ask(self, request: EditRequest) -> None:
-        """Request a plan. Stores the place of the diff first, since the answer may arrive at once."""
+        """Request a plan. Stores the present edit state first, since the answer may arrive at once."""
         change = self._change if request.what == "edit" else self._member_change
         change.arrival.asked(self._session.view().of(StudioView).edit_state)
         self._session.happen(EditWanted(request))
@@ -283,7 +285,7 @@ class WriteToFile(PagePart[SessionView]):
         # Hidden while "Save" is shown: a second press must not write a diff that the user has not read.
         can_plan = can_place and (edit_state.stage != "planned" or stale or of_members)
         wants_plan = can_plan and chosen is not None and chosen.moved and edit_state.stage != "written"
-        # Disabled, not hidden: appearing with the first movement, it would push the controls below away.
+        # Disabled, not hidden: a button that appears with the first movement would push the others away.
         plan = tool("Show the change", PlanCameraChange(), off=not wants_plan, tone="main")
         self._plan.visible, self._plan.content = can_plan, tools_html([plan])
         for change, here in ((self._change, not of_members), (self._member_change, of_members)):
@@ -321,9 +323,10 @@ def free_name(studio: StudioView, kind: CameraKind, like: str) -> str:
 
 # --- initial pose of a new sensor -------------------------------------------------------------------
 
-# A user who adds a camera looks at a whole table or a grid of sixteen from metres away, where a cube is four pixels of a
-# picture of 128. So the direction of the page's view is kept, and the eye moves along it to where the objects of all envs
-# fill the picture; if the view is from about there, the eye is the page's viewpoint.
+# A user who adds a camera looks at a whole table, or at a grid of sixteen envs, from metres away: in a
+# picture of 128 x 128, a cube would be four pixels wide. So the direction of the page's view is kept, and the
+# eye moves along it to where the objects of all envs fill the picture. If the page's viewpoint is already
+# near there, it is the eye.
 
 MARGIN_METRES = 0.1
 """Margin around the origins of the objects."""
@@ -343,7 +346,7 @@ def first_place(
     """The initial settings of a new sensor, and a sentence about its position.
 
     Args:
-        seen_from: settings with its lens at the page's viewpoint, in the env's frame.
+        seen_from: settings with the sensor's lens and the pose of the page's viewpoint, in the env's frame.
         names: names of the objects to see.
         places: (K, 3) positions of the objects in all envs, each in its env's frame.
     """
@@ -360,13 +363,14 @@ def first_place(
     if away <= KEEP_VIEW_FACTOR * wanted:
         return seen_from, stays
     x, y, z = rounded(middle - wanted * axes_of(pose[3:])[0], 4)
-    told = ", ".join(names[:MAX_NAMES]) + (" and others" if len(names) > MAX_NAMES else "")
-    words = f"It looks at {told} from where you look, {wanted:.2f} m away; you are {away:.1f} m away."
+    seen = ", ".join(names[:MAX_NAMES]) + (" and others" if len(names) > MAX_NAMES else "")
+    words = f"It looks at {seen} from where you look, {wanted:.2f} m away; you are {away:.1f} m away."
     return replace(seen_from, position=(x, y, z)), words
 
 
 def distance_to(settings: CameraSettings, places: NDArray[np.float64]) -> float | None:
-    """Distance in metres along the line of sight to the point nearest to the median of places (K, 3); None if behind."""
+    """Distance in metres along the line of sight to the point nearest to the median of `places` (K, 3); None
+    without places, or if that is less than `MIN_TARGET_METRES`."""
     if not len(places):
         return None
     pose = pose_of(settings)

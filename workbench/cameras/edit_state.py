@@ -77,25 +77,26 @@ def plan(task: TaskDescription, info: CameraInfo | None, request: EditRequest, r
             raise RefusedEdit(blocked, text)
     except RefusedEdit as refused:
         can_copy = not owner_text and _can_be_copied(task)
-        ways = (
+        advice = (
             " You can copy the text below into the file yourself." if refused.snippet and not can_copy else ""
         )
         if owner_text and info is not None and (not task.source_files or _is_robot_camera(info)):
-            ways = " The text below is for a class of your own that inherits from it."
-        message = f"Not written: {refused.reason}.{ways}"
+            advice = " The text below is for a subclass of your own."
+        message = f"Not written: {refused.reason}.{advice}"
         return EditState("refused", request, None, refused.snippet, message, can_copy)
     message = f"{change_text(request, PLANNED, edit.names)} Nothing is written yet."
     return EditState("planned", request, edit, message=message)
 
 
 def _owner_text(task: TaskDescription, info: CameraInfo) -> str:
-    """Reason why neither the task's file nor a copy of it contains this camera; empty if one of them may."""
+    """Reason why neither the task's file nor a copy of it contains this camera; empty if one of the two may
+    contain it."""
     own = {Path(file).resolve() for file in (task.file, *task.source_files) if file is not None}
     if info.site is None or Path(info.site.file).resolve() in own:
         return ""
     owner = info.site.function.rpartition(".")[0] or "another file"
-    brings = "the robot brings it, by" if _is_robot_camera(info) else "it is made by"
-    return f"{info.name} is not the task's own: {brings} {owner} ({info.site.file}, line {info.site.line})"
+    made = "the robot makes it, in" if _is_robot_camera(info) else "it is made by"
+    return f"{info.name} is not the task's own: {made} {owner} ({info.site.file}, line {info.site.line})"
 
 
 def _is_robot_camera(info: CameraInfo) -> bool:
@@ -110,7 +111,8 @@ def _override_edit(
     owner_text: str,
     run: RunHooks,
 ) -> SourceEdit:
-    """The edit that adds a hook to the task's own class to replace an inherited camera; refused with the hook as snippet."""
+    """The edit that adds a hook to the task's own class to replace an inherited camera. If the edit is
+    refused, the RefusedEdit has the hook as snippet, if there is one."""
     if request.settings is None or request.what == "remove":
         raise RefusedEdit(owner_text)
     (kind, _), (_, uid), site = request.key, request.result, info.site
@@ -125,7 +127,8 @@ def _override_edit(
         raise RefusedEdit(owner_text, whole)
     if info.varies:
         reason = (
-            f"{owner_text}; the task's own code also moves it, so one pose in the file would not place it"
+            f"{owner_text}; the task's own code also moves the camera, so one pose in the file would not "
+            "place it"
         )
         raise RefusedEdit(reason, whole)
     return members.plan_override(
@@ -162,7 +165,7 @@ def _own_edit(
         file = task.file or task.source_files[0]
         return members.plan_add(texts, file, task.class_name, request.key, request.settings, run)
     if info is None or info.settings is None:
-        raise RefusedEdit(f"there is no {kind} camera {uid!r} whose settings are known")
+        raise RefusedEdit(f"the settings of the {kind} camera {uid!r} are not known")
     if request.what == "remove":
         return members.plan_remove(texts, request.key, run)
     if request.what == "rename":
@@ -194,8 +197,9 @@ def _texts(task: TaskDescription) -> dict[str, str]:
 def mismatch(
     request: EditRequest, infos: Mapping[CameraKey, CameraInfo], written: CameraSettings | None
 ) -> str:
-    """Text: how the cameras of the reloaded env differ from the request; empty if they do not. The reload builds the camera
-    from the file, so only this check proves that the edit is right."""
+    """Text: how the cameras of the reloaded env differ from the request; empty if they do not.
+
+    The reload builds the camera from the file, so only this check proves that the edit is right."""
     kind, name = request.result
     info = infos.get(request.result)
     if request.what == "remove":

@@ -23,7 +23,8 @@ from workbench.task.write_edits import SourceEdit
 
 Triple = tuple[float, float, float]
 Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]
-"""A case on which a camera is measured: the env; the poses (B, 7) of its bodies, None for now; the moment of the history."""
+"""A case in which a camera is measured: the env; the poses (B, 7) of its bodies, None for the present ones;
+the moment of the history, None unless the camera is measured over steps."""
 
 Lane = Literal["live", "background", "preview", "new camera"]
 """Each lane has one job at a time; a new one replaces it. ``live`` uses the worker that plays, ``background`` the background
@@ -41,7 +42,7 @@ class CameraChosen:
 
 @dataclass(frozen=True)
 class CameraPlaced:
-    """Place a camera, live. If placements arrive faster than the worker handles them, only the newest is made."""
+    """Place a camera, live. If placements arrive too fast for the worker, only the newest is applied."""
 
     key: CameraKey
     settings: CameraSettings
@@ -81,14 +82,15 @@ class SuggestionsWanted:
 
 @dataclass(frozen=True)
 class ComparisonWanted:
-    """Draw the shown env with the selected camera as placed, and with other settings."""
+    """Draw the shown env twice with the selected camera: as placed, and with other settings."""
 
     other: CameraSettings
 
 
 @dataclass(frozen=True)
 class SheetWanted:
-    """Draw the selected camera's pictures of all envs, one by one; worst first if there is a report over them."""
+    """Draw the selected camera's pictures of all envs, one by one; the worst env first if a report covers
+    these envs."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,7 @@ class SuggestionsFound:
 
 @dataclass(frozen=True)
 class PicturesCompared:
-    """The shown env was drawn by a camera as placed and with other settings."""
+    """The shown env was drawn twice by one camera: as placed, and with other settings."""
 
     now: Picture
     other: Picture
@@ -176,7 +178,7 @@ class PlanFound:
 
 @dataclass(frozen=True)
 class NewCameraDrawn:
-    """The preview of a new camera; None if it was not drawn."""
+    """The job for the preview of a new camera has ended; its picture is None if it was not drawn."""
 
     request: EditRequest
     picture: Picture | None
@@ -196,6 +198,8 @@ class FileNotChanged:
 
 @dataclass(frozen=True)
 class TaskCopied:
+    """The task's file was copied, or could not be copied."""
+
     file: Path | None
     """The copy; None on failure."""
     state: EditState
@@ -251,19 +255,19 @@ class StopJobs:
 
 @dataclass(frozen=True)
 class StopQuestion:
-    """Cancel the question of an edit to the worker."""
+    """Cancel the question that an edit has sent to the worker."""
 
 
 @dataclass(frozen=True)
 class DrawPreview:
-    """Draw the selected camera at another size."""
+    """Draw the selected camera at the size of the preview."""
 
     question: DrawCamera
 
 
 @dataclass(frozen=True)
 class MeasureLive:
-    """Measure a camera on these cases, with a report after each `every` cases."""
+    """Measure a camera in these cases, with a report after every `every` cases."""
 
     what: str
     question: MeasureCamera
@@ -297,7 +301,7 @@ class Suggest:
 
 @dataclass(frozen=True)
 class Compare:
-    """Draw a camera as placed and with other settings."""
+    """Draw one env twice with a camera: as placed, and with other settings."""
 
     key: CameraKey
     other: CameraSettings

@@ -54,20 +54,22 @@ FORMS: dict[str, Form] = {"JSON": "json", "OpenCV YAML": "opencv", "ROS CameraIn
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
 """Length in metres of each unit: calibrations are often in the unit of the calibration board."""
 WHICH = {"this camera": False, "all cameras": True}
-CONVENTION_HINT = "The convention of the camera's own axes, for what is shown and what is pasted."
+CONVENTION_HINT = (
+    "The convention of the camera's axes, in the matrix shown below and in a pasted calibration."
+)
 DIRECTION_HINT = "OpenCV's extrinsic maps world to camera; a pose maps camera to world."
 CALIBRATION_HINT = (
     "Paste a matrix of 4 x 4 or 3 x 4 numbers, our JSON, or an OpenCV YAML. It is read in the convention and direction "
     "chosen above."
 )
-UNITS_HINT = "Units of what is pasted. What is shown or downloaded, and our own JSON, is in metres."
+UNITS_HINT = "Units of the pasted calibration. Shown and downloaded poses, and our own JSON, are in metres."
 
 
 class CameraExport(PagePart[SessionView]):
-    """The folder in the present container.
+    """The folder "Matrices and files", in the present container.
 
-    A matrix does not contain its direction and the convention of the camera's axes: both are chosen here, for shown and for
-    pasted matrices.
+    A matrix does not state its direction and the convention of the camera's axes: both are chosen here, for
+    shown and for pasted matrices.
     """
 
     does = (
@@ -167,7 +169,8 @@ class CameraExport(PagePart[SessionView]):
         self._session.happen(CameraPlaced(camera.key, frames.with_pose(now, pose)))
         client.add_notification(
             "Placed",
-            "The pose was applied. The lens, if the text has one, was not: its matrix goes into Lens and image.",
+            "The pose was applied, but no lens: enter the text's intrinsic matrix, if it has one, under Lens "
+            "and image.",
             color="green",
             auto_close_seconds=8.0,
         )
@@ -203,7 +206,7 @@ def calibration_text(cameras: Sequence[StudioCamera], form: Form) -> str:
     for camera in cameras:
         kind, name = camera.key
         if camera.now is None:
-            raise ValueError(f"there is no {kind} camera {name} whose settings are known")
+            raise ValueError(f"the {kind} camera {name} cannot be exported: its settings are not known")
         to_export.append(
             calibration_files.CameraToExport(camera.key, camera.now, camera.info.mount, camera.mount_pose)
         )
@@ -222,7 +225,7 @@ def calibrated_pose(
 ) -> frames.Floats:
     """(7,) pose from a calibration, in the frame of the camera's mount, or the env's if it has none.
 
-    Our own JSON contains direction and convention; for other texts they are arguments.
+    Our own JSON names its direction and convention; for other texts, the arguments do.
 
     Raises:
         ValueError: the text has no usable pose; the message is for the user.
@@ -232,7 +235,7 @@ def calibrated_pose(
     chosen = [pose for pose in found if info.name in pose.label] or list(found)
     if len(chosen) > 1:
         labels = ", ".join(pose.label for pose in chosen)
-        raise ValueError(f"it holds several poses ({labels}): paste only the one you mean")
+        raise ValueError(f"the text holds several poses ({labels}): paste only one of them")
     pose = calibration_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
     if chosen[0].stated is None or info.mount is None:
         return pose
@@ -248,7 +251,7 @@ def file_name(name: str, form: Form) -> str:
 
 
 def matrices_html(camera: StudioCamera | None, convention: Convention, direction: Direction) -> str:
-    """Intrinsic and extrinsic of the camera at its present pose, in the env's frame."""
+    """Intrinsic and extrinsic of the camera at its present pose in the env's frame, as HTML."""
     if camera is None or camera.now is None:
         return render("note", text="Choose a camera first.")
     pose = frames.pose_in_env(camera.now, camera.mount_pose)

@@ -30,13 +30,14 @@ THIN_PIXELS, THICK_PIXELS = 2.0, 4.0
 
 @dataclass(frozen=True)
 class PlacedFrustum:
-    """A camera that is being placed: drawn at its present pose, which its newest picture may not have yet."""
+    """A camera that is being placed. It is drawn at its present pose, since its newest picture may have an
+    earlier one."""
 
     pose: NDArray[np.float64]
     """(7,) pose in the view."""
     settings: CameraSettings
     hidden: bool = False
-    """Whether a page looks through the camera, and would see only the camera's picture."""
+    """Whether to hide the frustum: a page's viewpoint is at the camera and would see only its picture."""
 
 
 class CameraFrustums:
@@ -83,8 +84,8 @@ class CameraFrustums:
     def under_ray(self, origin: NDArray, direction: NDArray) -> CameraKey | None:
         """The camera whose frustum a ray (3,) in the view hits first, or None.
 
-        viser's clicks on nodes are not used: a clickable node captures every press in its area, also those on the gizmo
-        drawn over it.
+        viser's clicks on nodes are not used: a clickable node captures every press in its area, even on the
+        gizmo that is drawn over it.
         """
         met = [
             (distance, key)
@@ -142,7 +143,7 @@ class CameraFrustums:
 
 
 def _distance_to(handle: viser.CameraFrustumHandle, origin: NDArray, direction: NDArray) -> float | None:
-    """Distance at which a ray (3,) enters a frustum, in lengths of `direction`; None if it misses."""
+    """Distance at which a ray (3,) enters a frustum, in multiples of `direction`; None if it misses."""
     turn = viser.transforms.SO3(handle.wxyz).inverse()
     start, along = turn @ (np.asarray(origin, float) - handle.position), turn @ np.asarray(direction, float)
     # viser keeps the volume of the pyramid constant (CameraFrustumVariants.tsx); its tip is at the origin.
@@ -180,10 +181,11 @@ def frustum_pose(pose: NDArray, offset: NDArray) -> tuple[NDArray, NDArray]:
 def without_the_viewpoint(
     pictures: dict[CameraKey, Picture], seen: Mapping[CameraKey, Picture]
 ) -> dict[CameraKey, Picture]:
-    """The pictures to draw while one env is alone in the view.
+    """The pictures to draw while one env is alone in the view: those that are not near a human camera's
+    picture in `seen`.
 
-    The view then starts at the task's human camera (`viewpoint`); the picture of that camera, or of a sensor at the same
-    place, would fill it.
+    The view then starts at the task's human camera (`viewpoint`). The frustum's picture of this camera, or of
+    a sensor at the same place, would fill the view.
     """
     eyes = [picture.pose[:3] for (kind, _), picture in seen.items() if kind == "human"]
     return {

@@ -33,7 +33,7 @@ from workbench.page.widgets.notices import refusals_told
 from workbench.pictures.camera_conventions import axes_of, intrinsic_of, target_of, vertical_fov
 
 RELEASE_TIMEOUT_SECONDS = 60.0
-"""Time without movement after which a gizmo that was never released (its page was closed) counts as free."""
+"""Time without movement after which a gizmo counts as released, without an event (its page was closed)."""
 GIZMO_PIXELS = 76.0
 TARGET_PIXELS = 44.0
 """Sizes of the gizmos on the screen."""
@@ -57,15 +57,15 @@ class _Taken:
 class CameraGizmo:
     """A gizmo to move and rotate the chosen camera, or two gizmos for its eye and its target, in the view of one page.
 
-    viser's gizmo uses its own axes and has no steps. To rotate about the world's axes, it is aligned with them when a drag
-    begins, and its rotation since then is applied to the camera. With steps, the camera jumps while the gizmo follows the
-    pointer, and the gizmo returns to the camera on release. During a drag the server never writes the gizmo's pose, which
-    would pull it away from the pointer.
+    viser's gizmo uses its own axes and cannot snap. To rotate about the world's axes, the gizmo is aligned
+    with them when a drag begins, and its rotation since then is applied to the camera. With snap steps, the
+    camera jumps while the gizmo follows the pointer, and the gizmo returns to the camera on release. During a
+    drag the server never writes the gizmo's pose, which would pull the gizmo away from the pointer.
 
     Args:
-        snap: returns the chosen steps.
-        own_axes: returns whether it uses the camera's own axes.
-        look_at: returns whether to show eye and target.
+        snap: returns the chosen snap steps.
+        own_axes: returns whether the gizmo uses the camera's own axes.
+        look_at: returns whether to show the gizmos of eye and target.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class CameraGizmo:
         self._target.on_update(self._on_point)
 
     def remove(self) -> None:
-        """Remove the gizmo; a drag ends."""
+        """Remove the gizmos from the view, even during a drag."""
         self._line.draw()
         for handle in (self._camera, self._eye, self._target):
             handle.remove()
@@ -101,7 +101,7 @@ class CameraGizmo:
         return self._start is not None and time.monotonic() - self._held_at < RELEASE_TIMEOUT_SECONDS
 
     def draw(self, camera: StudioCamera | None) -> None:
-        """Draw the gizmos at this camera; None removes them."""
+        """Draw the gizmos at this camera, unless one is being dragged; None hides them."""
         if self.held:
             if camera is not None:
                 self._draw_line(camera)
@@ -214,6 +214,8 @@ UPRIGHT = np.array([0.0, 0.0, 1.0])
 
 @dataclass
 class _Looking:
+    """A page that looks through a camera, with the page's own viewpoint, to which it returns."""
+
     key: CameraKey
     position: Floats
     look_at: Floats
@@ -242,12 +244,13 @@ class LookThrough:
         return bool(self._looking)
 
     def toggle(self, client: viser.ClientHandle | None) -> None:
-        """Look through the chosen camera, or return, with the next drawing."""
+        """Look through the chosen camera, or return, at the next drawing."""
         if client is not None:
             self._asked.append(client.client_id)
 
     def draw(self, camera: StudioCamera | None) -> None:
-        """Follow the camera; return if it is no longer the chosen one."""
+        """Move the pages that look through the camera along with it; if another camera is chosen, return them
+        to their own view."""
         clients = self._server.get_clients()
         while self._asked:
             if (client := clients.get(self._asked.popleft())) is not None:

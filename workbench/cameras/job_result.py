@@ -29,7 +29,7 @@ class NewResult:
         self._came = -1e9
 
     def asked(self, now: object) -> None:
-        """Store that a new result was requested; `now` is the one that it will replace."""
+        """Store that a new result was requested; `now` is the result that it will replace."""
         self._before, self._waiting = now, True
 
     def just_came(self, now: object) -> bool:
@@ -62,26 +62,26 @@ class JobResult:
         self._drawn: object = None
 
     def asked(self, now: object) -> None:
-        """Store that a job was requested here; its result replaces `now`."""
+        """Store that a job was requested here; `now` is the result that the new one will replace."""
         JobResult._asked_last = self
         self._new.asked(now)
 
     def draw(
-        self, running: JobProgress | None, came: object, told: object, html: Callable[[bool], str]
+        self, running: JobProgress | None, result: object, other: object, html: Callable[[bool], str]
     ) -> None:
         """Draw the bar and the result, if they changed.
 
         Args:
-            came: the result, if there is one.
-            told: key of the other content of its HTML.
+            result: the result, if there is one.
+            other: other values that the HTML shows, compared to find out whether it changed.
             html: renders the result, given whether it is new.
         """
         self._draw_bar(running)
-        new = self._new.just_came(came)
-        if (wanted := (id(came), told, new)) != self._drawn:
+        new = self._new.just_came(result)
+        if (wanted := (id(result), other, new)) != self._drawn:
             self._drawn = wanted
-            self._html.visible = bool(came)
-            if came:
+            self._html.visible = bool(result)
+            if result:
                 self._html.content = html(new)
 
     def _draw_bar(self, running: JobProgress | None) -> None:

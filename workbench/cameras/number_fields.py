@@ -64,7 +64,7 @@ UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
 LENS = "Lens and image"
 ROTATION = "Rotation"
 GOES_ALONG = "The target moves with the position. To keep it fixed, set Handles to eye and target."
-STAYS = "Each moves alone: the camera keeps looking at its target."
+STAYS = "Eye and target move separately: the camera keeps looking at the target."
 SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
 """The shader packs of ManiSkill 3."""
 
@@ -73,9 +73,10 @@ class CameraNumbers:
     """Two folders in the present container: pose (with the rotation, folded), and lens and picture.
 
     All forms of the pose show the same camera and can change it; one of the three forms of the orientation is shown at a
-    time. With the pose handle, a new eye position moves the target along; with the eye and target handles, each changes
-    alone. The numbers of a mounted camera are in the frame of its link. The lens is a field of view or an intrinsic matrix,
-    which exclude each other in ManiSkill's config; changing the form keeps the picture.
+    time. With the pose handle, the target moves along with a new position; with the eye and target handles,
+    each of the two changes alone. The numbers of a mounted camera are in the frame of its link. The lens is a
+    field of view or an intrinsic matrix, which exclude each other in ManiSkill's config; changing the form
+    keeps the picture.
 
     Args:
         look_at: returns whether eye and target are placed separately, instead of a pose.
@@ -132,7 +133,7 @@ class CameraNumbers:
                     to,
                     SetCameraTarget,
                     XYZ,
-                    "A point on the line of sight, in metres: the camera stays where it is and turns towards it.",
+                    "A point on the line of sight, in metres. A new point rotates the camera in place.",
                 ),
             )
             for separately, at, to in ((False, "Position", "Looks at"), (True, "Eye", "Target"))
@@ -148,13 +149,14 @@ class CameraNumbers:
             "form",
             ROTATIONS,
             RPY,
+            hint="How the camera's rotation is shown below.",
         )
         self._rpy = self._row(
             "Degrees",
             SetCameraAngle,
             ANGLES,
-            "R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF and ROS. Yaw turns it to the left, a positive pitch "
-            "looks down, roll turns it clockwise.",
+            "R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF and ROS. Yaw turns the camera to the left, a "
+            "positive pitch looks down, roll turns it clockwise.",
             step=1.0,
         )
         self._wxyz = Field(
@@ -162,7 +164,7 @@ class CameraNumbers:
             "w x y z",
             SetCameraQuaternion,
             "wxyz",
-            hint="As in sapien.Pose(q=...), w first. It is normalised.",
+            hint="As in sapien.Pose(q=...), w first. The quaternion is normalised.",
             longest=200,
         )
         self._forward = self._row(
@@ -194,7 +196,7 @@ class CameraNumbers:
             "Width, height", SetPictureSize, ("width", "height"), "Pixels of the picture.", step=1.0
         )
         self._range = self._row(
-            "Near, far", SetNearOrFar, ("near", "far"), "Metres. What is nearer or farther is not drawn."
+            "Near, far", SetNearOrFar, ("near", "far"), "Metres. Nearer and farther things are not drawn."
         )
         self._shader = choice(
             self._server,
@@ -212,7 +214,7 @@ class CameraNumbers:
             folder.visible = camera is not None
         if camera is None or camera.now is None:
             return
-        now, alone, said = camera.now, self._look_at(), self._rotation
+        now, alone, form = camera.now, self._look_at(), self._rotation
         forward, left, up = axes_of(now.quaternion)
         by_matrix = now.intrinsic is not None
         for separately, (position, target) in self._points.items():
@@ -220,17 +222,17 @@ class CameraNumbers:
             position.show(rounded(now.position, UNIT))
             target.show(rounded(target_of(now), UNIT))
         self._about.content = render("aside", text=STAYS if alone else GOES_ALONG)
-        self._form.show(said)
-        self._rpy.visible = said == RPY
+        self._form.show(form)
+        self._rpy.visible = form == RPY
         angles = rounded(_angles(now), DEGREES)
         self._rpy.show(angles)
         name_fold(self._rotation_fold, ROTATION, ", ".join(f"{angle:.0f}\N{DEGREE SIGN}" for angle in angles))
-        self._wxyz.visible = said == WXYZ
+        self._wxyz.visible = form == WXYZ
         self._wxyz.show(" ".join(f"{n:.{QUATERNION}f}" for n in rounded(now.quaternion, QUATERNION)))
-        self._forward.visible = self._up.visible = self._left.visible = said == AXES
+        self._forward.visible = self._up.visible = self._left.visible = form == AXES
         self._forward.show(rounded(forward, UNIT))
         self._up.show(rounded(up, UNIT))
-        if said == AXES:
+        if form == AXES:
             text = ", ".join(f"{n:.{UNIT}f}" for n in rounded(left, UNIT))
             self._left.content = render("note", text=f"Left: {text}")
         self._lens.show(INTRINSIC if by_matrix else FOV)
@@ -260,7 +262,7 @@ class CameraNumbers:
             self._placing.change(type(command), partial(self._changed, command))
 
     def _changed(self, command: Command, now: CameraSettings, frame: Frame) -> CameraSettings:
-        """The camera's settings after this command. Raises ValueError with a sentence."""
+        """The camera's settings after this command. Raises ValueError with a message for the user."""
         forward, _, up = axes_of(now.quaternion)
         match command:
             case SetCameraPosition(of=axis, to=metres):
@@ -296,7 +298,7 @@ class CameraNumbers:
             case ChooseShader(shader=shader):
                 if shader not in self._shaders:
                     raise ValueError(
-                        f"There is no shader pack {shader!r}: they are {', '.join(self._shaders)}."
+                        f"There is no shader pack {shader!r}; choose from: {', '.join(self._shaders)}."
                     )
                 return replace(now, shader_pack=shader)
         raise AssertionError(command)
@@ -326,8 +328,8 @@ def _with_fov(settings: CameraSettings, fov: float) -> CameraSettings:
     return settings if settings.fov is None else replace(settings, fov=fov)
 
 
-def _with_lens(settings: CameraSettings, said: LensForm) -> CameraSettings:
-    if said == FOV:
+def _with_lens(settings: CameraSettings, form: LensForm) -> CameraSettings:
+    if form == FOV:
         return replace(settings, fov=_fov(settings), intrinsic=None)
     return replace(settings, fov=None, intrinsic=matrix3(intrinsic_of(settings)))
 
@@ -354,7 +356,7 @@ def _angles(settings: CameraSettings) -> list[float]:
 def _read_quaternion(text: str) -> Floats:
     words = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", text)
     if len(words) != 4 or re.search(r"[^\d\s,;()\[\].eE+-]", text):
-        raise ValueError("A quaternion is four numbers, w first: 1 0 0 0 is no rotation.")
+        raise ValueError("A quaternion is four numbers, w first; the identity is 1 0 0 0.")
     return normalised([float(word) for word in words])
 
 

@@ -37,11 +37,11 @@ from workbench.page.widgets.visitors import Visitor
 
 PICTURE_PERIOD_SECONDS = 1 / 15
 """Minimum interval between two pictures of one camera. A picture that is replaced before the browser has loaded it is never
-visible (measured: at 1,000 a second the page shows one in five seconds)."""
+visible (measured: at 1,000 pictures a second, the page shows one every five seconds)."""
 SHOWN_WIDTH_PIXELS = 400
 """Width of a shown picture; a panel is some 340 pixels wide."""
 SETTLE_SECONDS = 0.4
-"""Debounce time: after it without another picture, the last one is sent in full size."""
+"""Debounce time: if no other picture follows within it, the last one is sent in full size."""
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "human view"}
 
 
@@ -62,7 +62,7 @@ class CameraImage:
         self._handle: viser.GuiImageHandle | None = None
         self._drawn_at = -math.inf
         self._whole: tuple[str, NDArray[np.uint8]] | None = None
-        """Picture in full size, if it is shown smaller."""
+        """Modality and full-size pixels of the last picture, if it is shown smaller."""
 
     @property
     def visible(self) -> bool:
@@ -108,7 +108,7 @@ class _Camera:
     stale: bool = False
     """Whether its pictures are marked as pictures of another moment."""
     failed: str = ""
-    """Reason why the camera cannot be drawn."""
+    """Reason why the camera cannot be drawn; empty if it can."""
     hidden: tuple[str, ...] = ()
     """Names of objects that the task hides from the camera."""
 
@@ -137,7 +137,8 @@ class CamerasPanel:
         self._server, self._clock = server, clock
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._ticked: dict[tuple[CameraKind, str, str], bool] = {}
-        """Whether each modality of each camera is ticked; removed cameras are kept, since they may come back."""
+        """Whether each modality of each camera is ticked; entries of removed cameras are kept, since they may
+        come back."""
         self._cameras_serial = -1
         self._due = DrawThrottle(PICTURE_PERIOD_SECONDS, clock)
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task has loaded."))
@@ -147,7 +148,7 @@ class CamerasPanel:
         match command:
             case ShowPictures(kind=kind, name=name, modality=modality, on=on):
                 if (kind, name, modality) not in self._ticked:
-                    raise Refused(f"No camera {name} gives {modality}.")
+                    raise Refused(f"There is no {kind} camera {name} with the modality {modality}.")
                 self._ticked[kind, name, modality] = on
 
     def draw(self, seen: ShownCameras | None) -> None:
@@ -170,14 +171,14 @@ class CamerasPanel:
             picture = seen.pictures.get(key)
             if picture is None or picture.env != seen.env:
                 continue
-            # Do not redraw an equal picture: the browser would decode it again.
+            # Do not send the same picture again: the browser would decode it again.
             wanted = self._wanted(camera)
             if camera.drawn is None or camera.drawn[0] is not picture or camera.drawn[1] != wanted:
                 camera.drawn = (picture, wanted)
                 self._draw_camera(camera, picture, seen)
 
     def shown_pictures(self, seen: ShownCameras) -> dict[tuple[CameraKind, str], Picture]:
-        """The selected env's pictures of ticked cameras, for the frustums."""
+        """The selected env's pictures of ticked cameras and of the camera in the Studio, for the frustums."""
         return {
             key: picture
             for key, picture in seen.pictures.items()
@@ -230,7 +231,7 @@ class CamerasPanel:
                 given = {"kind": info.kind, "name": info.name, "modality": modality}
                 on = self._ticked.setdefault((*info.key, modality), first and modality == "rgb")
                 ticks[modality] = tick(self._server, modality, ShowPictures, "on", on, given=given)
-                # The picture is created with its first content, and is above its caption.
+                # The image is created with its first picture: the folder keeps its place above the caption.
                 images[modality] = CameraImage(self._server, gui.add_folder(None), self._clock)
                 captions[modality] = gui.add_html("")
         camera = _Camera(info, ticks, captions, folder, about, images)
@@ -261,7 +262,8 @@ class CamerasPanel:
         return tuple(modality for modality in camera.ticks if self._ticked[(*camera.info.key, modality)])
 
     def _wanted_of(self, key: CameraKey, camera: _Camera, seen: ShownCameras) -> tuple[str, ...]:
-        """The ticked modalities; for a camera that is being placed in full size, also the modality shown in the Studio."""
+        """The ticked modalities; for the camera in the Studio also `rgb` and the Studio's modality, unless
+        the Studio draws a preview."""
         wanted = self._wanted(camera)
         if seen.preview or key != seen.placed:
             return wanted
@@ -297,7 +299,8 @@ class CamerasPanel:
 class StudioPicture:
     """The chosen camera's picture in the present container, in any modality; overlays go into `folder`.
 
-    Depth and segmentation too: they show first that a far plane is too near, or that a gripper hides the cube.
+    Depth and segmentation are offered because they show first that a far plane is too near, or that a gripper
+    hides the cube.
     """
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
@@ -342,7 +345,7 @@ class StudioPicture:
             self._picture.show(False)
             self._caption.content, self._caption.visible = render("note", text=failed), True
             return
-        # The last picture stays until the next arrives; that of another camera does not.
+        # Keep the last picture until the next one arrives, but not a picture of another camera.
         self._picture.show(self._drawn is not None and self._drawn[0] == key)
         self._caption.visible = self.visible and bool(self._caption.content)
         kind = self.shows
@@ -354,7 +357,7 @@ class StudioPicture:
         self._span = depth_span(self._span if self._drawn and self._drawn[0] == key else None, picture)
         coloured = in_colours(picture, kind, view.task.segmentation, self._span)
         if coloured is None:
-            return  # there is no picture yet
+            return  # the picture does not have this modality yet
         self._drawn, self._drawn_at = (key, picture, kind), self._clock()
         pixels, self._caption.content = coloured
         self._picture.draw(kind, pixels)
@@ -372,7 +375,7 @@ def modalities_of(info: CameraInfo) -> tuple[str, ...]:
 
 
 def facts(camera: _Camera) -> str:
-    """The line below a camera's name."""
+    """The line below a camera's name, as HTML."""
     fovy = f"{np.degrees(camera.info.fovy):.0f}°"
     return render(
         "camera_facts",
@@ -395,13 +398,13 @@ MARK_METRES = 0.05
 class CameraPick:
     """Pixel picks: an overlay on the picture, the result, and a mark at the point in the 3D view.
 
-    viser's pictures do not report the position of a press, so a pane of our own HTML lies over the picture (``.wb-pane`` in
-    page.css). Construct it in the container of the picture, directly after it.
+    viser's images do not report the position of a press, so a pane of our own HTML lies over the picture
+    (``.wb-pane`` in page.css). Construct a `CameraPick` in the picture's container, right after the picture.
     """
 
     def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
         self._drawn: object = None
-        # The order puts it after a picture that is added to the container later.
+        # The high order puts the pane after a picture that is added to the container later.
         self._pane = server.gui.add_html("", order=1e5, visible=False)
         self._found = server.gui.add_html("", order=1e5 + 1, visible=False)
         self._cross = line_set(server, "/picked/cross", MARK_COLOUR, 3.0)
@@ -431,7 +434,7 @@ class CameraPick:
         """Mark the picked point with a cross and the body's name.
 
         Args:
-            offset: (3,) of the selected env in the view.
+            offset: (3,) position of the selected env in the view, metres.
         """
         picked = picked_here(view)
         if picked is None or picked.point is None:
@@ -458,5 +461,5 @@ def pane_html(camera: StudioCamera, picked: PickedPixel | None) -> str:
 
 
 def _size(camera: StudioCamera) -> tuple[int, int]:
-    said = camera.info if camera.now is None else camera.now
-    return said.width, said.height
+    source = camera.info if camera.now is None else camera.now
+    return source.width, source.height

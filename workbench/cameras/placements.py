@@ -14,7 +14,7 @@ from workbench.pictures.camera_conventions import axes_of
 
 _MAX_UNDO_STEPS = 500
 MIN_TARGET_METRES, MAX_TARGET_METRES, DEFAULT_TARGET_METRES = 0.1, 3.0, 1.0
-"""Distance from the eye: limits and default of the target of a camera without one."""
+"""Limits and default of the distance from the eye to the target, for a camera without a target."""
 
 
 @dataclass(frozen=True)
@@ -27,18 +27,19 @@ class PlacementChange:
     label: str
     """Text such as ``moved base_camera``."""
     control: object = None
-    """Id of the control that made it."""
+    """Id of the control that made the change."""
     at: float = 0.0
-    """Seconds of a monotonic clock."""
+    """Time of the change, in seconds of a monotonic clock."""
 
 
 @dataclass(frozen=True)
 class Placements:
     """Placements of cameras, with undo and redo. Methods that change something return a new value.
 
-    A step holds a camera's full settings before and after, so it can be undone even if the file changed since. A gesture
-    (a drag has a hundred positions) is one step. A new version keeps unwritten placements, except for cameras whose
-    settings changed in the file: the author's change wins, and Undo restores the placement.
+    An undo step has a camera's full settings before and after, so it can be undone even if the file has
+    changed since. A gesture (a drag has a hundred positions) is one step. When a new version is loaded,
+    placements that are not in the file stay, except for cameras whose settings changed in the file: the
+    author's change wins, and Undo restores the placement.
     """
 
     in_file: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
@@ -51,7 +52,8 @@ class Placements:
     """Steps that can be redone, the next last."""
 
     def now(self, key: CameraKey) -> CameraSettings | None:
-        """A camera's present settings; None if it is missing, or settings cannot describe its config."""
+        """A camera's present settings; None if there is no such camera, or `CameraSettings` cannot describe
+        its config."""
         return self.placed.get(key, self.in_file.get(key))
 
     @property
@@ -71,11 +73,11 @@ class Placements:
         pause: float = math.inf,
         label: str = "",
     ) -> Placements:
-        """Place a camera; nothing changes if it is missing.
+        """Place a camera; nothing changes if there is no such camera.
 
         Args:
             at: time in seconds of a monotonic clock.
-            control: id of the control; successive calls with the same one are one undo step (a drag).
+            control: id of the control; successive calls with the same id are one undo step (a drag).
             pause: seconds without a call after which a new step begins.
         """
         before = self.now(key)
@@ -157,10 +159,10 @@ class Placements:
     def loaded(
         self, in_file: Mapping[CameraKey, CameraSettings], own: frozenset[CameraKey] = frozenset()
     ) -> tuple[Placements, tuple[CameraKey, ...]]:
-        """Take the cameras of a new version.
+        """Update the placements for the cameras of a newly loaded version.
 
         Args:
-            in_file: their settings.
+            in_file: settings of the version's cameras.
             own: cameras that the studio itself changed in the file; their placements stay.
 
         Returns:
@@ -213,7 +215,8 @@ def _step_label(key: CameraKey, before: CameraSettings, after: CameraSettings) -
 
 
 def usual_distance(pose: ArrayLike) -> float:
-    """Default distance in metres from a camera's pose (7,) to its target: where its axis meets z = 0, if that is near."""
+    """Default distance in metres from a camera's pose (7,) to its target: to where its optical axis meets the
+    plane z = 0, if that is within the limits, else `DEFAULT_TARGET_METRES`."""
     p = np.asarray(pose, np.float64)
     forward = axes_of(p[3:])[0]
     distance = -float(p[2] / forward[2]) if abs(forward[2]) >= 1e-6 else DEFAULT_TARGET_METRES

@@ -65,7 +65,8 @@ class Frame:
     def from_view(
         self, settings: CameraSettings, pose: ArrayLike, distance: float | None = None
     ) -> CameraSettings:
-        """The camera at this pose (7,) in the view, with its present distance to the target, or `distance` metres."""
+        """`settings` moved to this pose (7,) in the view, with the present distance to the target, or
+        `distance` metres."""
         there = np.array(pose, np.float64)
         there[:3] -= self.offset
         moved = with_pose(settings, there if self.mount is None else relative_to(self.mount, there))
@@ -77,10 +78,10 @@ class Frame:
         return moved if distance is None else replace(moved, distance=max(distance, 1e-3))
 
     def turned_to(self, settings: CameraSettings, target: ArrayLike) -> CameraSettings:
-        """The camera rotated to look at a target (3,) in the frame of its position.
+        """`settings` rotated to look at a target (3,) in the frame of the camera's position.
 
         Raises:
-            ValueError: the target is its position.
+            ValueError: the target is at the camera's position.
         """
         pose, there = self.to_view(settings), self.point_to_view(target)
         return self.from_view(settings, looking_at(pose, pose[:3], there), math.dist(there, pose[:3]))
@@ -103,7 +104,7 @@ def looking_at(pose: ArrayLike, eye: ArrayLike, target: ArrayLike) -> Floats:
 
 
 def turned_in_world(start: ArrayLike, position: ArrayLike, turn: ArrayLike) -> Floats:
-    """(7,) `start` rotated by the quaternion `turn` about the world's axes, at another position."""
+    """(7,) pose `start` rotated by the quaternion `turn` about the world's axes, and moved to `position`."""
     s = np.asarray(start, np.float64)
     turned = rotation_matrix(turn) @ rotation_matrix(s[3:])
     return make_pose(position, quaternion_of(turned))
@@ -113,7 +114,7 @@ def snapped(start: ArrayLike, pose: ArrayLike, snap: Snap, own_axes: bool, origi
     """(7,) the dragged pose of a gizmo, snapped to whole steps.
 
     Along the world's axes the position snaps to a grid, so that round numbers are written; along the camera's own axes it
-    moves in steps from the start of the drag. It rotates in steps from the start of the drag.
+    moves in steps from the start of the drag. The rotation always has steps from the start of the drag.
 
     Args:
         origin: (3,) origin of the grid.
@@ -187,8 +188,11 @@ PAUSE_SECONDS = 1.2
 
 
 class Placing:
-    """Places the chosen camera for gizmo, keys, number fields and "move to my view": checks that the camera can be placed,
-    knows the frame of its numbers, and makes one movement one undo step."""
+    """Places the chosen camera for gizmo, keys, number fields and "move to my view".
+
+    It checks that the camera can be placed, knows the frame of the camera's numbers, and makes one movement
+    one undo step.
+    """
 
     def __init__(self, session: LiveSession) -> None:
         self._session = session
@@ -208,7 +212,7 @@ class Placing:
         """
         camera = self.camera
         if camera is None or camera.now is None:
-            raise Refused("Choose a camera that can be placed first.")
+            raise Refused("First choose a camera that can be placed.")
         return camera, camera.now, self.frame(camera)
 
     def frame(self, camera: StudioCamera) -> Frame:
@@ -220,7 +224,7 @@ class Placing:
         """Place the camera live; `control` and `pause` as in `CameraPlaced`.
 
         Raises:
-            Refused: it is too far from the origin.
+            Refused: the position is too far from the origin.
         """
         if not all(abs(x) <= MAX_COORDINATE_METRES for x in settings.position):
             raise Refused(f"A camera must be within {MAX_COORDINATE_METRES:g} m of the origin.")
@@ -230,7 +234,7 @@ class Placing:
         """Apply `change` to the chosen camera; `control` as in `place`.
 
         Args:
-            change: returns the new settings; raises ValueError with a sentence if they are impossible.
+            change: returns the new settings; raises ValueError, with a message for the user, if not possible.
 
         Raises:
             Refused: no camera is chosen, or it cannot have these settings.
@@ -251,5 +255,5 @@ def chosen_camera(session: LiveSession) -> tuple[StudioCamera, CameraSettings]:
     """
     camera = session.view().of(StudioView).chosen
     if camera is None or camera.now is None:
-        raise Refused("Choose a camera that can be placed first.")
+        raise Refused("First choose a camera that can be placed.")
     return camera, camera.now

@@ -24,16 +24,16 @@ class DrawCamera(Question[Picture]):
 
     key: CameraKey
     settings: CameraSettings | None
-    """Settings only for this picture; None for the current ones. Required for a camera that the env does not have, which is
-    fixed and drawn like one with a `scale`."""
+    """Settings for this picture only; None for the current ones. Required for a camera that the env does not
+    have: it is drawn without a mount, as if `scale` were not 1."""
     env: int
     modalities: tuple[str, ...] = ("rgb",)
     """Requested modalities; those that the camera's shader does not provide are left out."""
     poses: NDArray[np.float32] | None = None
     """(B, 7) poses of the env's bodies at a past moment; None for now."""
     scale: float = 1.0
-    """Factor on the picture's size. A factor other than 1 requires `settings`, and a temporary camera with the minimal shader
-    renders colours, depth and segmentation."""
+    """Factor on the picture's size. A factor other than 1 requires `settings`; a temporary camera with the
+    minimal shader then renders colours, depth and segmentation."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class MeasureCamera(Question[CameraReport]):
 
 @dataclass(frozen=True)
 class SuggestCameras(Question[tuple[OfferedPlacement, ...]]):
-    """Search for placements of one camera from which it sees the given objects."""
+    """Search for placements of one camera that see the objects of `space` in these envs."""
 
     space: SearchSpace
     envs: tuple[int, ...]

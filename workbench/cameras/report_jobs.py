@@ -61,7 +61,7 @@ def with_results(studio: Studio, **values: object) -> Studio:
 
 
 def outdated(studio: Studio) -> Studio:
-    """Mark the results as outdated: they are of an earlier version."""
+    """Mark the report as outdated, and drop the compared pictures, the picked pixel and the sheet."""
     results = replace(studio.results, outdated=True, compared=None, picked=None, sheet=())
     return replace(studio, results=results)
 
@@ -92,7 +92,10 @@ def apply_to_reports(studio: Studio, event: object, run: Run) -> Change:
         case Measuring(on=on):
             return with_results(studio, measuring=on), []
         case SuggestionsFound(found=found, objects=objects):
-            problem = "" if found else f"no placement in that box sees {' and '.join(objects)} in any env."
+            names = " and ".join(objects)
+            problem = (
+                "" if found else f"No placement in the search box sees {names} in any env: enlarge the box."
+            )
             return with_results(studio, suggestions=found, problem=problem), []
         case PicturesCompared():
             return with_results(studio, compared=(event.now, event.other)), []
@@ -111,7 +114,7 @@ def do_report(studio: Studio, command: Command, run: Run) -> Change:
         case PickPixel(x=u, y=v):
             camera = selected_camera(studio, run)
             if camera is None or run.task is None:
-                raise Refused("Choose the camera first.")
+                raise Refused("Choose a camera first.")
             pick = Pick(camera.info, u, v, run.shown_moment(), run.task.segmentation)
             return replace(studio, problem=""), [pick]
         case _:
@@ -153,7 +156,7 @@ def _suggest(studio: Studio, wanted: SuggestionsWanted, run: Run) -> Change:
     key = camera.key
     space = SearchSpace(wanted.objects, wanted.low, wanted.high, camera.now, key[0], mount=camera.info.mount)
     studio = with_results(studio, suggestions=(), suggestions_of=key)
-    return studio, [Suggest(f"searching placements for {key[1]}", space, load, wanted.seeds)]
+    return studio, [Suggest(f"searching for placements of {key[1]}", space, load, wanted.seeds)]
 
 
 def _compare(studio: Studio, other: CameraSettings, run: Run) -> Change:
@@ -161,7 +164,7 @@ def _compare(studio: Studio, other: CameraSettings, run: Run) -> Change:
     if camera is None:
         return studio, []
     if why_not := camera.refused or why_no_camera(other):
-        return replace(studio, problem=f"{camera.key[1]} is not compared: {why_not}."), []
+        return replace(studio, problem=f"{camera.key[1]} cannot be compared: {why_not}."), []
     return studio, [Compare(camera.key, other, run.shown_moment())]
 
 
@@ -188,7 +191,7 @@ class CameraReports:
     ) -> None:
         """
         Args:
-            asker, background: ask the worker that plays, and the background process.
+            asker, background: ask questions of the worker that plays, and of the background process.
             happen: handles the resulting events.
         """
         self._live, self._background, self._happen = asker, background, happen
@@ -201,7 +204,7 @@ class CameraReports:
         reports: list[CameraReport] = []
 
         async def measure() -> None:
-            """Continue with the first seed without a report: a job of higher rank may have interrupted this one."""
+            """Measure the seeds without a report: a job of higher rank may have interrupted this one."""
             num_envs = await self._background.ensure(job, _for_measuring(wanted.load))
 
             for seed in range(begun := len(reports), wanted.seeds):
@@ -294,7 +297,12 @@ def _for_measuring(load: Load) -> Load:
 
 
 def pick_pixel(info: CameraInfo, picture: Picture, u: float, v: float, names: dict[int, str]) -> PickedPixel:
-    """Probe a pixel; `u` and `v` are from 0 to 1, from the picture's upper left corner."""
+    """Probe a pixel.
+
+    Args:
+        u, v: 0 to 1 from the picture's upper left corner, to the right and down.
+        names: body names by id in the segmentation.
+    """
     shape = next(a.shape for a in (picture.depth, picture.segmentation, picture.rgb) if a is not None)
     height, width = shape[:2]
     column = int(np.clip(np.floor(u * width), 0, width - 1))

@@ -51,7 +51,9 @@ OVER_HINT = (
     "All envs at the shown moment; the selected env's episode, step by step; or freshly reset envs with other seeds, in "
     "another process."
 )
-STEPS_HINT = "The most steps of the episode to measure, evenly spaced: each takes a few pictures."
+STEPS_HINT = (
+    "Maximum number of steps to measure, evenly spaced over the episode. Each step takes a few pictures."
+)
 MAX_PICTURES = 64
 """Maximum number of pictures on the sheet, worst first."""
 THUMBNAIL_PIXELS = 128
@@ -59,7 +61,7 @@ THUMBNAIL_PIXELS = 128
 
 
 class CameraReportPanel(PagePart[SessionView]):
-    """The folder in the present container."""
+    """The Measure folder, in the present container."""
 
     does = (
         ChooseMeasured,
@@ -87,7 +89,7 @@ class CameraReportPanel(PagePart[SessionView]):
                 ChooseMeasuredResets,
                 "resets",
                 self._resets,
-                hint="How many, each with its own seed.",
+                hint="Number of resets, each with its own seed.",
             )
             gui.add_html(tools_html([tool("Measure this camera", MeasureChosenCamera())]))
             self._report = JobResult(server)
@@ -106,7 +108,7 @@ class CameraReportPanel(PagePart[SessionView]):
             case ChooseMeasuredResets(resets=resets):
                 self._resets = resets
             case MeasureChosenCamera() | DrawSheet() if studio.chosen is None:
-                raise Refused("Choose the camera first.")
+                raise Refused("Choose a camera first.")
             case MeasureChosenCamera():
                 self._report.asked(studio.results.report)
                 most = self._steps if self._over == "steps" else self._resets
@@ -155,11 +157,11 @@ class CameraReportPanel(PagePart[SessionView]):
             assert camera is not None and report is not None, "drawn only then"
             return self._report_html(studio, camera, report, new)
 
-        told = studio.report_stale, results.measuring, None if camera is None else camera.now
-        self._report.draw(studio.progress, report, told, html)
+        other = studio.report_stale, results.measuring, None if camera is None else camera.now
+        self._report.draw(studio.progress, report, other, html)
 
     def _report_html(self, studio: StudioView, camera: StudioCamera, report: CameraReport, new: bool) -> str:
-        """The table of objects, the depth histogram and suggested planes; `new`: scroll it into view."""
+        """HTML of the object table, the depth histogram and suggested planes; `new`: scroll it into view."""
         results, depth, lens = studio.results, report.depth, camera.now or camera.info
         moments = [
             {
@@ -217,11 +219,11 @@ class CameraReportPanel(PagePart[SessionView]):
         sheet = results.sheet
         mine = camera is not None and bool(sheet) and sheet[0].key == camera.key
         report = None if camera is None else results.report_over_envs(camera.key)
-        told = id(report), env
+        other = id(report), env
         self._pictures.draw(
             view.of(StudioView).progress,
             sheet if mine else None,
-            told,
+            other,
             lambda new: self._sheet_html(sheet, report, env, new),
         )
 
@@ -254,7 +256,7 @@ class CameraReportPanel(PagePart[SessionView]):
 # its worst object.
 
 MIN_HIDDEN_SHARE = 0.1
-"""Minimum hidden share of an object that is reported."""
+"""Share of an object from which on it is reported as hidden."""
 SMALL_PIXELS = 30.0
 """Number of pixels below which an object counts as small."""
 
@@ -270,6 +272,7 @@ class Histogram:
     near: float | None
     """Position of the near plane, in bars from the left; None if it is outside."""
     far: float | None
+    """Position of the far plane, as for `near`."""
 
 
 def percent(share: float) -> str:

@@ -61,7 +61,7 @@ class Edits:
 
 @dataclass(frozen=True)
 class Studio:
-    """State of the studio. The cameras themselves are in the run.
+    """State of the studio. The descriptions of the cameras are in ``Run.task``.
 
     A placement is here (with undo), in the worker's live cameras, and finally in the author's file. This state is
     authoritative: after each load it is sent to the worker again, so that neither a reload nor a crash moves a camera. If
@@ -71,9 +71,9 @@ class Studio:
     placements: Placements = Placements()
     selected: CameraKey | None = None
     was_chosen: bool = False
-    """Whether the user has made a choice: a camera, or none."""
+    """Whether the user has chosen a camera, or "none"."""
     is_open: bool = False
-    """Whether a page has opened the studio; a camera is chosen then."""
+    """Whether a page has opened the studio; from then on, a camera is selected before the user chooses."""
     select_when_loaded: CameraKey | None = None
     """The camera that was selected in the previous session."""
     problem: str = ""
@@ -83,7 +83,7 @@ class Studio:
     preview: Picture | None = None
     preview_problem: str = ""
     previewed: Previewed | None = None
-    """The last preview."""
+    """Step and question of the last preview."""
     drawing: bool = False
     """Whether a preview is being drawn."""
     results: StudioResults = StudioResults()
@@ -103,7 +103,7 @@ class KeptPlacements:
 
 
 def first_studio(kept: KeptPlacements | None = None) -> Studio:
-    """The studio before a version is loaded. A task is copied to the folder in which the program was started.
+    """The studio before a version is loaded. The folder for copies of a task is the current folder.
 
     Args:
         kept: state kept from the previous session of the task.
@@ -119,7 +119,7 @@ def kept_placements(studio: Studio) -> KeptPlacements:
 
 
 def placed_cameras(studio: Studio) -> tuple[PlaceCamera, ...]:
-    """All placements, as requests for another worker."""
+    """All placements, as requests to another worker."""
     return tuple(PlaceCamera(key, settings) for key, settings in studio.placements.placed.items())
 
 
@@ -149,7 +149,8 @@ def shown_step(run: Run) -> StepResult | None:
 
 
 def mount_pose(run: Run, info: CameraInfo) -> NDArray[np.float32] | None:
-    """(7,) pose of the camera's mount in the selected env's frame, at the shown moment; None without one."""
+    """(7,) pose of the camera's mount in the selected env's frame, at the shown moment; None without a mount,
+    or if the step does not have this body."""
     step, env = shown_step(run), run.env
     if info.mount is None or run.task is None or step is None:
         return None
@@ -176,8 +177,8 @@ def selected_camera(studio: Studio, run: Run) -> StudioCamera | None:
 
 
 def settings_in_file(placements: Placements, run: Run) -> dict[CameraKey, CameraSettings]:
-    """Settings of the cameras of the running version. A camera without a target in the file keeps its present distance, or
-    gets the default.
+    """Settings of the running version's cameras, as in the file. A camera without a target in the file keeps
+    its present target distance, or gets `usual_distance`.
 
     Args:
         placements: placements before the version was loaded.

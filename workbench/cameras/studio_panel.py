@@ -75,23 +75,26 @@ MOVES: dict[type[Command], tuple[float, float, float]] = {
     MoveCameraForward: (STEP_METRES, 0, 0),
     MoveCameraBack: (-STEP_METRES, 0, 0),
 }
-"""Direction (forward, left, up) of each command, in the camera's own frame."""
+"""Metres (forward, left, up) by which each command moves the camera, in the camera's own frame."""
 TURNS: dict[type[Command], tuple[float, float]] = {
     TurnCameraLeft: (TURN_DEGREES, 0),
     TurnCameraRight: (-TURN_DEGREES, 0),
     TurnCameraUp: (0, TURN_DEGREES),
     TurnCameraDown: (0, -TURN_DEGREES),
 }
-"""Rotation (left, up) of each command."""
+"""Degrees (left, up) by which each command rotates the camera."""
 HANDLES = (
-    "pose: move or rotate the camera; its target moves with it.\n"
-    "eye and target: move the eye, and it keeps looking at its target; or move the target."
+    "pose: move or rotate the camera; the target moves with the camera.\n"
+    "eye and target: move the eye, while the camera keeps looking at the target; or move the target."
 )
-AXES = "The axes along which it is moved and rotated. The camera's own: red is forward, green left, blue up."
-SNAP = "Dragging moves and rotates in steps of this size."
-SIZE = "Size of the preview above. The camera keeps its own."
-VARIES = "Its pose differs between envs, or the task moves it. A placement here applies to all envs until the task moves it again."
-IN_ITS_EYE = "You are at its position. Move the view to see its handles."
+AXES = "The axes of the handles. The camera's own: red is forward, green left, blue up."
+SNAP = "Dragging moves and rotates the camera in steps of this size."
+SIZE = "Size of the preview above. The size of the camera's own pictures stays the same."
+VARIES = (
+    "The camera's pose differs between envs, or the task moves the camera. A placement here applies to all "
+    "envs until the task moves the camera again."
+)
+IN_ITS_EYE = "Your view is at the camera's position. Move the view to see the handles."
 
 
 class StudioPanel(PagePart[SessionView]):
@@ -156,11 +159,11 @@ class StudioPanel(PagePart[SessionView]):
         with self._picture.folder:
             self._pick = CameraPick(server, session)
         self._gizmos: dict[int, CameraGizmo] = {}
-        """The handles in the view of each page that has this tab open, by client id. With another tab open, a drag to move the
-        view would move the camera."""
+        """The handles in the view of each page that has this tab open, by client id. A page with another tab
+        open has none: there, a drag that should move the view would move the camera."""
 
     def unfold(self) -> None:
-        """Handle that the tab was opened, perhaps before the task was loaded."""
+        """Handle the opening of the tab; the task may not be loaded yet."""
         self._session.happen(StudioOpened())
 
     @property
@@ -171,12 +174,12 @@ class StudioPanel(PagePart[SessionView]):
     # --- in the view -------------------------------------------------------------------------------------
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> dict[CameraKey, PlacedFrustum]:
-        """Draw the gizmos at the chosen camera; returns the pose of its frustum.
+        """Draw the gizmos at the chosen camera; returns its frustum by key, empty if it cannot be placed.
 
-        This is its present pose, not that of its newest picture, which would lag behind the pointer.
+        The frustum is at the camera's present pose: that of its newest picture would lag behind the pointer.
 
         Args:
-            offset: (3,) of the selected env in the view.
+            offset: (3,) position of the selected env in the view, metres.
         """
         self._placing.offset = offset
         self._suggest.draw_in_view(view, offset)
@@ -210,7 +213,8 @@ class StudioPanel(PagePart[SessionView]):
             self._gizmos[page].draw(camera)
 
     def _is_in_eye(self, pose: Floats) -> bool:
-        """Whether a page's viewpoint is at the camera, whose frustum, with its picture, would fill that view."""
+        """Whether a page's viewpoint is within 0.1 m of the camera's pose (7,): the frustum's picture would
+        fill that view."""
         near = (
             float(np.linalg.norm(c.camera.position - pose[:3])) for c in self._server.get_clients().values()
         )
@@ -233,7 +237,7 @@ class StudioPanel(PagePart[SessionView]):
         self._picture.draw(view)
         self._pick.draw(view, shown=self._picture.visible)
         for part in self._folders:
-            # Hidden: without a camera their controls would do nothing.
+            # Hidden without a camera, because the controls would do nothing.
             part.folder.visible = chosen is not None
             part.draw(view)
         if chosen is not None:
@@ -282,7 +286,9 @@ class StudioPanel(PagePart[SessionView]):
 
     def _tools_of(self, camera: StudioCamera, studio: StudioView) -> str:
         looks = self._look.any
-        file = "Restore the placement in the file." if camera.moved else "It matches the file."
+        file = (
+            "Return the camera to the file's placement." if camera.moved else "The camera matches the file."
+        )
         return tools_html(
             [
                 Tool("Back to my view" if looks else "Look through", ToggleLookThrough(), on=looks),
@@ -296,7 +302,7 @@ class StudioPanel(PagePart[SessionView]):
         )
 
     def _handles_of(self, scale: float) -> str:
-        """Buttons for the gizmos (pose or eye and target, axes, steps) and the size of the picture."""
+        """HTML of the buttons for the gizmos (pose or eye and target, axes, snap) and the preview's size."""
         rows = [
             _choice(
                 "Handles",
@@ -344,7 +350,7 @@ class StudioPanel(PagePart[SessionView]):
                 self._own_axes = own
             case ChooseSnap(snap=name):
                 if name not in SNAPS:
-                    raise Refused(f"There is no snap {name!r}: they are {', '.join(SNAPS)}.")
+                    raise Refused(f"There is no snap {name!r}; choose from: {'; '.join(SNAPS)}.")
                 self._snap = name
             case ShowModality(kind=kind):
                 self._picture.show_kind(kind)
@@ -392,7 +398,7 @@ def _step_tool(name: str, command: Command, step: str | None) -> Tool:
 def _choice(
     label: str, hint: str, commands: dict[str, Command], now: Command, off: bool = False
 ) -> list[Tool | Label]:
-    """A label and buttons of which one is on.
+    """A label, and buttons of which one is on.
 
     Args:
         now: the command of the button that is on.
@@ -420,6 +426,6 @@ def _preview_text(camera: StudioCamera, scale: float) -> str:
         return ""
     width, height = round(camera.now.width * scale), round(camera.now.height * scale)
     return (
-        f"The preview is {width} × {height}; the camera stays {camera.now.width} × "
-        f"{camera.now.height}, and only that is saved."
+        f"The preview is {width} × {height}. The camera stays {camera.now.width} × "
+        f"{camera.now.height}, and only this size is saved."
     )

@@ -1,4 +1,4 @@
-"""Suggests placements of a camera: objects to see, bounds of the eye, and the best results with pictures."""
+"""Suggests placements of a camera: objects to see, the search box, and the best results with pictures."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from workbench.pictures.camera_report import OfferedPlacement
 from workbench.task.description import TaskDescription
 
 BOX_METRES, MOUNTED_BOX_METRES = 0.3, 0.1
-"""Distance from the eye to each side of the initial box; smaller for a mounted camera, which its body has to carry."""
+"""Distance from the eye to each side of the initial box; a mounted camera must stay near its body."""
 MAX_LINKS = 12
-"""Maximum number of links of an articulation for which each link is offered separately."""
+"""Maximum number of links of an object whose links are offered too; with more, only the object is offered."""
 FIRST_ROBOT_LINKS = 4
 """Number of a robot's links that are offered at first, those of its hand; the others are offered on demand."""
 PICTURE_PIXELS = 160
@@ -47,7 +47,9 @@ MIN_PERFECT_SCORE = 0.995
 """Scores of at least this are shown as 1.00."""
 BOX_COLOUR = (230, 73, 128)
 
-RESETS_HINT = "Freshly reset envs in which each placement is measured; at most the number of envs."
+RESETS_HINT = (
+    "Number of freshly reset envs in which each placement is measured; at most the number of envs, and 16."
+)
 LOW_HINT = "Lowest corner of the box that the camera may be placed in, in metres."
 
 Corner = tuple[float, float, float]
@@ -67,10 +69,10 @@ class VisibleObject:
 
 
 class CameraSuggest(PagePart[SessionView]):
-    """The folder in the present container, and the box of the bounds in the 3D view.
+    """The folder "Suggest a placement", in the present container, and the search box in the 3D view.
 
-    The bounds are two corners of a box in the env's frame, or in that of the body that carries the camera. The box is
-    around the eye and follows the camera until the user edits it.
+    The search box is given by two corners, in the env's frame or in the frame of the body that carries the
+    camera. It is centred on the eye and follows the camera until the user edits it.
     """
 
     does = (
@@ -87,7 +89,7 @@ class CameraSuggest(PagePart[SessionView]):
         self._wanted: dict[CameraKey, frozenset[str]] = {}
         """Names of the objects that each camera must see, for cameras for which the user chose them."""
         self._boxes: dict[CameraKey, Box] = {}
-        """Bounds of each camera, for cameras for which the user edited them."""
+        """Search box of each camera, for cameras for which the user edited it."""
         self._all_links, self._draws_box, self._resets = False, False, 8
         self._drawn_names: object = None
         gui = server.gui
@@ -96,7 +98,7 @@ class CameraSuggest(PagePart[SessionView]):
             self._objects = gui.add_html("")
             self._low = self._corner_field(server, "Search box from", "from", LOW_HINT)
             self._high = self._corner_field(
-                server, "Search box to", "to", "Highest corner of that box, metres."
+                server, "Search box to", "to", "Highest corner of the box, in metres."
             )
             self._box_tick = tick(
                 server,
@@ -159,7 +161,7 @@ class CameraSuggest(PagePart[SessionView]):
         return by_default if key is None else self._wanted.get(key, by_default)
 
     def _box_of(self, camera: StudioCamera, now: CameraSettings) -> Box:
-        """The bounds that the user entered for this camera, or a box around its eye."""
+        """The search box that the user entered for this camera, or a box around its eye."""
         room = BOX_METRES if camera.info.mount is None else MOUNTED_BOX_METRES
         low, high = (np.round(np.add(now.position, by), 2) for by in (-room, room))
         return self._boxes.get(camera.key, (triple(low), triple(high)))
@@ -186,7 +188,7 @@ class CameraSuggest(PagePart[SessionView]):
         mount = None if camera is None else camera.info.mount
         self._mounted.visible = mount is not None
         if mount is not None:
-            text = f"Mounted on {mount}: the box is in that body's frame, as it is after a reset."
+            text = f"Mounted on {mount}: the box is in this body's frame. The search uses freshly reset envs."
             self._mounted.content = render("note", text=text)
 
     def _draw_names(self, view: SessionView) -> None:

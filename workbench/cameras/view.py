@@ -35,7 +35,7 @@ class EditRequest:
     key: CameraKey
     """The camera that is changed, copied, renamed, removed or added."""
     settings: CameraSettings | None = None
-    """New settings (the present ones if it is removed); None for its placement at the time of the request."""
+    """New settings (for a removal, the present ones); None for the placement at the time of the request."""
     name: str = ""
     """The new name."""
     about: str = ""
@@ -61,7 +61,7 @@ class StudioCamera:
     mount_pose: NDArray[np.float32] | None
     """(7,) p and wxyz of its mount in the selected env's frame, at the shown moment. None for a camera without a mount."""
     refused: str = ""
-    """Reason why it cannot be placed, as a sentence; empty if it can."""
+    """Reason why the camera cannot be placed, as a clause; empty if it can."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +76,13 @@ class EditState:
     message: str = ""
     """One or two sentences: what happened, and what to do next."""
     can_copy: bool = False
-    """Whether it was refused because the file must not be edited, while a copy could be: see `CopyTask`."""
+    """Whether the edit was refused because this file must not be edited, so that `CopyTask` is offered."""
     picture: Picture | None = None
     """Preview of a new camera, once it is drawn."""
     drawing: bool = False
     """Whether the preview is being drawn."""
     loading: bool = False
-    """Whether the file has changed and that version is not loaded yet."""
+    """Whether the edit was written or reverted and the changed file is not loaded yet."""
 
     @property
     def what(self) -> Change:
@@ -98,7 +98,7 @@ class PickedPixel:
     u: float
     """0 at the left edge, 1 at the right."""
     v: float
-    """0 at the top."""
+    """0 at the top edge, 1 at the bottom."""
     pixel: tuple[int, int]
     """Column and row."""
     body: str | None
@@ -111,7 +111,7 @@ class PickedPixel:
 
 @dataclass(frozen=True)
 class MeasuredMoment:
-    """The moment and env of an entry of a report over steps."""
+    """The moment and env of one entry in a report over steps."""
 
     serial: int
     env: int
@@ -121,7 +121,7 @@ class MeasuredMoment:
 
 @dataclass(frozen=True)
 class StudioResults:
-    """Results of reports so far."""
+    """The newest results of the jobs: report, suggestions, compared pictures, picked pixel and sheet."""
 
     report: CameraReport | None = None
     """The newest report."""
@@ -143,7 +143,7 @@ class StudioResults:
     """The camera as placed, and with the settings of `ComparisonWanted`."""
     picked: PickedPixel | None = None
     sheet: tuple[Picture, ...] = ()
-    """The selected camera's picture in every env, worst first if there is a report over them."""
+    """The selected camera's picture in every env, the worst env first if a report covers these envs."""
     problem: str = ""
     """Why the last job failed, as a sentence."""
 
@@ -161,9 +161,9 @@ class StudioView:
     cameras: tuple[StudioCamera, ...] = ()
     selected: CameraKey | None = None
     was_chosen: bool = False
-    """Whether the user has made a choice: a camera, or none."""
+    """Whether the user has chosen a camera, or "none"."""
     undo: str | None = None
-    """Text: the change that `UndoCamera` would undo (``moved base_camera``); None if there is nothing."""
+    """Text: the change that `UndoCamera` would undo (``moved base_camera``); None if there is none."""
     redo: str | None = None
     edit_state: EditState = EditState()
     copies_to: Path = Path()
@@ -213,7 +213,7 @@ class ShownCameras:
     """Render time of the newest picture; None for a recorded picture, and for one drawn while steps were made."""
     can_render: bool = True
     placed: CameraKey | None = None
-    """The camera that is placed by hand."""
+    """The camera that is selected in the Studio."""
     preview: bool = False
     """Whether the placed camera is shown at another size than its own."""
     failed: Mapping[CameraKey, str] = field(default_factory=dict)

@@ -81,7 +81,7 @@ class _Begun:
     """Number of the moment that the pictures show."""
     at: float
     ready_at: float
-    """Expected end, like `at` in seconds of `time.monotonic`."""
+    """Time at which they should be ready; like `at`, in seconds of `time.monotonic`."""
 
 
 class WorkerCameras:
@@ -106,10 +106,11 @@ class WorkerCameras:
         self._watched: tuple[int, tuple[CameraRequest, ...]] = 0, ()
         """The env and the cameras that the page shows."""
         self._there: tuple[CameraRequest, ...] = ()
-        """The watched cameras that the version has."""
+        """The watched cameras that the loaded version has."""
         self._wanted = False
         """Whether the pictures of the watched cameras are out of date."""
         self._hurried: set[CameraKey] = set()
+        """Watched cameras that were just placed: the next round draws only these, without a pause."""
         self._left: list[tuple[CameraRequest, ...]] = []
         """Groups of this round that are not started yet, one per kind."""
         self._begun: _Begun | None = None
@@ -134,16 +135,18 @@ class WorkerCameras:
     # --- requests ------------------------------------------------------------------------------------
 
     def watch(self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "exact") -> None:
-        # Every `Settings` contains the cameras, changed or not.
+        # Called for every `Settings` message, whether or not it changes the cameras.
         before, of_degree = self._watched, self._degree
         self._watched, self._degree = (env, cameras), degree
-        # From exact to auto, finished and pending pictures stay valid: redrawn, they would be fast for a moment.
+        # From exact to auto, finished and pending pictures stay valid: if redrawn, they would be fast ones
+        # for a moment.
         stay = degree == of_degree or (of_degree == "exact" and degree == "auto")
         if before != (env, cameras) or not stay:
             self.update_watched()
 
     def place(self, request: PlaceCamera) -> None:
-        # Not at once: the current picture is finished first, or a drag faster than the renderer would never show one.
+        # Not placed at once: if it interrupted the current picture, a drag faster than the renderer would
+        # never show one.
         self._to_place.pop(request.key, None)
         self._to_place[request.key] = request
 
@@ -186,8 +189,8 @@ class WorkerCameras:
         """
         self.settle()  # the same scene is about to be drawn
         with blamed("restore", opened.loaded, opened.env):
-            # All envs: the task's state for the whole batch and the process's random generators are restored only with all.
-            # No step follows, so the physics needs no fresh scene.
+            # Restore all envs: only then are the task's batch-wide state and the process's random generators
+            # restored too. No step follows, so the physics needs no fresh scene.
             opened.env.restore(pickle.loads(request.snapshot), fresh_physics=False)
             columns = read_state_columns(opened.env)
         wanted = recorded_pictures(opened.description.cameras) if request.pictures else ()
@@ -204,7 +207,8 @@ class WorkerCameras:
     # --- changes of the scene ------------------------------------------------------------------------
 
     def update_watched(self) -> None:
-        """Watch the requested cameras that the version has; call it when either may have changed."""
+        """Watch the requested cameras that the version has; call it when request or version may have
+        changed."""
         self.settle()
         opened = self._task.opened
         if opened is None:
@@ -229,7 +233,7 @@ class WorkerCameras:
         self.place_waiting()
 
     def finish_picture(self) -> None:
-        """Finish the current picture; call it before the envs move."""
+        """Finish the current picture and discard it, to be drawn again; call it before the envs move."""
         begun, self._begun = self._begun, None
         if begun is not None:
             self._left, self._wanted = [], bool(self._there)
@@ -263,7 +267,7 @@ class WorkerCameras:
     # --- called by the loop --------------------------------------------------------------------------
 
     def wait(self, now: float) -> float | None:
-        """Seconds until `make` has something to do; None if no camera is watched."""
+        """Seconds until `make` has something to do; None if there is nothing to draw."""
         if self._task.opened is None:
             return None
         if self._begun is not None:
@@ -332,10 +336,10 @@ class WorkerCameras:
         return "fast" if self._has_fast(env.env.scene) else "exact"
 
     def _has_fast(self, scene: Any) -> bool:
-        """Whether fast pictures can be drawn now; starts to make missing meshes."""
+        """Whether fast pictures can be drawn now; for a new scene, starts to simplify the missing meshes."""
         if scene is not self._fast_scene:
             self._fast_scene, meshes = scene, list[Mesh]()
-            # A GPU draws exact pictures as fast.
+            # A GPU draws exact pictures just as fast.
             self._may_be_fast = (
                 isinstance(scene, BatchedCpuScene) and not scene.sub_scenes[0].render_system.device.is_cuda()
             )
@@ -417,7 +421,7 @@ def _observe_again(opened: OpenedTask) -> None:
 
 
 REPORT_PIXELS = 128
-"""Maximum shorter side of a measured picture: an object too small for it is hardly visible."""
+"""Maximum shorter side of a measured picture: what vanishes at this size is hardly visible anyway."""
 MAX_SCALE = 4.0
 _PROGRESS_PERIOD_SECONDS = 0.2
 
@@ -454,7 +458,7 @@ def _draw_temporary(opened: OpenedTask, placed: PlacedCameras, question: DrawCam
     """A picture at another size than the camera's, or of a camera that the env does not have."""
     settings, scale = question.settings, question.scale
     if settings is None or not 0 < scale <= MAX_SCALE:
-        raise ValueError(f"a picture can have up to {MAX_SCALE} times its camera's size, not {scale}")
+        raise ValueError(f"a scaled picture needs settings and a scale of at most {MAX_SCALE}, not {scale}")
     size = (max(1, round(settings.width * scale)), max(1, round(settings.height * scale)))
     info = opened.description.camera(question.key)
     placement = Placement(settings, question.key[0], None if info is None else info.mount)
@@ -464,7 +468,7 @@ def _draw_temporary(opened: OpenedTask, placed: PlacedCameras, question: DrawCam
         and settings == info.settings
         and not info.varies
     ):
-        # Exactly its present pose: its own quaternion may not be of unit length.
+        # Take the camera's exact pose from the env: its quaternion may not be of unit length.
         placement = placement_of(opened.env.env, info.key, question.env)
     picture = picture_of(opened.env.env, question.env, placement, question.poses, size)
     wanted = question.modalities
@@ -528,7 +532,8 @@ def run_cameras(opened: OpenedTask, question: RunCameras) -> HookCameras:
 def _with_classes_of(
     env: Any, before: LoadedTask, after: LoadedTask, texts: Mapping[str, str]
 ) -> Iterator[None]:
-    """Within this context, give the env and its robots the new text's classes and the attributes that its constructors set."""
+    """Context in which the env and its robots have the new text's classes, and the attributes that their
+    constructors set."""
     agents = [] if env.agent is None else getattr(env.agent, "agents", [env.agent])
     classes = [(agent, type(agent)) for agent in agents]
     task, kept = maniskill_private.task_class(env), [(owner, dict(vars(owner))) for owner in (env, *agents)]

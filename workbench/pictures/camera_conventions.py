@@ -33,7 +33,7 @@ _AXES: dict[str, Floats] = {
     "opengl": np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
 }
 VERTICAL_SINE = 1e-6
-"""Sine of the angle to the vertical below which a camera looks straight down or up, so that "upright" is undefined."""
+"""Sine of the angle to the vertical below which a camera looks straight down or up: it has no "upright"."""
 ROTATION_TOLERANCE = 1e-3
 """Largest deviation of a matrix from a rotation: calibrations are printed with four digits."""
 
@@ -48,8 +48,8 @@ class LookAt:
     """Any point on the optical axis in front of the eye."""
     roll: float = 0.0
     """Radians about the line of sight; positive turns the camera clockwise as seen from behind it. At 0 the
-    camera is upright. Straight down, at 0, the top of the picture is towards +x, and straight up towards -x: where
-    an upright camera behind the target (at smaller x) ends when it is tilted."""
+    camera is upright. If it looks straight down, the top of the picture at 0 is towards +x, straight up
+    towards -x: an upright camera at smaller x than its target ends like this when it is tilted."""
 
 
 # --- rotations ---------------------------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ def normalised(quaternion: ArrayLike) -> Floats:
         ValueError: the quaternion is not a rotation (all zero, or not finite).
     """
     q = _vector(quaternion, 4, "a quaternion")
-    # Divide by the largest first: the squares of tiny numbers are zero.
+    # Divide by the largest first: the squares of tiny numbers underflow to zero.
     largest = np.abs(q).max()
     if largest == 0:
         raise ValueError("a quaternion of zeros is no rotation; 1, 0, 0, 0 (w first) is the identity")
@@ -108,8 +108,8 @@ def nearest_rotation(matrix: ArrayLike) -> Floats:
         )
     if scales[0] - scales[2] <= ROTATION_TOLERANCE * scales[0] and abs(scales[0] - 1) > ROTATION_TOLERANCE:
         raise ValueError(
-            f"the matrix is no rotation: it also scales by {scales.mean():.4g}. Divide its 3 x 3 part by that, and "
-            "see whether the translation is in metres"
+            f"the matrix is no rotation: it also scales by {scales.mean():.4g}. Divide its 3 x 3 part by "
+            "this number, and check that the translation is in metres"
         )
     if np.abs(scales - 1).max() > ROTATION_TOLERANCE:
         lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(m, axis=1))
@@ -127,8 +127,8 @@ def axes_of(quaternion: ArrayLike) -> tuple[Floats, Floats, Floats]:
 
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> float:
-    """Radians of the rotation from one orientation (4,) wxyz to the other; q and -q are the same one."""
-    # From the vector part, which keeps its precision where the angle is small.
+    """Radians of the rotation between two orientations (4,) wxyz; q and -q are the same orientation."""
+    # Computed from the vector part, which keeps its precision for small angles.
     w, *vector = qmult(normalised(a), qconjugate(normalised(b)))
     return 2 * math.atan2(math.hypot(*vector), abs(w))
 
@@ -139,7 +139,7 @@ def quaternion_from_axes(forward: ArrayLike, up: ArrayLike) -> Floats:
     `forward` is kept exactly; only the part of `up` at a right angle to it counts.
 
     Raises:
-        ValueError: one of them has no length, or both point the same way.
+        ValueError: one of them has no length, or the two are parallel.
     """
     ahead = _direction(forward, "forward")
     left = np.cross(_direction(up, "up"), ahead)
@@ -175,12 +175,13 @@ def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
 
 
 def pose_of(settings: CameraSettings) -> Floats:
-    """(7,) position, then quaternion wxyz, in the frame of its mount."""
+    """(7,) position, then quaternion wxyz, of the camera in the frame of its mount."""
     return make_pose(settings.position, settings.quaternion)
 
 
 def pose_in_env(settings: CameraSettings, mount: ArrayLike | None) -> Floats:
-    """(7,) in the env's frame; `mount` (7,) is the pose of the body that carries it, None without one."""
+    """(7,) pose of the camera in the env's frame; `mount` (7,) is the pose of the body that carries it, None
+    for a fixed camera."""
     return pose_of(settings) if mount is None else compose(mount, pose_of(settings))
 
 
@@ -197,31 +198,31 @@ def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Floats:
 
 
 def target_of(settings: CameraSettings) -> Floats:
-    """(3,) the target of a camera, in the frame of its mount; one metre ahead if it has none."""
+    """(3,) the target of a camera, in the frame of its mount; one metre ahead without a target distance."""
     return settings.position + (settings.distance or 1.0) * axes_of(settings.quaternion)[0]
 
 
 def inverse(pose: ArrayLike) -> Floats:
-    """(7,) the inverse pose: world to camera of camera to world."""
+    """(7,) the inverse pose: camera to world becomes world to camera."""
     p = _vector(pose, 7, "a pose")
     return make_pose(-rotation_matrix(p[3:]).T @ p[:3], qconjugate(p[3:]))
 
 
 def compose(mount: ArrayLike, local: ArrayLike) -> Floats:
-    """(7,) `local`, a pose in the frame of a body at `mount`, in the env's frame."""
+    """(7,) `local`, a pose (7,) in the frame of a body at `mount` (7,), converted to the env's frame."""
     m, p = _vector(mount, 7, "a mount's pose"), _vector(local, 7, "a pose")
     r = rotation_matrix(m[3:])
     return make_pose(m[:3] + r @ p[:3], qmult(normalised(m[3:]), normalised(p[3:])))
 
 
 def relative_to(mount: ArrayLike, world: ArrayLike) -> Floats:
-    """(7,) `world`, a pose in the env's frame, in the frame of a body at `mount`."""
+    """(7,) `world`, a pose (7,) in the env's frame, converted to the frame of a body at `mount` (7,)."""
     return compose(inverse(mount), world)
 
 
 def pose_from_look_at(look_at: LookAt) -> Floats:
-    """(7,) pose from eye, target and roll. Equals ManiSkill's ``look_at``, except that the latter's quaternion is not of unit
-    length straight down and up.
+    """(7,) pose from eye, target and roll. Equals ManiSkill's ``look_at``, except straight down and up, where
+    ManiSkill's quaternion is not of unit length.
 
     Raises:
         ValueError: eye and target are one point.
@@ -237,11 +238,11 @@ def pose_from_look_at(look_at: LookAt) -> Floats:
 def look_at_of(pose: ArrayLike, distance: float = 1.0) -> LookAt:
     """Eye, target and roll of a pose (7,), with the target `distance` metres ahead of the eye."""
     if not distance > 0:
-        raise ValueError(f"the target must be in front of the camera, not {distance} m")
+        raise ValueError(f"the target must be in front of the camera, not at a distance of {distance} m")
     p = _vector(pose, 7, "a pose")
     r = rotation_matrix(p[3:])
     target = p[:3] + distance * r[:, 0]
-    # As `pose_from_look_at` computes it: near the vertical the last digits decide what upright means.
+    # Computed as in `pose_from_look_at`: near the vertical, the last digits decide which roll is upright.
     forward = _direction(target - p[:3], "forward")
     turned = upright(forward).T @ r
     return LookAt(triple(p[:3]), triple(target), math.atan2(turned[2, 1], turned[1, 1]))
@@ -291,7 +292,7 @@ def pose_from_matrix(matrix: ArrayLike, convention: Convention, direction: Direc
         row = ", ".join(f"{number:.6g}" for number in m[3])
         hint = ""
         if np.abs(m[:, 3] - [0, 0, 0, 1]).max() <= 1e-6:
-            hint = "; it looks transposed (the translation belongs into the last column)"
+            hint = "; the matrix looks transposed (the translation belongs in the last column)"
         raise ValueError(f"the last row of a pose's 4 x 4 matrix is 0, 0, 0, 1, not {row}{hint}")
     r, t = nearest_rotation(m[:3, :3]), m[:3, 3]
     if direction == "world_to_camera":
@@ -329,7 +330,7 @@ def intrinsic_of(settings: CameraSettings) -> Floats:
     """(3, 3) intrinsic matrix in pixels, from the intrinsic or the fov of the settings.
 
     Raises:
-        ValueError: the settings have neither, or an impossible one.
+        ValueError: the settings have neither, or one that is not valid.
     """
     if settings.intrinsic is not None:
         return checked_intrinsic(settings.intrinsic)
@@ -353,17 +354,17 @@ def checked_intrinsic(matrix: ArrayLike) -> Floats:
     if k[0, 0] <= 0 or k[1, 1] <= 0:
         raise ValueError(f"focal lengths are positive, not {k[0, 0]:.6g} and {k[1, 1]:.6g} pixels")
     if abs(k[0, 1]) > 1e-6 * k[0, 0]:
-        raise ValueError(f"a skew of {k[0, 1]:.6g} pixels cannot be rendered: ManiSkill leaves it out")
+        raise ValueError(f"a skew of {k[0, 1]:.6g} pixels cannot be rendered: ManiSkill ignores it")
     return k
 
 
 def vertical_fov(intrinsic: ArrayLike, height: int) -> float:
-    """Radians from the picture's upper to its lower border, as if the principal point were in the middle."""
+    """Vertical field of view in radians, as if the principal point were in the middle of the picture."""
     return 2 * math.atan(height / 2 / float(checked_intrinsic(intrinsic)[1, 1]))
 
 
 def horizontal_fov(intrinsic: ArrayLike, width: int) -> float:
-    """Radians from the picture's left to its right border, as if the principal point were in the middle."""
+    """Horizontal field of view in radians, as if the principal point were in the middle of the picture."""
     return 2 * math.atan(width / 2 / float(checked_intrinsic(intrinsic)[0, 0]))
 
 
@@ -376,13 +377,13 @@ def scaled_intrinsic(intrinsic: ArrayLike, size: Sequence[int], new_size: Sequen
 
 
 def triple(vector: ArrayLike) -> tuple[float, float, float]:
-    """Three numbers, as settings and messages hold them."""
+    """The three numbers of a vector (3,) as plain floats."""
     x, y, z = np.asarray(vector, np.float64).tolist()
     return x, y, z
 
 
 def matrix3(matrix: ArrayLike) -> Matrix3:
-    """A (3, 3) array as `CameraSettings.intrinsic` has it."""
+    """A (3, 3) array as plain floats, in the form of `CameraSettings.intrinsic`."""
     rows = np.asarray(matrix, np.float64).reshape(3, 3)
     return triple(rows[0]), triple(rows[1]), triple(rows[2])
 

@@ -21,12 +21,12 @@ LARGE_ENOUGH_PIXELS = 100.0
 
 @dataclass(frozen=True)
 class ObjectToSee:
-    """One object that a search can name: an object of the task, or a robot, whose single links can be named too."""
+    """An object of the task, or a robot. A search can name objects and links, but not a whole robot."""
 
     name: str
     """Name of an actor or an articulation."""
     hidden: bool
-    """The task hides it from the sensors (a goal marker): only human cameras see it."""
+    """Whether the task hides it from the sensors (a goal marker), so that only human cameras see it."""
     links: tuple[str, ...] = ()
     """Names of an articulation's bodies, if it has several; for a robot its drawn links, the hand first."""
     robot: bool = False
@@ -41,12 +41,13 @@ class ObjectSummary:
     seen: float
     """Share of these envs in which at least one pixel of the object is in the picture."""
     median_pixels: float
+    """Median of the visible pixels in these envs."""
     cut: float
     """Share of these envs in which the border of the picture cuts the object."""
     hidden: float
     """Share of the object that the robot covers, averaged over the envs where it would be seen without the robot."""
     wholly_hidden: float
-    """Share of these envs in which the robot alone hides the object."""
+    """Share of these envs in which the object is visible only without the robot."""
     covered: float
     """Share of the object that other things than the robot cover, averaged over the envs where it is in the picture."""
 
@@ -58,17 +59,17 @@ class ObjectSeen:
     name: str
     """Name of an actor or an articulation."""
     never_drawn: bool
-    """The task hides it from this kind of camera (a goal marker from the sensors)."""
+    """Whether the task hides it from this kind of camera (a goal marker from the sensors)."""
     scenery: bool
-    """Part of the room (a table, a static body), which a policy need not find."""
+    """Whether it is part of the room (a table, a static body), which a policy need not find."""
     present: NDArray[np.bool_]
     """(E,) whether the env has the object at all."""
     pixels: NDArray[np.float32]
-    """(E,) visible pixels, at the camera's own size, even if smaller pictures were measured."""
+    """(E,) visible pixels, scaled to the camera's own picture size if smaller pictures were measured."""
     unhindered: NDArray[np.float32]
-    """(E,) pixels without the robot."""
+    """(E,) pixels that are visible without the robot."""
     alone: NDArray[np.float32]
-    """(E,) pixels with nothing else drawn; `unhindered` for scenery, which is not measured alone."""
+    """(E,) pixels with nothing else drawn; equals `unhindered` for scenery, which is not measured alone."""
     cut: NDArray[np.bool_]
     """(E,) whether the object, drawn alone, reaches the border of the picture."""
     margin: NDArray[np.float32]
@@ -77,19 +78,21 @@ class ObjectSeen:
 
     @property
     def hidden_share(self) -> NDArray[np.float32]:
-        """(E,) share that the robot covers; NaN where it would not be seen without the robot either."""
+        """(E,) share of the object that the robot covers; NaN where the object is not visible even without
+        the robot."""
         return _share_lost(self.pixels, self.unhindered)
 
     @property
     def covered_share(self) -> NDArray[np.float32]:
-        """(E,) share that other things than the robot cover; NaN where it is out of the picture."""
+        """(E,) share of the object that things other than the robot cover; NaN outside of the picture."""
         return _share_lost(self.unhindered, self.alone)
 
     def marks(self) -> NDArray[np.float32]:
-        """(E,) mark from 0 (not seen) to 1 (whole, uncovered and large enough); NaN where it is absent.
+        """(E,) mark from 0 (not seen) to 1 (whole, uncovered, large enough); NaN where the object is absent.
 
-        Product of the share that nothing covers, one half if the border cuts it, and for small objects the square root of
-        their pixels (a length: twice as far away is half as good).
+        Product of the share that nothing covers, one half if the border cuts the object, and for small
+        objects the square root of their share of `LARGE_ENOUGH_PIXELS` (a ratio of lengths: twice as far away
+        is half as good).
         """
         size = np.sqrt(np.clip(self.alone / LARGE_ENOUGH_PIXELS, 0, 1))
         open_share = np.clip(self.pixels / np.maximum(self.alone, 1e-6), 0, 1)
@@ -122,7 +125,7 @@ class DepthReport:
     background: NDArray[np.float32]
     """(E,) share of the picture where a ray meets nothing (depth 0)."""
     beyond: NDArray[np.float32]
-    """(E,) share farther away than robot and objects: far floor and walls."""
+    """(E,) share of the picture that is farther away than robot and objects: far floor and walls."""
     nearest: NDArray[np.float32]
     """(E,) metres; NaN where the picture is all background."""
     farthest_object: NDArray[np.float32]
@@ -136,7 +139,8 @@ class DepthReport:
 
     @property
     def suggested_far(self) -> float | None:
-        """Metres: 1.5 times the farthest object seen, rounded up; what is behind becomes background."""
+        """Metres: 1.5 times the depth of the farthest object seen, rounded up; farther things become
+        background. None if no object was seen."""
         farthest = _least(-self.farthest_object)
         return None if farthest is None else _rounded(-farthest * 1.5, up=True)
 
@@ -149,7 +153,8 @@ class CameraReport:
     size: tuple[int, int]
     """Width and height of the camera's own picture."""
     measured_size: tuple[int, int]
-    """Width and height of the measured pictures. In smaller ones, anything below a pixel is not seen."""
+    """Width and height of the measured pictures. If they are smaller, objects smaller than one of their
+    pixels are missed."""
     envs: tuple[int, ...]
     """(E,) an env may occur several times: at several moments, or with several seeds."""
     objects: tuple[ObjectSeen, ...]
@@ -174,13 +179,17 @@ class CameraReport:
         return np.where(np.isinf(worst), np.nan, worst).astype(np.float32)
 
     def worst_first(self, wanted: Collection[str] | None = None) -> tuple[int, ...]:
-        """Positions in `envs`, the worst mark first; equal marks in their order, envs with nothing to see last."""
+        """Indices in `envs`, worst mark first; equal marks in the order of `envs`, NaN last."""
         return tuple(
             int(i) for i in np.argsort(np.nan_to_num(self.env_marks(wanted), nan=2.0), kind="stable")
         )
 
     def wanted_objects(self, wanted: Collection[str] | None = None) -> tuple[ObjectSeen, ...]:
-        """The objects of these names; None for all that are drawn, without scenery."""
+        """The objects of these names; None for all that are drawn, without scenery.
+
+        Raises:
+            ValueError: there is no such object.
+        """
         if wanted is None:
             return tuple(thing for thing in self.objects if not (thing.never_drawn or thing.scenery))
         unknown = sorted(set(wanted) - {thing.name for thing in self.objects})
@@ -197,10 +206,13 @@ class SearchSpace:
     objects: tuple[str, ...]
     """Names of actors, articulations and single links (``cabinet/handle``) that must be seen."""
     low: tuple[float, float, float]
-    """Lower corner of the box for the eye, metres in the frame of the mount, or the env's if there is none."""
+    """Lower corner of the box for the eye, in metres, in the frame of the mount, or in the env's frame
+    without a mount."""
     high: tuple[float, float, float]
+    """Upper corner of the box."""
     lens: CameraSettings
-    """Settings of the camera. The pose is not used, except on a mount, where it decides which way the picture is up."""
+    """Settings of the camera. The pose is used only on a mount, where its orientation decides which way is up
+    in the picture."""
     kind: CameraKind = "sensor"
     candidates: int = 100
     """Placements that the first round draws."""
@@ -217,7 +229,8 @@ class SearchSpace:
         box = np.array([self.low, self.high], np.float64)
         if not np.isfinite(box).all() or (box[0] > box[1]).any():
             raise ValueError(
-                f"the box for the eye goes from {self.low} to {self.high}: each low must be below its high"
+                f"the search box's lower corner {self.low} must be finite and not above its upper corner "
+                f"{self.high}"
             )
         if not self.objects:
             raise ValueError("name at least one object that must be seen")
@@ -275,7 +288,7 @@ def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
 
 
 def _end_to_end(parts: Sequence[_Part]) -> _Part:
-    """One part with the concatenated arrays of all."""
+    """The first part, with each array replaced by the concatenated arrays of all parts."""
     first = parts[0]
     arrays = [f.name for f in fields(first) if isinstance(getattr(first, f.name), np.ndarray)]
     return replace(

@@ -48,13 +48,15 @@ FREE_METRES = 0.1
 ROBOT_DISTANCE_METRES = 0.2
 """Least distance of an eye from the origin of every robot link, in the searched envs."""
 MOUNT_DISTANCE_METRES = 0.05
-"""Least distance of an eye on a mount from the origin of every robot link; such an eye is meant to be near one."""
+"""Least distance of an eye on a mount from the origin of every robot link; a mounted camera is meant to be
+near a link."""
 SUFFICIENT_SCORE = 0.995
 """Score at which no further round is sampled."""
 ROUNDS = 2
 """Number of rounds of samples around the best candidates."""
 MAX_EYE_ATTEMPTS = 50
-"""Maximum attempts to sample an eye clear of the robot; a box within the robot is searched anyway."""
+"""Maximum attempts to sample an eye clear of the robot. After them any eye is used, so a box within the robot
+is searched too."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
 
@@ -67,14 +69,15 @@ def suggest_cameras(
     progress: Callable[[int, int], None] = lambda done, total: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[OfferedPlacement, ...]:
-    """Search placements for envs that are already reset, and return the best first; the envs stay unchanged.
+    """Search for placements in envs that are already reset; returns the best first. The envs stay unchanged.
 
-    Returned placements keep a distance from each other, since five neighbours would be one suggestion. They are fewer than
-    `SearchSpace.best` if no more are found, or if the search is cancelled. The same seed gives the same result.
+    Returned placements keep a distance from each other, since five neighbours would be one suggestion. There
+    are fewer than `SearchSpace.best` if no more are found, or if the search is cancelled. The same seed gives
+    the same result.
 
     Args:
-        progress: called after each picture with the number made and the maximum that will be made; keep it cheap.
-        cancelled: called before each picture.
+        progress: called after each measured view with the number so far and the maximum; keep it cheap.
+        cancelled: called before each measured view; True ends the search.
 
     Raises:
         ValueError: no env is named; an object is missing, never drawn for such a camera, or the robot itself.
@@ -88,8 +91,8 @@ def suggest_cameras(
 def score_of(report: CameraReport, objects: Sequence[str]) -> float:
     """Score of a placement: the mean of the average env's mark and the worst env's, 0 to 1.
 
-    An env's mark is that of its worst object (`ObjectSeen.marks`), up to a fifth less near the border, and less where
-    something is right in front of the lens.
+    An env's mark is the mark of its worst object (`ObjectSeen.marks`), which is reduced by up to a fifth near
+    the border, and further if something is right in front of the lens.
     """
     marks = []
     for thing in report.wanted_objects(objects):
@@ -121,14 +124,14 @@ class _Search:
     ) -> None:
         space.check()
         if not envs:
-            raise ValueError("no env is named to search in")
+            raise ValueError("name at least one env to search in")
         for e in envs:
             require_env(e, env.num_envs)
         self.env, self.space, self.envs, self.index = env, space, envs, scene_index(env)
         self.progress, self.cancelled = progress, cancelled
         every = list_objects(env)
         self.wanted = [_wanted(every, name, space.kind, self.index) for name in space.objects]
-        # A requested link of the robot does not count as the robot that may hide it.
+        # A requested link of the robot does not count as the robot that may hide objects.
         asked = {body for thing in self.wanted for body in thing.bodies}
         robots = [replace(t, bodies=tuple(b for b in t.bodies if b not in asked)) for t in every if t.robot]
         self.objects = [*robots, *self.wanted]
@@ -267,7 +270,7 @@ class _Search:
         """(7,) pose of a candidate, in the mount's or the env's frame."""
         if self.mounts is None:
             return pose_from_look_at(LookAt(triple(candidate[0]), triple(candidate[1])))
-        # "Up" in a link's frame means nothing: the picture keeps its present orientation.
+        # A link's frame has no "up" direction: the picture keeps its present orientation.
         eye, target = candidate
         forward, up = target - eye, self.up[1]
         if abs(float(forward @ up)) > 0.999 * float(np.linalg.norm(forward)):

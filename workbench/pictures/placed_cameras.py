@@ -61,12 +61,12 @@ class PlacedCameras:
         return None if placed is None else placed.settings
 
     def place(self, env: Any, key: CameraKey, settings: CameraSettings | None) -> bool:
-        """Place a camera in all envs; None puts it back where the task had it.
+        """Place a camera in all envs; None restores the task's own settings.
 
         No picture may be pending.
 
         Returns:
-            Whether the shape or the modalities of its pictures changed.
+            Whether the shape or the modalities of the camera's pictures changed.
 
         Raises:
             ValueError: there is no such camera, or it cannot be placed; nothing has changed.
@@ -89,7 +89,7 @@ class PlacedCameras:
         return changed
 
     def put_back(self, env: Any) -> None:
-        """Place cameras again after a reset that rebuilt the scene or a failed exchange."""
+        """Place the placed cameras again if the scene was rebuilt, such as by a reset."""
         for key, placed in list(self._placed.items()):
             camera = maniskill_private.cameras(env).get(key)
             if camera is None:
@@ -106,7 +106,7 @@ def _camera(env: Any, key: CameraKey) -> Any:
     if moved := maniskill_private.why_not(maniskill_private.PLACING):
         raise ValueError(moved)
     if not maniskill_private.camera_components(camera):
-        raise ValueError(f"{name!r} is not a plain camera, and only those can be placed")
+        raise ValueError(f"{name!r} is not a plain camera, and only plain cameras can be placed")
     if env.scene.gpu_sim_enabled and batched_system(env.scene) is None:
         raise ValueError(NOT_ON_THE_GPU)
     return camera
@@ -117,14 +117,14 @@ def _pose(settings: CameraSettings) -> sapien.Pose:
 
 
 def _config(config: Any, settings: CameraSettings) -> Any:
-    """The task's config with these settings: as if the author had written them."""
+    """Copy of the task's config with these settings, as if the author had written them."""
     wrong = why_no_camera(settings)
     if wrong is not None:
         raise ValueError(wrong)
     shaders = PREBUILT_SHADER_CONFIGS
     if settings.shader_pack != config.shader_pack and settings.shader_pack not in shaders:
         raise ValueError(
-            f"there is no shader pack {settings.shader_pack!r}; there are {', '.join(sorted(shaders))}"
+            f"there is no shader pack {settings.shader_pack!r}; choose from {', '.join(sorted(shaders))}"
         )
     placed = copy.copy(config)
     placed.pose = Pose.create(_pose(settings))
@@ -185,10 +185,11 @@ def _of_env(value: Any, env_index: int) -> float:
 
 
 def settings_of(config: Any) -> CameraSettings | None:
-    """A ``CameraConfig`` as plain numbers, of the first env where poses differ.
+    """A ``CameraConfig`` as plain numbers; if poses differ between envs, the pose of the first env.
 
-    The quaternion is normalised (``look_at`` straight down gives one that is not of unit length). `distance` is that of the
-    target if ``look_at`` made the pose. None if a lens, near or far differs between envs, or the pose is invalid.
+    The quaternion is normalised (``look_at`` straight down gives one that is not of unit length). `distance`
+    is the distance to the target if ``look_at`` made the pose. None if the lens, near or far differs between
+    envs, or the pose is invalid.
     """
     pose = rows_of_pose(config)[0].astype(np.float64)
     length = float(np.linalg.norm(pose[3:]))

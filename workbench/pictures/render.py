@@ -221,18 +221,18 @@ def begin_pictures(
 
 
 def _degree_of(scene: Any, component: Any, asked: PictureDegree | None = None) -> PictureDegree:
-    """Degree in which a picture is drawn if `asked` is requested: fast pictures need a batch on the CPU."""
+    """Degree in which a picture is drawn if `asked` is requested; exact unless the env is a CPU batch."""
     return scene.degree_of(component, asked) if isinstance(scene, BatchedCpuScene) else "exact"
 
 
 def _textures(camera: Any, modalities: Sequence[str]) -> set[str]:
-    """Textures of the camera's shader that give the modalities."""
+    """Textures of the camera's shader that contain the modalities."""
     of = camera.config.shader_config.texture_names
     return {texture for texture, gives in of.items() if set(gives) & set(modalities)}
 
 
 def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) -> Places:
-    """Entities of an env to draw at other poses than their own; call it before objects are shown or hidden.
+    """Entities of an env that are to be drawn at `poses`; call it before objects are shown or hidden.
 
     Args:
         poses: as in `take_pictures`.
@@ -281,12 +281,12 @@ def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[Camera
 
 @contextmanager
 def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
-    """Context in which the task's hidden objects are drawn in this env, or are not.
+    """Context in which the task's hidden objects are drawn in this env if `shown`, else are not drawn.
 
     ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by visibility, in GPU
     simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back for
     pictures of human cameras. If something else has moved an object back meanwhile, sensors see it, as the policy does.
-    Both are undone, so a picture does not change the simulation.
+    Both changes are undone afterwards, so a picture does not change the simulation.
     """
     slot_of = scene_index(env).slot_of
     true = (
@@ -391,8 +391,8 @@ def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Requ
     """Pictures of the requested cameras, of the last observed state, env by env.
 
     A picture takes 25 to 50 ms on a software renderer, so pictures in the observation are reused: they are the same
-    (tested), with depth and segmentation as ManiSkill's int16 millimetres and ids. Rendered are only other pictures, depth
-    beyond 32.767 m, and shaders with more precision than millimetres. Raises as `take_pictures`.
+    (tested), with depth and segmentation as ManiSkill's int16 millimetres and ids. Only other pictures, depth
+    beyond 32.767 m, and shaders with more precision than millimetres are rendered. Raises as `take_pictures`.
     """
     if not requests:
         return []

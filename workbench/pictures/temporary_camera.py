@@ -26,7 +26,7 @@ _TEXTURE = "PositionSegmentation"
 
 @dataclass
 class TemporaryCamera:
-    """A camera for depth and segmentation of the objects that its kind of camera sees."""
+    """A camera that renders segmentation, depth and colours of the objects that its kind of camera sees."""
 
     _key: CameraKey
     _sub_scene: Any
@@ -37,7 +37,7 @@ class TemporaryCamera:
         """Segmentation (H, W), 0 for background, and depth (H, W) in metres, from a pose (7,) in the env's frame."""
         p = np.asarray(pose, np.float32).tolist()
         self._component.local_pose = sapien.Pose(p[:3], p[3:])
-        # A camera renders from where its entity was at the last update.
+        # A camera renders from the pose that its entity had at the last update.
         self._sub_scene.update_render()
         self._move_bodies()
         with drawing(self._key):
@@ -69,8 +69,8 @@ def temporary_camera(
 
     Args:
         kind: sensors do not see what the task hides from them.
-        settings: its lens; `look` takes the pose.
-        size: width and height of the pictures, which show the same view; None for its own.
+        settings: the camera's lens; the pose is an argument of `look`.
+        size: width and height of the pictures, which show the same view; None for the size in `settings`.
         poses: (B, 7) where to draw the env's bodies; None for where they are.
 
     Raises:
@@ -83,7 +83,7 @@ def temporary_camera(
     size = size or own
     k = scaled_intrinsic(intrinsic_of(settings), own, size)
     if not 0 < near < far:
-        raise ValueError(f"the near plane must be before the far plane, and both ahead: {near} m, {far} m")
+        raise ValueError(f"near must be positive and less than far, not {near} m and {far} m")
     scene = env.scene
     sub_scene = scene.sub_scenes[env_index]
     render_system = sub_scene.render_system

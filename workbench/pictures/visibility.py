@@ -50,7 +50,7 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class Placement:
-    """Settings, kind and mount of a camera that need not exist."""
+    """Settings, kind and mount of a camera, which the env need not have."""
 
     settings: CameraSettings
     kind: CameraKind = "sensor"
@@ -105,8 +105,8 @@ def objects_to_see(env: Any) -> tuple[ObjectToSee, ...]:
 def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
     """Names of a robot's drawn links: its hand, then the others by their distance from the tool centre point.
 
-    ManiSkill's agents with a hand have that point as the link ``tcp``; the hand is the link that carries it, although the
-    fingers may be nearer. Without a ``tcp`` the last link comes first.
+    In ManiSkill's agents with a hand, the tool centre point is the link ``tcp``; the hand is the drawn link
+    that carries ``tcp``, although the fingers may be nearer. Without a ``tcp`` the last link comes first.
     """
     names, entities = scene_index(env).names, scene_index(env).entities[0]
     drawn = [body for body in reversed(robot.bodies) if is_drawn(entities[body])]
@@ -138,7 +138,7 @@ def is_drawn(entity: Any) -> bool:
 
 
 def placement_of(env: Any, camera: CameraKey, e: int, settings: CameraSettings | None = None) -> Placement:
-    """The placement of a camera of one env, or with other `settings` (in the frame of its mount).
+    """The placement of a camera in one env: its present settings, or `settings` (in the mount's frame).
 
     Raises:
         ValueError: there is no such camera.
@@ -163,11 +163,11 @@ def measure_placement(
     """Report what a camera, which need not exist, sees in one env.
 
     Args:
-        poses: (B, 7) where to draw the bodies, as `read_poses` gives them; None for where the tensors have them.
-        size: of the measured pictures, with the same view (`small_size`); None for the camera's own.
+        poses: (B, 7) where to draw the bodies, as `read_poses` returns them; None for their present poses.
+        size: size of the measured pictures, with the same view (`small_size`); None for the camera's own.
 
     Raises:
-        ValueError: the lens is impossible, or there is no such mount.
+        ValueError: the lens is not valid, or there is no such mount.
         IndexError: there is no such env.
         RuntimeError: the renderer failed.
     """
@@ -212,7 +212,7 @@ def present_settings(camera: Any, env_index: int) -> CameraSettings:
 
 
 def small_size(width: int, height: int, shorter: int = MEASURED_SIDE_PIXELS) -> tuple[int, int]:
-    """Width and height with about the same aspect, the shorter side at most `shorter`."""
+    """Width and height with about the same aspect ratio, and a shorter side of at most `shorter` pixels."""
     scale = min(1.0, shorter / min(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
@@ -252,14 +252,14 @@ def measure(
 ) -> CameraReport:
     """Render pictures and count pixels; returns the report of one env.
 
-    Boxes and frustums ignore what is in front of an object, so it is rendered. The segmentation gives each pixel's object; a
-    second picture without the robot gives what the robot covers; one of each object alone gives what the border cuts and
-    what other things cover. The robot's meshes are nearly all of a picture's cost (30 ms with a Panda on a software
-    driver, 2 ms without), so the further pictures are almost free. An object that the task hides from sensors counts as
-    never drawn for a sensor.
+    Bounding boxes and frustums ignore occlusion, so pictures are rendered. The segmentation gives each
+    pixel's object; a second picture without the robot shows what the robot covers; a picture of each object
+    alone shows what the border cuts and what other things cover. The robot's meshes are nearly all of a
+    picture's cost (30 ms with a Panda on a software driver, 2 ms without), so the further pictures are almost
+    free. An object that the task hides from sensors counts as never drawn for a sensor.
 
     Args:
-        settings: of the camera, whose pixels are counted; `view` may have fewer.
+        settings: settings of the camera; pixel counts are scaled to its size, since `view` may be smaller.
         bare: the report from this pose without the robot, if there is one: then one picture is enough.
     """
     began = time.perf_counter()

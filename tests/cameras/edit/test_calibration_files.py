@@ -138,9 +138,9 @@ def test_many_formats_of_one_pose_are_read(text: str) -> None:
     [
         ("", "nothing to read"),
         ('{"a": ', "begins like JSON"),
-        ("!!python/object/apply:os.system ['true']", "no YAML"),
-        ('{"camera_matrix": [[1,0,0],[0,1,0],[0,0,1]]}', "no pose is in it"),
-        ("a: " + "[" * 5000, "no YAML"),
+        ("!!python/object/apply:os.system ['true']", "neither YAML"),
+        ('{"camera_matrix": [[1,0,0],[0,1,0],[0,0,1]]}', "the text has no pose"),
+        ("a: " + "[" * 5000, "neither YAML"),
         ("a: &a [*a]", "alias"),
         ("9" * 300_000, "characters"),
     ],

@@ -196,7 +196,7 @@ def test_settings_that_env_arguments_override_are_left_alone_with_a_note() -> No
     plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), running, higher(running), run_class)
     assert isinstance(plan, SourceEdit) and plan.settings is not None
     assert (plan.settings.width, plan.settings.height) == (640, 480)
-    assert "left alone" in plan.notes[-1]
+    assert "not changed there" in plan.notes[-1]
     plan = planned(
         plan_edit, {FILE: TWO}, ("sensor", "cam"), running, dataclasses.replace(running, width=320), run_class
     )

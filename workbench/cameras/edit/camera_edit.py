@@ -30,7 +30,8 @@ class CameraEdit(Changes):
         uid = key[1]
         if key not in self.hook_cameras.cameras:
             raise RefusedEdit(
-                f"the files make no {key[0]} camera {uid!r}: other code makes it, or they were edited since"
+                f"your files make no {key[0]} camera {uid!r}: other code makes it, or the files were edited "
+                "since the load"
             )
         run = self.hook_cameras.cameras[key]
         if run.site is not None:
@@ -52,7 +53,8 @@ class CameraEdit(Changes):
         return CameraCall(file, node, key, arguments(node, PARAMETERS), run, run.trace)
 
     def verified(self, first: SourceFile, key: CameraKey | None, expected: CameraKey | None) -> SourceEdit:
-        """The edit with all replacements, verified by running it: only `key` changes, to `expected`.
+        """The edit with all replacements. The new text is run to verify that only the camera `key` changes,
+        and becomes `expected`.
 
         Args:
             first: the file to name first if several change.
@@ -60,7 +62,8 @@ class CameraEdit(Changes):
             expected: key of the resulting camera; None if it is removed.
 
         Raises:
-            RefusedEdit: another camera would change, appear or disappear.
+            RefusedEdit: no text changes, the camera's mount would change, or another camera would change,
+                appear or disappear.
         """
         files = {file.path: file for file, _ in self.replacements}
         if not files:
@@ -101,7 +104,7 @@ def planning(
     settings: CameraSettings | None = None,
     more: Sequence[str] = (),
 ) -> Iterator[CameraEdit]:
-    """A `CameraEdit`; a RefusedEdit within the context gets the camera of `settings` as text to copy."""
+    """Context with a `CameraEdit`; a RefusedEdit within it gets the camera of `settings` as text to copy."""
     try:
         yield CameraEdit(sources, run)
     except RefusedEdit as refused:
@@ -110,7 +113,7 @@ def planning(
 
 
 def check_camera(settings: CameraSettings) -> None:
-    """Raises RefusedEdit if `settings` are not valid for a camera."""
+    """Raise RefusedEdit if `settings` are not valid for a camera."""
     why = why_no_camera(settings)
     if why is not None:
         raise RefusedEdit(why)

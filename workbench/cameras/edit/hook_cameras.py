@@ -28,9 +28,10 @@ class HookCamera:
     """One camera that a hook made."""
 
     made: CameraSettings | None
-    """Settings of its ``CameraConfig`` call; None if the call was not recorded or has other settings."""
+    """Settings of its ``CameraConfig`` call; None if the call was not recorded, or `CameraSettings` cannot
+    describe it."""
     settings: CameraSettings | None
-    """Settings of the config that the hook returned."""
+    """Settings of the config that the hook returned; None if `CameraSettings` cannot describe it."""
     mount: str
     """Text that identifies the body that the camera is mounted on."""
     site: CallSite | None
@@ -68,12 +69,12 @@ class CameraCall:
 
     @property
     def hook(self) -> str | None:
-        """Name of ManiSkill's hook that contains the call."""
+        """Name of ManiSkill's hook that contains the call; None if no hook does."""
         return next((name for name in reversed(self.trace.function.split(".")) if name in HOOKS), None)
 
     @property
     def key(self) -> ast.expr | ast.keyword | None:
-        """Key of the call, if it is a value in a dict."""
+        """Key of the call in a dict; None if the call is no value of a dict."""
         outer = self.file.parents[self.node]
         if isinstance(outer, ast.Dict):
             return outer.keys[outer.values.index(self.node)]
@@ -89,7 +90,7 @@ class CameraCall:
 
     @property
     def loop(self) -> ast.AST | None:
-        """The loop in its function that contains the call."""
+        """The loop or comprehension around the call, within the same function; None without one."""
         scope = self.file.scopes(self.node)[0]
         outers = self.file.ancestors(self.node)
         return next((o for o in outers if isinstance(o, LOOPS) and scope in self.file.ancestors(o)), None)

@@ -72,7 +72,8 @@ def append_camera(
         new = f"[\n{indent}    {inner},\n{indent}    {text(indent + '    ')},\n{indent}]"
         return [Replacement(start, end, new)]
     raise RefusedEdit(
-        f"what is returned at line {file.line(value)} is neither a CameraConfig(...) nor a list or dict of them"
+        f"the value returned at line {file.line(value)} is neither a CameraConfig(...) nor a list or dict "
+        "of them"
     )
 
 
@@ -119,7 +120,7 @@ def at_end_of_class(
     """Add `text(indent)`, the whole hook, at the end of the class. Raises RefusedEdit."""
     first = file.inner_span(cls.body[0])[0]
     if file.line_at(first) == file.line(cls):
-        raise RefusedEdit(f"the class {cls.name} has no body to add {hook} to")
+        raise RefusedEdit(f"the class {cls.name} is written in one line, so {hook} cannot be added to it")
     indent = file.indent(first)
     at = file.line_start(file.line_at(file.inner_span(cls.body[-1])[1]) + 1)
     lead = "\n" if file.text[:at].endswith(("\n", "\r")) else "\n\n"

@@ -1,4 +1,4 @@
-"""Plans edits that add, duplicate, rename or remove a camera, or override one of a parent class."""
+"""Plans edits that add, duplicate, rename or remove a camera, or override a camera of a parent class."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def plan_add(
     settings: CameraSettings,
     run: RunHooks,
 ) -> SourceEdit:
-    """Add a fixed camera to the hook of `class_name`, which is added if the class has none.
+    """Add a fixed camera to the camera hook of `class_name`; adds the hook if the class has none.
 
     A hook returns one config, a list or tuple of them, or a dict; one config becomes a list. The pose is written as a
-    ``look_at`` if the other cameras have one that can express it.
+    ``look_at`` if another camera in the file uses one and it can express the pose.
 
     Raises:
         RefusedEdit: the hook returns anything else (a name, a concatenation, a call of the parent's hook) or has several
-            returns. Like all plans here it contains the reason and the text to copy.
+            returns. As in all plans here, the exception has the reason and the text to copy.
     """
     check_camera(settings)
     kind, uid = key
@@ -133,7 +133,7 @@ def override_text(
     more: Sequence[str] = (),
     indent: str = "    ",
 ) -> str:
-    """Text of a hook that takes the parent's cameras and replaces one.
+    """Text of a hook that returns the parent's cameras with one of them replaced.
 
     Args:
         parse: ManiSkill's function for a hook's result, `TaskDescription.parse_cameras`.
@@ -173,12 +173,12 @@ def plan_override(
         owner, where = (class_name, file) if own else edit.hook_cameras.owners.get(hook, ("", ""))
         if where in sources:
             raise RefusedEdit(
-                f"{uid} is made by {parent}, and the {hook} of {owner} ({edit.project.file(where).name}) returns it: put "
-                "the text below in its place there"
+                f"{uid} is made by {parent}, and the {hook} of {owner} ({edit.project.file(where).name}) "
+                "returns it: replace it there by the text below"
             )
         edit.note(
-            f"{uid} is made by {parent}, from which {class_name} inherits: {class_name} gets a {hook} of its own, with all "
-            f"cameras of {parent} and this one in place of its {uid}"
+            f"{uid} is made by {parent}, from which {class_name} inherits: {class_name} gets its own {hook}, "
+            f"which returns the cameras of {parent} with {uid} replaced"
         )
         edit.add_imports(
             source, needed_imports(settings) | {parse: f"from mani_skill.sensors.camera import {parse}"}
@@ -215,7 +215,7 @@ def _is_in_hook(call: CameraCall) -> bool:
 
 
 def _look_at_name(edit: CameraEdit, file: SourceFile, kind: CameraKind) -> str:
-    """The name by which a camera in this file calls look_at, preferably one of that kind; empty if none does."""
+    """Name by which a camera in this file, preferably of this kind, calls look_at; empty if none does."""
     for key in sorted(edit.hook_cameras.cameras, key=lambda key: key[0] != kind):
         trace = edit.hook_cameras.cameras[key].trace
         pose = None if trace is None else trace.parts.get("pose")
@@ -231,7 +231,7 @@ def _look_at_name(edit: CameraEdit, file: SourceFile, kind: CameraKind) -> str:
 
 
 def _renaming(call: CameraCall, new_uid: str) -> list[Replacement]:
-    """Edits of the name only at its call: a constant with the same value may name other things too."""
+    """Edits that rename the camera, only at its call: an equal constant may name other things too."""
     file, key, uid = call.file, call.key, call.arguments.get("uid")
     found: list[Replacement] = []
     if isinstance(key, ast.keyword):
@@ -271,6 +271,8 @@ def _removal(call: CameraCall) -> Replacement:
         )
     items = file.items(container)
     if isinstance(container, ast.Tuple) and len(items) <= 2:
-        raise RefusedEdit("a tuple of one or none is easily misread; remove the camera by hand")
+        raise RefusedEdit(
+            "the tuple would have one item or none, which is easily misread; remove the camera by hand"
+        )
     place = file.inner_span(call.node)[0]
     return file.without_item(container, next(i for i, item in enumerate(items) if item[0] <= place < item[1]))

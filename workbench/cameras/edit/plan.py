@@ -29,8 +29,9 @@ def plan_edit(
 ) -> SourceEdit:
     """Plan the edit that changes a camera from `before`, its settings in the running env, to `after`. Nothing is written.
 
-    It runs the files and finds the ``CameraConfig(...)`` call of the camera, changes the arguments that differ, then runs
-    the new text and checks that this camera has the new settings and no other camera changed.
+    It runs the files, finds the ``CameraConfig(...)`` call of the camera and changes the arguments that
+    differ. Then it runs the new text, and checks that this camera has the new settings and that no other
+    camera changed.
 
     Args:
         sources: the author's files on disk, by path.
@@ -44,9 +45,9 @@ def plan_edit(
     with planning(sources, run, key[1], after, mount) as edit:
         fields = changed_fields(before, after)
         if not fields:
-            raise RefusedEdit("nothing of this camera was changed")
+            raise RefusedEdit("no setting of this camera was changed")
         call = edit.call(key)
-        # The pose is relative to the mount, so the text to copy needs it.
+        # The pose is relative to the mount, so the text to copy needs the mount too.
         names = [name for name in ("entity_uid", "mount") if name in call.arguments]
         mount += [f"{name}={call.file.code(call.arguments[name])}" for name in names]
         return _plan(edit, call, fields, before, after)
@@ -71,7 +72,7 @@ def _plan(
         if why:
             raise RefusedEdit(f"{why} ({call.where})")
     if call.hook is None:
-        edit.note(f"the camera is made outside of a hook ({call.where}): other users of it change too")
+        edit.note(f"the camera is made outside of a hook ({call.where}): other code that uses it changes too")
     _write_fields(edit, call, fields, after)
     for name in FIELDS:
         if name in call.trace.parts:
@@ -84,16 +85,16 @@ def _plan(
     if left:
         be = "is" if len(left) == 1 else "are"
         edit.note(
-            f"{' and '.join(left)} of the running camera {be} not what the file says, and {be} left alone there"
+            f"{' and '.join(left)} of the running camera {be} not as in the file, and {be} not changed there"
         )
     return replace(planned, notes=tuple(edit.notes), settings=settings)
 
 
 def _why_not(changes: Changes, call: CameraCall, name: str) -> str | None:
-    """Reason why an argument cannot be edited in its form; None if it can."""
+    """Reason why an argument cannot be edited in the form in which it is written; None if it can."""
     part = call.trace.parts.get(name)
     if part is None:
-        return "it is given no pose" if name == "pose" else None
+        return "the camera's call has no pose" if name == "pose" else None
     if name == "pose":
         return why_not_a_pose(changes, part)
     readable = {
@@ -124,7 +125,7 @@ def _write_fields(changes: Changes, call: CameraCall, fields: list[str], after: 
         elif part is not None:
             changes.number(part, getattr(after, name), 0 if name in ("width", "height") else 4)
         elif name in ("width", "height"):
-            raise RefusedEdit(f"{call.where} gives no {name}")
+            raise RefusedEdit(f"the camera's call has no {name} ({call.where})")
         else:
             added.append(f"{name}={number_text(getattr(after, name), 4)}")
     if "fov" in fields or "intrinsic" in fields:
@@ -168,7 +169,7 @@ def _write_lens(changes: Changes, call: CameraCall, after: CameraSettings) -> li
 def _check_asked(
     found: CameraSettings | None, fields: list[str], made: CameraSettings, after: CameraSettings
 ) -> CameraSettings:
-    """Check that the edited camera has the new `fields` of `after`, and the others of `made`."""
+    """Check that the edited camera has the `fields` of `after` and the others of `made`; returns `found`."""
     if found is None:
         raise RefusedEdit("the settings of the edited camera cannot be read")
     as_requested = not set(changed_fields(made, found)) - set(fields)
@@ -198,5 +199,5 @@ def _difference_text(name: str, written: CameraSettings, has: CameraSettings) ->
     )
     return (
         f"{name} is {setting_text(there)} in the file and {setting_text(here)} in the env, so something else changes it: an argument of "
-        "gym.make, a class that inherits, or code that runs later"
+        "gym.make, a subclass, or code that runs later"
     )

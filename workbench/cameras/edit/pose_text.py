@@ -1,4 +1,4 @@
-"""Writes a new camera pose in the author's own form if that can express it."""
+"""Writes a new camera pose in the form that the author uses, if this form can express it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _DECIMALS = (4, 5, 6)
 
 
 def why_not_a_pose(changes: Changes, pose: TracedValue) -> str | None:
-    """Reason why a pose cannot be edited in its form; None if it can."""
+    """Reason why a pose cannot be edited in the form in which it is written; None if it can."""
     p, q = pose.parts.get("p"), pose.parts.get("q")
     if pose.function == "look_at":
         triples = [
@@ -65,12 +65,12 @@ def _is_vector(part: TracedValue, length: int) -> bool:
 
 
 def write_pose(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
-    """Edit `pose` to that of `after`, in its own form if possible, else with a quaternion.
+    """Edit `pose` to the pose of `after`: in its written form if possible, else with a quaternion.
 
-    A ``look_at`` stays one while the camera is level and does not look along `up`: the target is kept if the camera still
-    looks at it; if not, it is put on the new line of sight, at the distance of `after` or the old one. ManiSkill's
-    ``look_at`` returns no unit quaternion straight down or up (its `left` is the zero vector there), so those poses get a
-    quaternion.
+    A ``look_at`` stays one while the camera is level and does not look along `up`. Its target is kept if the
+    camera still looks at it; if not, the target is put on the new line of sight, at the distance of `after`,
+    or at the old distance. Straight down or up, ManiSkill's ``look_at`` returns no unit quaternion (its
+    `left` is the zero vector there), so those poses get a quaternion.
     """
     if pose.function == "look_at":
         if not _look_at(changes, pose, after):
@@ -117,7 +117,7 @@ def _vector(changes: Changes, vector: TracedValue, requested: Sequence[float], d
 
 
 def _written_values(vector: TracedValue, requested: Sequence[float], decimals: int) -> tuple[float, ...]:
-    """The numbers after rounding by writing `requested`."""
+    """The vector's numbers after `requested` is written with this many decimals."""
     if vector.literal:
         pairs = zip(vector.parts.values(), requested, strict=True)
         return tuple(written_value(item, number, decimals) for item, number in pairs)
@@ -131,7 +131,7 @@ def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool
     eye, target = pose.parts["eye"], pose.parts["target"]
     up = pose.parts["up"].numbers if "up" in pose.parts else (0.0, 0.0, 1.0)
     forward = rotation_matrix(after.quaternion)[:, 0].tolist()
-    # This close to `up`, 0.1 mm of the target rotates the picture.
+    # This close to `up`, moving the target by 0.1 mm rotates the picture.
     if abs(_cosine(forward, up)) > math.cos(1e-3):
         return False
 
@@ -155,7 +155,7 @@ def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool
 
 
 def look_at_text(name: str, settings: CameraSettings) -> str | None:
-    """A new camera's pose as a call of the look_at function `name`; None if that cannot express it."""
+    """A new camera's pose as a call of the look_at function `name`; None if look_at cannot express it."""
     forward = rotation_matrix(settings.quaternion)[:, 0]
     if abs(_cosine(forward.tolist(), (0.0, 0.0, 1.0))) > math.cos(1e-3):
         return None
@@ -169,7 +169,7 @@ def look_at_text(name: str, settings: CameraSettings) -> str | None:
 
 
 def _as_quaternion(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
-    """Replace a look_at by a pose with a quaternion; keeps the author's expression for the position."""
+    """Replace a look_at with a pose that has a quaternion; keeps the author's expression for the position."""
     file, node = changes.find(pose.at)
     assert isinstance(node, ast.Call)
     height = float(rotation_matrix(after.quaternion)[2, 0])
@@ -223,7 +223,8 @@ def pose_call(changes: Changes, file: SourceFile) -> str:
 def look_at(
     eye: Sequence[float], target: Sequence[float], up: Sequence[float] = (0, 0, 1)
 ) -> NDArray[np.float64] | None:
-    """The orientation of ManiSkill's ``look_at`` as a quaternion (wxyz); None straight along `up`, where it has none."""
+    """The orientation of ManiSkill's ``look_at`` as a quaternion (wxyz); None along `up`, where it has
+    none."""
     # ManiSkill computes in float32, whose rounding rotates the picture if the eye is nearly above its target.
     seen = np.asarray(target, np.float32).astype(float), np.asarray(eye, np.float32).astype(float)
     forward, upward = np.subtract(*seen), np.asarray(up, float)
@@ -241,17 +242,17 @@ def to_euler(quaternion: ArrayLike, near: Sequence[float]) -> tuple[float, float
     if level > 1e-6:
         roll, pitch = math.atan2(m[2, 1], m[2, 2]), math.atan2(-m[2, 0], level)
         yaw = math.atan2(m[1, 0], m[0, 0])
-        ways = [(roll, pitch, yaw), (roll + math.pi, math.pi - pitch, yaw + math.pi)]
+        candidates = [(roll, pitch, yaw), (roll + math.pi, math.pi - pitch, yaw + math.pi)]
     else:
         # Along z only the sum or difference of roll and yaw matters: keep yaw.
         pitch = math.copysign(math.pi / 2, -m[2, 0])
         whole = math.atan2(m[0, 1], m[1, 1]) if pitch > 0 else math.atan2(-m[0, 1], m[1, 1])
-        ways = [(whole + near[2] if pitch > 0 else whole - near[2], pitch, near[2])]
+        candidates = [(whole + near[2] if pitch > 0 else whole - near[2], pitch, near[2])]
     turned = [
-        tuple(a - 2 * math.pi * round((a - b) / (2 * math.pi)) for a, b in zip(way, near, strict=True))
-        for way in ways
+        tuple(a - 2 * math.pi * round((a - b) / (2 * math.pi)) for a, b in zip(angles, near, strict=True))
+        for angles in candidates
     ]
-    best = min(turned, key=lambda way: sum(abs(a - b) for a, b in zip(way, near, strict=True)))
+    best = min(turned, key=lambda angles: sum(abs(a - b) for a, b in zip(angles, near, strict=True)))
     return best[0], best[1], best[2]
 
 

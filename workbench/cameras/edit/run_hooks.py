@@ -19,7 +19,7 @@ from workbench.source.parsed import RefusedEdit, Trace
 from workbench.source.read_values import trace_call
 
 RecordedCalls = dict[int, tuple[Any, CameraSettings | None, Trace | None]]
-"""Config, the settings that it was made with, and its call, by the config's ``id``."""
+"""Each config, the settings that it was made with, and the trace of its call, by the config's ``id``."""
 
 
 @contextmanager
