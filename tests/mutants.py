@@ -110,7 +110,7 @@ PROTECTED = {
     "rescore/state": "record/test_apply.py",
     "rescore/past_jobs": "rescore/test_past_rescorer.py",
     "cameras/placements": "cameras/test_placements.py",
-    "cameras/edit_jobs": "cameras/test_studio_state.py cameras/test_edit_state.py",
+    "cameras/edit_state": "cameras/test_studio_state.py cameras/test_edit_state.py",
     "cameras/apply": "cameras/test_studio_state.py",
     "cameras/worker": "cameras/test_worker.py",
     "page/door/access": "page/door/test_access.py",

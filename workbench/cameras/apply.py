@@ -21,8 +21,8 @@ from workbench.cameras.commands import (
     UndoCamera,
     UsePlacement,
 )
-from workbench.cameras.edit_jobs import (
-    FileEdits,
+from workbench.cameras.edit_jobs import FileEdits
+from workbench.cameras.edit_state import (
     apply_to_edits,
     do_edit,
     edit_failed_to_load,
@@ -55,14 +55,8 @@ from workbench.cameras.events import (
 )
 from workbench.cameras.placements import Placements
 from workbench.cameras.questions import DrawCamera
-from workbench.cameras.report_jobs import (
-    STOP_REPORTS,
-    CameraReports,
-    apply_to_reports,
-    do_report,
-    outdated,
-    with_results,
-)
+from workbench.cameras.report_jobs import CameraReports
+from workbench.cameras.report_state import STOP_REPORTS, apply_to_reports, do_report, outdated, with_results
 from workbench.cameras.state import Change, Studio, info_of, refusal, settings_in_file, shown_step
 from workbench.envs.camera_data import CameraKey, why_no_camera
 from workbench.live.effects import Asked

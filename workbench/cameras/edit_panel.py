@@ -26,7 +26,7 @@ from workbench.cameras.commands import (
     RevertCameraChange,
     SaveCameraChange,
 )
-from workbench.cameras.edit_jobs import IN_FILE
+from workbench.cameras.edit_state import IN_FILE
 from workbench.cameras.events import EditWanted
 from workbench.cameras.job_result import NewResult
 from workbench.cameras.pose_math import rounded
@@ -150,7 +150,7 @@ WITH_CHOSEN = (
     tool("Remove", RemoveCamera()),
 )
 ADD = tool("Add sensor", AddCamera(kind="sensor")), tool("Add human view", AddCamera(kind="human"))
-NAME_HINT = "Letters, digits, - and _. If this is empty, a new camera gets a free name."
+NAME_HINT = "Letters, digits and _. If this is empty, a new camera gets a free name."
 WHERE = (
     "A new sensor looks at the task's objects from where you look; a new human view is placed at your "
     "viewpoint. The new camera's picture appears before anything is saved."
@@ -264,11 +264,11 @@ class WriteToFile(PagePart[SessionView]):
         name = self._name.strip()
         if not name and like:
             return free_name(view, kind, like)
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", name):
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
             raise Refused(
-                "Type a new name first: letters, digits, - and _."
+                "Type a new name first: letters, digits and _."
                 if not name
-                else "A name has letters, digits, - and _."
+                else "A name has letters, digits and _, and does not begin with a digit."
             )
         if any(camera.key == (kind, name) for camera in view.cameras):
             raise Refused(f"There is a camera {name} already.")

@@ -1,23 +1,44 @@
-"""Plans a camera's edit of the author's file, and checks the reloaded camera against it."""
+"""The part of the studio's state about edits of the author's file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import replace
+from typing import Any
 
-from workbench.cameras.edit import members
-from workbench.cameras.edit.hook_cameras import RunHooks
-from workbench.cameras.edit.hook_text import HOOK_OF, snippet
-from workbench.cameras.edit.plan import plan_edit
-from workbench.cameras.view import Change, EditRequest, EditState
+from workbench.cameras.commands import CopyTask, DropCameraChange, RevertCameraChange, SaveCameraChange
+from workbench.cameras.events import (
+    ChangeFile,
+    CopyToFolder,
+    DrawNewCamera,
+    EditFailed,
+    EditWanted,
+    FileChanged,
+    FileNotChanged,
+    FindPlan,
+    NewCameraDrawn,
+    PlanFound,
+    StopJobs,
+    StudioClosed,
+    StudioEffect,
+    TaskCopied,
+)
+from workbench.cameras.questions import DrawCamera
+from workbench.cameras.state import Change, EditAsked, Edits, Studio, info_of
+from workbench.cameras.view import EditKind, EditRequest, EditStage, EditState
 from workbench.envs.camera_data import CameraInfo, CameraKey, CameraSettings, differences, setting_text
-from workbench.source.parsed import RefusedEdit
-from workbench.task.copy import CannotCopy, copy_task
+from workbench.live.run import Run
+from workbench.page.command import Command, Refused
+from workbench.source.parsed import plain_line_ends
 from workbench.task.description import TaskDescription
-from workbench.task.modules import read_exactly
-from workbench.task.write_edits import SourceEdit, why_not_writable
+from workbench.task.write_edits import SourceEdit
 
-SENTENCES: dict[Change, tuple[str, str, str]] = {
+IN_FILE: tuple[EditStage, ...] = ("written", "checked", "mismatch")
+"""Stages in which the change is in the file."""
+_PREVIEW_PIXELS = 256
+"""Shorter side of a new camera's preview."""
+_STOP_DRAWING = StopJobs(("new camera",))
+SENTENCES: dict[EditKind, tuple[str, str, str]] = {
     "edit": ("This changes {old} in {file}.", "{old}: saved to {file} and verified.", ""),
     "add": ("This adds {new} to {file}.", "{old}: added to {file} and verified.", "{new} was not added."),
     "duplicate": (
@@ -46,152 +67,262 @@ def change_text(request: EditRequest, when: int, file: str = "") -> str:
     return SENTENCES[request.what][when].format(old=request.key[1], new=request.result[1], file=file)
 
 
-def plan(task: TaskDescription, info: CameraInfo | None, request: EditRequest, run: RunHooks) -> EditState:
-    """Plan the edit of the files on disk for a request, or report why there is none.
+def with_edits(studio: Studio, **values: Any) -> Studio:
+    return replace(studio, edits=replace(studio.edits, **values))
 
-    The worker also runs the edited files; a plan whose camera differs from the request is refused. Not thread-safe, and too
-    slow for the page's thread.
 
-    Args:
-        info: description of the live camera; None if one is added.
-        run: runs the hooks in the worker.
+def do_edit(studio: Studio, command: Command, run: Run) -> Change:
+    """Carry out a command about the file."""
+    match command:
+        case SaveCameraChange():
+            shown = studio.edits.shown
+            if shown.stage != "planned" or _is_stale(studio, shown.request):
+                raise Refused("Show the change first: only what you have read is saved.")
+            return _ask(studio, command, run)
+        case RevertCameraChange() | CopyTask():
+            return _ask(studio, command, run)
+        case DropCameraChange():
+            return _drop(studio, run)
+        case _:
+            raise AssertionError(f"{command} is not in DOES")
+
+
+def apply_to_edits(studio: Studio, event: object, run: Run) -> Change:
+    """The studio after an event about the file. Edits are made one after another.
+
+    Placements change only when the version with the edit is loaded.
     """
-    placed = None if request.what == "remove" else request.settings
-    text = "" if placed is None else snippet(request.result[1], placed)
-    owner_text = "" if request.what == "add" or info is None else _owner_text(task, info)
-    try:
-        texts = _texts(task)
-        if owner_text and info is not None:
-            edit = _override_edit(task, texts, info, request, owner_text, run)
-        elif not task.source_files:
-            where = "" if task.file is None else f" ({task.file})"
-            raise RefusedEdit(
-                f"{task.class_name} is installed{where}, and installed files are not edited: copy the task into a "
-                "folder of your own",
-                text,
+    match event:
+        case EditWanted(request=request):
+            if request.settings is None:
+                event = EditWanted(replace(request, settings=studio.placements.now(request.key)))
+            return _ask(studio, event, run)
+        case PlanFound():
+            return _plan_found(studio, event, run)
+        case NewCameraDrawn(request=request, picture=picture) if request == studio.edits.shown.request:
+            shown = replace(studio.edits.shown, picture=picture, drawing=False)
+            return with_edits(studio, shown=shown), []
+        case FileChanged():
+            return _ended(studio, run)
+        case FileNotChanged(reason=reason):
+            shown, done = studio.edits.before
+            stage = "refused" if shown.stage == "planned" else shown.stage
+            shown = replace(shown, stage=stage, message=f"The file was not changed: {reason}.")
+            return _ended(with_edits(studio, shown=shown, done=done), run)
+        case TaskCopied(file=file, state=state):
+            # Keep the request until the copy is loaded.
+            studio = with_edits(
+                studio,
+                copied=file,
+                shown=replace(state, request=studio.edits.shown.request),
+                just_copied="" if file is None else f"This is your copy of the task, {file}.",
+                done=studio.edits.done if file is None else (),  # those edits are in the original file
             )
-        else:
-            edit = _own_edit(task, texts, info, request, run)
-        blocked = next(filter(None, (why_not_writable(change.file) for change in edit.changes)), None)
-        if blocked is not None:
-            raise RefusedEdit(blocked, text)
-    except RefusedEdit as refused:
-        can_copy = not owner_text and _can_be_copied(task)
-        advice = (
-            " You can copy the text below into the file yourself." if refused.snippet and not can_copy else ""
-        )
-        if owner_text and info is not None and (not task.source_files or _is_robot_camera(info)):
-            advice = " The text below is for a subclass of your own."
-        message = f"Not written: {refused.reason}.{advice}"
-        return EditState("refused", request, None, refused.snippet, message, can_copy)
-    message = f"{change_text(request, PLANNED, edit.names)} Nothing is written yet."
-    return EditState("planned", request, edit, message=message)
+            return _ended(studio, run)
+        case EditFailed(error=error):
+            problem = (
+                f"A bug of the workbench ended the edit ({error}). Check the file; the Log has the traceback."
+            )
+            return _ended(replace(studio, problem=problem), run)
+        case StudioClosed():
+            return with_edits(studio, closed=True, waiting=()), []
+    return studio, []
 
 
-def _owner_text(task: TaskDescription, info: CameraInfo) -> str:
-    """Reason why neither the task's file nor a copy of it contains this camera; empty if one of the two may
-    contain it."""
-    own = {Path(file).resolve() for file in (task.file, *task.source_files) if file is not None}
-    if info.site is None or Path(info.site.file).resolve() in own:
-        return ""
-    owner = info.site.function.rpartition(".")[0] or "another file"
-    made = "the robot makes it, in" if _is_robot_camera(info) else "it is made by"
-    return f"{info.name} is not the task's own: {made} {owner} ({info.site.file}, line {info.site.line})"
+def _is_stale(studio: Studio, request: EditRequest | None) -> bool:
+    """Whether the camera was moved since its change was planned."""
+    if request is None or request.what == "add":
+        return False
+    now = studio.placements.now(request.key)
+    return now is not None and now != request.settings
 
 
-def _is_robot_camera(info: CameraInfo) -> bool:
-    return info.site is not None and info.site.function.rpartition(".")[2] == "_sensor_configs"
+def _ask(studio: Studio, asked: EditAsked, run: Run) -> Change:
+    """Queue an edit behind those that were requested earlier."""
+    if studio.edits.closed:
+        return studio, []
+    studio = with_edits(
+        studio,
+        waiting=(*studio.edits.waiting, asked),
+        shown=replace(studio.edits.shown, drawing=False),
+    )
+    studio, effects = _go_on(studio, run)
+    return studio, [_STOP_DRAWING, *effects]
 
 
-def _override_edit(
-    task: TaskDescription,
-    texts: dict[str, str],
-    info: CameraInfo,
-    request: EditRequest,
-    owner_text: str,
-    run: RunHooks,
-) -> SourceEdit:
-    """The edit that adds a hook to the task's own class to replace an inherited camera. If the edit is
-    refused, the RefusedEdit has the hook as snippet, if there is one."""
-    if request.settings is None or request.what == "remove":
-        raise RefusedEdit(owner_text)
-    (kind, _), (_, uid), site = request.key, request.result, info.site
-    assert site is not None
-    link = (info.mount or "").partition("/")[2]
-    robot = "self.robot" if _is_robot_camera(info) else "self.agent.robot"
-    more = [f'mount={robot}.links_map["{link}"]'] if link else []
-    if site.function.rpartition(".")[2] not in HOOK_OF.values():
-        raise RefusedEdit(owner_text, snippet(uid, request.settings, more=more))
-    whole = members.override_text(kind, uid, request.settings, task.parse_cameras, more)
-    if request.what != "edit" or task.file is None or task.file not in texts:
-        raise RefusedEdit(owner_text, whole)
-    if info.varies:
-        reason = (
-            f"{owner_text}; the task's own code also moves the camera, so one pose in the file would not "
-            "place it"
-        )
-        raise RefusedEdit(reason, whole)
-    return members.plan_override(
-        texts, task.file, task.class_name, kind, uid, request.settings, site, run, task.parse_cameras, more
+def _ended(studio: Studio, run: Run) -> Change:
+    """Handle the end of the current edit."""
+    return _go_on(with_edits(studio, busy=False), run)
+
+
+def _go_on(studio: Studio, run: Run) -> Change:
+    """Start the next edit, unless one is in progress."""
+    effects: list[StudioEffect] = []
+    while studio.edits.waiting and not studio.edits.busy:
+        first, *rest = studio.edits.waiting
+        studio, begun = _begin(with_edits(studio, waiting=tuple(rest)), first, run)
+        effects += begun
+    return studio, effects
+
+
+def _begin(studio: Studio, asked: EditAsked, run: Run) -> Change:
+    shown, task = studio.edits.shown, run.task
+    match asked:
+        case EditWanted(request=request) if task is not None:
+            left = shown.request if shown.stage == "planned" else None
+            # Clear the result of the previous request, but keep a written edit while its version is loading.
+            shown = shown if shown.loading else EditState(request=request)
+            find = FindPlan(request, task, info_of(run, request.key), run.running_load())
+            return with_edits(studio, shown=shown, left=left, busy=True), [find]
+        case SaveCameraChange() if shown.edit is not None and shown.stage == "planned":
+            return _change_file(studio, shown.edit, "written", "Saved to {file}; loading it.")
+        case RevertCameraChange() if shown.edit is not None and shown.stage in IN_FILE:
+            return _change_file(studio, shown.edit, "undone", "Edit reverted in {file}; loading it.")
+        case CopyTask() if task is not None and shown.can_copy:
+            return with_edits(studio, busy=True), [CopyToFolder(task, studio.edits.folder)]
+    return studio, []
+
+
+def _change_file(studio: Studio, edit: SourceEdit, stage: EditStage, message: str) -> Change:
+    edits = studio.edits
+    # Before the file is written: the version with the edit may be loaded before the write is reported as done.
+    studio = _with_stage(studio, message.format(file=edit.names), stage, loading=True)
+    done = edits.done[:-1] if stage == "undone" else (*edits.done, studio.edits.shown)
+    studio = with_edits(studio, done=done, before=(edits.shown, edits.done), busy=True)
+    return studio, [ChangeFile(edit, revert=stage == "undone")]
+
+
+def _plan_found(studio: Studio, found: PlanFound, run: Run) -> Change:
+    request, left, first = found.request, studio.edits.left, studio.edits.just_copied
+    if left is not None and (left.what, left.key) != (request.what, request.key):
+        first = change_text(left, LEFT)
+    drawing = found.state.stage == "planned" and request.what == "add"
+    message = f"{first} {found.state.message}".strip()
+    shown = replace(found.state, message=message, drawing=drawing)
+    studio, effects = _ended(with_edits(studio, shown=shown, just_copied=""), run)
+    if not drawing or request.settings is None:
+        return studio, effects
+    moment, settings = run.shown_moment(), request.settings
+    scale = min(1.0, _PREVIEW_PIXELS / min(settings.width, settings.height))
+    question = DrawCamera(request.key, settings, moment.env, poses=moment.of(moment.env), scale=scale)
+    return studio, [DrawNewCamera(request, question), *effects]
+
+
+def _drop(studio: Studio, run: Run) -> Change:
+    """Drop the plan and show the newest written edit again; if one is shown already, drop all of them."""
+    done = () if studio.edits.shown.stage in IN_FILE else studio.edits.done
+    shown = done[-1] if done else EditState()
+    studio = with_edits(studio, done=done, shown=shown, copied=None, just_copied="")
+    if run.task is not None:
+        studio, _ = edit_loaded(studio, run.task)  # the version with that edit may have loaded meanwhile
+    return studio, [_STOP_DRAWING]
+
+
+def edit_loaded(studio: Studio, task: TaskDescription) -> tuple[Studio, frozenset[CameraKey]]:
+    """Compare the running version with the written or reverted edit.
+
+    Returns:
+        The studio, and the cameras that the edit changed; none if this is not the version after the edit.
+    """
+    request, edit = studio.edits.shown.request, studio.edits.shown.edit
+    if request is None or edit is None or not _is_in(studio.edits, task, edit):
+        return studio, frozenset()
+    changed = frozenset({request.key, request.result})
+    infos = {info.key: info for info in task.cameras}
+    had = infos.get(request.key)
+    studio, went_back = _with_placements(studio, request, None if had is None else had.settings)
+    done = studio.edits.done
+    if studio.edits.shown.stage == "undone":
+        back = f" {request.key[1]} is where the file places it; Undo restores your placement."
+        message = f"Edit reverted in {edit.names}.{back if went_back else ''}"
+        if not done:
+            return _with_stage(studio, message, "undone"), changed
+        # Show the previous edit, which can be reverted next.
+        shown = replace(done[-1], message=f"{message} The edit before it: {done[-1].message}")
+        return with_edits(studio, shown=shown), changed
+    if wrong := mismatch(request, infos, edit.settings):
+        more = "Revert the change, or look for what else in the task places this camera."
+        studio = _with_stage(studio, f"{wrong} {more}", "mismatch")
+    else:
+        studio = _with_stage(studio, change_text(request, DONE, edit.names), "checked")
+    return with_edits(studio, done=(*done[:-1], studio.edits.shown)), changed
+
+
+def _is_in(edits: Edits, task: TaskDescription, edit: SourceEdit) -> bool:
+    """Whether this is the expected version: with a written edit, or without a reverted one."""
+    written = edits.shown.stage == "written"
+    return edits.shown.loading and all(
+        task.source.get(change.file) == plain_line_ends(change.new_text if written else change.old_text)
+        for change in edit.changes
     )
 
 
-def _can_be_copied(task: TaskDescription) -> bool:
-    """Whether the task consists of one file that must not be edited."""
-    if task.file is None or len(task.source_files) > 1:
-        return False
-    return not task.source_files or why_not_writable(task.file) is not None
+def plan_in_copy(studio: Studio, run: Run) -> Change:
+    """Plan the refused request in the copy of the task, if this is the copy."""
+    edits = studio.edits
+    if edits.copied is None or run.task is None or run.task.file != str(edits.copied):
+        return studio, []
+    studio, request = with_edits(studio, copied=None), edits.shown.request
+    return (studio, []) if request is None else _ask(studio, EditWanted(request), run)
 
 
-def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, EditState]:
-    """Copy the task's file into a folder; returns the copy (None on failure) and the new state."""
-    if task.file is None:
-        return None, EditState("refused", message="Not copied: the task has no file.")
-    try:
-        made = copy_task(Path(task.file), folder)
-    except CannotCopy as reason:
-        return None, EditState("refused", message=f"Not copied: {reason}.")
-    named = ", ".join(f"{new} for {old}" for old, new in made.ids)
-    ids = f" It registers {named}." if named else ""
-    return made.file, EditState(message=f"The task was copied to {made.file}; opening it.{ids}")
+def _with_placements(
+    studio: Studio, request: EditRequest, in_file: CameraSettings | None
+) -> tuple[Studio, bool]:
+    """Update the placements after an edit was written or reverted, and keep those that are not in the file.
 
+    Args:
+        in_file: the camera's settings in the loaded version; None if there is no such camera.
 
-def _own_edit(
-    task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, request: EditRequest, run: RunHooks
-) -> SourceEdit:
-    kind, uid = request.key
-    if request.what == "add":
-        assert request.settings is not None
-        file = task.file or task.source_files[0]
-        return members.plan_add(texts, file, task.class_name, request.key, request.settings, run)
-    if info is None or info.settings is None:
-        raise RefusedEdit(f"the settings of the {kind} camera {uid!r} are not known")
-    if request.what == "remove":
-        return members.plan_remove(texts, request.key, run)
+    Returns:
+        The studio, and whether the camera moved from its placement to the file's pose.
+    """
+    key, went_back = request.key, False
+    placements, removed = studio.placements, dict(studio.edits.removed)
+    undone = studio.edits.shown.stage == "undone"
+    now, placed = placements.now(key), placements.placed.get(key)
     if request.what == "rename":
-        return members.plan_rename(texts, request.key, request.name, info.settings, run)
-    if request.what == "duplicate":
-        return members.plan_duplicate(texts, request.key, request.name, info.settings, run)
-    assert request.settings is not None
-    if info.varies:
-        raise RefusedEdit(
-            f"the task's own code moves {uid!r} (it is randomised, or moved after it was made), so one pose in the "
-            "file would not place it",
-            snippet(uid, request.settings),
-        )
-    return plan_edit(texts, request.key, info.settings, request.settings, run)
+        placements = placements.rename(*((request.result, key) if undone else (key, request.result)))
+    elif request.what == "duplicate" and not undone and placed is not None:
+        placements = placements.with_placed(request.result, placed)
+    elif request.what == "edit" and request.settings is not None:
+        if undone and in_file is not None:
+            back = placements.edit_undone(key, request.settings, in_file)
+            went_back, placements = back is not None, back or placements
+        elif not undone and now is not None and not differences(now, request.settings):
+            placements = placements.without(key)  # the file now has it, up to rounding
+    elif request.what == "remove":
+        if not undone and placed is not None:
+            removed[key] = placed
+        elif undone and key in removed:
+            placements = placements.with_placed(key, removed.pop(key))
+    studio = with_edits(replace(studio, placements=placements), removed=removed)
+    if not undone and request.what in ("add", "duplicate", "rename"):
+        studio = replace(studio, selected=request.result)
+    return studio, went_back
 
 
-def _texts(task: TaskDescription) -> dict[str, str]:
-    """The author's files on disk, with their own line endings. Raises RefusedEdit."""
-    texts: dict[str, str] = {}
-    for path in task.source_files:
-        try:
-            texts[path] = read_exactly(path)[1]
-        except (OSError, SyntaxError) as error:
-            reason = error.msg if isinstance(error, SyntaxError) else error.strerror
-            raise RefusedEdit(f"{path} cannot be read: {reason}") from error
-    return texts
+def edit_failed_to_load(studio: Studio) -> Studio:
+    """Handle a version that failed to load."""
+    edits = studio.edits
+    if edits.copied is not None:
+        why = f"{edits.copied} was made, but does not load: fix or delete it."
+        studio = with_edits(studio, shown=EditState("refused", edits.shown.request, message=why))
+    shown = studio.edits.shown
+    if not shown.loading or shown.edit is None:
+        return studio
+    undone = shown.stage == "undone"
+    hint = "the camera's change is in it; revert the change if it is the cause"
+    if undone:
+        hint = "the camera's change was reverted, so something else is the cause"
+    does = "does" if len(shown.edit.changes) == 1 else "do"
+    message = f"{shown.edit.names} {does} not load: {hint}."
+    return _with_stage(studio, message, shown.stage, loading=not undone)
+
+
+def _with_stage(studio: Studio, message: str, stage: EditStage, loading: bool = False) -> Studio:
+    shown = replace(studio.edits.shown, stage=stage, message=message, snippet="", loading=loading)
+    return with_edits(studio, shown=shown)
 
 
 def mismatch(

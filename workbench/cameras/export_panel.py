@@ -29,7 +29,7 @@ from workbench.live.view import SessionView
 from workbench.page.command import Command, Refused
 from workbench.page.widgets.fields import Field, choice
 from workbench.page.widgets.parts import PagePart
-from workbench.page.widgets.templates import render
+from workbench.page.widgets.templates import render, sentence
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Visitor
 from workbench.pictures import camera_conventions as frames
@@ -154,7 +154,7 @@ class CameraExport(PagePart[SessionView]):
         try:
             text = calibration_text(cameras, self._form)
         except ValueError as reason:
-            raise Refused(str(reason)) from None
+            raise Refused(sentence(str(reason))) from None
         name = file_name("cameras" if self._every else camera.key[1], self._form)
         client.send_file_download(name, text.encode("utf-8"), save_immediately=True)
 
@@ -165,7 +165,7 @@ class CameraExport(PagePart[SessionView]):
         try:
             pose = calibrated_pose(camera, self._text, self._direction, self._convention, UNITS[self._units])
         except ValueError as reason:
-            raise Refused(str(reason)) from None
+            raise Refused(sentence(str(reason))) from None
         self._session.happen(CameraPlaced(camera.key, frames.with_pose(now, pose)))
         client.add_notification(
             "Placed",

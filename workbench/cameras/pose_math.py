@@ -16,6 +16,7 @@ from workbench.cameras.view import StudioCamera, StudioView
 from workbench.envs.camera_data import CameraKey, CameraSettings
 from workbench.live.session_protocol import LiveSession
 from workbench.page.command import Refused
+from workbench.page.widgets.templates import sentence
 from workbench.pictures.camera_conventions import (
     LookAt,
     axes_of,
@@ -243,7 +244,7 @@ class Placing:
         try:
             changed = change(now, frame)
         except ValueError as error:
-            raise Refused(str(error)) from None
+            raise Refused(sentence(str(error))) from None
         self.place(camera.key, changed, control)
 
 

@@ -23,7 +23,7 @@ EditStage = Literal["none", "planned", "refused", "written", "checked", "mismatc
 edit. ``mismatch``: it does not. ``undone``: reverted in the file."""
 
 
-Change = Literal["edit", "add", "duplicate", "rename", "remove"]
+EditKind = Literal["edit", "add", "duplicate", "rename", "remove"]
 """Kind of change to a camera in the file."""
 
 
@@ -31,7 +31,7 @@ Change = Literal["edit", "add", "duplicate", "rename", "remove"]
 class EditRequest:
     """A requested change of a camera in the file."""
 
-    what: Change
+    what: EditKind
     key: CameraKey
     """The camera that is changed, copied, renamed, removed or added."""
     settings: CameraSettings | None = None
@@ -85,7 +85,7 @@ class EditState:
     """Whether the edit was written or reverted and the changed file is not loaded yet."""
 
     @property
-    def what(self) -> Change:
+    def what(self) -> EditKind:
         return "edit" if self.request is None else self.request.what
 
 

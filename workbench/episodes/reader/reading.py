@@ -184,7 +184,7 @@ def recover_confined(folder: Path) -> tuple[Path, ...]:
     try:
         answer = reader.ask(Recover(folder.absolute()), RECOVERY_SECONDS).answer
     except OSError as error:
-        raise RecordingError(f"{failed}it {error}") from error
+        raise RecordingError(f"{failed}{error}") from error
     finally:
         reader.close()
     if isinstance(answer, Recovered):
