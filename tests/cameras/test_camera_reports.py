@@ -251,6 +251,7 @@ def test_a_typed_name_is_used_once(panels: Panels) -> None:
     for name, button, why_not in (
         ("", "Rename", "Type a new name"),
         ("a b", "Duplicate", "has letters"),
+        ("a-b", "Duplicate", "has letters"),
         (key[1], "Rename", "already"),
     ):
         panels.type("New name", name)
