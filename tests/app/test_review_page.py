@@ -18,7 +18,7 @@ from tests.drive.reviewed import Reviewed, review_of
 from tests.drive.waiting import until
 from tests.episodes.sweep_files import sweep_folder
 from workbench.episodes.columns import TextEntry
-from workbench.live.commands import TogglePlay
+from workbench.live.commands import SelectBody, TogglePlay
 from workbench.live.timeline_commands import Seek
 from workbench.page.command import Command
 from workbench.page.door.gated_server import GatedServer
@@ -131,6 +131,20 @@ def test_an_opened_recording_fills_every_part(shown: Reviewed) -> None:
     assert abs(int(np.asarray(image.image).mean()) - 140) <= 3
     assert shown.shows(GO_LIVE) and not shown.shows("Layout")
     assert "open two" in shown.part("Compare").html().lower()
+
+
+def test_the_pressed_body_is_marked_and_its_pose_is_that_of_the_shown_step(shown: Reviewed) -> None:
+    shown.open(1)
+    shown.seek(0)
+    shown.do(SelectBody(body="cube"))
+    shown.draw()
+    assert "cube" in shown.part("Review").html("wb-body") and shown.nodes("/selected_body/box")
+    before = shown.part("Review").html("wb-body")
+    shown.seek(5)
+    assert shown.part("Review").html("wb-body") != before
+    shown.do(SelectBody(body=""))
+    shown.draw()
+    assert shown.part("Review").html("wb-body") == "" and shown.nodes("/selected_body/box") == []
 
 
 def test_two_recordings_are_compared_and_aligned(shown: Reviewed, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,7 @@ def test_planning_rules_are_off_by_default() -> None:
     assert degree_of_each(ignore=["reward-flat"], solve=True)["reward-flat"] == "off"
     counted = [count_rules(degrees_of_request(CheckOptions("x", solve=solve))) for solve in (False, True)]
     assert counted[1] - counted[0] == len(SOLVE_RULES)
-    with pytest.raises(ValueError, match="--solve checks"):
+    with pytest.raises(ValueError, match="use --solve"):
         degrees_of_request(CheckOptions("x", actions="solve"))
 
 

@@ -167,11 +167,11 @@ def test_rows_of_other_versions_are_marked_as_soon_as_the_open_version_changes(
     open_version = OpenVersion(*recorded)
     panel = LibraryPanel(panels.server, library, lambda ids: None, lambda: open_version)
     panel.draw()
-    assert "another version" not in panels.html("wb-library")
+    assert "another version of its source" not in panels.html("wb-library")
     open_version = OpenVersion(recorded[0], "edited")
     clock.passes()
     panel.draw()
-    assert panels.html("wb-library").count("another version") == ROWS_PER_PAGE
+    assert panels.html("wb-library").count("another version of its source") == ROWS_PER_PAGE
 
 
 def test_a_new_search_filter_or_order_starts_on_the_first_page(table: Table) -> None:

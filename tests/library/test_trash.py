@@ -112,7 +112,7 @@ def test_whatever_call_fails_no_recording_is_split_over_two_places(tmp_path: Pat
         for paths in both:
             moved = [path for path in paths if not path.exists()]
             if len(moved) not in (0, len(paths)):
-                assert then and all(f"{path} is {folder / TRASH}" in problem for path in moved), (
+                assert then and all(f"{path} is now at {folder / TRASH}" in problem for path in moved), (
                     call,
                     problem,
                 )

@@ -56,6 +56,7 @@ from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Done, Visitor
 from workbench.rescore.recording_jobs import Rescorer
 from workbench.rescore.recordings_panel import RescoreChoices, RescorePanel
+from workbench.review.body_panel import ReviewBodyPanel
 from workbench.review.commands import ChoosePlaybackSpeed, RescoreChosen
 from workbench.review.compare_panel import ReviewComparePanel
 from workbench.review.curves_panel import ReviewCurves, ReviewNumbers
@@ -164,7 +165,7 @@ class ReviewPage:
         review_tab, in_tabs = self._add_tabs(dark)
         self._timeline = ReviewTimeline(server, review)
         icons = ViewIcons(server, shared.stage.choice)
-        self._in_3d = ReviewIn3D(server, review, shared.stage)
+        self._in_3d = ReviewIn3D(server, review, shared.stage, self._body.select)
         self._parts = Parts((self._panel, self._timeline, icons, *in_tabs, self._opening), clock)
         if self._sweep is not None:
             self._parts.add(self._sweep)
@@ -184,6 +185,7 @@ class ReviewPage:
         tabs = server.gui.add_tab_group()
         review_tab = tabs.add_tab("Review", viser.Icon.PLAYER_PLAY)
         with review_tab:
+            self._body = ReviewBodyPanel(server)
             self._panel = ReviewPanel(server, review, go_live.go, go_live.going)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras_note = server.gui.add_html("")
@@ -210,6 +212,7 @@ class ReviewPage:
             going = GoLivePart(server, go_live)
             self._view_panel = ViewPanel(server, dark, shared.stage.choice)
         return review_tab, [
+            self._body,
             numbers,
             curves,
             compare,
@@ -319,7 +322,7 @@ class ReviewPage:
         chosen = view.chosen
         cameras = () if chosen is None else self._reader.cameras(chosen.episode)
         pictures = self._pictures if self._shared.stage.choice.frustums else {}
-        self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures)
+        self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures, self._body.body)
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
         """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -17,6 +17,7 @@ from workbench.episodes.episode import CameraTrack
 from workbench.machine.loop import post
 from workbench.page.command import Refused
 from workbench.page.scene.bodies import DrawStyle
+from workbench.page.scene.body_pick import BodyMark, body_under_ray
 from workbench.page.scene.env_grid import (
     EnvLayout,
     SelectionMark,
@@ -184,12 +185,15 @@ class ReviewIn3D:
         server: The page.
         review: The review of the page; a click in the view selects one of its recordings.
         stage: The 3-D view.
+        on_body: Called with the name of the body that was clicked; empty for none.
     """
 
-    def __init__(self, server: viser.ViserServer, review: Review, stage: View3D) -> None:
-        self._review = review
+    def __init__(
+        self, server: viser.ViserServer, review: Review, stage: View3D, on_body: Callable[[str], None]
+    ) -> None:
+        self._review, self._on_body = review, on_body
         self.bodies, self._framing, self._in_software = stage.scene, stage.framing, stage.in_software
-        self._mark = SelectionMark(server)
+        self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
         self._names = [view_label(server, f"/names {index}", "top-center") for index in range(MAX_NAMED)]
         self._frustums = CameraFrustums(server)
         self._scene: ReviewScene | None = None
@@ -208,6 +212,7 @@ class ReviewIn3D:
         looks: DrawStyle,
         cameras: tuple[CameraInfo, ...],
         pictures: dict[CameraKey, Picture],
+        body: str,
     ) -> None:
         """Draw the present states.
 
@@ -216,6 +221,7 @@ class ReviewIn3D:
             looks: Style of the bodies.
             cameras: Cameras of the selected recording.
             pictures: Pictures to draw in the frustums of the cameras.
+            body: Name of the selected body; empty for none.
         """
         wanted = (view.opened_serial, ghosts, len(view.opened))
         if wanted != self._scene_of:
@@ -230,8 +236,11 @@ class ReviewIn3D:
         if self._looks != looks:
             self._looks = looks
             self.bodies.build(scene.geometry, scene.layout, scene.poses(view.states), None, looks)
-        self.bodies.move(scene.poses(view.states), scene.layout, None)
+        poses = scene.poses(view.states)
+        self.bodies.move(poses, scene.layout, None)
         in_grid = len(view.opened) > 1 and not scene.ghosts
+        index = solid_recording(view, scene)
+        self._body_mark.draw(scene.geometry, poses, index, body, scene.layout.offsets[index])
         self._mark.draw(scene.layout, view.selected, shown=in_grid, name=caption(view, view.selected))
         self._draw_names(view, scene if in_grid else None)
         self._draw_frustums(view, scene, cameras, pictures)
@@ -246,6 +255,7 @@ class ReviewIn3D:
     def _draw_nothing(self, view: ReviewView) -> None:
         self.bodies.clear()
         self._mark.clear()
+        self._body_mark.clear()
         self._frustums.clear()
         self._draw_names(view, None)
         self._framing.is_new(None)
@@ -301,12 +311,24 @@ class ReviewIn3D:
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         scene, view = self._scene, self._view
-        if scene is None or scene.ghosts or len(view.opened) < 2:
+        if scene is None:
             return
-        index = env_under_ray(scene.layout, np.array(event.ray_origin), np.array(event.ray_direction))
-        if index is not None:
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        index: int | None = solid_recording(view, scene)
+        if not scene.ghosts and len(view.opened) > 1:
+            index = env_under_ray(scene.layout, origin, direction)
+            if index is None or index >= len(view.opened):
+                return
             with suppress(Refused):  # the recording was closed after the view was drawn
                 self._review.do(SelectRecording(id=view.opened[index].id))
+        poses = scene.poses(view.states)
+        body = body_under_ray(scene.geometry, poses, index, origin - scene.layout.offsets[index], direction)
+        self._on_body("" if body is None else scene.geometry.body_names[body])
+
+
+def solid_recording(view: ReviewView, scene: ReviewScene) -> int:
+    """Index of the recording whose bodies are selected: of overlaid ones the first, since the others are ghosts."""
+    return 0 if scene.ghosts else view.selected
 
 
 def human_camera(view: ReviewView) -> CameraTrack | None:

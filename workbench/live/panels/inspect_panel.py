@@ -346,8 +346,7 @@ def body_html(body: str, view: SessionView, now: Inspection | None) -> str:
     return render(
         "inspect_body",
         name=body,
-        kind=geometry.body_kinds[row],
-        env=env,
+        about=f"{geometry.body_kinds[row]}, env {env}",
         pose=poses[0] if poses else None,
         contacts=contacts,
         clear=SelectBody(body=""),

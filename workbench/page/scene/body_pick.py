@@ -99,9 +99,13 @@ class BodyMark:
         if (of := (id(geometry), env, body)) != self._box_of:
             self._box_of, self._box = of, None if body < 0 else box_of_body(geometry, env, body)
         if body < 0 or self._box is None or not np.isfinite(pose).all():
-            self._edges.draw()
-            self._label.draw()
+            self.clear()
             return
         corners = SO3(pose[3:]).apply(box_corners(*self._box)) + pose[:3] + offset
         self._edges.draw(corners[_EDGES].astype(np.float32))
         self._label.draw(name, corners[corners[:, 2].argmax()])
+
+    def clear(self) -> None:
+        """Mark no body."""
+        self._edges.draw()
+        self._label.draw()
