@@ -130,6 +130,22 @@ def test_a_recording_opens_from_the_library_and_keys_step_through_it(desk: tuple
     assert [e for e in errors if LATE_UPDATE_ERROR not in e] == []
 
 
+def test_a_click_on_a_body_shows_its_pose_until_that_is_closed(
+    desk: tuple[Page, list[str]],
+) -> None:
+    page, errors = desk
+    page.get_by_role("tab", name="Review").click()
+    body = page.locator(".wb-body")
+    expect(body).to_have_count(0)
+    view = page.locator("canvas[data-engine]").bounding_box()
+    assert view is not None
+    page.mouse.click(view["x"] + view["width"] / 2, view["y"] + view["height"] / 2)
+    expect(body).to_contain_text("pose")
+    body.get_by_text("✕").click()
+    expect(body).to_have_count(0)
+    assert [e for e in errors if LATE_UPDATE_ERROR not in e] == []
+
+
 def test_two_recordings_are_compared_and_their_first_difference_shown(desk: tuple[Page, list[str]]) -> None:
     page, errors = desk
     open_both(page)
