@@ -136,7 +136,7 @@ def test_success_that_does_not_stay_is_lost() -> None:
     blinking.success[16] = False
     (verdict,) = of_episodes([blinking, blinking, rises(0)])
     assert (verdict.rule, verdict.seeds) == ("success-lost", (6, 6))
-    assert "at step 15 and not 2 steps later" in verdict.message
+    assert "at step 15 and lost success 2 steps later" in verdict.message
     assert rules(blinking, rises(0)) == []
 
 

@@ -162,7 +162,7 @@ def test_only_the_part_of_a_long_record_around_the_shown_moment_is_drawn() -> No
 
 @pytest.mark.parametrize(
     ("metres", "radians", "says", "far"),
-    [(0.0, 0.0, "to the last bit", False), (4e-4, 1e-4, "0.4 mm", False), (0.032, 0.0, "3.2 cm", True)]
+    [(0.0, 0.0, "exactly where it was recorded", False), (4e-4, 1e-4, "0.4 mm", False), (0.032, 0.0, "3.2 cm", True)]
     + [(0.0, 0.2, "11°", True), (float("inf"), 0.0, "infinite", True)],
 )  # fmt: skip
 def test_drift_is_reported_and_large_drift_raises_doubt(

@@ -55,7 +55,9 @@ def test_all_verdicts_are_summarised_in_one_sentence() -> None:
     )
     assert verdict_text.summary(many[:1]).startswith("Nothing differs in 1 episode:")
     assert verdict_text.summary(many[2:]) == "No episode could be rescored."
-    assert "to the last bit" in verdict_text.drift_summary(many) and not verdict_text.count_drifted(many)
+    assert "exactly where it was recorded" in verdict_text.drift_summary(
+        many
+    ) and not verdict_text.count_drifted(many)
     assert verdict_text.drift_summary([verdict(metres=None)]) == ""
     summary = verdict_text.drift_summary([verdict(metres=0.032)], verdict_text.PUT_IN)
     assert "3.2 cm" in summary and "furthest in push_a" in summary and summary.endswith(verdict_text.PUT_IN)

@@ -133,7 +133,7 @@ def test_a_solved_episode_can_be_saved_but_not_while_playing(solve: Solve) -> No
     assert solve.live.asked == [SaveSolved()]
     part = solve.live.part("Solve")
     solve.draw(recording=RecordingStatus(saving=SaveStatus(progress=JobProgress("rendering it again", 2, 8))))
-    assert "2 of 8 moments" in part.html() and part.button(SAVE_SOLVED).command is None
+    assert "2 of 8" in part.html() and part.button(SAVE_SOLVED).command is None
     solve.draw(recording=RecordingStatus(saving=SaveStatus("saved 1 episode, 7 steps")))
     assert "saved 1 episode, 7 steps" in part.html() and part.button(SAVE_SOLVED).command is not None
     solve.draw(replace(SOLVED, solved=()))

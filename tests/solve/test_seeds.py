@@ -80,7 +80,7 @@ def test_a_task_that_fails_is_reported_with_its_line(child_process: None, tmp_pa
 def test_a_task_named_by_a_recording_is_not_run_from_disk(tmp_path: Path) -> None:
     with solving(RecordedTask("PushCube-v1"), tmp_path / "recordings") as told:
         view = solve(told, 2)
-    assert view.state == "failed" and "open its file" in view.why
+    assert view.state == "failed" and "open the task's file" in view.why
 
 
 def test_solving_seeds_is_refused_without_a_task(fake: FakeWorkerSession) -> None:

@@ -30,7 +30,7 @@ def test_a_robot_file_opens_in_an_empty_scene_with_a_message(write: Write) -> No
     assert task.default_kwargs == {"robot_uids": "small_panda"}
     assert (task.file, task.followed) == (file, True)
     (notice,) = task.notices
-    assert "an agent, SmallPanda with the uid 'small_panda'" in notice
+    assert "SmallPanda, with the uid 'small_panda'" in notice
     assert (
         f"type in {file.parent}: workbench open PickCube-v1 --import arms --env robot_uids=small_panda"
         in notice

@@ -53,7 +53,8 @@ class ActionChooser:
         self._task_folder: Path | None = None
         self._rng = np.random.default_rng(0)
         self._sliders: NDArray[np.float32] | None = None
-        """(N, A) slider values, not read for joint targets (only for deltas, velocities); NaN without one."""
+        """(N, A) slider values; NaN where no slider was set. Used for deltas and velocities; joint targets come from
+            `_targets`."""
         self._targets: NDArray[np.float32] | None = None
         """(N, A) the last action of each env, or the slider value set after it, used for joint targets; NaN
         from a reset until the first action."""

@@ -62,6 +62,7 @@ from workbench.page.commands import (
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.body_pick import BodyMark, body_under_ray
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
+from workbench.page.scene.frames import Frames
 from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
@@ -201,7 +202,7 @@ class Page:
         self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
 
         self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
-        self._frustums = CameraFrustums(server)
+        self._frames, self._frustums = Frames(server), CameraFrustums(server)
         self._forces = ForceArrows(server)
         self._parts.add(TaskCommands(server, visitors))
         kinds = DOES | state.DOES | self._parts.does | also
@@ -445,7 +446,12 @@ class Page:
         placed = self._studio.draw_in_view(view, offset)
         self._frustums.draw(task.cameras, pictures, offset, SMALL_METRES if alone else LARGE_METRES, placed)
         self._forces.draw(self._inspect.forces(view), offset)
-        self._body_mark.draw(task.geometry, step.poses, env, self._inspect.body, offset)
+        selected = task.geometry, step.poses, env, self._inspect.body, offset
+        self._body_mark.draw(*selected)
+        if self._view_choice.frames:
+            self._frames.draw(*selected)
+        else:
+            self._frames.clear()
         self._solve.draw_in_view(view, offset)
         # A scene of another size is framed again; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()

@@ -237,7 +237,7 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
     """Handle a loaded version: update cameras and placements, and compare it with a written edit.
 
     Args:
-        scene_changed: whether the version changed more than the cameras, so that reports are outdated.
+        scene_changed: whether more than the cameras changed in this version, so that reports are outdated.
     """
     if run.task is None:
         return studio, []
@@ -263,7 +263,7 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
     if scene_changed:
         studio, stop = outdated(studio), [STOP_REPORTS]
     # Send dropped placements too: one may have been in transit to the worker during the load. Send edited
-    # cameras too: after a revert the version may count as the same, and the worker's camera would not move.
+    # cameras too: the reload after a revert may create no camera, so the worker's camera would stay where it is.
     to_send = dict.fromkeys((*placements.placed, *dropped, *sorted(own & in_file.keys())))
     studio, sent = _send(studio, *to_send)
     studio, planned = plan_in_copy(studio, run)

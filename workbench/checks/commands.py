@@ -1,4 +1,4 @@
-"""Commands of the Checks tab: check rules, time a step, solve seeds."""
+"""Commands of the Checks and Try tabs: check rules, time a step, solve seeds."""
 
 from __future__ import annotations
 

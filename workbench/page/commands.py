@@ -65,6 +65,12 @@ class FrameScene(Command, frozen=True):
     key = "f"
 
 
+class ShowFrames(Command, frozen=True):
+    """Show the frames of the env and of its objects: x red, y green, z blue."""
+
+    on: bool
+
+
 class ShowFrustums(Command, frozen=True):
     """Show or hide the camera frustums with their pictures in the 3D view."""
 

@@ -170,10 +170,10 @@ class ReviewCurves(PagePart[ReviewView]):
         """Draw the lines, reduced to their peaks if there are many positions.
 
         Args:
-            chosen: The line whose peaks are exact.
+            chosen: The line whose peaks are drawn exactly; other lines may be off by less than a span.
             at: The present position.
         """
-        # Put the chosen line first: the steps are those of the first line's peaks.
+        # Put the chosen line first: the x values are those of the first line's peaks.
         ordered = sorted(drawn, key=lambda line: line is not chosen)
         if not ordered:
             self._charts[chart].hide()

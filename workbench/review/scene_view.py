@@ -26,6 +26,7 @@ from workbench.page.scene.env_grid import (
     lay_out,
     view_label,
 )
+from workbench.page.scene.frames import Frames
 from workbench.page.scene.viewpoint import View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.templates import colour, letter
 from workbench.review.commands import SelectRecording
@@ -195,7 +196,8 @@ class ReviewIn3D:
         self.bodies, self._framing, self._in_software = stage.scene, stage.framing, stage.in_software
         self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
         self._names = [view_label(server, f"/names {index}", "top-center") for index in range(MAX_NAMED)]
-        self._frustums = CameraFrustums(server)
+        self._choice = stage.choice
+        self._frames, self._frustums = Frames(server), CameraFrustums(server)
         self._scene: ReviewScene | None = None
         self._view = ReviewView()
         """View that was drawn last. The review's present view may have other recordings."""
@@ -240,7 +242,12 @@ class ReviewIn3D:
         self.bodies.move(poses, scene.layout, None)
         in_grid = len(view.opened) > 1 and not scene.ghosts
         index = solid_recording(view, scene)
-        self._body_mark.draw(scene.geometry, poses, index, body, scene.layout.offsets[index])
+        selected = scene.geometry, poses, index, body, scene.layout.offsets[index]
+        self._body_mark.draw(*selected)
+        if self._choice.frames:
+            self._frames.draw(*selected)
+        else:
+            self._frames.clear()
         self._mark.draw(scene.layout, view.selected, shown=in_grid, name=caption(view, view.selected))
         self._draw_names(view, scene if in_grid else None)
         self._draw_frustums(view, scene, cameras, pictures)
@@ -256,6 +263,7 @@ class ReviewIn3D:
         self.bodies.clear()
         self._mark.clear()
         self._body_mark.clear()
+        self._frames.clear()
         self._frustums.clear()
         self._draw_names(view, None)
         self._framing.is_new(None)

@@ -1,4 +1,4 @@
-"""The folder *Solve many seeds* of the Checks tab: the result of planning from each seed, and verdicts on the reward."""
+"""The folder *Solve many seeds* of the Try tab: the result of planning from each seed, and verdicts on the reward."""
 
 from __future__ import annotations
 

@@ -67,10 +67,10 @@ class SolveView:
     plan_step: int = 0
     """Control step of the episode for which the plan was made, from 0."""
     predicted: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
-    """(T,) predicted reward per step of the best rollout, from each step of the episode on; NaN where nothing was planned."""
+    """(T,) For each step of the episode: mean reward per step over the horizon that begins there, as the best rollout
+    predicted it; NaN where nothing was planned."""
     achieved: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
-    """(T,) mean achieved reward per step over the horizon from each step on, or over the steps so far; NaN
-    for steps to come."""
+    """(T,) The same mean, as it was achieved; over the steps so far if the horizon is not over; NaN for steps to come."""
     begins: int = 0
     """Control step of the episode at which `predicted` and `achieved` begin."""
     solved_at: int = 0
@@ -334,7 +334,7 @@ class PlanJobs:
 
 
 def _curves(episode: RunningEpisode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Predicted and achieved reward per step, from each step of the episode on."""
+    """Predicted and achieved reward, as in `SolveView`."""
     rewards = np.array(episode.rewards, np.float32)
     count = max(len(rewards), max(episode.predicted, default=-1) + 1)
     predicted = np.full(count, np.nan, np.float32)

@@ -75,7 +75,8 @@ def looks_like_file(env_id: str) -> bool:
 
 
 def is_path(reference: str) -> bool:
-    """Whether `reference` has the form of a path, contains a slash and exists, or names a file in the current folder.
+    """Whether `reference` is a path: it has the form of one, or it contains a slash and exists, or it names a file
+    in the current folder.
 
     A folder in the current folder does not count: it may have the name of an env id.
     """

@@ -225,7 +225,7 @@ def test_a_viser_that_starts_its_server_differently_starts_no_server(monkeypatch
         worker(self, ready)
 
     monkeypatch.setattr(viser.infra._infra.WebsockServer, "_background_worker", as_a_later_viser_might)
-    with pytest.raises(ServerError, match="known way"):
+    with pytest.raises(ServerError, match="viser did not start its server"):
         open_server(ServerOptions(port=0))
 
 

@@ -13,7 +13,7 @@ from tests.drive.waiting import until
 from workbench.envs.camera_data import Picture
 from workbench.live.env_commands import ShowEnvs, ToggleOnlySelected
 from workbench.live.panels.view_panel import ViewIcons, ViewPanel
-from workbench.page.commands import ShowFrustums, ToggleTheme
+from workbench.page.commands import ShowFrames, ShowFrustums, ToggleTheme
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import lay_out
 from workbench.page.scene.viewpoint import (
@@ -148,3 +148,5 @@ def test_the_selected_env_or_all_envs_are_shown_as_chosen_for_the_task(panels: P
     assert icons.only_selected
     panels.ask(ShowFrustums(on=False))
     assert not choice.frustums
+    panels.ask(ShowFrames(on=True))
+    assert choice.frames

@@ -191,7 +191,8 @@ def _box(env: BaseEnv, begun: States) -> tuple[NDArray[np.float32], NDArray[np.f
 
 
 def _joints(articulation: Any, count: int, rng: np.random.Generator, at_limits: bool) -> NDArray[np.float32]:
-    """(N, 2 J) joint positions within the limits, and zero velocities. A joint without limits gets up to pi (rad or m)."""
+    """(N, 2 J) random joint positions within the limits (each at its lower or upper limit if `at_limits`), and zero
+    velocities. Missing limits, and limits beyond ±pi (rad or m), count as ±pi."""
     limits = np.array(articulation.get_qlimits().numpy(force=True), np.float32)
     low, high = np.clip(np.broadcast_to(limits, (count, *limits.shape[1:])), -np.pi, np.pi).transpose(2, 0, 1)
     share = rng.random(low.shape)

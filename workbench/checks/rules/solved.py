@@ -36,7 +36,7 @@ _MIN_SOLVED = {
 def reward_exploited(checkup: Checkup) -> Iterator[Found | Note]:
     """An episode without success earns less than a successful one.
 
-    A policy learns what pays as much, and never solves the task.
+    A policy learns something else that earns as much as success, and never solves the task.
 
     ## Why
     A policy maximises the reward as written, not as meant. If something else pays as much as success,

@@ -7,7 +7,14 @@ import viser
 from workbench.live.env_commands import NextEnv, PreviousEnv, ShowEnvs, ToggleOnlySelected
 from workbench.live.view import SessionView
 from workbench.page.command import Command
-from workbench.page.commands import ChooseDetail, ChooseTheme, FrameScene, ShowFrustums, ToggleTheme
+from workbench.page.commands import (
+    ChooseDetail,
+    ChooseTheme,
+    FrameScene,
+    ShowFrames,
+    ShowFrustums,
+    ToggleTheme,
+)
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.viewpoint import DETAILS, ViewChoice
 from workbench.page.widgets.fields import choice
@@ -31,7 +38,7 @@ class ViewIcons(PagePart[object]):
         task: key of the open task among the choices.
     """
 
-    does = (ShowEnvs, ToggleOnlySelected, ShowFrustums)
+    does = (ShowEnvs, ToggleOnlySelected, ShowFrames, ShowFrustums)
 
     def __init__(self, server: viser.ViserServer, choice: ViewChoice, task: str = "") -> None:
         self._choice, self._task = choice, task
@@ -61,7 +68,9 @@ class ViewIcons(PagePart[object]):
                 ("all", Tool("All envs", ShowEnvs(all_envs=True), with_key(ToggleOnlySelected), on=not one)),
             ]
         shown = Tool("Cameras", ShowFrustums(on=not cameras), ShowFrustums.help(), on=cameras)
-        icons += [("cameras", shown), ("home", tool("Frame the scene", FrameScene()))]
+        frames = self._choice.frames
+        axes = Tool("Frames", ShowFrames(on=not frames), ShowFrames.help(), on=frames)
+        icons += [("cameras", shown), ("frames", axes), ("home", tool("Frame the scene", FrameScene()))]
         env = f"env {view.selected_env}" if isinstance(view, SessionView) and several else ""
         self._html.content = render("toolbar", kind="view-icons", label="View", tools=icons, text=env)
 
@@ -75,6 +84,8 @@ class ViewIcons(PagePart[object]):
                 self._choice.all_envs ^= {self._task}
             case ShowFrustums(on=on):
                 self._choice.frustums = on
+            case ShowFrames(on=on):
+                self._choice.frames = on
 
 
 class ViewPanel(PagePart[object]):

@@ -269,6 +269,8 @@ class ViewChoice:
     """The tasks of which all envs are shown; of the others only the selected one."""
     frustums: bool = True
     """Whether the cameras are drawn in the view."""
+    frames: bool = False
+    """Whether the coordinate frames are drawn in the view."""
     detail: str = "normal"
     table: bool | None = None
     """Whether the table of envs is open; None before it was opened or closed."""
