@@ -12,7 +12,7 @@ import pytest
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from workbench.checks import run_rules as run
-from workbench.checks.evidence.checkup import Checkup
+from workbench.checks.evidence.collect import Checkup
 from workbench.checks.results import RuleResult, by_rule
 from workbench.checks.rule_table import RULES, gpu_rules_of
 from workbench.envs.gpu_rules import Finding

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.checks.checked import EXAMPLE, Checked, check_rules, results_of, the_finding
-from workbench.checks.evidence.checkup import Checkup
+from workbench.checks.evidence.collect import Checkup
 from workbench.checks.rule_table import RULES
 from workbench.task.load import load_task, undo_load
 

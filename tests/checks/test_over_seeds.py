@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from workbench.checks.evidence.checkup import Found, Note, NotKnown
+from workbench.checks.evidence.collect import Found, Note, NotKnown
 from workbench.checks.results import RuleResult, Seen
 from workbench.checks.run_rules import RULES_OVER_SEEDS, over_seeds, result_of
 from workbench.task.problem import Problem

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.checks.checked import EXAMPLE
-from workbench.checks.evidence.checkup import Checkup
+from workbench.checks.evidence.collect import Checkup
 from workbench.checks.evidence.time_step import StepProfile, profile_step
 from workbench.task.load import load_task, undo_load
 

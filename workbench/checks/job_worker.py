@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.actions.choose import STEPS_WITHOUT_LIMIT, RecordActionChooser, find_actions, plain_chooser
-from workbench.checks.evidence.checkup import CheckEnded, Checkup
+from workbench.checks.evidence.collect import CheckEnded, Checkup
 from workbench.checks.job_items import CheckedTask, CheckOptions, CheckUpdate, Item, ItemOutcome, plan_of
 from workbench.checks.rule_table import degree_of_each
 from workbench.checks.run_rules import GPU_SIMULATION, check_gpu_rules, check_rule, findings_of

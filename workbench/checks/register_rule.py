@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from workbench.checks.evidence.checkup import Check, Checkup, Found, Note
+from workbench.checks.evidence.collect import Check, Checkup, Found, Note
 from workbench.checks.evidence.over_seeds import OverSeeds
 from workbench.checks.results import Seen
 from workbench.envs.gpu_rules import DeclaredRule, Degree, declared_rule

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import workbench
-from workbench.checks.evidence.checkup import (
+from workbench.checks.evidence.collect import (
     Check,
     CheckEnded,
     Checkup,

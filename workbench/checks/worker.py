@@ -13,7 +13,7 @@ from workbench.task.description import TaskOptions
 from workbench.task.open import OpenedTask
 
 if TYPE_CHECKING:
-    from workbench.checks.evidence.checkup import Checkup
+    from workbench.checks.evidence.collect import Checkup
     from workbench.checks.results import RuleResult
     from workbench.task.load import LoadedTask
 
@@ -51,7 +51,7 @@ class WorkerChecks:
             CannotAnswer: another request came.
             TaskError: the task raised while a step was timed.
         """
-        from workbench.checks.evidence.checkup import CheckEnded
+        from workbench.checks.evidence.collect import CheckEnded
         from workbench.checks.evidence.time_step import profile_step
 
         checkup = self._checkup_of(opened, options)
@@ -106,7 +106,7 @@ class WorkerChecks:
         return CheckedGroup(len(groups), total, groups[following].name if following < len(groups) else "")
 
     def _checkup_of(self, opened: OpenedTask, options: TaskOptions) -> Checkup:
-        from workbench.checks.evidence.checkup import Checkup  # late: the worker that plays checks nothing
+        from workbench.checks.evidence.collect import Checkup  # late: the worker that plays checks nothing
 
         loaded = opened.loaded
         if self._checkup is None or self._of is not loaded:
@@ -124,7 +124,7 @@ class WorkerChecks:
         return self._checkup
 
     def _keep_going(self) -> None:
-        from workbench.checks.evidence.checkup import CheckEnded
+        from workbench.checks.evidence.collect import CheckEnded
 
         if self._waits():
             raise CheckEnded

@@ -12,7 +12,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import common
 from numpy.typing import NDArray
 
-from workbench.checks.evidence.checkup import Checkup, leaf_rows
+from workbench.checks.evidence.collect import Checkup, leaf_rows
 from workbench.envs import action_vector as actions
 from workbench.envs import maniskill_private
 from workbench.envs.evaluate_entries import split_entries

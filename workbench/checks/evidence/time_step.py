@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.checks.evidence.checkup import Checkup
+from workbench.checks.evidence.collect import Checkup
 from workbench.checks.results import HookTime, LineTime, StepProfile
 from workbench.envs import action_vector as actions
 from workbench.envs.task_env import TaskEnv

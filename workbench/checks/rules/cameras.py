@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.register_rule import rule
 from workbench.envs import maniskill_private
 from workbench.envs.broken_rule import Place

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note
 from workbench.checks.evidence.places import Module
 from workbench.checks.evidence.tensor_watch import TensorUses
 from workbench.checks.evidence.time_step import EVERY_STEP

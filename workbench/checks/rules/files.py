@@ -13,7 +13,7 @@ from typing import Any
 from mani_skill import ASSET_DIR
 from mani_skill.utils import assets
 
-from workbench.checks.evidence.checkup import Checkup, Found, Note
+from workbench.checks.evidence.collect import Checkup, Found, Note
 from workbench.checks.evidence.places import Module
 from workbench.checks.register_rule import rule
 from workbench.checks.rules.source import HOOKS

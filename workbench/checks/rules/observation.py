@@ -8,7 +8,7 @@ import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.odd_states import odd_states
 from workbench.checks.evidence.over_seeds import together, tried
 from workbench.checks.register_rule import outlier_check, rule

@@ -13,7 +13,7 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.utils.structs.link import Link
 from numpy.typing import NDArray
 
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.over_seeds import together, tried
 from workbench.checks.register_rule import rule
 from workbench.checks.results import Seen

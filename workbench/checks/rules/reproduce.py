@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.checks.evidence.builds import shapes_of_env
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown, read_obs
-from workbench.checks.evidence.random_calls import first_draw, global_draw, torch_draw
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note, NotKnown, read_obs
+from workbench.checks.evidence.random_draws import first_draw, global_draw, torch_draw
 from workbench.checks.evidence.time_step import EVERY_STEP
 from workbench.checks.register_rule import rule
 from workbench.envs.action_vector import random_action

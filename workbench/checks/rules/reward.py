@@ -9,10 +9,10 @@ import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
-from workbench.checks.evidence.episode_batches import Episodes
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, SHORT, OddStates, odd_states
 from workbench.checks.evidence.over_seeds import first_kind, tried
+from workbench.checks.evidence.rolled_episodes import Episodes
 from workbench.checks.register_rule import outlier_check, rule
 from workbench.checks.results import Seen
 from workbench.checks.rules.evaluate import flags

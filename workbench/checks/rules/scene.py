@@ -12,7 +12,7 @@ import numpy as np
 from mani_skill.utils.structs.actor import Actor
 
 from workbench.checks.evidence.builds import Built
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.meshes import is_hollow, triangles_in
 from workbench.checks.evidence.over_seeds import together, tried
 from workbench.checks.register_rule import rule

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.register_rule import rule
 from workbench.envs.task_env import TaskEnv, given_arguments
 from workbench.planning.planned_episodes import EpisodeLog, PlannedEpisode

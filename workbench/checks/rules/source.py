@@ -14,8 +14,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.building import ActorBuilder, ArticulationBuilder
 
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note
-from workbench.checks.evidence.random_calls import global_draw
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note
+from workbench.checks.evidence.random_draws import global_draw
 from workbench.checks.register_rule import rule
 from workbench.checks.rules.devices import EVERY_STEP
 from workbench.checks.rules.reward import REWARD_HOOKS

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note
-from workbench.checks.evidence.episode_batches import SeenOutlier
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note
 from workbench.checks.evidence.over_seeds import together, tried
+from workbench.checks.evidence.rolled_episodes import SeenOutlier
 from workbench.checks.register_rule import outlier_check
 from workbench.checks.results import Seen
 from workbench.checks.rules.placement import where_placed

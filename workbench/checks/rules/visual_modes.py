@@ -11,7 +11,7 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown, leaf_rows
+from workbench.checks.evidence.collect import Checkup, Found, NotApplicable, Note, NotKnown, leaf_rows
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, write_all
 from workbench.checks.register_rule import rule
 from workbench.checks.rules.observation import place_of_leaf

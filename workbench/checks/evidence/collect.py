@@ -23,8 +23,8 @@ from workbench.checks.evidence.builds import (
     noting_poses,
     shapes_of_env,
 )
-from workbench.checks.evidence.episode_batches import Actor, Episodes, SeenOutliers, joined, stacked
 from workbench.checks.evidence.places import Places
+from workbench.checks.evidence.rolled_episodes import Actor, Episodes, SeenOutliers, joined, stacked
 from workbench.checks.evidence.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
 from workbench.checks.results import Silenced
 from workbench.envs import action_vector as actions
