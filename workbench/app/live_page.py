@@ -50,7 +50,7 @@ from workbench.page.commands import (
     CloseDialog,
     CloseHints,
     FrameScene,
-    OpenFile,
+    OpenInEditor,
     ShowRecordings,
     ShowTab,
     TellDrawnInSoftware,
@@ -62,7 +62,7 @@ from workbench.page.commands import (
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.body_pick import BodyMark, body_under_ray
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
-from workbench.page.scene.frames import Frames
+from workbench.page.scene.frames import BodyFrames
 from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.editor_links import editor_link
 from workbench.page.widgets.fields import choice
@@ -93,7 +93,7 @@ DOES: frozenset[type[Command]] = frozenset(
         FrameScene,
         CloseHints,
         CloseDialog,
-        OpenFile,
+        OpenInEditor,
         *CamerasPanel.does,
     }
 )
@@ -202,7 +202,7 @@ class Page:
         self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
 
         self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
-        self._frames, self._frustums = Frames(server), CameraFrustums(server)
+        self._frames, self._frustums = BodyFrames(server), CameraFrustums(server)
         self._forces = ForceArrows(server)
         self._parts.add(TaskCommands(server, visitors))
         kinds = DOES | state.DOES | self._parts.does | also
@@ -337,7 +337,7 @@ class Page:
             case CloseHints():
                 self._hints.content = ""
                 self._choices.begin(close_hints)
-            case OpenFile(file=file):
+            case OpenInEditor(file=file):
                 self._open_file(file, visitor)
             case SelectCamera():
                 session.do(command, visitor.name)

@@ -16,7 +16,7 @@ from workbench.live.panels.timeline_panel import strip_curves
 from workbench.live.timeline_commands import ChooseStripCurve
 from workbench.live.view import SessionView
 from workbench.page.command import Command
-from workbench.page.commands import OpenFile, OpenHelp
+from workbench.page.commands import OpenHelp, OpenInEditor
 from workbench.page.widgets.keys_and_palette import add
 from workbench.page.widgets.parts import PagePart
 from workbench.page.widgets.visitors import Visitors
@@ -84,7 +84,7 @@ def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
         *((f"Body {name}", SelectBody(body=name), "marked in the view") for name in task.geometry.body_names),
         *((f"Curve {name}", ChooseStripCurve(curve=name), "on the strip") for name in strip_curves(view)),
         *(
-            (f"File {Path(file).name}", OpenFile(file=file), f"in the editor: {file}")
+            (f"File {Path(file).name}", OpenInEditor(file=file), f"in the editor: {file}")
             for file in task.source_files
         ),
     ]

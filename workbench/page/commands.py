@@ -91,7 +91,7 @@ class OpenHelp(Command, frozen=True):
     """Help: open the documents."""
 
 
-class OpenFile(Command, frozen=True):
+class OpenInEditor(Command, frozen=True):
     """Open a file of the task in the editor."""
 
     file: str

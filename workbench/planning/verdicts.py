@@ -75,7 +75,7 @@ class PlannedEpisodes:
 def of_episodes(episodes: Sequence[PlannedEpisode]) -> list[RewardVerdict]:
     """The verdicts on a task's reward, at most one for each rule."""
     every = PlannedEpisodes(tuple(episodes))
-    return [verdict for find in RULES.values() if (verdict := find(every)) is not None]
+    return [verdict for find in VERDICTS.values() if (verdict := find(every)) is not None]
 
 
 def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> str:
@@ -221,7 +221,7 @@ def failing_pays(episodes: PlannedEpisodes) -> RewardVerdict | None:
     )
 
 
-RULES: dict[str, Callable[[PlannedEpisodes], RewardVerdict | None]] = {
+VERDICTS: dict[str, Callable[[PlannedEpisodes], RewardVerdict | None]] = {
     "reward-exploited": exploited,
     "reward-flat": flat,
     "reward-stuck": stuck,

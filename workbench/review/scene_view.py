@@ -26,7 +26,7 @@ from workbench.page.scene.env_grid import (
     lay_out,
     view_label,
 )
-from workbench.page.scene.frames import Frames
+from workbench.page.scene.frames import BodyFrames
 from workbench.page.scene.viewpoint import View3D, Viewpoint, frame_all, frame_one
 from workbench.page.widgets.templates import colour, letter
 from workbench.review.commands import SelectRecording
@@ -197,7 +197,7 @@ class ReviewIn3D:
         self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
         self._names = [view_label(server, f"/names {index}", "top-center") for index in range(MAX_NAMED)]
         self._choice = stage.choice
-        self._frames, self._frustums = Frames(server), CameraFrustums(server)
+        self._frames, self._frustums = BodyFrames(server), CameraFrustums(server)
         self._scene: ReviewScene | None = None
         self._view = ReviewView()
         """View that was drawn last. The review's present view may have other recordings."""

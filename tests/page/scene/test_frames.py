@@ -6,14 +6,14 @@ import numpy as np
 
 from tests.drive.panels import Panels
 from tests.drive.scenes import table_scene
-from workbench.page.scene.frames import Frames
+from workbench.page.scene.frames import BodyFrames
 
 GEOMETRY, POSES = table_scene(3)
 HAND, TABLE, CUBE = (GEOMETRY.body_names.index(name) for name in ("arm/hand", "table", "cube"))
 
 
 def test_the_origin_the_objects_and_the_selected_body_have_axes_at_their_poses(panels: Panels) -> None:
-    frames, offset = Frames(panels.server), np.array([10.0, 0, 0])
+    frames, offset = BodyFrames(panels.server), np.array([10.0, 0, 0])
 
     def drawn(selected: str, poses: np.ndarray = POSES) -> list[list[float]]:
         frames.draw(GEOMETRY, poses, 1, selected, offset)

@@ -13,8 +13,7 @@ from workbench.planning.planned_episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
 from workbench.planning.rollouts import NotAlike, NothingToPlan, control_mode_to_plan, require_plannable
 from workbench.planning.seeds_report import few_seeds_text
-from workbench.planning.verdicts import MIN_EPISODES, MIN_SEEDS, PlannedEpisodes
-from workbench.planning.verdicts import RULES as VERDICTS
+from workbench.planning.verdicts import MIN_EPISODES, MIN_SEEDS, VERDICTS, PlannedEpisodes
 from workbench.task.blame import blamed
 
 MAX_SEEDS = MIN_SEEDS

@@ -14,7 +14,7 @@ from workbench.page.scene.env_grid import InView
 AXIS_METRES, RADIUS_METRES = 0.1, 0.003
 
 
-class Frames:
+class BodyFrames:
     """Axes at the origin of one env, at its bodies that are no links and not fixed, and at the selected body."""
 
     def __init__(self, server: viser.ViserServer) -> None:
