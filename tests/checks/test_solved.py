@@ -9,7 +9,7 @@ import pytest
 from tests.checks.checked import check_rule
 from workbench.checks.job_items import CheckOptions, count_rules, degrees_of_request
 from workbench.checks.rule_table import SOLVE_RULES, degree_of_each
-from workbench.planning.verdicts import RULES as VERDICTS
+from workbench.planning.verdicts import VERDICTS
 
 TASKS = Path(__file__).parents[2] / "tasks"
 
