@@ -104,7 +104,8 @@ class _ProcessPool:
             raise failure
 
     def end(self) -> None:
-        """Wait for finished processes, and kill the others at once: after a second Ctrl-C they may hang."""
+        """Wait until finished processes exit, and kill the others at once: these may hang after a second
+        Ctrl-C."""
         for process in self._processes:
             if not process.heard:
                 self._exit_code(process, _EXIT_SECONDS)
@@ -123,7 +124,7 @@ class _ProcessPool:
                 python_command("-m", "workbench.machine.processes.family", str(os.getpid()), *module),
                 stdin=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
-                start_new_session=True,  # Ctrl-C in the terminal reaches only this process, which ends them
+                start_new_session=True,  # Ctrl-C in the terminal reaches only the parent, which ends the pool
                 env=child_environment(),
             )
         process = _Process(MessageSocket(ours, MESSAGES), keeper, place)

@@ -38,7 +38,8 @@ _POLL_SECONDS = 0.1
 _ANSWER_SECONDS = 1.0
 """Timeout of a request to the broker, after which the cluster is checked: a broker that has ended never answers."""
 _SEND_SECONDS = 1.0
-"""Interval of a worker's messages: the broker handles a few thousand messages per second from all workers."""
+"""Interval at which a worker sends its messages: the broker handles only a few thousand messages per second
+from all workers together."""
 _END_SECONDS = 120.0
 """Timeout for a stopped worker to write its finished items."""
 _EXIT_SECONDS = 10.0
@@ -50,8 +51,9 @@ class Cluster:
     """An executor whose workers are actors of a Ray cluster."""
 
     address: str = AUTO
-    """``local`` starts a cluster on this machine, to which only this user can connect and which ends with the
-    job; ``auto`` uses a running cluster, or else starts one like ``local``."""
+    """Address of a running cluster, ``local`` or ``auto``. ``local`` starts a cluster on this machine; only
+    this user can connect to it, and it ends with the job. ``auto`` uses a running cluster; if there is none,
+    it does the same as ``local``."""
     workers: int | None = None
     """Number of workers; None for as many as the cluster has room for."""
     cpus_per_worker: float = 1
@@ -68,7 +70,8 @@ class Cluster:
 
         Raises:
             NoCluster: no cluster answers, Ray is not installed, or the cluster has no room for a worker.
-            PoolError: a machine has other versions of the packages, the cluster ended, or see `Executor.run`.
+            PoolError: a machine has other versions of the packages, or the cluster ended; also as in
+                `Executor.run`.
             TooMuch: the files for the workers are too large.
         """
         worker_files = pack_worker_files(work.folders, work.files)
@@ -163,7 +166,8 @@ class _ActorPool:
             raise failure
 
     def end(self) -> None:
-        """Wait for finished actors, and kill the others at once: after a second Ctrl-C they may hang."""
+        """Wait until finished actors end, and kill the others at once: these may hang after a second
+        Ctrl-C."""
         if self._ending:
             ended = [actor.ended for actor in self._ending]
             self._ray.wait(ended, num_returns=len(ended), timeout=_EXIT_SECONDS)
@@ -189,8 +193,8 @@ class _ActorPool:
             self._ending.remove(actor)
 
     def _guarded(self, number: int, failure: Any, act: Any) -> Any:
-        """Call `act` for a worker; returns the first failure so far. After an error that ends the job, the
-        other workers finish their items."""
+        """Call `act` for a worker. Returns `failure`, or if that is None the error of `act`. After an error
+        that ends the job, the other workers finish their items."""
         try:
             act()
         except (TaskError, PoolError) as error:
@@ -283,13 +287,14 @@ class MessageBroker:
         self._limit = NO_LIMIT
 
     async def put(self, worker: int, messages: list[bytes]) -> int:
-        """Store messages of a worker; returns the limit."""
+        """Store messages of a worker; returns the scheduler's limit (`ItemQueue.limit`)."""
         self._said.extend((worker, message) for message in messages)
         self._came.set()
         return self._limit
 
     async def ask(self, worker: int, messages: list[bytes]) -> tuple[Chunk | None, int]:
-        """Store messages, the last of which requests a chunk; returns the chunk and the limit."""
+        """Store messages, the last of which requests a chunk; returns this chunk and the scheduler's
+        limit."""
         future: asyncio.Future[Chunk | None] = asyncio.get_running_loop().create_future()
         self._answers[worker] = future
         await self.put(worker, messages)
@@ -330,7 +335,8 @@ class RayWorker:
         """Do the work.
 
         Args:
-            work: the pickled function and its setup; its imports take seconds, so `quick_imports` is active.
+            work: the pickled function and its setup. To unpickle them, modules are imported, which takes
+                seconds: so `quick_imports` is active then.
 
         Raises:
             OtherVersions: this machine has other versions of the packages than the submitting side.
@@ -387,7 +393,7 @@ class _BrokerQueue(WorkerQueue):
         self._said = 0.0
         self._limit: int = NO_LIMIT
         self._put: Any = None
-        """Ray reference to the last `MessageBroker.put` call; its value is the limit at that time."""
+        """Ray reference to the result of the last `MessageBroker.put` call: the limit at that time."""
 
     def next(self) -> Chunk | None:
         import ray

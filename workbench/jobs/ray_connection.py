@@ -20,7 +20,8 @@ BREAKPOINT = "PYTHONBREAKPOINT"
 _CONNECT_SECONDS = 5.0
 _PROBE_SECONDS = 2.0
 _HEAD_DOWN_SECONDS = 20.0
-"""Time for which the head may refuse connections, as during its restart. After 60 s Ray ends this process."""
+"""Time for which the head of the cluster may refuse connections, for example while it restarts. After 60 s of
+this, Ray itself would end this process."""
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
 _AUTH_MODE = "RAY_AUTH_MODE"
 
@@ -45,7 +46,7 @@ class ClusterHealth:
         self._raylet: socket.socket | None = None
         self._head = ""
         self._probed_at = self._answered_at = time.monotonic()
-        if _global_node is None:  # a ray:// address: Ray's own errors report it
+        if _global_node is None:  # a ray:// address: Ray's own errors report its end
             return
         self._head = _global_node.gcs_address
         self._raylet = socket.socket(socket.AF_UNIX)
@@ -73,7 +74,7 @@ class ClusterHealth:
 
 @contextmanager
 def connected(address: str = AUTO) -> Iterator[Any]:
-    """Yield the module ``ray``, connected to a cluster. A cluster that this context starts ends with it.
+    """Yield the module ``ray``, connected to a cluster. A cluster that is started here ends with the context.
 
     Raises:
         NoCluster: Ray is not installed, or nothing answers at the address.
@@ -111,9 +112,9 @@ def connected(address: str = AUTO) -> Iterator[Any]:
 def _token_given(ray: Any, address: str) -> Iterator[None]:
     """Within this block, send this user's token if the cluster requires one and ``RAY_AUTH_MODE`` is not set.
 
-    A cluster of ``ray start`` requires a token if this user has one, but by default Ray does not send the
-    token, and is refused after twenty seconds. If the token is sent to a cluster that requires none, no
-    worker starts.
+    A cluster that ``ray start`` has started requires a token if this user has one. By default Ray does not
+    send the token, and is refused after twenty seconds. If the token is sent to a cluster that requires none,
+    no worker starts.
     """
     if not _asks_for_token(ray, address):
         yield
@@ -138,7 +139,8 @@ def _asks_for_token(ray: Any, address: str) -> bool:
 
 
 def _why_deaf(address: str) -> str | None:
-    """Why no cluster can be at the address; None if something listens there. Ray would retry for minutes."""
+    """Why no cluster can be at the address; None if something listens there. Ray itself would retry for
+    minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
         with socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS):
@@ -219,7 +221,7 @@ def _only_for_this_user() -> Iterator[None]:
     os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"
     # Workers get the niceness of local processes; Ray's default of 15 is for shared machines.
     os.environ.setdefault("RAY_worker_niceness", "0")
-    # Without this Ray, which requires a token, writes one into the home folder, where others may read it.
+    # Ray requires a token; without this it writes one into the home folder, where other users may read it.
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
     try:
         yield

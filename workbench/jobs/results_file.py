@@ -1,4 +1,4 @@
-"""Keeps the results of a job in a file as they arrive: a stopped job resumes from it, and parts are merged.
+"""Keeps the results of a job in a file as they arrive: a stopped job can resume, and parts can be merged.
 
 The file is an SQLite database: each result is stored atomically, even if the process is killed.
 """
@@ -64,7 +64,7 @@ def job_of(
         task: the task as the user named it.
         request: a dataclass with all options.
         leaves_out: fields of `request` that the results do not depend on.
-        files: other files that the results depend on, such as a policy's.
+        files: other files that the results depend on, such as the file of a policy.
 
     Raises:
         OSError: a file cannot be read.
@@ -118,7 +118,8 @@ class JobFile:
             self._database = sqlite3.connect(path, timeout=0, isolation_level=None)
         try:
             with _named(path):
-                # Locked while the file is open: two processes with the same job would each do all items.
+                # Lock the file while it is open: otherwise two processes with one job would both do all
+                # items.
                 self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
                 self._database.execute("BEGIN EXCLUSIVE")
                 if not self._database.execute("PRAGMA schema_version").fetchone()[0]:
@@ -141,7 +142,7 @@ class JobFile:
         self._database.executemany("INSERT INTO kept VALUES (?, ?)", kept.items())
 
     def results(self, kind: Any) -> dict[int, Any]:
-        """Results in the file, by item. Raises JobFileError if a result cannot be read as this type."""
+        """Results in the file, by item. Raises JobFileError if a result cannot be read as the type `kind`."""
         return _results(self.path, self._database, kind)
 
     def keep(self, number: int, result: object) -> None:
@@ -150,7 +151,7 @@ class JobFile:
             self._database.execute("INSERT OR REPLACE INTO result VALUES (?, ?)", (number, pack(result)))
 
     def put(self, packed: Mapping[int, bytes]) -> None:
-        """Write packed results, also in place of results in the file. Raises JobFileError."""
+        """Write packed results; they replace results of the same items in the file. Raises JobFileError."""
         with _named(self.path):
             self._database.execute("BEGIN")
             self._database.executemany("INSERT OR REPLACE INTO result VALUES (?, ?)", packed.items())
@@ -216,7 +217,7 @@ class JobParts:
 
 
 def write_whole(path: Path, merged: JobParts) -> None:
-    """Write the results of all parts to a job file, also in place of results that it has.
+    """Write the results of all parts to a job file; they replace results of the same items in the file.
 
     Raises:
         JobFileError: the file exists and belongs to another job, or another process has it open.
@@ -232,8 +233,8 @@ def read_parts(files: Sequence[Path]) -> JobParts:
     """The results of these job files.
 
     Raises:
-        JobFileError: the files belong to different jobs (the message lists the differences), or two have the
-            same item.
+        JobFileError: the files belong to different jobs (the message lists the differences), or two files
+            have a result of the same item.
         FileNotFoundError: a file does not exist.
     """
     about: Mapping[str, str] | None = None

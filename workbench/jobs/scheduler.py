@@ -15,10 +15,11 @@ from workbench.task.problem import Problem, TaskError
 
 NO_LIMIT = sys.maxsize
 MAX_ALIKE_FIRST, MAX_ALIKE_LATER = 5, 20
-"""Number of chunks that fail in the same way without a result in between, after which the others would fail
-too: before the first result, and later."""
+"""If this many chunks of a group fail in the same way, without a result in between, the rest of the group is
+not tried; without groups, the job ends. The first number applies before the group's first result, the second
+one after it."""
 _MAX_EARLY_DEATHS = 3
-"""Number of workers that may die before their first chunk."""
+"""The job ends when this many workers have died before their first chunk, without a result in between."""
 _NO_GROUP = -1
 """Placeholder for the group of a worker that has no chunk yet."""
 
@@ -28,15 +29,15 @@ Update = TypeVar("Update")
 
 
 class PoolError(RuntimeError):
-    """A worker died or failed; the others were stopped and dropped their running items."""
+    """A worker died or failed; the other workers were stopped and dropped their running items."""
 
 
 @dataclass(frozen=True)
 class Chunk:
     """Items that one worker runs together.
 
-    The division into chunks does not depend on the number of workers, so that the results do not either: a
-    policy's results differ in the last bits with the batch size and with the row in the batch.
+    The number of workers does not change the division into chunks, and so does not change the results: those
+    of a policy differ in the last bits with the batch size and with the row in the batch.
     """
 
     numbers: tuple[int, ...]
@@ -60,7 +61,7 @@ class ItemQueue(Protocol):
         ...
 
     def limit(self) -> int:
-        """The first item number that is not needed, even if the item has begun. The limit never rises."""
+        """Items from this number on are not needed, even if they have begun. The limit never rises."""
         ...
 
     def send_result(self, number: int, result: Any) -> None:
@@ -130,7 +131,7 @@ class Scheduler(Generic[Result, Update]):
     """The chunks of a job, and the callbacks for the results of its items. Used on one thread.
 
     Chunks are dealt in ascending order. Items from the limit on are not needed: a caller with enough results lowers the
-    limit, and a limit of 0 stops the job. A chunk whose worker died is dealt again, after the others.
+    limit, and a limit of 0 stops the job. A chunk whose worker died is dealt again, after all other chunks.
     """
 
     def __init__(
@@ -151,9 +152,9 @@ class Scheduler(Generic[Result, Update]):
             stop: called often; as soon as it returns True, no more items are needed.
             chunk: number of items in a chunk: item k belongs to chunk ``k // chunk``.
             tries: maximum number of times that a chunk is started, if its workers die.
-            on_failure: called with items in which the author's code failed, or whose workers died in every
-                try. The job continues unless too many chunks fail in the same way. If None, the first failure
-                ends the job.
+            on_failure: called with items that failed: the author's code raised in them, or their workers died
+                in every try. The job then continues, unless too many chunks fail in the same way. Without
+                `on_failure`, the first failure ends the job.
             group: number of items in a group: item k belongs to group ``k // group``. Each group begins with
                 a new chunk. If too many chunks of a group fail in the same way, or the task cannot be built
                 for the group, the rest of the group counts as failed, and the job continues.
@@ -164,7 +165,7 @@ class Scheduler(Generic[Result, Update]):
         self._with_results: set[int] = set()
         """Groups that have a result."""
         self._given_up: dict[int, Problem] = {}
-        """Problem of each group that was given up because its chunks failed alike."""
+        """For each group that was given up: its problem."""
         self._known: Mapping[int, Result] = {}
         self._keep: Callable[[int, Result], None] = lambda number, result: None
         self._left = self._chunks()
@@ -193,7 +194,7 @@ class Scheduler(Generic[Result, Update]):
         self._left = islice(self._chunks(), part.start, part.stop)
 
     def go_on(self, known: Mapping[int, Result], keep: Callable[[int, Result], None]) -> None:
-        """Take the results of an earlier run of the job, and leave only the items that lack one.
+        """Take the results of an earlier run of the job, and leave only the items that have no result.
 
         Args:
             keep: called with each new result before anything else uses it.
@@ -239,7 +240,7 @@ class Scheduler(Generic[Result, Update]):
         self._limit = min(limit, self._limit)
 
     def result(self, worker: Hashable, number: int, result: Result) -> None:
-        """Take the result of an item. Raises PoolError if the worker does not have it."""
+        """Take the result of an item. Raises PoolError if the worker does not have this item."""
         held = next((held for held in self._held.get(worker, ()) if number in held.missing), None)
         if held is None:
             raise PoolError("sent the result of an item that it does not have")
@@ -263,8 +264,8 @@ class Scheduler(Generic[Result, Update]):
             raise PoolError("ended before it was done")
 
     def failed(self, worker: Hashable, error: TaskError) -> None:
-        """Handle a failure of the author's code in the last chunk of this worker, which has ended. The items
-        of the failed chunk are then dealt one by one.
+        """Handle a failure of the author's code in the last chunk of this worker; the worker has ended. The
+        items of the failed chunk are then dealt one by one.
 
         Raises:
             TaskError: the job is over: the worker had no chunk, too many chunks failed in this way, or there
@@ -289,7 +290,7 @@ class Scheduler(Generic[Result, Update]):
 
         Args:
             how: predicate of a sentence whose subject is the worker's name.
-            code: its exit code, if known; deaths with the same code are of the same kind.
+            code: exit code of the worker, if known; deaths with the same code are of the same kind.
 
         Raises:
             PoolError: the job is over.
@@ -348,7 +349,9 @@ class Scheduler(Generic[Result, Update]):
             self._returned.append(Chunk(held.chunk.numbers, frozenset(held.missing), again=True))
 
     def _divide(self, held: _Held) -> bool:
-        """Deal the missing items of a chunk one by one. Returns False if there is only one."""
+        """Deal the missing items of a chunk one by one. Returns False if the chunk is not divided: it has
+        only one item, none of its missing items is needed, its group was given up, or there is no
+        `on_failure`."""
         limit = self.limit()
         missing = sorted(number for number in held.missing if number < limit)
         given_up = held.chunk.numbers[0] // self._group in self._given_up
@@ -401,7 +404,7 @@ class Work(Generic[Setup, Result, Update]):
     """The first argument of `run`; can be pickled."""
     result: Any
     update: Any
-    """Types of results and updates; `wire` checks the messages of other processes against them."""
+    """Types of results and updates; `wire` checks the messages of other processes against these types."""
     name: str
     """Clause that describes a worker in messages: "a process *that records* was killed by SIGKILL"."""
     folders: Sequence[Path] = ()
@@ -421,7 +424,8 @@ class Executor(Protocol):
         ...
 
     def run(self, work: Work[Setup, Result, Update], scheduler: Scheduler[Result, Update]) -> None:
-        """Deal until no chunk is left or needed and all running items are finished.
+        """Deal chunks until no more are left, or no more are needed; return when all running items are
+        finished.
 
         Raises:
             TaskError, PoolError: too much failed (see `Scheduler`), or a worker failed in the workbench's own

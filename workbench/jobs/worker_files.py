@@ -38,8 +38,8 @@ class WorkerFiles:
     stay valid."""
 
     def unpack(self, folder: Path) -> dict[str, str]:
-        """Write all files below `folder`, which is empty, and make the copy of the submitting side's current
-        folder the current one.
+        """Write all files below `folder`, which is empty. The copy of the submitting side's current folder
+        becomes the current folder of this process.
 
         Returns:
             for each root: its path on the submitting side, and its path here.
@@ -113,7 +113,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def relocated(value: Value, places: Mapping[str, str]) -> Value:
-    """Copy of `value` in which each key of `places` is replaced by its value, in every text and path,
+    """Copy of `value` in which ``places[old]`` replaces each occurrence of ``old``, in every text and path,
     recursively through dataclasses, sequences, sets and mappings. Arrays and bytes stay unchanged.
     """
     return _relocated(value, sorted(places.items(), key=lambda pair: -len(pair[0]))) if places else value

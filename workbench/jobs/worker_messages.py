@@ -23,7 +23,7 @@ class ItemUpdate:
     """Progress of a worker."""
 
     value: bytes
-    """Progress, packed as `Work.update`."""
+    """Progress of the type `Work.update`, packed."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ItemResult:
 
     number: int
     value: bytes
-    """Result, packed as `Work.result`."""
+    """Result of the type `Work.result`, packed."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Listener:
     """Handles the messages of workers for a scheduler."""
 
     kind: str
-    """What messages call a worker: "*a process* that records was killed"."""
+    """Name of a worker in messages: "*a process* that records was killed"."""
     work: Work[Any, Any, Any]
     scheduler: Scheduler[Any, Any]
     on_death: Callable[[str], None]
@@ -99,8 +99,8 @@ class Listener:
         """Handle a message.
 
         Returns:
-            ``asks``: the worker waits for a chunk. ``failed``: the worker has failed, and the job continues. ``done``: the
-            worker has finished.
+            ``asks``: the worker waits for a chunk. ``goes on``: the worker continues. ``failed``: the worker
+            has failed, and the job continues. ``done``: the worker has finished.
 
         Raises:
             TaskError, PoolError: the worker failed, and the job is over.

@@ -142,7 +142,8 @@ DOES: frozenset[type[Command]] = frozenset(
 )
 """Commands that `apply` handles."""
 PICTURES_DELAY_SECONDS = 0.35
-"""Debounce: pictures of a past moment are drawn after it was shown this long, or every drag would draw."""
+"""Debounce: the pictures of a past moment are drawn only after the moment was shown for this long, so not for
+every moment that the user drags over."""
 
 
 def apply(run: Run, event: object, now: Now) -> Change:
@@ -276,7 +277,7 @@ def _do_command(run: Run, command: Command) -> Change:
         case ChooseEpisodeEnd(rule=rule):
             return _change_settings(run, episode_end=rule)
         case ChooseActions(source=source):
-            # The source may be a policy without a name: the next step reports what is missing.
+            # The policy may have no name yet: the next step reports that it is missing.
             policy = run.named_policy if source == "policy" else None
             return _change_settings(run, action_source=source, policy=policy)
         case SetPolicy(policy=policy):
@@ -457,7 +458,8 @@ def _take_pictures(run: Run, event: Pictures | PastPictures) -> Run:
         return run if run.past is None else new_pictures(run)
     if not event.pictures or event.pictures[0].env != run.env:
         return run
-    # Sensors and human cameras come separately, so pictures are merged; unwatched cameras are dropped.
+    # Pictures of sensors and of human cameras come in separate events: merge them, and drop unwatched
+    # cameras.
     watched = {camera.key for camera in run.settings.cameras}
     made = {picture.key: picture for picture in event.pictures}
     shown = {key: picture for key, picture in {**run.pictures, **made}.items() if key in watched}

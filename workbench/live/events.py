@@ -37,10 +37,11 @@ class RunToEnter:
     everywhere: bool = False
     source_file: str | None = None
     source: Mapping[str, str] = field(default_factory=dict)
-    """The task's source when it was recorded; changes since are reported with the result."""
+    """The task's source when the run was recorded; later changes of the source are reported with the
+    result."""
 
 
-# --- events of the session; the others are in `live.messages`, and `Asked` ------------------------
+# --- events of the session; all other events are `Asked` and those of `live.messages` -------------
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class WorkerDied:
 
 @dataclass(frozen=True)
 class WorkerBusy:
-    """One piece of work keeps the worker busy for long; None when that work is done."""
+    """The worker has been busy with one piece of work for long; `busy` is None when that work is done."""
 
     busy: Busy | None
 
@@ -232,7 +233,7 @@ class Follow:
 
     files: frozenset[Path]
     texts: Mapping[str, str] = field(default_factory=dict)
-    """The loaded texts by path; a file that differs was saved since."""
+    """The loaded texts by path; a file with another text was saved since the load."""
 
 
 @dataclass(frozen=True)

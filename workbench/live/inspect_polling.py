@@ -15,7 +15,7 @@ READ_PERIOD_SECONDS = 0.2
 
 
 def schedule(run: Run, event: object, now: Now) -> Change:
-    """Schedule a reading if `event` made the last one outdated and none is pending."""
+    """Schedule a reading if `event` made the last reading outdated and no reading is pending."""
     if run.reading != "none" and isinstance(event, Inspection | TaskFailed | VersionLoaded | WorkerDied):
         run = replace(run, reading="none")
     if run.reading != "none" or not run.read_sections or not run.pages or run.task is None:

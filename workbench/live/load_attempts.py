@@ -9,13 +9,14 @@ from typing import Literal, NamedTuple
 from workbench.task.description import TaskDescription
 
 Attempt = Literal["file", "moment", "version", "nothing"]
-"""What to load: the file on disk, the last good version at its newest moment or from its start, nothing."""
+"""What to load: the file on disk, the last good version at its newest moment, the same from its start, or
+nothing."""
 Newest = Callable[[], bytes | None]
 """Returns the newest state of the batch, a pickled `envs.snapshots.snapshot.Snapshot`, or None. Called only when needed,
 since assembling one takes longer than a step."""
 _GOOD_VERSIONS = 2
 _PROVEN_SECONDS = 30.0
-"""A version whose process crashes later than this after its load counts as one that works."""
+"""A version that ran for longer than this before its process crashed counts as one that works."""
 
 
 class LoadInputs(NamedTuple):
@@ -24,7 +25,7 @@ class LoadInputs(NamedTuple):
     source: dict[str, str] | None
     """Texts to use in place of the files; None to read the files on disk."""
     snapshot: bytes | None
-    """Pickled snapshot to restore; None for none."""
+    """Pickled snapshot to restore, or None."""
     number: int
     """`Load.number`."""
 
@@ -45,7 +46,8 @@ class GoodVersion:
 
 @dataclass(frozen=True)
 class Recovery:
-    """Chooses what the next worker loads after one has ended. Methods that change something return a new value.
+    """Chooses what the next worker loads after a worker has ended. Methods that change something return a new
+    `Recovery`.
 
     Loading may end the worker again: the version is refused, the moment cannot be restored, the import crashes, memory runs
     out. So the attempts are, in order: the file on disk if no worker has tried it yet, the last good version at its newest
@@ -60,7 +62,8 @@ class Recovery:
     attempt: Attempt = "file"
     asked: int = 1
     begun: int = 1
-    """Numbers of the newest requested load of the file, and of the newest that a worker has begun."""
+    """`asked`: number of the newest requested load of the file. `begun`: number of the newest load that a
+    worker has begun."""
     loading: bool = True
     """Whether a load is running."""
     has_env: bool = False

@@ -50,8 +50,8 @@ def first_requests(run: Run) -> tuple[Run, list[Request]]:
 
 
 def watched_files(run: Run, paths: Iterable[str] = (), at_fault: str | None = None) -> frozenset[Path]:
-    """The task's own file, those of `paths` in its folder, and the file `at_fault` in any folder; empty if nothing is
-    watched."""
+    """The files to watch: the task's own file, each of `paths` that is in the task's folder, and `at_fault`
+    in any folder. Empty if the task has no file of its own."""
     if run.own_file is None or run.own_folder is None:
         return frozenset()
     modules = (Path(p) for p in paths if Path(p).is_relative_to(run.own_folder))
@@ -214,7 +214,8 @@ def task_failed(run: Run, event: TaskFailed, now: Now) -> Change:
 
 
 def try_next(run: Run, failed: TaskFailed) -> Change:
-    """Send the next attempt of `Recovery` to a worker without a version, unless it is spoiled and ends."""
+    """Send the next attempt of `Recovery` to a worker without a version, unless the worker is spoiled and
+    ends."""
     if failed.spoiled:
         return replace(run, needed=NewProcessNeeded(failed.spoiled, failed.at_run)), []
     recovery, goes_on = run.recovery.failed(failed.kept, run.newest_moment)

@@ -41,7 +41,7 @@ class Load(Question["Loaded"]):
     """A path, ``path:ClassName`` or a registered env id, as the user named it, or a task named by a recording."""
     options: TaskOptions
     source: dict[str, str] | None = None
-    """Text to use in place of the files on disk, to restore the last good version."""
+    """Texts by path to use in place of the files on disk, to restore the last good version."""
     level: LoadLevel = "auto"
     """How to replace a running version of the same task."""
     snapshot: bytes | None = None
@@ -139,8 +139,8 @@ class ReadPolicyAgain:
 
 @dataclass(frozen=True)
 class FollowPlan:
-    """The answer to a `PlanWanted`: the actions to take from its moment on. The worker drops the answer if
-    anything else moved the envs since then."""
+    """The answer to a `PlanWanted`: the actions to take from the moment of the `PlanWanted` on. The worker
+    drops the answer if anything else has moved the envs since that moment."""
 
     number: int
     """Number of the `PlanWanted` that this answers."""
@@ -198,7 +198,7 @@ class Restore:
     undoes: int | None = None
     """The server's number of the jump that this undoes, if any; returned unchanged."""
     ways: Mapping[int, ReplayPath] = field(default_factory=dict)
-    """Replay paths of those of `env_idx` that can be replayed up to the moment."""
+    """Replay paths by env, for those of `env_idx` that can be replayed up to the moment."""
     starts: Mapping[int, bytes] = field(default_factory=dict)
     """Pickled snapshots of the whole batch at the beginnings of `ways`, by number of the moment."""
 
@@ -362,7 +362,8 @@ class TaskFailed:
     kept: bool
     """Whether the previous version still runs."""
     classes: tuple[str, ...] = ()
-    """Tasks of the file, the tried one first; empty if the file has only one or none was tried."""
+    """Tasks of the file, beginning with the tried one; empty if the file has only one task, or no task was
+    tried."""
     options: TaskOptions | None = None
     """Options of the `Load` that failed; None if the problem came later."""
     at_run: bool = False

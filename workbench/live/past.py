@@ -97,11 +97,12 @@ class Strip:
 
 @dataclass(frozen=True)
 class Past:
-    """The history of the present task and its shown moment. Methods that change something return a new value.
+    """The history of the present task and its shown moment. Methods that change something return a new
+    `Past`.
 
-    Live is the newest moment. The slider pins another one; then everything that the page draws of the batch (poses,
-    numbers, pictures) comes from the server's memory, while the worker continues. The worker gets requests only to
-    continue from a moment, to undo a jump, and to draw a moment that has no pictures.
+    Live is the newest moment. The slider pins another moment; then everything that the page draws of the
+    batch (poses, numbers, pictures) comes from the server's memory, while the worker continues. The worker
+    gets requests only to continue from a moment, to undo a jump, and to draw a moment that has no pictures.
     """
 
     history: History
@@ -116,7 +117,7 @@ class Past:
     # --- events --------------------------------------------------------------------------------------
 
     def added(self, stepped: Stepped) -> tuple[Past, Moment]:
-        """Add a moment. Returns the past with it, and the moment."""
+        """Add a moment. Returns the new past, and the moment."""
         moment = self.history.add(stepped)
         past = self
         if stepped.restored is not None and stepped.restored.number:
@@ -167,8 +168,8 @@ class Past:
         return self.seek(serials[min(serials, key=lambda known: abs(known - step))])
 
     def seek_env_event(self, env: int, event: EnvEvent) -> Past:
-        """Go to the end of this env's newest episode that failed, or to the first outlier of its newest episode with one; stay
-        if none is kept."""
+        """Go to this env's newest event of this kind: the end of an episode that failed, or the first outlier
+        of an episode. Stay at the shown moment if no such event is kept."""
         for _, stop in reversed(self.history.segments(env)):
             moment = self.history.at(stop)
             step = None if moment is None else event_step(moment.rows, env, event)
@@ -310,7 +311,7 @@ class Past:
         """Numbers of this env's whole shown episode, and of the episodes before it; see `History.episodes`.
 
         Args:
-            last: serial of the live moment; the history may have newer ones by now.
+            last: serial of the live moment; the history may have newer moments by now.
         """
         end = last if self.pinned is None else min(self.history.segment_at(env, self.at)[1], last)
         return self.history.episodes(env, end, columns, before)
@@ -365,9 +366,10 @@ class Past:
     def draw(
         self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "auto"
     ) -> tuple[Past, DrawPast | None]:
-        """Request the missing pictures of the shown moment, only once for each moment, env and set of cameras.
+        """Request the missing pictures of the shown moment, unless the last request was for the same moment,
+        env and cameras.
 
-        A fast picture, drawn while something moved, counts as missing unless fast ones are requested.
+        A fast picture, drawn while something moved, counts as missing unless fast pictures are requested.
         """
         moment = self.shown
         if moment is None:

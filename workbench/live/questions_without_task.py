@@ -57,6 +57,7 @@ class TaskPicture:
 
 @dataclass(frozen=True)
 class DrawTask(Question[TaskPicture]):
-    """Render a registered task after a reset with its human camera, or with its first sensor if it has none."""
+    """Reset a registered task, and render it with its human camera, or with its first sensor if it has no
+    such camera."""
 
     env_id: str

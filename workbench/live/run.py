@@ -83,13 +83,14 @@ class Run:
     to_enter: RunToEnter | None = None
     """Recorded run to enter as soon as a task is loaded."""
     first_step_due: bool = False
-    """Whether the next step is the first of a new scene, which does not prove that the task runs."""
+    """Whether the next step is the first of a new scene. That step does not prove that the task runs."""
     pages: int = 0
     """Number of open pages."""
     tried_options: TaskOptions | None = None
     """Options that the user applied and that no load has accepted or refused yet."""
     plays_asked: int = 0
-    """Number of `Play` requests to this worker. A `Status` from before the last one says nothing about playing."""
+    """Number of `Play` requests to this worker. A `Status` from before the last `Play` says nothing about
+    `playing`."""
     wants_play: bool = False
     policy_failed: bool = False
     """Whether a failure of the policy stopped playing, and playing has not resumed since. `problem` may be None already: a
@@ -111,13 +112,13 @@ class Run:
     """Increases with every new set of cameras."""
     load_milliseconds: float = 0.0
     reload: ReloadReport | None = None
-    """How the running version was loaded; None for the first."""
+    """How the running version was loaded; None for the first version."""
     after_load: PastAfterLoad = "same"
     """Effect of the last load on the history."""
     loads: tuple[PastLoad, ...] = ()
     """The last loads, newest first."""
     choices: tuple[str, ...] = ()
-    """Task classes of the file, the chosen one first; empty if it has only one."""
+    """Task classes of the file, the chosen class first; empty if the file has only one."""
     step: StepResult | None = None
     """The newest step."""
     step_serial: int = 0

@@ -1,4 +1,4 @@
-"""Interface of the session of the open task for panels."""
+"""Interface through which panels use the session of the open task."""
 
 from __future__ import annotations
 

@@ -83,8 +83,8 @@ class ContinueFromHere(Command, frozen=True):
     key = "shift+g"
     context = "live"
     scope: Literal["this", "all", "into all"] = "this"
-    """``this``: the selected env from its shown state; ``all``: each env from its own; ``into all``: all envs from the
-    selected one's."""
+    """``this``: the selected env from its shown state; ``all``: each env from its own shown state;
+    ``into all``: all envs from the shown state of the selected env."""
 
 
 class ChooseStripCurve(Command, frozen=True):

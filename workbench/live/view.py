@@ -45,13 +45,13 @@ class SessionView:
     """Increases with every new set of cameras."""
     load_milliseconds: float = 0.0
     reload: ReloadReport | None = None
-    """How the running version was loaded; None for the first."""
+    """How the running version was loaded; None for the first version."""
     timeline_cleared: bool = False
     """Whether the load of the running version started a new history."""
     loads: tuple[PastLoad, ...] = ()
     """The last loads, newest first."""
     choices: tuple[str, ...] = ()
-    """Task classes of the file, the chosen one first; empty if it has only one."""
+    """Task classes of the file, the chosen class first; empty if the file has only one."""
     step: StepResult | None = None
     """The shown step: the newest, or a past one (`timeline`)."""
     step_serial: int = 0

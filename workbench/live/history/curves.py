@@ -20,9 +20,11 @@ _FIRST_ROWS = 1024
 
 
 class Columns:
-    """Columns of numbers by name, each (rows, N). Rows are numbered upwards; the oldest are dropped when space runs out.
+    """Columns of numbers by name, each (rows, N). Rows are numbered upwards; the oldest rows are dropped when
+    space runs out.
 
-    Curves are drawn several times a second: reading them from some thousand moments would take longer than a step.
+    Curves are drawn several times a second: collecting their numbers from some thousand moments would take
+    longer than a step.
     """
 
     def __init__(self, num_envs: int, first: int = 0) -> None:
@@ -40,7 +42,7 @@ class Columns:
     def write(self, number: int, oldest: int, values: Mapping[str, ArrayLike]) -> None:
         """
         Args:
-            number: the row to write: the newest one, or the one after it.
+            number: number of the row to write: the newest row, or the row after it.
             oldest: number of the oldest row to keep.
             values: (N,) by name of the column; missing columns become NaN in this row.
         """
@@ -91,7 +93,7 @@ class Column(NamedTuple):
     group: Group
     name: str
     part: int | None = None
-    """Index of the number in an entry with several."""
+    """Index of the number in an entry with several numbers; None in an entry with one."""
 
     @property
     def label(self) -> str:
@@ -106,7 +108,7 @@ def columns_of(step: StepResult, joints: Sequence[str] = ()) -> dict[Column, NDA
     """(N,) values of each column that a step has: the reward, success, the reward's terms, ``evaluate``, the joints.
 
     Args:
-        joints: names of `StepResult.qpos`.
+        joints: names of the joints of `StepResult.qpos`.
     """
     num_envs = len(step.reward)
     found: dict[Column, NDArray] = {REWARD: step.reward}
@@ -178,15 +180,15 @@ class Spans:
     one step stays visible."""
 
     width: int
-    """Steps of a span; the last one may have fewer."""
+    """Number of steps in a span; the last span may have fewer."""
     end: int
-    """The last step. The first one of span k is ``k * width + first``."""
+    """The last step of the lines. Span k begins at step ``k * width + first``."""
     low: NDArray[np.floating]
     high: NDArray[np.floating]
-    """(L, B) least and greatest finite number; NaN if there is none."""
+    """(L, B) least and greatest finite number in each span; NaN if there is none."""
     low_at: NDArray[np.int32]
     high_at: NDArray[np.int32]
-    """(L, B) the first step with the least number, the last step with the greatest."""
+    """(L, B) the first step with the least number, and the last step with the greatest number."""
     gap: NDArray[np.bool_]
     """(L, B) whether some number is NaN or infinite."""
     last: NDArray[np.floating]
@@ -196,8 +198,8 @@ class Spans:
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(K,) steps and (L, K) numbers to draw.
 
-        The steps are those of the first line's extremes, so that its points are exact; points of the other lines are off
-        by less than a span. NaN where a line has a gap.
+        The steps are those of the first line's extremes, so only the points of this line are exact; points of
+        the other lines are off by less than a span. NaN where a line has a gap.
         """
         lines, count = self.low.shape
         starts = self.first + self.width * np.arange(count)

@@ -35,7 +35,7 @@ EnvEvent = Literal["failed", "flagged"]
 
 @dataclass(frozen=True)
 class LastEpisode:
-    """The last episode of each env, before the present one, that ended or had outliers.
+    """For each env: the last episode before the present one that ended or had outliers.
 
     Envs are reset as soon as an episode ends, so "failed" would never be visible in the row of the present episode.
     """
@@ -74,8 +74,8 @@ class EnvRows:
     followed: NDArray[np.bool_]
     """(N,) whether `total` is known: the task has a reward, and the episode was followed from its start."""
     first: Mapping[Hashable, NDArray[np.int32]]
-    """(N,) first step at which an entry was true; 0 is the reset, -1 is never. Keys are bool entries of ``evaluate`` and
-    `OutlierKind`, also of rules that are off."""
+    """(N,) first step at which an entry was true; 0 is the reset, -1 is never. Keys are the names of
+    bool entries of ``evaluate``, and `OutlierKind`, also those of rules that are off."""
     outliers: Outliers
     last: LastEpisode
     ended: NDArray[np.int64]
@@ -111,10 +111,12 @@ def event_step(rows: EnvRows, env: int, event: EnvEvent) -> int | None:
 
 
 class EnvTable:
-    """Updates the table with every reset and control step of the batch, by array operations; `add` all events in order.
+    """Updates the table with every reset and control step of the batch, by array operations. Call `add` with
+    every event, in order.
 
-    If an env goes back to a moment, its row becomes the one that the source env had at that moment. Only the
-    counts of ended episodes continue.
+    If an env goes back to a moment, its row becomes the row that the source env (whose state it takes) had at
+    that moment. The counts of ended episodes continue, and an env that takes another env's state keeps its
+    own last episode.
     """
 
     def __init__(
@@ -161,7 +163,7 @@ class EnvTable:
 
         Args:
             then: the rows at the moment that some envs went back to. None without a jump back, or if that moment is
-                unknown: the rows of these envs begin without a past then.
+                unknown. If it is unknown, the rows of these envs begin without a past.
             rewards_then: returns the rewards of an env's episode up to that moment, oldest first.
 
         Returns:
@@ -244,7 +246,8 @@ class EnvTable:
         return True
 
     def _begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
-        """Start new episodes in these envs (N,); `EnvRows.last` keeps those that ended or had outliers."""
+        """Start new episodes in these envs (N,); `EnvRows.last` keeps the previous ones that ended or had
+        outliers."""
         now, from_start = self._now, step.elapsed_steps == 0
         worth_keeping = envs & ((now.end >= 0) | np.isin(np.arange(len(envs)), list(now.outliers)))
         until = np.where(now.end < 0, now.steps, now.end)

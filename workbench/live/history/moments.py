@@ -26,10 +26,12 @@ from workbench.task.description import NO_MOMENT, Restored, Stepped
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 32
 """Event flags of an env at a moment. Success, fail and a NaN or infinite reward are flagged only once per episode."""
 _OVERHEAD_BYTES = 2500
-"""Memory of the objects around a moment's arrays; with it, tracemalloc measures the same total within 2 %."""
+"""Memory of the objects around a moment's arrays; with it, the counted total agrees with tracemalloc
+within 2 %."""
 _PICTURES_SHARE = 0.5
-"""Share of the memory limit for pictures: they are by far the largest (a human camera's is 0.8 MB; a step of 16
-PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be rendered again."""
+"""Share of the memory limit for pictures: they are by far the largest part, and can be rendered again. A
+picture of a human camera has 0.8 MB; a step without pictures has 21 KB for 16 PickCube envs, and 72 KB for
+64."""
 _MAX_ENDED = 64
 """Maximum number of ended episodes whose numbers are cached for curves."""
 _RECENT_MOMENTS = 200
@@ -167,11 +169,12 @@ class History:
     """The moments of one built task, oldest first, append-only. Not thread-safe: used on the loop.
 
     A reset is a separate moment, and so is going back: the envs *jump*, and new moments follow the jump. The moments that
-    they left are kept and can be returned to; undo goes back to the moment before a jump. A *segment* is a run of an env's
-    moments without a jump: it starts from a snapshot and has all actions, so it can be replayed. An *episode* starts at a
-    reset and continues through jumps back.
+    the envs left are kept, and the envs can go back to them; undo goes back to the moment before a jump. A
+    *segment* is a run of an env's moments without a jump: it starts from a snapshot and has all actions, so
+    it can be replayed. An *episode* starts at a reset and continues through jumps back.
 
-    Memory is bounded: pictures beyond half the limit are dropped first, oldest first; then the oldest moments.
+    Memory is bounded. First, the oldest pictures are dropped, until pictures use at most half of the limit;
+    then the oldest moments are dropped.
     """
 
     def __init__(
@@ -182,7 +185,7 @@ class History:
             table: the table of envs, without events so far.
             limit: memory limit in bytes; the newest moment is always kept.
             first_serial: the number of the first moment.
-            joints: names of `StepResult.qpos`.
+            joints: names of the joints of `StepResult.qpos`.
         """
         self._table, num_envs = table, table.rows().num_envs
         self.num_envs = num_envs
@@ -208,7 +211,8 @@ class History:
         """Add a moment.
 
         Without an action (a reset or a jump back) the worker sends reward zero and no reward terms. The stored values are
-        NaN after a reset, those of the origin after a jump back, and in all other envs those of the previous moment.
+        NaN in envs that were reset. Envs that went back get the values of the origin, and all other envs keep
+        the values of the previous moment.
         """
         restored, jumps = stepped.restored, bool(stepped.reset_mask.any())
         origin = None if restored is None else self.at(restored.origin)
@@ -366,7 +370,8 @@ class History:
         return [(low + int(k), int(event_flags[k])) for k in np.flatnonzero(event_flags)]
 
     def numbers(self, env: int, low: int, high: int, column: Column = REWARD) -> NDArray[np.float32]:
-        """(K,) numbers of this env between two moments, both included; at a reset, the reward is NaN."""
+        """(K,) numbers of this env in a column, between two moments, both included; at a reset, the reward is
+        NaN."""
         low, high = max(low, self.first), min(high, self.last)
         if column == REWARD:
             return self._columns.between("reward", low, high)[:, env]
@@ -376,8 +381,8 @@ class History:
     def episodes(
         self, env: int, serial: int, columns: Sequence[Column], before: int
     ) -> tuple[EpisodeNumbers, ...]:
-        """Numbers of this env's episode up to a moment, and of at most `before` episodes before it; the newest first. Episodes
-        without a control step are left out, except the first."""
+        """Numbers of this env's episode up to a moment, and of at most `before` episodes before it; newest
+        first. Earlier episodes without a control step are left out."""
         found = [self._episode_numbers(env, serial, columns)]
         last = found[0].before
         while last is not None and len(found) <= before:
@@ -555,7 +560,8 @@ class History:
 
         kept = np.flatnonzero(~jumped | stepped.resumed)
         if self._moments:
-            # Also if every env was reset: if an entry disappeared for a moment, the rows below would move.
+            # Also if every env was reset: otherwise entries would disappear for a moment, and the rows below
+            # move.
             take(self._moments[-1].step, kept, kept)
         if restored is not None and origin is not None:
             take(origin.step, list(restored.env_idx), list(restored.source))

@@ -23,8 +23,8 @@ from workbench.task.new_task import CannotBegin, fill_blank_file, is_blank
 from workbench.task.problem import Problem
 
 WIDTH_PIXELS, BUSY_WIDTH_PIXELS = 520, 460
-"""Widths if the view is wide enough. In a narrower view the style sheet narrows the banner, which would cover
-the controls: they still work, for the last good version."""
+"""Widths if the view is wide enough. In a narrower view the style sheet narrows the banner: otherwise it
+would cover the controls, which still work for the last good version."""
 
 FILL = "Write the minimal task into it"
 RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Restart the worker"
@@ -34,8 +34,8 @@ REBUILD_HINT = (
     "attribute. The current state is restored."
 )
 _MAY_BE_OLD = ("reset", "step", "evaluate", "reward", "observation", "returns")
-"""Stages that use objects made while the scene was built: a patch keeps those objects, and some that the new code
-expects may be missing."""
+"""Stages that use objects made while the scene was built: a patch keeps those objects. Other objects, which
+the new code expects, may be missing."""
 SHOWN_AFTER_SECONDS = 4.0
 """Time after which the banner of long-running code is shown. The status line shows it earlier; a banner is for code
 that the user may want to end."""
@@ -78,7 +78,8 @@ class Banner(PagePart[SessionView]):
     Args:
         server: The page.
         link: Links the line in the file.
-        is_own: Returns whether a file may be written: it is the task's, and the user (no recording) named it.
+        is_own: Returns whether the banner may write this file: it is the task's file, and was named by the
+            user, not by a recording.
     """
 
     does = (FillEmptyFile,)
@@ -96,7 +97,8 @@ class Banner(PagePart[SessionView]):
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
-            # A separate element: rewriting the first one when this text changes would close a traceback.
+            # A separate element, since its text changes: rewriting the element above would close a traceback
+            # there.
             self._kept = server.gui.add_html("")
             self._tools = server.gui.add_html("")
         self._panel.float(width=WIDTH_PIXELS)
@@ -197,9 +199,10 @@ def _kept(view: SessionView) -> str:
 class BusyBanner(PagePart[SessionView]):
     """A floating panel that is shown while the worker is busy for long: hook, line and seconds.
 
-    The code may only be slow, so nothing is done automatically. *Interrupt* raises in the author's code and keeps process
-    and envs. If that does not help (native code, a loop that catches everything), *Restart* ends the process.
-    A new one loads the file as it is now; if the file was being loaded, it restores the last good version.
+    The code may only be slow, so nothing is done automatically. *Interrupt* raises an exception in the
+    author's code, and keeps process and envs. If that does not help (native code, a loop that catches
+    everything), *Restart* ends the process. A new process loads the file as it is now; if the old process was
+    loading the file, the new one restores the last good version instead.
 
     Args:
         server: The page.
@@ -221,7 +224,7 @@ class BusyBanner(PagePart[SessionView]):
             self._panel.visible = False
             return
         self._html.content = busy_html(busy, view, self._link)
-        # A separate element: rewriting it for the changing seconds would close an open traceback.
+        # The traceback is a separate element: rewriting it with the changing seconds would close it.
         trace = (
             render("traceback", traceback=busy.traceback) if busy.ignores_interrupt and busy.traceback else ""
         )

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 CHARACTER_PIXELS, PADDING_PIXELS, NARROW_PADDING_PIXELS = 6.7, 15.7, 9.9
-"""Widths of an average character, and of the padding between two columns."""
+"""Widths of an average character, of the padding between two columns, and of this padding in a narrow
+panel."""
 DOT_PIXELS = 14.0
 """Width of the dot before the name of a state."""
 MARGIN_PIXELS = 36.0
@@ -20,8 +21,8 @@ class EnvColumn:
     Args:
         name: Its heading, which may break after each underscore.
         text: Length of its longest cell in characters.
-        word: Length of the word in this cell, which is left out first: the dot before it means the same.
-        fixed: Further pixels of a cell.
+        word: Length of the word in this cell. The word is left out first: the dot before it means the same.
+        fixed: Width of what a cell contains besides text, in pixels.
         rank: Order in which columns are left out, 0 first; None: never.
     """
 
@@ -47,13 +48,14 @@ class EnvColumn:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Content that is left out if the panel is at most `below` pixels wide, in addition to that of the previous levels."""
+    """Content that is left out if the panel is at most `below` pixels wide, in addition to what the previous
+    levels leave out."""
 
     below: int
     columns: tuple[int, ...] = ()
     """Numbers of the columns, from 1, that this level leaves out."""
     names: tuple[str, ...] = ()
-    """Names of everything that is left out."""
+    """Names of all columns that this level and the previous ones leave out."""
 
 
 def wanted_width(columns: Sequence[EnvColumn]) -> float:

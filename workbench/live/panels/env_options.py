@@ -41,14 +41,15 @@ LABELS = {
 }
 NONE = "none (null)"
 _MIN_DECIMALS, _MAX_DECIMALS = 4, 9
-"""Minimum and maximum number of decimals of the step of a number."""
+"""Minimum and maximum number of decimals of the step by which an arrow key changes a number."""
 
 
 class EnvOptionsPanel(PagePart[SessionView]):
     """A form that is applied as a whole, since every change rebuilds the envs.
 
-    Entered values stay in the form until they are applied or discarded, also if the task fails with them; the running
-    envs stay unchanged then. The form is rewritten when the envs were made with other options.
+    Entered values stay in the form until they are applied or discarded. If the task fails with them, they
+    stay too, and the running envs do not change. The form is rewritten when the envs were made with other
+    options.
     """
 
     does = (SetNumEnvs, SetKeyword, ApplyEnvOptions, DiscardEnvOptions, ResetEnvOptions)
@@ -142,7 +143,8 @@ class EnvOptionsPanel(PagePart[SessionView]):
         self._num_envs = view.options.num_envs
         self._values = {keyword.name: _in_effect(keyword) for keyword in self._keywords}
         if view.options_refused is not None:
-            # The task works with the options in effect: loading it removes the problem from the page.
+            # The task works with the options in effect: loading it with these removes the problem from the
+            # page.
             self._session.happen(OptionsApplied(view.options))
 
     def _apply(self) -> None:
@@ -166,10 +168,11 @@ class EnvOptionsPanel(PagePart[SessionView]):
 
 
 def merged(given: Mapping[str, Any], values: Mapping[Keyword, Any]) -> dict[str, Any]:
-    """The keyword arguments `given`, with the values of a form in place of theirs.
+    """The keyword arguments `given`, updated with the `values` of a form.
 
-    Unchanged arguments are kept, and arguments equal to the class's default are omitted. A new robot has other control
-    modes, so the old mode is dropped unless it was chosen together with the robot.
+    Unchanged arguments are kept. A changed argument that equals the class's default is omitted, unless it is
+    a mode. A new robot has other control modes, so the old mode is dropped unless a mode was chosen together
+    with the robot.
     """
     result = dict(given)
     changed = {keyword.name for keyword, value in values.items() if not _same(as_json(value), keyword.value)}

@@ -65,7 +65,7 @@ REWARD_CURVE = "reward curve"
 """Name of the only column by which the table cannot be sorted."""
 CURVE_WIDTH, CURVE_HEIGHT = 60, 14
 _GRAVITY = np.array([2, 3, 0, 1])
-"""Sort key of each `Outcome`: failed, then truncated, then running, then solved."""
+"""Sort key of each `Outcome`. The order is: fail, truncated, running, success."""
 
 
 def bool_entries(rows: EnvRows) -> tuple[str, ...]:
@@ -74,7 +74,8 @@ def bool_entries(rows: EnvRows) -> tuple[str, ...]:
 
 
 def entry_names(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[str, ...]:
-    """Bool entries that get a column: as the user has switched them, else the first `MAX_DEFAULT_ENTRIES`.
+    """Bool entries that get a column: those that the user switched on, and those of the first
+    `MAX_DEFAULT_ENTRIES` that the user did not switch off.
 
     Args:
         chosen: True or False for each entry that the user has switched.
@@ -141,8 +142,8 @@ def first_flagged(rows: EnvRows) -> int | None:
 def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") -> NDArray[np.int64]:
     """The envs that pass a filter, sorted by a column.
 
-    Envs without a value come last in both directions. Ties keep the order of the envs, or rows would jump although
-    nothing changes.
+    Envs without a value come last in both directions. Envs with equal values keep the order of their numbers:
+    otherwise rows would jump although nothing changes.
     """
     envs = np.flatnonzero(mask(rows, wanted))
     keys = _keys(rows, column)[envs]
@@ -161,7 +162,8 @@ def moment_of(rows: EnvRows, env: int) -> int | None:
 def make_rows(
     rows: EnvRows, envs: NDArray[np.int64], chosen: Mapping[str, bool] | None = None
 ) -> list[dict[str, Any]]:
-    """The cells of these envs. A curve is ``points`` of SVG polylines; flags of this episode come first."""
+    """The cells of these envs. A curve is ``points`` of SVG polylines; flags of the present episode come
+    before those of the previous one."""
     names = entry_names(rows, chosen)
     curves = _curves(rows.rewards, envs)
     made = []
@@ -420,7 +422,8 @@ class EnvPanel(MomentPart):
         return [*start, plain, *entries, *end]
 
     def _sorted_by(self, rows: EnvRows) -> tuple[str, bool]:
-        """The chosen order; by env number while the table lacks the column."""
+        """The chosen sort column, and whether it descends; the env's number while the table lacks that
+        column."""
         return self._sort if self._sort[0] in columns(rows, self._chosen) else ("env", False)
 
     def _measure(self, rows: EnvRows, shown: list[dict[str, Any]]) -> list[EnvColumn]:
@@ -487,8 +490,8 @@ class EnvPanel(MomentPart):
             self._session.happen(EnvEventShown(env, "flagged"))
 
     def _select_next(self, wanted: EnvEvent) -> None:
-        """Select the next env (by number, wrapping around) whose present or previous episode failed or has an
-        outlier, and go to this event. Uses the newest moment, so that pressing again visits all such envs."""
+        """Select the next env (by number, wrapping around) with the wanted event in its present or previous
+        episode, and go to this event. Uses the newest moment, so that pressing again visits all such envs."""
         rows = self._session.look(lambda run: run.newest_env_table())
         envs = np.zeros(0, int) if rows is None else np.flatnonzero(mask(rows, wanted))
         if not len(envs):

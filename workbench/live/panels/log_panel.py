@@ -31,13 +31,14 @@ DARK_PAGE: Rgb = (66, 66, 66)
 MIN_CONTRAST = 4.5
 """Minimum contrast ratio of text in WCAG 2.1."""
 MAX_SPANS = 1500
-"""Maximum number of spans in all lines: each character may have another colour. Older lines are plain."""
+"""Maximum number of spans of all lines together, since each character may have its own colour. If there are
+more, the oldest lines are shown without colours."""
 SIXTEEN = TerminalTheme(
     (255, 255, 255), (0, 0, 0),
     [(0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229)],
     [(102, 102, 102), (241, 76, 76), (35, 209, 139), (245, 245, 67), (59, 142, 234), (214, 112, 214), (41, 184, 219), (255, 255, 255)],
 )  # fmt: skip
-"""Theme for the sixteen colours as a background, or on a background colour."""
+"""Theme for the sixteen standard colours where they are a background, or text on a background colour."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Span:
 
 
 def spans_of_lines(lines: Sequence[tuple[str, tuple[StyledText, ...]]]) -> list[list[Span]]:
-    """The spans of each line (its text and its runs), at most `MAX_SPANS` in total."""
+    """The spans of each line, at most `MAX_SPANS` in total. A line is given as its text and its runs."""
     left = MAX_SPANS
     found: list[list[Span]] = []
     for text, runs in reversed(lines):
@@ -149,7 +150,8 @@ class LogPanel(PagePart[SessionView]):
         self._vitals = server.gui.add_html("")
         self._cleared = 0
         self._drawn: object = None
-        """Filter and number of clears at the last drawing; a change is drawn even while the log is held."""
+        """Filter and number of clears at the last drawing; a change of either is drawn even while the log is
+        paused."""
 
     def key(self, view: SessionView) -> object:
         return view.printed.serial, self._held, self._wanted, self._cleared, view.vitals
@@ -166,7 +168,8 @@ class LogPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         self._vitals.content = vitals_html(view.vitals)
-        # An empty log needs no controls. A paused one needs them as soon as there are lines, to be resumed.
+        # An empty log needs no controls. A paused log needs them once there are lines, so that the user can
+        # resume it.
         some = bool(view.printed.lines or view.printed.dropped)
         self._filter.visible = self._hold.visible = some
         self._hold.show(self._held)

@@ -54,7 +54,8 @@ Entry = tuple[Group, str]
 
 
 class CurvesPanel(MomentPart):
-    """Curves of the selected env's episode over its last episodes, or over the episodes of the other envs.
+    """Curves of the selected env's episode, drawn over the curves of its previous episodes, or of the
+    episodes of the other envs.
 
     The user chooses the curves; the choice is kept per task. A press on a curve, or a drag along it, shows the step.
     """
@@ -157,7 +158,8 @@ class CurvesPanel(MomentPart):
             own, alone = together[:MAX_LINES], len(together) == 1
             chosen = [(column, episodes[0]) for column in own]
             chosen += [(own[0], one) for one in episodes[1:]] if alone else []
-            # The shown episode is the first line: in a long episode, only the first line's peaks are exact.
+            # Put the shown episode first: `points` takes its steps from the first line's extremes, so only
+            # the peaks of that line are exact.
             x, values = spans_of(
                 np.stack([_along(one, column, first, last) for column, one in chosen]), first=first
             ).points()
@@ -342,8 +344,8 @@ def _other_row(name: str, entry: OtherEntry, env: int) -> NumberRow:
 
 
 def _earned_row(name: str, values: NDArray, step: StepResult, env: int, about: str = "") -> NumberRow:
-    """The row of the reward or of a reward term: a dash right after a reset, which has no reward (neither zero nor a NaN
-    of the task)."""
+    """The row of the reward or of a reward term. Right after a reset there is no reward: the row shows a
+    dash, not zero or NaN."""
     there = (step.elapsed_steps > 0) & (np.isfinite(values) | (step.action is not None))
     return NumberRow(
         name,

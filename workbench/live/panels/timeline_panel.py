@@ -124,9 +124,10 @@ class TimeBar(PagePart[View]):
 
 
 class TimelinePanel(TimeBar[SessionView], MomentPart):
-    """The live page's timeline. It counts control steps backwards: 0 is live and -37 is 37 steps ago, so that the slider
-    stays at its right end while the simulation runs and nothing is sent. Dragging shows moments that the session has in
-    memory; the worker draws pictures only after the slider has rested at one moment.
+    """The live page's timeline. It counts control steps backwards: 0 is live and -37 is 37 steps ago. So the
+    slider stays at its right end while the simulation runs, and nothing needs to be sent. Dragging shows
+    moments that the session has in memory; the worker draws pictures only after the slider has rested at one
+    moment.
     """
 
     does = (SeekBack, ZoomTimeline, GoToFirst, ChooseStripCurve)
@@ -317,8 +318,8 @@ def continue_tools(view: SessionView) -> list[Tool]:
 
 
 STRIP_POINTS = 240
-"""Number of points of the strip's line, minimum and maximum of each interval in turn: a spike of one step stays
-visible."""
+"""Number of points of the strip's line. The points are the minimum and the maximum of each interval, so that
+a spike of one step stays visible."""
 LINE_HEIGHT = 30.0
 """Height of the line in units of the SVG; the marks are above."""
 FLAGS = {
@@ -389,7 +390,7 @@ def strip_curves(view: SessionView) -> dict[str, Column]:
         return {REWARD.label: REWARD}
     found: dict[str, Column] = {}
     for column in columns_of(view.step, view.task.joints):
-        # A term and an entry of evaluate may have one name.
+        # A term and an entry of evaluate may have the same name.
         found[column.label if column.label not in found else f"{column.group.value} {column.label}"] = column
     return found
 
@@ -407,7 +408,7 @@ def strip_html(
         column: the number that the strip shows.
     """
     is_known = column != REWARD or view.task is None or view.task.reward_mode != "none"
-    # ManiSkill's reward is 0 if a task has none.
+    # ManiSkill returns the reward 0 for a task without a reward.
     numbers = strip.values if is_known else np.full_like(strip.values, np.nan)
     marks, finite = marks_of(strip), numbers[np.isfinite(numbers)]
     values = {

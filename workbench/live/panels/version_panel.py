@@ -65,7 +65,7 @@ class VersionPanel(PagePart[SessionView]):
         )
         self._again.content = tools_html(*again if view.state != "stopped" else ())
         self._task.visible = len(view.choices) > 1
-        # Sorted, so that the order does not depend on the shown one.
+        # Sorted, so that the order does not depend on the chosen class.
         self._task.show(next(iter(view.choices), ""), options=by_name(sorted(view.choices)))
         notices = () if task is None else task.notices
         refused = view.refused if view.state not in ("starting", "loading") else None
@@ -94,7 +94,7 @@ def version_html(
     """The panel's text about the running version, and about the file if it was refused.
 
     Args:
-        report: how the running version was loaded; None for the first.
+        report: how the running version was loaded; None for the first version.
         milliseconds: duration of the load.
         loaded: whether a version runs.
         refused: why the file's present text does not run.

@@ -31,7 +31,8 @@ BRAND = (28, 112, 190)
 
 
 class ViewIcons(PagePart[object]):
-    """What the 3-D view shows: the selected env or all, the cameras, the whole scene.
+    """Icons that choose what the 3-D view shows: the selected env or all envs, cameras, frames, the whole
+    scene.
 
     Args:
         choice: the choices; they outlive the page.

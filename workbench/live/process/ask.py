@@ -127,7 +127,7 @@ class Background(QuestionClient):
         super().__init__(self._send_call)
         self._niceness = niceness
         self._turn: _Rank | None = None
-        """Rank of the job that has the process, until its last answer has arrived."""
+        """Rank of the job whose turn it is; None between two turns."""
         self._waiting: dict[_Rank, asyncio.Future[None]] = {}
         self._idle: asyncio.TimerHandle | None = None
         """Timer that ends an idle process."""
@@ -153,8 +153,8 @@ class Background(QuestionClient):
     async def in_turns(
         self, job: Job, work: Callable[[], Awaitable[Value]], priority: Priority = "person"
     ) -> Value:
-        """Run `work` when it is this job's turn. If a job of higher rank preempts `work`, it is called again
-        in the next turn; the envs are in another state then.
+        """Run `work` when it is this job's turn. If a job of higher rank preempts `work`, `work` is called
+        again in the next turn; the envs are in another state then.
         """
         rank = _ORDER[priority], job.number
         while True:
@@ -202,7 +202,7 @@ class Background(QuestionClient):
         self._grant()
 
     def _is_waited_for(self) -> bool:
-        """Whether a job waits whose rank is higher than that of the job that has the process."""
+        """Whether a waiting job has a higher rank than the job that has the process."""
         return self._turn is not None and max(self._waiting, default=self._turn) > self._turn
 
     @property
@@ -228,7 +228,7 @@ class Background(QuestionClient):
             the number of envs.
 
         Raises:
-            JobFailed: one of the steps failed; has the problem, if the author's code raised.
+            JobFailed: one of these steps failed; `JobFailed.problem` is set if the author's code raised.
         """
         if self._process is None:
             job.report(0, 0, "starting a process in the background")
@@ -264,9 +264,10 @@ class Background(QuestionClient):
         Raises:
             JobFailed: there is no answer.
             ProcessDied: there is no answer because the process died.
-            Preempted: a job of higher rank waits. A load is finished first: that job probably needs it too.
+            Preempted: a job of higher rank waits. A load is not preempted: the waiting job probably needs it
+                too.
         """
-        # Check before sending: the waiting job would have to wait for the answer.
+        # Check before sending: otherwise the waiting job would have to wait for the answer.
         if self._is_waited_for() and not _is_load(question):
             raise Preempted
         if self._idle is not None:

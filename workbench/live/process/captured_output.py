@@ -21,7 +21,8 @@ SWITCHES = ("bold", "dim", "italic", "underline", "reverse", "strike")
 _MAX_LINE_BYTES = 2000
 _LINES_KEPT = 1000
 _LINES_PER_SECOND = 400
-"""Rate limit; further lines are counted and dropped. Handling them costs 1 % of a core."""
+"""Maximum number of lines per second that are kept; handling them costs 1 % of a core. Further lines are
+counted and dropped."""
 _BAR_PERIOD_SECONDS = 0.1
 """Minimum interval of reports of an unfinished line that is overwritten."""
 _FLOOD_BYTES = 16_384

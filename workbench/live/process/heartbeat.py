@@ -300,8 +300,8 @@ class Interrupts:
     A signal handler runs in the main thread between two bytecodes and may raise there: this ends an endless
     Python loop, with a traceback at the author's line. In the workbench's code it must not raise: half a
     message in the pipe would end the session. So the handler raises only while `allowed`, and not within
-    `shielded`. It cannot stop native code that does not return or a loop that catches everything; the
-    supervisor reports that.
+    `shielded`. It cannot stop native code that does not return, nor a loop that catches everything; the
+    supervisor reports both.
     """
 
     def __init__(self) -> None:

@@ -16,7 +16,7 @@ _SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kmgt]?)i?b?", re.IGNORE
 _SHARE = 0.8
 """Share of the memory of the machine or the container that ``auto`` allows."""
 _MIN_BYTES = 2**30
-"""Lowest allowed limit; a worker that has only imported uses about half of it."""
+"""Lowest allowed limit; a worker that has done only its imports uses about half of it."""
 _CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _PSS_PERIOD_SECONDS = 2.0
 
@@ -67,7 +67,8 @@ class FamilyMemory:
 
     Pages that a forked child shares with its parent count once: summed resident memory (RSS) would count a worker of
     1 GB with seven children as 8 GB. Reading the proportional set size (PSS) takes milliseconds, so it is read every two
-    seconds, and at once if the memory seems above the limit. Until then, new memory counts as not shared.
+    seconds, and at once if the memory seems above the limit. Between two readings, new memory counts as not
+    shared.
     """
 
     def __init__(self) -> None:

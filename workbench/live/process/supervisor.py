@@ -44,16 +44,18 @@ _INTERRUPT_TIMEOUT_SECONDS = 1.5
 _LOAD_WAIT_SECONDS = 2.0
 """Time that a load may wait behind other work before this work is interrupted."""
 _SILENCE_TIMEOUT_SECONDS = 4.0
-"""Time after this interrupt at which the worker is ended if the load still waits."""
+"""The worker is ended if the load still waits this long after the interrupt."""
 _RESTART_DELAY_SECONDS = 0.5
 _HEADLESS_SECONDS = 1.0
-"""Time without a main thread after which a worker is ended; an exiting process has none for a moment."""
+"""Time without a main thread after which a worker is ended; an exiting process has no main thread for a
+moment."""
 _MAX_DEATHS = 3
-"""Maximum number of workers that may die in a row without a load in between."""
+"""After this many deaths of workers in a row, without a load in between, the next worker is started only on
+request."""
 _SPARE_DELAY_SECONDS = 5.0
 """Time between a load and the start of a spare."""
 _MAX_SPARE_FAILURES = 2
-"""Maximum number of spares that may die while they warm up; then no more are started."""
+"""When this many spares have died, no more are started."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,8 @@ class ProcessMemory:
 
 
 class SpareWorker:
-    """A second, warmed-up worker that replaces one that dies. Used on one thread, which must outlive the spare.
+    """A second, warmed-up worker that replaces a worker that dies. Used on one thread, which must outlive the
+    spare.
 
     A new worker makes a render system and compiles its shaders; if it is not forked (`worker_start`), it also imports
     torch, SAPIEN and ManiSkill, which takes 4 s or more. The spare does this in the background once a task runs, then
@@ -181,10 +184,10 @@ class Supervisor:
     thread starts a worker, sends the requests of `first_requests`, forwards its events and checks it ten times a second.
     When the worker ends, the thread reports why and continues with the next one: the spare, if there is one.
 
-    The supervisor ends a worker whose main thread has ended or whose data is unusable. It ends a working one
-    only in two cases: memory above the limit, and a load that waits behind work that cannot be interrupted,
-    since a corrected file must not wait for a worker that hangs. A busy worker may just be slow: it is
-    reported with its line and left alone. Time during which a debugger holds the worker does not count.
+    The supervisor ends a worker whose main thread has ended or whose data is unusable. Otherwise it ends a
+    worker in only two cases: memory above the limit, and a load that waits behind work that cannot be
+    interrupted, since a corrected file must not wait for a worker that hangs. A busy worker may just be slow:
+    it is reported with its line and left alone. Time during which a debugger holds the worker does not count.
     """
 
     def __init__(
@@ -202,7 +205,7 @@ class Supervisor:
         """The callbacks are called on this object's threads, and may call `send`, `replace` and `interrupt`.
 
         Args:
-            first_requests: returns the requests that restore the previous worker's state in a new one.
+            first_requests: returns the requests that restore the previous worker's state in a new worker.
             on_busy: called about once a second during a long piece of work, and with None at its end.
             own_files: returns the author's files, to find the author's line in a stack.
             output: as for `WorkerProcess`.

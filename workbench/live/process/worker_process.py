@@ -44,7 +44,8 @@ from workbench.machine.processes.wire import MessageSocket
 _ONLY_LAST = (Load, Settings)
 """Request types of which only the last counts if several are queued in a row."""
 _MAX_REQUESTS = 1000
-"""Maximum queue length while the worker reads nothing; above it steps and resets are dropped (a key is held down)."""
+"""Maximum queue length while the worker reads nothing. Above it, steps and resets are dropped: many come from
+a key that is held down."""
 _PIECE_BYTES = 1 << 20
 _FLOOD_PAUSE_SECONDS = 0.005
 """Pause between two reads during a flood: with pieces of a megabyte, 200 MB are read in a second."""
@@ -63,7 +64,7 @@ class WorkerProcess:
     Start a worker on a thread that outlives it: a worker that is not forked (`worker_start`) is ended by the
     kernel with the thread that started it, so that no worker is left behind when the server is killed.
 
-    A worker has no standard input, so that a task that reads it gets EOF instead of hanging, and its own
+    A worker has no standard input, so that a task that reads it gets EOF and does not hang. It has its own
     process group, so that Ctrl-C in the terminal reaches only the server. The author's code may keep the
     worker from reading, writing and ending, so nothing here waits for the worker: requests go through a queue
     and a thread (an unread socket is full after some hundred messages, and the page would block), the
@@ -172,7 +173,7 @@ class WorkerProcess:
         return self._memory.measure(self._process.pid, limit)
 
     def main_thread_ended(self) -> bool:
-        """Whether the main thread has ended while another keeps the process alive."""
+        """Whether the main thread has ended while another thread keeps the process alive."""
         pid = self._heartbeat.pid
         return pid != 0 and main_thread_ended(pid) and self._process.poll() is None
 

@@ -44,10 +44,10 @@ def go_back(
     from the moment's snapshot in both cases.
 
     Args:
-        on_step: called with the number of replayed steps, and their total.
+        on_step: called with the number of steps replayed so far, and with the number of all steps to replay.
 
     Raises:
-        TaskError: the task's code raised at the moment itself.
+        TaskError: the task's code raised at the moment itself, not during a replay.
     """
     task, env = opened.env, opened.env.env
     snapshot: Snapshot = pickle.loads(request.snapshot)
@@ -59,7 +59,7 @@ def go_back(
         if put:
             report = restore_snapshot(env, snapshot, put, [source[i] for i in put])
         if replayed:
-            # All replayed envs in one call: only a whole batch restores the process's random generators.
+            # All replayed envs in one call: only a call for the whole batch restores the random generators.
             every, own = list(source), all(i == of for i, of in source.items())
             positions = [snapshot.env_idx.index(of) for of in source.values()]
             whole = own and snapshot.num_envs == env.num_envs == len(every)

@@ -49,7 +49,8 @@ class GuardedTask:
         self.when_loaded: ProcessState | None = None
         """Process settings at the end of the load of `opened`."""
         self.spoiled = False
-        """Whether the author's code left something in this process that cannot be undone: it must end."""
+        """Whether the author's code left something in this process that cannot be undone: the process must
+        end."""
 
     def run(self, doing: Doing | None, work: Callable[[], object], loads: bool = False) -> Problem | None:
         """Run `work`. Returns the failure, which was sent to the server, or None.
@@ -59,8 +60,9 @@ class GuardedTask:
         ends the process.
 
         Args:
-            doing: what the heartbeat shows; None if `work` runs no code of the author: no interrupt then.
-            loads: `work` loads a version, which is refused if it fails.
+            doing: what the heartbeat shows; None if `work` runs no code of the author, and cannot be
+                interrupted.
+            loads: whether `work` loads a version; if `work` fails, this version is refused.
         """
         if doing is None:
             work()
@@ -90,8 +92,8 @@ class GuardedTask:
         return None
 
     def _own_files(self, error: BaseException) -> list[Path]:
-        """The author's files, and the files in the task's folder on the traceback: their import may not have
-        finished."""
+        """The author's files, and the files on the traceback that are in the task's folder: these may not be
+        known yet, since their import may not have finished."""
         known = [] if self.opened is None else list(self.opened.loaded.source_files)
         if self.requested_file is not None:
             folder, frames = self.requested_file.parent, traceback.extract_tb(error.__traceback__)
@@ -117,7 +119,7 @@ class GuardedTask:
 
     def fail(self, problem: Problem) -> None:
         """Send a failure of the running task, and stop playing. The batch is restored to the end of the last
-        step; if this process is spoiled, another process restores it."""
+        step; if this process is spoiled, another process restores the batch."""
         self.failed = self.failed or problem.stage != "policy"
         spoiled = self._settings_changed()
         if not spoiled and problem.stage != "policy" and self.restore_last_step() is not None:

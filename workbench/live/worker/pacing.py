@@ -59,7 +59,8 @@ class Pacer:
 
 @dataclass
 class Rate:
-    """Events per second over a window of `window` seconds; if they are rarer, over the last two events."""
+    """Events per second over the last `window` seconds; over the last two events, if fewer than two lie in
+    that time."""
 
     window: float = 1.0
     _times: deque[float] = field(default_factory=deque)
@@ -84,7 +85,7 @@ class Rate:
 
 @dataclass
 class Shares:
-    """Shares of the last seconds that kinds of work took."""
+    """Share of the last `window` seconds that each kind of work took."""
 
     window: float = 2.0
     _spent: deque[tuple[float, str, float]] = field(default_factory=deque)

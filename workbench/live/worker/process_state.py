@@ -29,7 +29,7 @@ ProcessState = Mapping[str, object]
 
 
 def read_process_state() -> ProcessState:
-    """The present settings by name. Takes some milliseconds; compare two with `changed_settings`."""
+    """The present settings by name. Takes some milliseconds. `changed_settings` compares two states."""
     state: dict[str, object] = {
         "torch.get_default_dtype()": torch.get_default_dtype(),
         "torch.get_default_device()": torch.get_default_device(),
@@ -56,7 +56,7 @@ def read_process_state() -> ProcessState:
 
 
 def changed_settings(before: ProcessState, now: ProcessState) -> list[str]:
-    """Names of settings that were changed or removed, and of added environment variables (not functions)."""
+    """Names of settings that were changed or removed, and of environment variables that were added."""
     if may_be_debugged():
         # A debugger replaces functions of Python by its own, some when it attaches.
         before = {

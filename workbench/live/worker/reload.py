@@ -64,14 +64,16 @@ def load_version(
 ) -> tuple[OpenedTask, ReloadReport | None]:
     """Load the requested version of the task, and keep as much state of `running` as possible.
 
-    The env stays and gets the new class (``same``, ``patched``; ``cameras`` rebuilds the cameras); or another env is built
-    and takes over the state by name (``rebuilt``), and the caller closes the old env; or a new worker's env
-    takes over a snapshot that the server kept (``restarted``). In each case the new version is tried first:
-    on a copy of the current moment if only reward, evaluate or observation changed; also with a reset and a
-    step, which are undone, if the code of resets or steps changed. No picture may be in progress.
+    ``same`` and ``patched`` keep the env and give it the new class; ``cameras`` also rebuilds its cameras.
+    ``rebuilt`` builds another env, which takes over the state by name; the caller closes the old env.
+    ``restarted``: the env of a new worker takes over a snapshot that the server kept. In each case the new
+    version is tried first: on a copy of the current moment if only reward, evaluate or observation changed;
+    also with a reset and a step, which are undone, if the code of resets or steps changed. No picture may be
+    in progress.
 
     Raises:
-        TaskError: the version does not work. If its code ran, the process must end: effects are not undone.
+        TaskError: the version does not work. If its code ran, the process must end: the effects of
+            this code are not undone.
     """
     opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
@@ -133,7 +135,7 @@ def _bring_in(
                 change = replace(change, level="rebuilt", reason=str(why))
         return _build(request, running, loaded, change, opening)
     except BaseException:
-        # Or the running version would use helper modules and registrations of the failed one.
+        # Otherwise the running version would use helper modules and registrations of the failed version.
         undo_load(loaded)
         raise
 
@@ -144,8 +146,8 @@ def _bring_in(
 def why_new_process(
     request: Load, running: Running, failed: bool, at_start: ProcessState, when_loaded: ProcessState
 ) -> NewProcessNeeded | None:
-    """What the running version left in this process that no reload undoes. None if there is nothing, or if
-    the new version will leave the same.
+    """What the running version left in this process that no reload undoes. None if there is nothing, if the
+    new version will leave the same, or if the new version is not Python.
 
     Args:
         failed: whether the running version raised while it ran.
@@ -255,7 +257,7 @@ def _exchange(
     if change.level == "cameras" and not can_exchange_cameras(env):
         raise _MustRebuild(f"{change.reason}, and cameras cannot be exchanged here")
     rules = opened.env.broken_rules or BrokenRules({})
-    # Nothing from here on is undone on failure: the process ends then.
+    # From here on nothing is undone: after a failure the process ends.
     put_class(env, loaded.cls)
     left: dict[str, str] = {}
     if change.level != "same":
@@ -298,7 +300,8 @@ def _exchange(
 
 
 def _find_place(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[str, int] | None:
-    """The place of a finding in the new version; None if its function has changed."""
+    """The place of a finding in the new version; None if its function has changed, or the finding has no
+    file."""
     if row.file is None or row.line is None or row.file not in before.source:
         return None if row.file is None else (row.file, row.line or 1)
     text = after.source.get(row.file)
