@@ -53,7 +53,8 @@ class Card:
 
 
 def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
-    """Cards by degree, ``stop`` first, then ``warn``, then the findings of an earlier version.
+    """Cards by degree: ``stop``, then ``warn``. Cards with nothing but findings of an earlier version come
+    last.
 
     Args:
         played: findings seen while playing.
@@ -67,8 +68,8 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
         known = rows[place].finding
         same = known.key == finding.key
         rows[place] = Row(known, _played(finding) if same else f"{_played(finding)}: {finding.message}")
-    # The checks reach the rules of GPU simulation last, but playing shows a breach at once: then the old
-    # finding is left out.
+    # A finding of an earlier version is left out if a row has it already: the checks reach the rules of GPU
+    # simulation last, but playing shows their breaches at once.
     rows += [Row(finding, old=True) for finding in checks.before if _same(finding, rows) is None]
     together: dict[str, list[Row]] = {}
     for row in rows:
@@ -79,8 +80,8 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
 
 
 def _same(finding: Finding, rows: Sequence[Row]) -> int | None:
-    """Index of the row with the same finding; None without one. For an outlier any row of its rule matches:
-    playing reports an outlier at its hook, the checks report it at its line."""
+    """Index of the row with the same finding; None if no row has it. For an outlier any row of its rule
+    matches: playing reports an outlier at its hook, the checks report it at its line."""
     of_rule = [place for place, row in enumerate(rows) if row.finding.rule == finding.rule]
     alike = [place for place in of_rule if rows[place].finding.key == finding.key]
     if not alike and finding.rule in OUTLIER_RULES:
@@ -94,8 +95,8 @@ def count(shown: Iterable[Card]) -> int:
 
 
 def without_finding(checks: ChecksView, shown: list[Card]) -> list[RuleResult]:
-    """Results of the rules without a finding. A rule that is kept in the checks may have a finding from
-    playing."""
+    """Results of the rules without a finding. A rule that the checks found kept is left out if playing found
+    a breach of it."""
     broken = {card.rule.id for card in shown if not card.old}
     return [result for result in checks.results if result.rule not in broken]
 
@@ -121,7 +122,8 @@ def undecided(results: Iterable[RuleResult]) -> list[Undecided]:
 
 
 def summary(checks: ChecksView, shown: list[Card]) -> str:
-    """``2 stop, 3 warn, 50 kept, 3 not known``: findings by degree, then rules."""
+    """Number of findings by degree, then number of rules by state: ``2 stop, 3 warn, 50 kept, 3 not
+    known``."""
     by_degree = dict.fromkeys(DEGREES, 0)
     for card in shown:
         for row in card.rows:
@@ -137,8 +139,8 @@ def summary(checks: ChecksView, shown: list[Card]) -> str:
 
 
 def times(count: int) -> str:
-    """``once``, ``7 times``, ``300 times and more``. Of large counts only the first digit is shown, or the
-    list would change at each step."""
+    """``once``, ``7 times``, ``300 times and more``. Of large counts only the first digit is shown, so that
+    the list does not change at each step."""
     if count < 10:
         return "once" if count == 1 else f"{count} times"
     scale = 10 ** (len(str(count)) - 1)

@@ -48,7 +48,7 @@ class CheckReport:
     comments: tuple[Comment, ...] = ()
     """Silencing comments without effect."""
     missing: int = 0
-    """Number of rules that were not checked, counted for each part of the seeds."""
+    """Number of rules that were not checked, added up over the parts of the seeds."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -60,8 +60,9 @@ class CheckReport:
         return tuple(result for result in self.results if result.state == state)
 
     def fails(self, fail_on: FailOn) -> bool:
-        """Whether a finding has this degree or a higher one, the check of a rule failed, or a rule is not known because the
-        author's code raised. False if `fail_on` is ``never``."""
+        """Whether the check counts as failed. It does if a finding has this degree or a higher one, if the
+        check of a rule failed, or if the author's code raised and no comment silences the rule `runs`. It
+        does not if `fail_on` is ``never``."""
         if fail_on == "never":
             return False
         if self.of_state("failed") or any(fails(finding.degree, fail_on) for finding in self.findings):
@@ -83,13 +84,14 @@ def check(
 
     Args:
         on_activity: gets the name of the current work, for a status line.
-        on_result: gets each result as it comes; a rule may get several results from several checks. With
-            several parts of the seeds, it gets only the results that no further part changes.
-        stop: called between steps; after True the rules that are not done are missing in the report.
+        on_result: gets each result as it comes; several checks may give results of one rule. With several
+            parts of the seeds, a result that a further part may change is left out.
+        stop: called between steps. Once it returns True, the check ends; rules that are not done are missing
+            in the report.
         executor: None to run in this process, or in spawned processes if there are several workers.
         began: when the work began, by ``time.monotonic()``; None for now.
-        on_progress: with several parts of the seeds, gets the number of rules that are done, counted for each
-            part.
+        on_progress: called only with several parts of the seeds; gets the number of rules that are done,
+            added up over the parts.
 
     Raises:
         TaskError: the task or the policy cannot be imported, or the task lacks assets.
@@ -180,7 +182,7 @@ class _Results:
             self._task, self._started = task, time.monotonic()
 
     def report(self, began: float | None, stopped: bool) -> CheckReport:
-        # The check was stopped before the task was imported: nothing is known of the task.
+        # Nothing is known of the task if the check was stopped before the task was imported.
         task = self._task or CheckedTask("", "", None)
         by_part: dict[int, list[ItemOutcome]] = {}
         for number in sorted(self._outcomes):

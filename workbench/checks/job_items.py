@@ -1,4 +1,4 @@
-"""Options of a check, and how it is divided into items: a rule on a part of the seeds."""
+"""Options of a check, and its division into items. An item is a rule on a part of the seeds."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class CheckPlan:
     chunk: int
     """Number of item numbers in a chunk; some numbers have no item."""
     part: int
-    """Number of seeds of a part. A rule that compares whole batches uses one seed for each env."""
+    """Number of seeds of a part: at least one for each env, which rules that compare whole batches need."""
     parts: int
 
     @property
@@ -134,7 +134,7 @@ class CheckPlan:
         return len({number // self.chunk for number in self.items})
 
     def episodes(self, part: int, seeds: int) -> range:
-        """Range of the seeds in a part, counted from 0, out of `seeds` seeds."""
+        """Indices of the seeds of a part, from 0. `seeds` is the number of all seeds."""
         return range(part * self.part, min((part + 1) * self.part, seeds))
 
 

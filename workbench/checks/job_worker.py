@@ -96,7 +96,8 @@ class _Worker:
         if self._checkup is not None and part == self._part:
             return self._checkup
         self.close()
-        # What the task draws outside of resets must not depend on what this process did before.
+        # The random numbers that the task draws outside of resets must not depend on what this process did
+        # before.
         random.seed(0)
         np.random.seed(0)
         torch.manual_seed(0)
@@ -133,7 +134,7 @@ class _Worker:
 
 
 def _require_assets(loaded: LoadedTask, what: CheckOptions) -> None:
-    """Raise TaskError if a download is missing, which is no fault of a line of the task."""
+    """Raise TaskError if a download is missing: no line of the task is at fault."""
     given = given_arguments(loaded.cls, what.options.env_kwargs, loaded.default_kwargs)
     with blamed("build", loaded):
         require_assets(loaded.cls.__name__, loaded.asset_ids, robots_of(loaded.cls, given))
@@ -171,7 +172,7 @@ class _Given:
         self._loaded = loaded
         first = what.options.seed
         if runs:
-            # Actions that belong to no start are tried from each seed.
+            # A single run without a seed and without states: its actions are tried from each seed.
             from_seeds = len(runs) == 1 and runs[0].seed < 0 and not runs[0].env_states
             count = what.seeds if from_seeds else min(len(runs), what.seeds)
             chosen = {k: runs[k % len(runs)] for k in episodes if k < count}

@@ -31,7 +31,7 @@ REST = "rest"
 
 
 class ChecksPanel(PagePart[SessionView]):
-    """Findings of the checks and of what was played, worst first, each with its line.
+    """Findings of the checks and of playing, worst first, each with its line.
 
     Args:
         server: The page.
@@ -111,7 +111,8 @@ def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) 
 
 
 def _comments(view: SessionView) -> list[Comment]:
-    """Silencing comments without effect; those without a finding are known once all rules are checked."""
+    """Silencing comments without effect. Which comments silence no finding is known once all rules are
+    checked."""
     task, checks = view.task, view.of(ChecksView)
     if task is None:
         return []
@@ -128,10 +129,10 @@ def list_html(
     link: LinkTo = no_links,
     comments: Sequence[Comment] = (),
 ) -> str:
-    """HTML of the findings and, if that part is unfolded, of the rules without a finding.
+    """HTML of the findings, and of the rules without a finding if their part is unfolded.
 
     Args:
-        more: breaches seen while playing at lines that are not listed.
+        more: number of findings from playing that are not listed.
         opened: ids of the unfolded rules, and `REST`.
         toggle: gives the command that unfolds or folds a part.
         comments: silencing comments without effect.

@@ -49,7 +49,7 @@ class StepProfilePanel(PagePart[SessionView]):
 
 
 def profile_html(shown: ProfileView, link: LinkTo = no_links) -> str:
-    """HTML of the tables; without a profile, of what they show."""
+    """HTML of the tables; without a profile, of a sentence that says what the tables will show."""
     lines = () if shown.profile is None else shown.profile.lines[:MOST_LINES]
     lines = [line for place, line in enumerate(lines) if place < FEWEST_LINES or line.share >= SMALL]
     known = {"lines": lines, "most_hooks": MOST_HOOKS, "ms": milliseconds, "part": share_text}

@@ -19,7 +19,7 @@ class CheckedGroup:
     groups: int
     """Number of groups."""
     rules: int
-    """Number of rules in all groups that are not off."""
+    """Number of rules in all groups, without the rules that are off."""
     next: str
     """What the next group looks at; empty after the last group."""
 

@@ -32,8 +32,8 @@ def rule(id: str, degree: Degree, hook: str, *, see: See | None = None, solve: b
     """Declare the decorated function as the check of a rule, and its docstring as the rule's page (`declared_rule`).
 
     Args:
-        see: only for a rule over all seeds: gives rows about a part of the seeds, which the decorated
-            function judges.
+        see: only for a rule over all seeds: gives rows about a part of the seeds. The decorated function
+            judges the rows.
         solve: as `Rule.solve`.
     """
 
@@ -45,7 +45,8 @@ def rule(id: str, degree: Degree, hook: str, *, see: See | None = None, solve: b
 
 
 def outlier_check(id: str, *, see: See) -> Declare:
-    """Declare the decorated function as the check of a rule of `OUTLIER_RULES`, where the rule's page is.
+    """Declare the decorated function as the check of a rule of `OUTLIER_RULES`. The rule's page is there, not
+    in the docstring.
 
     Args:
         see: as in `rule`.

@@ -11,9 +11,11 @@ from workbench.envs.gpu_rules import Finding
 from workbench.task.problem import Problem
 
 State = Literal["broken", "failed", "silenced", "not_known", "kept", "not_applicable"]
-"""Result of a rule. If one check gives a rule several results, the first in this order counts.
+"""Result of a rule. If a rule has several results in one check, the one whose state comes first in this type
+counts.
 
-- ``broken``: it has findings. ``silenced``: comments in the source silence all of them.
+- ``broken``: the rule has findings that no comment in the source silences.
+- ``silenced``: the rule has findings, and comments silence all of them.
 - ``kept``: the rule was tried and has no finding.
 - ``not_known``: the rule was not tried, or not to the end: no episode succeeded, the task raised, and so on.
 - ``not_applicable``: the rule says nothing about this task.
@@ -23,7 +25,7 @@ STATES: tuple[State, ...] = get_args(State)
 
 
 def state_text(state: State) -> str:
-    """``not known``."""
+    """The state as text, such as ``not known``."""
     return state.replace("_", " ")
 
 
@@ -47,7 +49,7 @@ class Seen:
     place: tuple[str, int, str] | None = None
     """File, line and function at which a breach is reported."""
     tried: int = 0
-    """Number of episodes, or of other things that the rule counts, that the check looked at."""
+    """Number of episodes that the check looked at, or of other things if the rule counts those."""
     seeds: tuple[int, ...] = ()
     """Seeds of the episodes that break the rule."""
     count: int = 0
@@ -61,7 +63,7 @@ class Seen:
     code: str = ""
     """The text of the line of `place`."""
     silence: tuple[str, int] | None = None
-    """Reason and line of the comment that silences the rule there."""
+    """Reason and line of the comment that silences the rule at `place`."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class RuleResult:
     was not completed."""
     seconds: float = 0.0
     seen: tuple[Seen, ...] = ()
-    """Rows of an `OverSeeds` check, from which this result and those of further seeds are judged together."""
+    """Rows of an `OverSeeds` check. The rows of all parts of the seeds are judged together."""
     problem: Problem | None = None
     """The error that the author's code raised; in a failed check, the error of the check."""
 
@@ -113,7 +115,8 @@ def merged(results: Iterable[RuleResult], other_seeds: bool = False) -> RuleResu
     results = sorted(results, key=lambda result: STATES.index(result.state))
     findings: dict[object, Finding] = {}
     for finding in (finding for result in results for finding in result.findings):
-        # One line may have two mistakes; with other seeds, the message about one mistake has other numbers.
+        # On the same seeds, two messages at one line are two mistakes. On different seeds they may be one
+        # mistake with other numbers.
         key = finding.key if other_seeds else (finding.key, finding.message)
         known = findings.setdefault(key, finding)
         if known is not finding and other_seeds:

@@ -92,14 +92,15 @@ _OF_SEVERAL = frozenset(
         *("other-env-written", "stepped-in-reset", "rows-lost", "rows-rewritten", "applied-by-reset"),
     )
 )
-"""Rules of GPU simulation about the other envs: one env alone cannot break them."""
+"""Rules of GPU simulation about several envs: a task with one env cannot break them."""
 GPU_RESETS = 6
 """Number of resets of random envs, with steps between them."""
 ONE_ENV = "The task runs with one env: --num-envs 1."
 
 
 def check_rule(rule: str, check: Check, checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
-    """The result of a rule, then one of the rule `runs` if the task raised. Raises CheckEnded."""
+    """The result of a rule, then a result of the rule `runs` if the task raised an error that no rule reports
+    yet. Raises CheckEnded."""
     began = time.perf_counter()
     rows: list[Seen] = []
     further: list[RuleResult] = []
@@ -163,8 +164,8 @@ def ended_as(look: Callable[[], None]) -> LookEnd:
 
 
 def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
-    """Run a check. If the task uses something that exists for one env only, run it again with one env, as
-    opening a task does. An exception in the author's code, such as a robot's property, becomes a
+    """Run a check. If the task uses something that exists for one env only, run the check again with one env;
+    opening a task does the same. An exception in the author's code, such as a robot's property, becomes a
     TaskError."""
     try:
         look()
@@ -201,7 +202,8 @@ def _ended(result: RuleResult, ended: LookEnd) -> RuleResult:
 
 
 def problem_of_crash(error: Exception) -> Problem:
-    """The exception that a check raised, at the innermost line of the workbench, with the whole traceback."""
+    """A problem for the exception that a check raised: its innermost line in the workbench, and the whole
+    traceback."""
     frames = traceback.extract_tb(error.__traceback__)
     at = next((frame for frame in reversed(frames) if Path(frame.filename).is_relative_to(_PACKAGE)), None)
     file = None if at is None else str(Path(at.filename).relative_to(_PACKAGE.parent))
@@ -277,9 +279,9 @@ def raised(error: Problem, checkup: Checkup) -> Found:
 
 
 def check_gpu_rules(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
-    """Step and reset random envs under the rules of GPU simulation. Returns a result without breaches for
-    each rule: `gpu_results` makes those with breaches from `Checkup.findings`, to which all checks add.
-    Raises CheckEnded."""
+    """Step all envs and reset random ones under the rules of GPU simulation. Returns a result without
+    breaches for each rule: `gpu_results` makes the results with breaches from `Checkup.findings`, to which
+    all checks add. Raises CheckEnded."""
     further: list[RuleResult] = []
     not_applicable: dict[str, str] = {}
     try:

@@ -33,8 +33,10 @@ def comments_without_effect(
 
     Args:
         sources: texts of the author's files by path.
-        results: results of all checked rules, once the check is done. Comments on rules without a decided result are left out.
-        class_name: the class that was checked. Comments in other tasks are left out: those were not checked.
+        results: results of all checked rules, once the check is done. Only a rule that is kept, broken or
+            silenced can show that a comment silences no finding.
+        class_name: the class that was checked. A comment in another task is not reported for silencing no
+            finding, since that task was not checked.
         others: class names of other tasks in the file.
     """
     found: list[Comment] = []
@@ -97,7 +99,7 @@ def _classes(text: str) -> list[ast.ClassDef]:
     try:
         return [node for node in ast.walk(parse_python(text)) if isinstance(node, ast.ClassDef)]
     except (SyntaxError, ValueError, RecursionError):
-        return []  # the page reads files that are being edited
+        return []  # a file that is being edited may not parse
 
 
 def _bases(node: ast.ClassDef) -> set[str]:

@@ -24,11 +24,11 @@ from workbench.page.command import Command, Refused
 from workbench.task.problem import Problem
 
 AHEAD_SECONDS = 2.0
-"""Seconds of checking at low priority. After that, the priority is the lowest: a person waits more for the
-rescored history than for the last rule."""
+"""Seconds of checking at low priority. After that, the priority is the lowest: a person needs the rescored
+history sooner than the results of the last rules."""
 MAX_DEATHS = 5
 """Maximum number of processes that may die in one check. If one dies, the running rule fails and a new
-process checks the others."""
+process checks the remaining rules."""
 ChecksState = Literal["none", "off", "loading", "checking", "done", "stopped", "failed"]
 RUNNING: tuple[ChecksState, ...] = ("loading", "checking")
 DOES: frozenset[type[Command]] = frozenset({CheckNow, StopChecks, CheckAfterSave})
@@ -180,8 +180,8 @@ def apply(checks: Checks, event: object, before: Run, run: Run) -> Change:
             return checks, effects
         case VersionLoaded() if _task_id(before) != _task_id(run):
             return _changed(checks, before=(), results=()), []
-        # Not at `VersionLoaded`, at which rescoring begins: of two jobs of one priority, the later one comes
-        # first.
+        # The check begins here, and not at `VersionLoaded`, at which rescoring begins: of two jobs of the
+        # same priority, the one that begins later runs first.
         case LoadDone() if (load := run.running_load()) is not None:
             return _check_loaded(checks, load)
         case _ if checks.view.state in RUNNING:
@@ -358,7 +358,8 @@ async def load_version(process: Background, job: Job, load: Load) -> None:
 
 
 def _still_there(finding: Finding, source: Mapping[str, str] | None) -> bool:
-    """Whether this version still contains the finding's line of code; True for a finding without a line."""
+    """Whether this version still contains the finding's line of code; True if the line or the text of its
+    file is not known."""
     if source is None or finding.file is None or not finding.code:
         return True
     text = source.get(finding.file)

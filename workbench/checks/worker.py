@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from workbench.task.load import LoadedTask
 
 OnProgress = Callable[[int, int, RuleProgress], None]
-"""Progress callback (done, total, progress): results of this group so far, rules in all groups that are not
-off, and the rule that began or has its result."""
+"""Progress callback (done, total, progress): number of results of this group so far; number of rules in all
+groups, without the rules that are off; the rule that began or has its result."""
 NUM_ENVS, SEEDS = 8, 32
 """Number of envs of a check (1 if the opened task has one env), and number of seeds."""
 
@@ -30,7 +30,7 @@ class WorkerChecks:
     def __init__(self, waits: Callable[[], bool]) -> None:
         """
         Args:
-            waits: returns whether a request is waiting, which ends the check.
+            waits: returns whether a request is waiting; if so, the check ends.
         """
         self._waits = waits
         self._checkup: Checkup | None = None
@@ -106,7 +106,7 @@ class WorkerChecks:
         return CheckedGroup(len(groups), total, groups[following].name if following < len(groups) else "")
 
     def _checkup_of(self, opened: OpenedTask, options: TaskOptions) -> Checkup:
-        from workbench.checks.evidence.collect import Checkup  # late: the worker that plays checks nothing
+        from workbench.checks.evidence.collect import Checkup  # late: the worker that plays never needs it
 
         loaded = opened.loaded
         if self._checkup is None or self._of is not loaded:

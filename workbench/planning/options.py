@@ -69,8 +69,8 @@ class PlanOptions(PlanArguments):
 
         Args:
             control_dt: simulated seconds of a control step.
-            has_success: whether the task's ``evaluate`` reports success. Without success, a task is to hold a state, such
-                as a balanced pole, and a plan of half a second is too short to see a fall.
+            has_success: whether the task's ``evaluate`` reports success. A task without success has to hold a
+                state, such as a balanced pole, and a plan of half a second is too short to see a fall.
         """
         fewest, most = _HORIZON_STEPS
         seconds = 0.5 if has_success else 1.0

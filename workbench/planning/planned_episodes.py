@@ -52,12 +52,12 @@ class PlannedEpisode:
 
     @property
     def solved_at(self) -> int:
-        """The step of the first success, from 1 on; 0 without one."""
+        """The step of the first success, from 1 on; 0 if there is no success."""
         return int(self.success.argmax()) + 1 if self.success.any() else 0
 
     @property
     def failed_at(self) -> int:
-        """The step of the first fail, from 1 on; 0 without one."""
+        """The step of the first fail, from 1 on; 0 if there is no fail."""
         return int(self.fail.argmax()) + 1 if self.fail.any() else 0
 
 

@@ -109,7 +109,8 @@ def make_rollout_env(
         Exception: raised by the author's class while it builds.
     """
     kept = {name: value for name, value in kwargs.items() if name not in _NOT_FOR_ROLLOUTS}
-    # With "state" the reward gets the same parts, but they are also flattened to a vector for a policy.
+    # With "state" the reward gets the same parts as with "state_dict", but ManiSkill also flattens them to a
+    # vector for a policy.
     plain = "state_dict" if "state_dict" in env.SUPPORTED_OBS_MODES else "state"
     kept["obs_mode"] = "none" if env.obs_mode == "none" else plain
     kept["reward_mode"] = env.reward_mode
@@ -126,7 +127,8 @@ def make_rollout_env(
     try:
         rolled = build_env(task_class(env), options)
     except Exception:
-        # A task may need a renderer while it builds, for many reasons: only a second try shows whether that was the cause.
+        # A task may need a renderer while it builds, for many reasons: only a second try, with a renderer,
+        # shows whether that was the cause.
         if not env.scene.can_render():
             raise
         rolled = build_env(task_class(env), replace(options, render=True))
@@ -169,7 +171,8 @@ class RolloutPlanner:
         self._scale = torch.tensor([_noise_scale(part) for part in dimensions])
         self._samplers: dict[int, Sampler] = {}
         self._alike: tuple[object, set[int]] = (None, set())
-        """Scene of the live batch, and its envs that are known to have the same bodies."""
+        """Scene of the live batch, and those of its envs that are known to have the same bodies as the
+        rollouts' envs."""
 
     def begin(self, env: int, seed: int) -> None:
         """Begin an episode in this env of the live batch: forget its plan, and seed its candidates."""
@@ -261,7 +264,8 @@ class RolloutPlanner:
         success (K,).
 
         Args:
-            traced: body whose positions (K, 3), at the start and after each step, are appended to `paths`; None for none.
+            traced: body whose positions (K, 3), at the start and after each step, are appended to `paths`;
+                None to trace no body.
         """
         count, horizon, _ = sequences.shape
         env, device = self.env, self.env.device
@@ -315,8 +319,8 @@ def _noise_scale(part: actions.ActionPart) -> float:
 
 @once_a_scene
 def bodies_of(env: BaseEnv) -> list[dict[str, bytes]]:
-    """Hash of each body by name, one dict per env. Covers what determines how the body moves and collides, not its state.
-    The same in every process."""
+    """Hash of each body by name, one dict per env. The hash covers what determines how the body moves and
+    collides, not its state. Equal bodies have the same hash in every process."""
     index = scene_index(env)
     return [
         {

@@ -12,16 +12,17 @@ plan."""
 _MOVE_PROBABILITY = 0.5
 """Probability that a dimension is changed from the plan, in a third of the candidates."""
 _FLIP_PROBABILITY = 0.3
-"""Probability that a knot of a switching dimension is redrawn, in half of the candidates. The others keep
-theirs: a candidate that drops an object does not find how to carry it."""
+"""Probability that a knot of a switching dimension is redrawn, in half of the candidates. The other half
+keeps the plan's knots: a candidate that drops an object does not find how to carry it."""
 _TOP_FRACTION = 0.25
 """Fraction of best candidates whose spread of returns scales MPPI's temperature: if many candidates drop an object, the
 spread of all is so wide that all good ones get the same weight."""
 _KEPT_CANDIDATES = 2
 """Number of best candidates of a round that are tried again in the next round."""
 _MOTION_PENALTY = 1.0
-"""MPPI's penalty on motion, in spreads of the best candidates: the extra return that full motion in every dimension needs
-over holding still. Without it, useless rotations add up, and a hand that arrives tilted grasps badly."""
+"""MPPI's penalty on motion, in spreads of the best candidates: the return of full motion in every dimension
+must exceed the return of holding still by this much. Without it, useless rotations add up, and a hand that
+arrives tilted grasps badly."""
 _MIN_SPREAD = 0.2
 """CEM's minimum spread, as a fraction of the noise: a spread of zero finds nothing new."""
 

@@ -52,7 +52,7 @@ class SolveReport:
 
     @property
     def median_steps(self) -> float | None:
-        """Median control steps to success over the solved seeds; None without one."""
+        """Median control steps to success over the solved seeds; None if no seed is solved."""
         return median(one.solved_at for one in self.solved) if self.solved else None
 
     @property
@@ -68,8 +68,8 @@ class SolveReport:
 
     @property
     def summary(self) -> str:
-        """``Solved 14 of 16 seeds, in 9 control steps (median). 61 s.``; ``3 of 16 seeds are done, 2 solved
-        ...``."""
+        """``Solved 14 of 16 seeds, in 9 control steps (median). 61 s.``; while seeds are left, ``3 of 16
+        seeds are done, 2 solved ...``."""
         done, solved = len(self.seeds), len(self.solved)
         steps = "" if self.median_steps is None else f", in {self.median_steps:g} control steps (median)"
         what = f"Solved {solved} of {_seeds(done)}"

@@ -147,7 +147,8 @@ def flat(episodes: PlannedEpisodes) -> RewardVerdict | None:
 
 
 def stuck(episodes: PlannedEpisodes) -> RewardVerdict | None:
-    """Unsolved episodes at whose end no rollout earned more than holding still, or than the episode already did."""
+    """Unsolved episodes at whose end no rollout earned more than the better of two: holding still, and
+    repeating the previous reward."""
     found = [
         one
         for one in episodes.unsolved

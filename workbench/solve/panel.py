@@ -252,7 +252,7 @@ class SolvePanel(PagePart[SessionView]):
             self._traces.draw(plan.paths, offset, 0 if view.playing else self._place_in(plan))
 
     def _place_in(self, plan: PlannedEnv) -> int:
-        """Index of the chosen rollout; 0, the best one, if this plan has fewer."""
+        """Index of the chosen rollout among the drawn ones; 0, the best one, if this plan draws too few."""
         return self._place if self._place < len(plan.drawn) else 0
 
     def _draw_saving(self, view: SessionView) -> None:
@@ -286,7 +286,8 @@ class SolvePanel(PagePart[SessionView]):
         self._chart.draw("Mean reward per step over the horizon of the plan", steps, lines)
 
     def _tell(self, view: SessionView) -> None:
-        """Notify every page of newly solved envs, on any tab: this tab may not be open while it plans."""
+        """Notify every page of newly solved envs, whichever tab is open: a person may look at another tab
+        during planning."""
         solved = view.of(SolveView).solved
         new = [one for one in solved if one not in self._told]
         self._told = solved

@@ -61,7 +61,7 @@ class SeedsView:
 
 @dataclass(frozen=True)
 class SeedsTold:
-    """An update from the other process."""
+    """An update from the solving process."""
 
     activity: str = ""
     """New value of `SeedsView.activity`."""
@@ -157,7 +157,7 @@ def _changed(view: SeedsView, **values: Any) -> SeedsView:
 
 @dataclass(frozen=True)
 class _Setup:
-    """Options as fields of `solve.job.SolveOptions`, whose module the server cannot import."""
+    """Some fields of `solve.job.SolveOptions`. The server cannot import its module."""
 
     task: str
     out: Path
@@ -224,13 +224,13 @@ class SeedsJobs:
 
 
 def _run(setup: _Setup, queue: ItemQueue) -> None:
-    """Entry point of the other process, which starts the workers."""
+    """Entry point of the solving process, which starts the workers."""
     from workbench.solve.job import SolveOptions, solve
 
     if queue.next() is None:
         return
     os.nice(_NICENESS)
-    # One seed at a time, so that each result is shown as soon as possible.
+    # Each worker solves one seed at a time, so that each result is shown as soon as possible.
     options = replace(setup.options, num_envs=1)
     what = SolveOptions(setup.task, setup.out, setup.seeds, setup.workers, plan=setup.plan, options=options)
     report = solve(

@@ -54,7 +54,7 @@ class SolveSeedsPanel(PagePart[SessionView]):
         self._session, self._on_look, self._link = session, on_look, link
         self._open: set[str] = set()
         """Ids of unfolded rules."""
-        # When the user comes back from a recording, the rows are shown again.
+        # If there are rows already, they are shown: the user comes back from a recording.
         before = session.view().of(SeedsView)
         self._folder = server.gui.add_folder(TITLE, expand_by_default=before.state != "none")
         with self._folder:
@@ -112,7 +112,7 @@ def _toggle(rule: str) -> ToggleVerdict:
 
 
 def seeds_html(seeds: SeedsView, link: LinkTo = no_links) -> str:
-    """HTML of the progress and of a row for each seed, which opens its recording in the review."""
+    """HTML of the progress and of a row for each seed; the row opens the seed's recording in the review."""
     running = seeds.state in RUNNING
     show = lambda seed: ShowSolved(seed=seed)  # noqa: E731
     return render("solve_seeds", seeds=seeds, running=running, show=show, link=link)

@@ -89,7 +89,8 @@ class RunningEpisode:
     """Number of control steps of the env's episode before the first one that is kept here."""
     rewards: tuple[float, ...] = ()
     predicted: Mapping[int, float] = field(default_factory=dict)
-    """Predicted reward per step, by index into `rewards`."""
+    """Predicted mean reward per step over the horizon that begins at a step, by the index of the step in
+    `rewards`."""
     horizon: int = 1
     plan: PlannedEnv | None = None
     plan_step: int = 0

@@ -1,4 +1,4 @@
-"""Plans in the worker: requests them in the worker that plays, and makes them in the background process."""
+"""Requests plans in the worker that plays, and makes plans in the planning process."""
 
 from __future__ import annotations
 
@@ -126,8 +126,8 @@ def _wanted(opened: OpenedTask, moment: int, envs: tuple[int, ...]) -> PlanWante
     try:
         snapshot = pickle.dumps(opened.env.snapshot(list(envs)))
     except Exception as error:
-        # A task may keep an object that cannot be copied. As for the history (`step_events`), that must not
-        # stop it.
+        # A task may keep an object that cannot be copied. That must not stop the task, here or in the history
+        # (`step_events`).
         return PlanWanted(
             moment, envs, why_not=f"the task's state cannot be copied: {type(error).__name__}: {error}"
         )
@@ -145,7 +145,7 @@ class WorkerPlans:
     def __init__(self, waits: Callable[[], bool]) -> None:
         """
         Args:
-            waits: returns whether a request waits, which ends the planning.
+            waits: returns whether a request waits; if so, the planning ends.
         """
         self._waits = waits
         self._rolled: TaskEnv | None = None

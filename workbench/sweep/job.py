@@ -30,7 +30,8 @@ from workbench.task.reference import file_and_class, find_module, named_file, sp
 from workbench.task.settings_in_text import Argument, Constant, SettingError, TaskText
 
 _MIN_CHUNKS = 64
-"""Minimum number of chunks of a whole sweep, if it has enough episodes; each chunk opens the task once in its worker."""
+"""Chunks of a long sweep grow until there are about this many of them, since each chunk opens the task once
+in its worker."""
 _STEPS_AFTER_SUCCESS = 5
 """Number of control steps that a planned episode continues after its success, as in `solve.job`."""
 _MAX_NAME_CHARACTERS = 80

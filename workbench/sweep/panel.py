@@ -78,14 +78,15 @@ def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Ax
         if k < len(results.names):
             made.append(_of_set(name, x, values, summaries))
         else:
-            # Identified by its index, since a term of the reward may have the same name.
+            # The axis of the success rate is identified by its index, since a term of the reward may have the
+            # same name.
             is_rate = k == len(results.names) and name == _RATE
             made.append(_of_numbers(name, x, values, is_rate))
     return made
 
 
 def terms_of(summaries: Sequence[PointSummary]) -> list[str]:
-    """Names of the means: the reward's terms if the task reports them, else all."""
+    """Names of the means: the reward's terms if the task reports them, else all means."""
     names = list(dict.fromkeys(name for one in summaries for name in one.means))
     return [name for name in names if name.startswith(_TERMS)] or names
 
@@ -142,8 +143,8 @@ def _short_number(value: float) -> str:
 
 
 def best_first(rows: Sequence[SweepEpisode]) -> list[SweepEpisode]:
-    """Episodes in order: successes first, then by earlier success, then by higher return. Failed ones are
-    left out."""
+    """Episodes in order: successes first, then by earlier success, then by higher return. Episodes that could
+    not be recorded are left out."""
 
     def goodness(row: SweepEpisode) -> tuple[bool, float, float]:
         solved = math.inf if row.solved_at is None else row.solved_at
@@ -160,8 +161,8 @@ class Shown:
     column: str = "success"
     descending: bool = True
     chosen: int | None = None
-    """Index of the chosen point. If None, the point of the open episode is shown; without one, the best
-    point."""
+    """Index of the chosen point. If None, the point of the open episode is shown; without an open episode,
+    the best point."""
     only: frozenset[tuple[str, str]] = frozenset()
     """Shown values by setting; a setting that is missing here shows all values."""
     pages: Paged = field(default_factory=lambda: Paged(PAGE_ROWS))

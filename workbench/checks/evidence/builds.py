@@ -33,7 +33,7 @@ class Shape:
     file: str
     """File of a mesh; empty for other shapes."""
     numbers: tuple[float, ...]
-    """Sizes in metres, pose in the body, colour or friction."""
+    """Sizes in metres and pose in the body; then the colour, or friction and density."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Built:
     of_robot: bool
     """Whether an agent class built it."""
     quaternion: NDArray[np.float32] | None
-    """(M, 4) of the initial pose, wxyz; None if the builder was given none."""
+    """(M, 4) of the initial pose, wxyz; None if the builder was given no pose."""
     envs: tuple[int, ...]
     place: Place | None
     """The author's line; None where other code builds it."""

@@ -58,7 +58,7 @@ FIRST_BUILT_SEED = 2022
 SEEDS_ALONE = 2
 """Number of seeds for which a single env is built."""
 MAX_LEAF_NUMBERS = 4096
-"""Maximum numbers per env of a leaf of the observation; larger leaves are pictures."""
+"""Maximum number of values per env in a leaf of the observation; a larger leaf counts as a picture."""
 
 
 @dataclass(frozen=True)
@@ -261,8 +261,8 @@ class Checkup:
         cannot be built without one. Reset them before use."""
         with noting_builds(self.builds, self.merges, self.files):
             made = self._without_renderer()
-            # Outside of any `except`, or a traceback would name the error without a renderer as the cause of
-            # one with it.
+            # Not inside an `except`: an error of this build would name the error of the build without a
+            # renderer as its cause.
             if made is None:
                 for noted in (self.findings, self.builds, self.merges):
                     noted.clear()
@@ -277,7 +277,8 @@ class Checkup:
         try:
             return self._made(self.num_envs, False, "warn", {})
         except TaskError as error:
-            # A missing renderer raises errors of many kinds: only another try shows whether that was the cause.
+            # A missing renderer raises errors of many kinds: only another try, with a renderer, shows whether
+            # that was the cause.
             if isinstance(error.__cause__, (MissingAssets, ImportError)):
                 raise
             if not self._may_render:
@@ -299,8 +300,8 @@ class Checkup:
 
     @property
     def _may_render(self) -> bool:
-        """Whether a failed build can be tried again with a renderer: one is found, and no argument chooses
-        it."""
+        """Whether a failed build can be tried again with a renderer: a renderer is found, and no argument
+        chooses a render backend."""
         return self._render_backend == "found" and find_renderer() is not None
 
     @property
@@ -359,7 +360,7 @@ class Checkup:
             )
             if isinstance(env, BatchedCpuMixin):
                 # Without this, earlier episodes change the last bits of the physics, and a touch sensor reads
-                # the contacts of the last episode.
+                # the contacts of the episode before.
                 env.begins_anew = True
             return TaskEnv(env, self.loaded.max_episode_steps, check=returns_check(self.loaded, num_envs))
 
@@ -480,7 +481,8 @@ class Checkup:
 
     @evidence
     def fails_with_several(self) -> Problem | None:
-        """The error that several envs raise in a reset and three steps; None if they raise none, or one env raises too."""
+        """The error that several envs raise in a reset and three steps; None if they raise none, or if one
+        env alone raises too."""
         several, alone = (self._raises_early(count) for count in (self.num_envs, 1))
         return several if alone is None and self.num_envs > 1 else None
 
@@ -488,7 +490,7 @@ class Checkup:
         rng, task = np.random.default_rng(0), None
         built = "task" in self.__dict__
         try:
-            # Not by `env`, which builds `task`: with several envs that may fail.
+            # Not with `env`, which builds `task` first: that may fail with several envs.
             task = self._made(num_envs, self._built_with_renderer if built else self._may_render, "off", {})
             self.reset(task, self.seeds[0])
             for _ in range(3):
@@ -524,7 +526,7 @@ class Checkup:
             chosen = range(first, min(first + n, len(actor.seeds)))
             seeds, lengths = ([of[k] for k in chosen] for of in (actor.seeds, actor.lengths))
             self._keep_going()
-            # Every env needs an episode: the others run the last one again, and are ignored.
+            # Every env needs an episode. Envs that are left over run the last episode too, and are ignored.
             states = [actor.begin(task, [min(first + i, chosen[-1]) for i in range(n)])]
             seen = None
             if watched:

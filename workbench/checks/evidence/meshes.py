@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 
 _BYTES_PER_TRIANGLE = 3.0
-"""Minimum size of a triangle in an uncompressed mesh file."""
+"""Minimum number of bytes of a triangle in an uncompressed mesh file."""
 _RAYS = 162
 """Number of directions in which walls are looked for."""
 _MAX_TRIANGLES = 50_000
@@ -19,7 +19,8 @@ _MIN_WALL_SHARE, _MIN_OPEN_SHARE = 0.6, 0.03
 
 
 def triangles_in(file: str, more_than: int) -> int | None:
-    """Number of triangles of a mesh file; 0 if the file is too small for `more_than`, None if it cannot be read."""
+    """Number of triangles of a mesh file; 0 if the file is missing or too small to have more than `more_than`
+    triangles, None if it cannot be read."""
     if not Path(file).is_file() or Path(file).stat().st_size < _BYTES_PER_TRIANGLE * more_than:
         return 0
     mesh = _read(file)
@@ -28,8 +29,9 @@ def triangles_in(file: str, more_than: int) -> int | None:
 
 @lru_cache(maxsize=256)
 def is_hollow(file: str) -> bool | None:
-    """Whether a mesh is hollow, so that things could be put into it: rays from the middle of its convex hull meet walls in most
-    directions and nothing in some, on one side. None if it cannot be read or has too many triangles."""
+    """Whether a mesh is hollow, so that things could be put into it: from the middle of its convex hull, rays
+    in most directions meet a wall, and the rays that meet nothing are on one side. None if the mesh cannot be
+    read or has too many triangles."""
     mesh = _read(file)
     if mesh is None or len(mesh.faces) > _MAX_TRIANGLES:
         return None
@@ -73,6 +75,6 @@ def _crossings(
 def _read(file: str) -> trimesh.Trimesh | None:
     try:
         mesh = trimesh.load(file, force="mesh")
-    except Exception:  # from any of a dozen readers; the rule missing-file reports a missing file
+    except Exception:  # any of a dozen readers may raise; the rule missing-file reports a missing file
         return None
     return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None

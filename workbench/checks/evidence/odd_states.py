@@ -26,9 +26,10 @@ from workbench.task.blame import blamed, returns_check
 BATCHES = 2
 """Number of batches of seeds whose states are changed."""
 MARGIN_METRES = 0.15
-"""Bodies are placed within this margin in metres, in x and y, around the box of their start positions."""
+"""Bodies are placed, in x and y, within the box of all their start positions, widened by this margin in
+metres on each side."""
 HEIGHT_METRES = 0.3
-"""Metres above the start of a body within which it is placed."""
+"""A body is placed between its start height and this many metres above."""
 KINDS = ("right after the reset", "with joints and bodies at random places", "with joints at their limits")
 """Descriptions of the states of each batch, for a sentence."""
 MAX_GOALS = 4
@@ -36,8 +37,8 @@ MAX_GOALS = 4
 AT_GOAL = "with bodies at the place of {}"
 SHORT = "between the reset and a success"
 HALVINGS = 6
-"""Halvings of the way back to the reset. The last states are at most 1/64 of the way from the point where
-success ends."""
+"""Number of halvings with which the point where success ends is searched, on the way from a success back to
+the reset. The last states are at most 1/64 of the way from this point."""
 DENSE_HOOKS = {"dense": "compute_dense_reward", "normalized_dense": "compute_normalized_dense_reward"}
 """Hook of each dense reward mode."""
 
@@ -89,7 +90,7 @@ def odd_states(checkup: Checkup) -> OddStates:
 def _put(
     checkup: Checkup, kind: str, states: States, seeds: list[int], rng: np.random.Generator, seen: OddStates
 ) -> NDArray[np.bool_]:
-    """Put all envs into these states and call the hooks; (N,) whether each env has success."""
+    """Put all envs into these states and call the hooks. Returns (N,) whether each env has success."""
     task = checkup.task
     write_all(task.env, states)
     action = actions.random_action(task.parts, task.num_envs, rng)
@@ -141,7 +142,7 @@ def _tell_success(
 
 
 def _rows(reward: Any, num_envs: int) -> NDArray[np.float64]:
-    """(N,)"""
+    """(N,) the reward of each env."""
     return np.broadcast_to(torch.as_tensor(reward).double().numpy(force=True), (num_envs,)).copy()
 
 
@@ -243,7 +244,7 @@ def _between(states: States, begun: States, shares: NDArray[np.float64]) -> Stat
     for name, rows in states.items():
         first = begun[name]
         between = rows + share * (first - rows)
-        # The shorter way round, to a quaternion of length 1.
+        # The turn takes the shorter way round; the quaternion gets length 1.
         sign = np.where((rows[:, 3:7] * first[:, 3:7]).sum(axis=1, keepdims=True) < 0, -1, 1)
         turned = rows[:, 3:7] + share * (sign * first[:, 3:7] - rows[:, 3:7])
         between[:, 3:7] = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)

@@ -1,4 +1,5 @@
-"""Checks over all seeds, in two parts: several processes look at parts of the seeds, one judges what all saw."""
+"""Checks over all seeds, in two parts: several processes look at parts of the seeds, and one process judges
+what all of them saw."""
 
 from __future__ import annotations
 
@@ -11,13 +12,14 @@ from workbench.checks.results import Seen
 
 @dataclass(frozen=True)
 class OverSeeds:
-    """A `Check` in two parts. A part of the seeds must not decide the result: a reward that is the same at all steps of 32 seeds
-    may differ in the next seeds."""
+    """A `Check` in two parts. A part of the seeds must not decide the result: a reward that is constant over
+    32 seeds may vary in the next seeds."""
 
     see: Callable[[Checkup], Iterator[Seen]]
     """Looks at the seeds of a checkup, and gives what it saw as rows."""
     judge: Callable[[Sequence[Seen]], Iterator[Found | Note]]
-    """Gives the breaches for the rows of one or several checkups, in the order of their seeds. Raises as a `Check`."""
+    """Gives the breaches for the rows of one or several checkups; the rows are in the order of the seeds.
+    Raises the errors of a `Check`."""
 
     def __call__(self, checkup: Checkup) -> Iterator[Found | Note]:
         return self.judge([*self.see(checkup)])
@@ -64,5 +66,6 @@ def tried(seen: Iterable[Seen], *names: str) -> int:
 
 
 def first_kind(seen: Iterable[Seen]) -> Seen | None:
-    """The first kind of episodes that has breaches; the names of the rows are kinds."""
+    """The row of the first kind of episodes that has breaches, if the rows are named by kinds of episodes;
+    None if no kind has a breach."""
     return next((row for row in together(seen) if row.count), None)

@@ -105,7 +105,8 @@ class Places:
 
     @cached_property
     def methods(self) -> tuple[tuple[Module, ast.FunctionDef], ...]:
-        """Methods of the task's class and of those that it inherits, in the author's files; in the order of inheritance."""
+        """Methods of the task's class and of its base classes that are in the author's files, in the order of
+        inheritance."""
         classes = filter(None, map(self.class_definition, self._loaded.cls.__mro__))
         return tuple(
             (module, node)
@@ -129,7 +130,8 @@ class Places:
                 yield module, function
 
     def reached_from(self, *hooks: str) -> Iterator[tuple[Module, ast.FunctionDef]]:
-        """These hooks of the task, and the author's functions that they name directly or through others."""
+        """These hooks of the task, and the author's functions that they name, directly or through other
+        functions."""
         known: dict[str, list[tuple[Module, ast.FunctionDef]]] = {}
         for module, function in self.functions():
             known.setdefault(function.name, []).append((module, function))
@@ -173,8 +175,8 @@ class Places:
         Args:
             name: as in `SceneIndex.names`.
             hooks: functions that are searched for a line that sets the pose of the attribute that holds the
-                body. If there is none, the result is the line of any function that names the body; else the
-                ``def`` line of a hook.
+                body. If there is no such line, the result is the first line of any function that names the
+                body; if there is none of these either, the ``def`` line of a hook.
         """
         owner = name.split("/", 1)[0]
         attributes = set(self._attributes_of(owner))
@@ -190,8 +192,8 @@ class Places:
         return self.hook(*hooks)
 
     def _attributes_of(self, owner: str) -> Iterator[str]:
-        """The body's name, and the names of attributes that a statement with this name in its value
-        assigns."""
+        """The body's name, and the names of the attributes to which a statement assigns a value that contains
+        this name."""
         yield owner
         if any(robot in owner for robot in ("panda", "robot", "agent")):
             yield from ("agent", "robot")
@@ -218,9 +220,9 @@ def _places(node: ast.AST, attributes: set[str]) -> bool:
 
 
 def _identity(cls: type) -> tuple[str | None, str]:
-    """File and qualified name: two files may have a class of one name."""
+    """File and qualified name: two files may have classes of the same name."""
     file = getattr(sys.modules.get(cls.__module__), "__file__", None)
-    # As `LoadedTask.source_files` has it: an environment may be a link.
+    # Resolved, like the paths in `LoadedTask.source_files`: a folder of the path may be a link.
     return file and os.path.realpath(file), cls.__qualname__
 
 

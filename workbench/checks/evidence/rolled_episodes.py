@@ -66,8 +66,8 @@ class SeenOutlier:
 @dataclass
 class Episodes:
     """K episodes over T control steps; episode k has the seed ``seeds[k]``. The leading dimension is T + 1 for states, T for
-    rewards. An ended episode is stepped on, as in stock ManiSkill: `length` says where it ended. Once it has no more actions,
-    its last state and reward are repeated."""
+    rewards. An episode that has ended gets further steps, as in stock ManiSkill; `length` says where it
+    ended. Once an episode has no more actions, its last state and reward are repeated."""
 
     kind: str = "random"
     """Kind of the actor, as `Actor.kind`."""

@@ -1,4 +1,5 @@
-"""Watches what the author's lines do with tensors: the device of each on a GPU, and copies to the host."""
+"""Watches what the author's lines do with tensors: on which device each would be with a GPU, and copies to
+the host."""
 
 from __future__ import annotations
 
@@ -43,8 +44,8 @@ _OWN = "own"
 """State of a tensor on the env's device. The state of a tensor that would stay on the host is the `Place` that made it. A
 tensor of unknown origin (``torch.Tensor([1])``) has no state."""
 _HOST = torch.device("cpu", 0)
-"""Value of ``tensor.device`` for a host tensor: a tensor that is made on this device counts as a host tensor
-too. It differs from the env's device by its index, which the env's device lacks."""
+"""What ``tensor.device`` gives for a host tensor, so that a tensor that is made on the device of a host
+tensor counts as a host tensor too. Unlike the env's device, it has an index."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class TensorUses:
     iterated: Counter[Place] = field(default_factory=Counter)
     """Number of iterations over the rows of a tensor of `NUM_ENVS` rows in these steps, by line."""
     mixes: dict[Place, Mix] = field(default_factory=dict)
-    """First mix by line, also while the env was built and reset."""
+    """The first mix of each line, including mixes while the env was built and reset."""
 
 
 class TensorWatch(TorchFunctionMode):
@@ -84,7 +85,7 @@ class TensorWatch(TorchFunctionMode):
         """
         Args:
             files: paths of the author's files.
-            num_envs: number of envs that are watched; loops over envs are seen with `NUM_ENVS` only.
+            num_envs: number of envs that are watched; loops over envs are seen only if it is `NUM_ENVS`.
         """
         super().__init__()
         self.uses = TensorUses(num_envs)
@@ -102,7 +103,7 @@ class TensorWatch(TorchFunctionMode):
             self.uses.steps += 1
 
     def __enter__(self) -> Any:
-        # The only function that makes a tensor without calling a TorchFunctionMode.
+        # torch.from_numpy is the only function that makes a tensor without calling a TorchFunctionMode.
         self._from_numpy = torch.from_numpy
         torch.from_numpy = self._made_from_numpy
         return super().__enter__()
@@ -135,7 +136,8 @@ class TensorWatch(TorchFunctionMode):
             if any(made is each for each in tensors):
                 if name not in _MOVES or getattr(made, _STATE, _OWN) == state:
                     continue
-                # With nothing to move, torch returns the tensor itself; the original must keep its state.
+                # If there is nothing to move, torch returns the given tensor, which must keep its state. So
+                # the result becomes a view of it.
                 result = made = made.view(made.shape)
             if state is None:
                 continue
@@ -261,7 +263,7 @@ def _tensors(values: Iterable[Any]) -> Iterator[torch.Tensor]:
 
 
 def _device_of(args: Any, kwargs: Any) -> str | None:
-    """``host``, ``own`` or None if no device is given."""
+    """``host`` or ``own``; None if no device is given."""
     for value in (*args[1:], *kwargs.values()):
         if isinstance(value, torch.Tensor):
             return "host" if _is_host(value) else "own"

@@ -57,11 +57,11 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     The pictures do not show what a policy must act on.
 
     ## Why
-    A policy from pictures cannot act on what is in none of them. Training runs without an error and learns
-    the mean.
+    A policy from pictures cannot act on an object that is in none of the pictures. Training raises no error,
+    and the policy learns the same action for all places of the object.
 
     ## Mend
-    Aim the camera at where the objects begin.
+    Aim the camera at the place where the objects are after a reset.
 
     ```python fragment
     pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])
@@ -72,7 +72,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     Two envs are reset four times. The rule renders every sensor camera, also with each object alone. It
     reports an object that is out of view of all cameras in more than a quarter of the resets. It leaves out
     scenery, the robot, hidden bodies and bodies with nothing to see, and looks for at most 30 objects. It
-    notes objects that others cover in every picture. It does not look at later steps.
+    notes objects that are covered by other things in every picture. It does not look at later steps.
     """
     reports = checkup.look(sensor_reports)
     in_view: dict[str, list[Any]] = {}
@@ -204,8 +204,8 @@ def camera_names(checkup: Checkup) -> Iterator[Found | Note]:
     The last camera with a name replaces the others silently.
 
     ## Why
-    ManiSkill keeps sensor cameras in a dict by name: of two cameras with one name it makes the last one, and
-    a camera of the robot replaces the task's. Observations lack a picture without an error.
+    ManiSkill keeps sensor cameras in a dict by name: of two cameras with the same name it makes only the last
+    one, and a camera of the robot replaces the task's. Observations lack a picture, and no error says so.
 
     ## Mend
     Give each camera its own name.
@@ -218,9 +218,9 @@ def camera_names(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule compares the configs that the hooks of task and robot return; it renders no picture. A sensor and
-    a camera for people may have the same name. The rule does not compare the names of the robot's own cameras
-    with each other.
+    The rule compares the configs that the hooks of task and robot return; it renders no picture. A sensor
+    camera and a camera for people may have the same name. The rule does not compare the names of the robot's
+    own cameras with each other.
     """
     of_task, of_robot = checkup.look(sensor_configs)
     if not of_task and not of_robot:
@@ -360,7 +360,8 @@ def _objects(env: Any) -> list[SceneObject]:
 
 
 def _drawn(env: Any) -> list[SceneObject]:
-    """Objects that are neither robot nor scenery and that are drawn: a body may only carry a camera."""
+    """Objects that are drawn and are neither robot nor scenery. A body that only carries a camera is not
+    drawn."""
     index = scene_index(env)
     return [
         thing
@@ -371,7 +372,7 @@ def _drawn(env: Any) -> list[SceneObject]:
 
 
 def _own_configs(checkup: Checkup) -> list[Any]:
-    """Configs of the task's sensor cameras. Raises NotApplicable without one."""
+    """Configs of the task's sensor cameras. Raises NotApplicable if there are none."""
     of_task, _ = checkup.look(sensor_configs)
     if not of_task:
         raise NotApplicable("the task has no sensor camera of its own")
@@ -388,7 +389,7 @@ def _place(checkup: Checkup, key: CameraKey) -> Place | None:
 
 
 def _site(checkup: Checkup, config: Any, hook: str = "_default_sensor_configs") -> Place | None:
-    """The author's line that makes a config; the hook if other code makes it."""
+    """The author's line that makes a config; the line of the hook if other code makes the config."""
     site = maniskill_private.camera_site(config)
     if site is None or site.file not in map(str, checkup.loaded.source_files):
         return checkup.places.hook(hook)

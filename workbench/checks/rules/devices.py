@@ -69,7 +69,7 @@ def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
     Python. One copy for each of 4096 envs makes 4096 stops in every step.
 
     ## Mend
-    Stay in tensors; choose by masks.
+    Compute with tensors only, and choose values by masks.
 
     ```python fragment
     reward = 1 - torch.tanh(5 * distance)
@@ -77,10 +77,10 @@ def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule watches three steps with five envs, after a build and a reset. It counts a copy if a line of the
-    author's files makes it, also by `pose.sp` or `common.to_numpy`. It leaves out copies of tensors that
-    would be on the host anyway, and copies in a build or a reset. It does not count a mask as an index
-    (`x[mask]`), or copies in other code of ManiSkill.
+    The rule watches three steps with five envs, after a build and a reset. It counts each copy that a line of
+    the author's files makes, including copies by `pose.sp` or `common.to_numpy`. It leaves out copies of
+    tensors that would be on the host anyway, and copies in a build or a reset. It does not count an index by
+    a mask (`x[mask]`), or copies in other code of ManiSkill.
     """
     uses = checkup.tensor_uses
     for place, count in uses.copies.items():
@@ -113,9 +113,9 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
     With 4096 envs the loop takes longer than the simulation.
 
     ## Why
-    A loop over envs runs N times as many small operations as one operation on the whole batch. With 16 envs
-    the difference does not show. With 4096 envs on a GPU, each operation costs some 10 microseconds, whatever
-    its size: a loop of five operations takes 0.2 s, longer than the simulation.
+    A loop over N envs runs N small operations instead of one operation on the whole batch. With 16 envs the
+    difference does not show. With 4096 envs on a GPU, each operation costs some 10 microseconds, whatever its
+    size: a loop of five operations takes 0.2 s, longer than the simulation.
 
     ## Mend
     Write the operation once for the batch, with `dim=1`, masks and `torch.where`.
@@ -126,18 +126,18 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule reads the source of what the hooks of a step call, and looks for loops and comprehensions over
-    `self.num_envs`, `_objs` and `sub_scenes`. It watches a build, a reset and three steps with five envs for
-    iterations over the rows of a tensor. With one env it reads only the source: without a finding there, the
-    result is *not known*. Loops in a build or a reset are left out. The rule does not see a loop over the
-    length of another batch, as in `range(len(distance))`.
+    The rule reads the source of the hooks of a step and of the functions that they call, and looks for loops
+    and comprehensions over `self.num_envs`, `_objs` and `sub_scenes`. It also runs a build, a reset and three
+    steps with five envs, and looks for iterations over the rows of a tensor in the steps. With one env it
+    reads only the source: without a finding there, the result is *not known*. Loops in a build or a reset are
+    left out. The rule does not see a loop over the length of another batch, as in `range(len(distance))`.
     """
     found: dict[tuple[str, int], Place] = {}
     for module, function in checkup.places.reached_from(*EVERY_STEP):
         for loop in _loops_over_envs(function):
             place = module.place(loop.iter, function.name)
             found.setdefault(place[:2], place)
-    # Reported before anything runs: the task may raise.
+    # These findings come before anything runs, since the task may raise.
     yield from map(_found_loop, found.values())
     if not any(True for _ in checkup.places.reached_from(*EVERY_STEP)):
         raise NotApplicable("the task has no hook of its own that runs at every step")

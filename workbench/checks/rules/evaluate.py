@@ -22,7 +22,8 @@ from workbench.machine.text import listed, of
 READ_BY_MANISKILL = ("success", "fail", "elapsed_steps")
 """Entries of ``evaluate()`` that ManiSkill reads."""
 FLICKER_SHARE = 0.25
-"""Maximum share of the steps at which success becomes true that may be followed by a step without success."""
+"""Of the steps at which success becomes true: the maximum share that may be followed by a step without
+success."""
 
 
 def see_success_at_reset(checkup: Checkup) -> Iterator[Seen]:
@@ -39,9 +40,9 @@ def success_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     Episodes end before the policy acts, and the success rate counts them.
 
     ## Why
-    ManiSkill ends an episode when success is true, so a trainer resets it after one step, again and again.
-    The success rate counts these episodes, and a policy that does nothing looks good. With thousands of envs
-    even a few percent of such starts shift the curve.
+    ManiSkill ends an episode when success is true, so a trainer resets the env after one step, again and
+    again. The success rate counts these episodes, and a policy that does nothing looks good. With thousands
+    of envs even a few percent of such starts shift the curve.
 
     ## Mend
     Place the goal farther away than the threshold reaches, or ask for more in `evaluate`.
@@ -67,7 +68,8 @@ def success_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_success_stays_possible(checkup: Checkup) -> Iterator[Seen]:
-    """Rows: whether ``evaluate()`` has an entry, and how many episodes of each kind reach success."""
+    """One row if ``evaluate()`` has neither success nor fail. If it has success, a row for each kind of
+    rollouts: how many episodes reach success."""
     entries = checkup.starts.evaluate
     own = checkup.loaded.cls.compute_sparse_reward is not BaseEnv.compute_sparse_reward
     sparse = checkup.task.env.reward_mode == "sparse" and not own
@@ -89,8 +91,8 @@ def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     The sparse reward is made of success and fail: without them it is always 0.
 
     ## Why
-    ManiSkill makes the sparse reward from `success` and `fail`. Without either it is 0 at every step, no
-    episode ends early, and no success rate can be counted.
+    ManiSkill makes the sparse reward from `success` and `fail`. If a task has neither, the sparse reward is 0
+    at every step, no episode ends early, and no success rate can be counted.
 
     ## Mend
     Return a bool tensor with a row for each env.
@@ -102,11 +104,12 @@ def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule reads the entries of `evaluate()` after a reset. A task without either breaks the rule if its
-    reward is ManiSkill's sparse one. With a dense reward, no reward or its own `compute_sparse_reward` the
-    result is *not applicable*: tasks of walking and balancing have no success. The rule notes how many random
-    episodes and how many episodes with the actions of `--actions` succeed. It does not find out by itself
-    whether success can be reached. The result is *not known* if `entry-name` finds a misspelt entry.
+    The rule reads the entries of `evaluate()` after a reset. A task with neither `success` nor `fail` breaks
+    the rule if its reward is ManiSkill's sparse one. If such a task has a dense reward, no reward, or its own
+    `compute_sparse_reward`, the result is *not applicable*: tasks of walking and balancing have no success.
+    The rule notes how many random episodes and how many episodes with the actions of `--actions` succeed. It
+    does not find out by itself whether success can be reached. The result is *not known* if `entry-name`
+    finds a misspelt entry.
     """
     for row in rows[:1]:
         if not row.names and not row.count:
@@ -201,7 +204,8 @@ def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def see_success_and_fail(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each kind of rollouts, up to the first breach: states with both, and whether any success and any fail occurred."""
+    """A row for each kind of rollouts, up to the first breach: the number of states with both success and
+    fail, and whether any state has success and any has fail."""
     for episodes in checkup.rollouts:
         success, fail = _flag(episodes, "success"), _flag(episodes, "fail")
         both = success & fail
@@ -295,8 +299,9 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule counts how often success becomes true and how often it is false again at the next step, in random
-    rollouts (all seeds, up to 50 steps) and in those of `--actions`. It reports more than a quarter. The
-    result is *not known* if no episode succeeds, or if success is true from the reset on
+    rollouts (all seeds, up to 50 steps) and in those of `--actions`. It reports a task if success is false
+    again more than once, and after more than a quarter of the steps at which it becomes true. The result is
+    *not known* if no episode succeeds, or if success is true from the reset on
     ([success-at-reset](success-at-reset.md)).
     """
     times, gone = sum(row.tried for row in rows), sum(row.count for row in rows)
@@ -320,7 +325,8 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_entries_finite(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each kind of rollouts, and one for each of its entries that is not finite."""
+    """A row for each kind of rollouts, and a row for each entry of ``evaluate()`` that is not finite, with
+    the first kind in which it is not."""
     reported: set[str] = set()
     for episodes in checkup.rollouts:
         numbers = float(sum(rows.dtype.kind == "f" for rows in episodes.evaluate.values()))

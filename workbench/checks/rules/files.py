@@ -107,7 +107,7 @@ def undeclared_assets(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## Why
     `asset_download_ids` tells ManiSkill what to fetch before the task is made. Without it, the build fails on
-    a machine that has not downloaded the set, or waits at a prompt that a cluster does not have.
+    a machine that has not downloaded the assets, or waits at a prompt that a cluster does not have.
 
     ## Mend
     Name the download in the registration.
@@ -190,7 +190,8 @@ def _paths_in(node: ast.AST, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
 
 
 def _loaded_by(call: ast.Call, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
-    """The file that a call reads: its first argument or ``filename=``, if that is a name, a constant or a relative path."""
+    """The files that a call reads: its first argument, and ``filename=``, ``path=`` or ``file=``; each only
+    if it is a name, a constant or a relative path."""
     name = getattr(call.func, "attr", getattr(call.func, "id", ""))
     if name not in _LOADS and not name.endswith("_from_file"):
         return

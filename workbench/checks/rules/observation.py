@@ -103,8 +103,8 @@ def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     The rule reports an entry of the observation if none of its numbers changes over all seeds, all steps of
     random rollouts and the states that `reward-finite` makes. It only notes an entry of zeros and ones (a
     flag, a force, a unit rotation), since random actions may never change it, and an entry that the robot's
-    class adds (`agent/...`). It accepts single constant numbers in an entry, such as the height of a goal.
-    The result is *not known* with one seed.
+    class adds (`agent/...`). It accepts an entry in which only some numbers are constant, such as the height
+    of a goal. The result is *not known* with one seed.
     """
     named = [row for row in rows if row.names]
     _require_leaves(named)
@@ -118,7 +118,8 @@ def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         if len(values[row.names]) > 1 or not row.numbers:
             continue
         if np.isin(value, (0.0, 1.0)).all() or row.texts:
-            # A flag or a force, which random actions may never raise; or the robot's own, such as a palm that is fixed.
+            # A flag or a force, which random actions may never change; or an entry of the robot's class, such
+            # as a palm that is fixed.
             yield Note(f"{name!r} of the observation is {_text(value)} in all states that were tried")
             continue
         yield Found(

@@ -93,10 +93,12 @@ def overlap_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule resets all seeds (32 by default) and reads the contacts of one substep. Overlaps of more than 2
-    mm count. It leaves out links of one articulation and pairs in which neither body can move; of the pairs
-    between two owners it reports only the deepest one. Bodies without a collision shape cannot overlap.
+    mm count. It leaves out links of one articulation and pairs in which neither body can move; of all pairs
+    of links between the same two objects it reports only the deepest one. Bodies without a collision shape
+    cannot overlap.
     """
-    # One robot in a table has many links in it: a finding for each pair of owners, of the deepest bodies.
+    # Many links of a robot may be in a table: each pair of owners gets one finding, about the deepest pair of
+    # bodies.
     deepest: dict[frozenset[str], Seen] = {}
     for row in sorted(together(rows), key=lambda row: -row.size):
         deepest.setdefault(frozenset(body.split("/", 1)[0] for body in row.names), row)
@@ -111,7 +113,8 @@ def overlap_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_falls_at_reset(checkup: Checkup) -> Iterator[Seen]:
-    """Rows of the bodies that move while the robot holds still for a second, and of those that are left out."""
+    """Rows of three kinds: objects that are left out (``wanted``), objects that move freely (``loose``), and
+    bodies that move while the robot holds still for a second (``body``)."""
     index, still = scene_index(checkup.task.env), checkup.still
     robots = _robots(checkup)
     # A body in the hand may slip, and a body that is pushed out of the robot breaks another rule.
@@ -134,7 +137,7 @@ def see_falls_at_reset(checkup: Checkup) -> Iterator[Seen]:
         away = after[:, body, :3] - before[:, body, :3]
         moved = np.linalg.norm(away, axis=1)
         turned = _angle(before[:, body, 3:], after[:, body, 3:])
-        # A body that an env lacks is NaN in both.
+        # A body that an env lacks is NaN both before and after.
         lost = ~np.isfinite(after[:, body]).all(axis=1) & np.isfinite(before[:, body]).all(axis=1)
         bad = (moved > MOVED_METRES) | (turned > TURNED_RADIANS) | lost
         if not bad.any():
@@ -176,8 +179,8 @@ def falls_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     ## How it is checked
     The rule resets all seeds, and the robot holds the pose of the reset for one second. It reports a body
     that moves by more than 2 cm or turns by more than 20 degrees in that second. It leaves out bodies that a
-    reset gives a velocity, and bodies that touch the robot after the reset of some seed; if there are no
-    others, the result is *not known*. It does not see what falls after the first second.
+    reset gives a velocity, and bodies that touch the robot after the reset of some seed; if no other bodies
+    move freely, the result is *not known*. It does not see what falls after the first second.
     """
     wanted, loose = (
         {row.names[1] for row in rows if row.names[:1] == (what,)} for what in ("wanted", "loose")
@@ -186,7 +189,7 @@ def falls_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         raise NotApplicable("nothing but the robot moves freely")
     if loose <= wanted:
         raise NotKnown(f"{listed(sorted(loose))} moves from the start, or touches the robot after the reset")
-    # One rope has many links that fall: a finding for each owner, of the body that moves furthest.
+    # Many links of a rope may fall: each owner gets one finding, about the body that moves furthest.
     bodies_of: dict[str, list[Seen]] = {}
     for row in together((row for row in rows if row.names[:1] == ("body",)), worst=True):
         if row.names[2] not in wanted:
@@ -294,8 +297,8 @@ def _name_of(node: ast.AST) -> str:
 
 
 def _uses(node: ast.AST, made: Mapping[str, ast.AST]) -> Iterator[ast.AST]:
-    """Calls that make a whole batch (`_whole_batches`), if this part of the source contains the call or names
-    its result, and does not take only some rows of it."""
+    """Calls that make a whole batch (`_whole_batches`) that this part of the source uses: it contains the
+    call, or it names its result. Uses that take only some rows do not count."""
     batches = {id(batch): batch for batch in _whole_batches(node)}
     waiting: list[ast.AST] = [node]
     while waiting:
@@ -360,10 +363,10 @@ def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule notes the quaternions that the author's lines set in a reset of the first seeds. If those of a
-    body are (0, 0, a, b) in all envs, with different a and b, they are turns about the vertical in the wrong
-    order. The rule also searches the source for `as_quat()` in functions that neither ask for `scalar_first`
-    nor reorder the numbers. (0, 0, 0, 1) in all envs is only noted, since it may be meant as half a turn. The
-    rule does not recognise other rotations in the wrong order.
+    body are (0, 0, a, b) in all envs, and a and b differ from env to env, they are turns about the vertical
+    in the wrong order. The rule also searches the source for `as_quat()` in functions that neither ask for
+    `scalar_first` nor reorder the numbers. (0, 0, 0, 1) in all envs is only noted, since it may be meant as
+    half a turn. The rule does not recognise other rotations in the wrong order.
     """
     by_name: dict[str, list[tuple[NDArray[np.float32], Place | None]]] = {}
     for name, quaternions, place in _quaternions(checkup):
@@ -417,7 +420,7 @@ def unit_quaternion(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## Why
     A quaternion whose length is not 1 is no rotation. Matrices made of it are scaled or sheared, and
-    distances between rotations are wrong. PhysX may normalise it or not, so that CPU and GPU differ.
+    distances between rotations are wrong. PhysX may normalise it or not, so that CPU and GPU may differ.
 
     ## Mend
     Divide by the length, or make the quaternion from angles.
@@ -585,9 +588,9 @@ def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     ## How it is checked
     The reach is the largest distance from the base to the `tcp` over 40 random postures of each env's robot
     within the joint limits. The rule reports a dynamic body that is more than 5 cm beyond the reach after
-    some resets, and within it after others. The result is *not known* if a body is always beyond the reach:
-    it may be part of the scene, or be fetched with a tool. It is also *not known* for several robots, and for
-    a robot without a `tcp`. It is *not applicable* for robots that drive or walk.
+    some resets, but not after all. The result is *not known* if a body is always beyond the reach: it may be
+    part of the scene, or be fetched with a tool. It is also *not known* for several robots, and for a robot
+    without a `tcp`. It is *not applicable* for robots that drive or walk.
     """
     bodies = together(rows, worst=True)
     if not bodies:
@@ -682,8 +685,8 @@ def _is_fixed(articulation: Any) -> bool:
 
 
 def immovable(checkup: Checkup) -> set[str]:
-    """Names of the bodies that no contact moves: static and kinematic bodies, and links without a joint between them and a
-    fixed root."""
+    """Names of the bodies that no contact moves: static and kinematic bodies, and links that only fixed
+    joints connect to a fixed root."""
     index: SceneIndex = scene_index(checkup.task.env)
     found = {
         name for name, kind in zip(index.names, index.kinds, strict=True) if kind in ("static", "kinematic")

@@ -29,7 +29,8 @@ REPLAYED_STEPS = 10
 SAME_TOLERANCE = 1e-4
 """Maximum difference of two numbers that count as equal: poses come back rounded."""
 RESTORED_TOLERANCE = 1e-3
-"""Maximum difference after a state dict is restored, which computes link poses from joints; relative for numbers above 1."""
+"""Maximum difference of two numbers that count as equal after a state dict is restored: restoring computes
+link poses from joints. Relative for numbers above 1."""
 _RESET_HOOKS = ("_initialize_episode", "reset")
 _RESULT_HOOKS = ("evaluate", "_get_obs_extra", "_get_obs_agent", "get_info", "get_obs")
 """Hooks that make the result of a reset."""
@@ -57,10 +58,10 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule resets random subsets of the envs six times, half of them with seeds, and makes a step of
-    random actions after each reset; in the first step all actions are at their bounds. An error that any
-    other check raises in the task is reported under this rule too. If several envs raise and one env does
-    not, the finding says so. With one env no partial reset can be tried, and the result is *not known* unless
+    The rule resets random subsets of the envs six times, three times with seeds, and makes a step of random
+    actions after each reset; in the first step all actions are at their bounds. An error that the task raises
+    in any other check is reported under this rule too. If several envs raise and one env does not, the
+    finding says so. With one env no partial reset can be tried, and the result is *not known* unless
     something raises. The rule does not see what fails in a state that random actions do not reach.
     """
     task, rng = checkup.task, np.random.default_rng(1)
@@ -72,7 +73,7 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
         checkup.reset(task, None if turn % 2 else [1000 * turn + i for i in chosen], chosen)
         action = random_action(task.parts, task.num_envs, rng)
         checkup.step(task, np.sign(action) if turn == 0 else action)
-    # With one env no reset leaves another in the middle of its episode.
+    # With one env no reset leaves another env in the middle of its episode.
     checkup.require_several()
     return iter(())
 
@@ -119,7 +120,7 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     differing = _differing(first, again, SAME_TOLERANCE)
     if differing:
         drawn = first_draw(checkup.places, global_draw, *_RESET_HOOKS, *_RESULT_HOOKS)
-        # torch is seeded within the reset; the hooks of its result run after it.
+        # ManiSkill seeds torch for the duration of a reset; the hooks that make its result run afterwards.
         drawn = drawn or first_draw(checkup.places, torch_draw, *_RESULT_HOOKS)
         place, called = drawn or (checkup.places.hook("_initialize_episode"), "")
         yield Found(
@@ -276,10 +277,10 @@ def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule compares what the first two envs of the batch are built of with one env alone, built for the same
-    two seeds: kinds, sizes, poses in the body, colours, frictions and mesh files. It does not compare where a
-    reset places bodies, since ManiSkill seeds the whole batch with the seed of its first env there. The
-    result is *not known* with one env.
+    The rule builds one env alone for the two seeds of the first two envs of the batch, and compares the
+    bodies of both builds: kinds, sizes, poses in the body, colours, frictions and mesh files. It does not
+    compare where a reset places bodies, since ManiSkill seeds the whole batch with the seed of its first env
+    there. The result is *not known* with one env.
     """
     checkup.require_several()
     assert checkup.task

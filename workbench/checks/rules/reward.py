@@ -27,16 +27,18 @@ MAX_NORMALIZED = 1.0 + 1e-4
 FULL_REWARD = 0.999
 """Minimum normalized reward that counts as the largest."""
 RATIO_TOLERANCE = 1e-3
-"""Maximum difference of the normalized reward from the dense one times a constant, as a share of the largest
-normalized reward."""
+"""Maximum difference between the normalized reward and a constant times the dense reward, as a share of the
+largest normalized reward."""
 RATIO_SHARE = 0.05
-"""Minimum dense reward for the ratio, as a share of the largest one: near 0, rounding decides the ratio."""
+"""Minimum size of a dense reward from which the ratio is computed, as a share of the largest one: near 0,
+rounding decides the ratio."""
 CLEARLY_LOWER_SHARE = 0.05
 """Minimum difference of rewards that counts, as a share of the range of all rewards."""
 
 
 def see_reward_finite(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each kind of rollouts up to the first breach; without one, a row for the odd states."""
+    """A row for each kind of rollouts up to the first breach; without a breach, also a row for the odd
+    states."""
     _require_reward(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     for episodes in checkup.rollouts:
@@ -121,8 +123,8 @@ def reward_changes(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_reward_normalized(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each kind of rollouts up to the first breach; without one, a row for the odd states with success. For a
-    normalized or sparse reward only."""
+    """A row for each kind of rollouts up to the first breach; without a breach, also a row for the odd states
+    with success. For a normalized or sparse reward only."""
     mode = checkup.task.env.reward_mode
     if mode not in REWARD_RANGES:
         raise NotApplicable("the reward is neither normalized nor sparse")
@@ -253,8 +255,9 @@ def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] |
 
 
 def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each episode, of rollouts or odd states, whose reward is higher elsewhere than at success. One more row for the
-    reward at success, if it is the same number in all states."""
+    """For each kind of rollouts and each batch of odd states: a row with the number of compared episodes and
+    the range of the rewards, and a row for each episode whose reward is higher elsewhere than at success. One
+    more row for the reward at success, if it is the same number in all states."""
     _require_dense(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     every = _scored(checkup)
@@ -307,11 +310,11 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    For each episode that has states with and without success, the rule compares the largest rewards of both:
-    in random rollouts, in those of `--actions`, and in the states that `reward-finite` makes. A body at the
-    goal is often a success; from there the rule moves all bodies and joints back towards the reset until
-    success ends, so that states just short of success are compared too. A difference below 5% of the rewards'
-    range does not count.
+    For each episode that has states with and without success, the rule compares the largest reward with
+    success and the largest without it: in random rollouts, in those of `--actions`, and in the states that
+    `reward-finite` makes. A body at the goal is often a success; from there the rule moves all bodies and
+    joints back towards the reset until success ends, so that states close to success are compared too. A
+    difference below 5% of the rewards' range does not count.
 
     The rule also calls the reward hook once more for each of these states, with `info["success"]` true in all
     envs. If the reward is then one number, as after `reward[info["success"]] = 0.5`, that number is what

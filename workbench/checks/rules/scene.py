@@ -94,11 +94,11 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule notes the builders that the author's files use while the task is built, including those of
-    `actors.build_cube` and the like. It leaves out bodies without a collision shape, and bodies that stay at
-    the origin for good: static bodies, and those kinematic bodies and articulations without a movable joint
-    that no reset moves. [overlap-at-load](overlap-at-load.md) reports other bodies inside them. The rule also
-    leaves out a kinematic body that a reset moves, unless it is built inside another body. Robots have their
-    own rule ([robot-pose](robot-pose.md)).
+    `actors.build_cube` and the like. It leaves out bodies without a collision shape. It also leaves out
+    bodies that stay at the origin for good: static bodies, and, if no reset moves them, kinematic bodies and
+    fixed articulations without a movable joint. [overlap-at-load](overlap-at-load.md) reports other bodies
+    inside them. The rule also leaves out a kinematic body that a reset moves, unless it is built inside
+    another body. Robots have their own rule ([robot-pose](robot-pose.md)).
     """
     unposed: dict[Place | None, list[str]] = {}
     own = [*_own(checkup)]
@@ -175,7 +175,7 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     The rule builds one env, puts all bodies to their initial poses with joints at zero, and reads the
     contacts of one substep. Overlaps of 5 mm and more count. The rule leaves out links of one articulation,
     pairs in which neither body can move, and what [initial-pose](initial-pose.md) reports. It does not see
-    bodies of other envs that are built with other shapes.
+    overlaps in other envs, whose bodies may have other shapes.
     """
     builds = _builds(checkup)
     # The rule initial-pose reports these.
@@ -198,8 +198,9 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def see_kinematic_never_moved(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each kinematic body, with the range of its pose over resets and random episodes. Raises NotKnown if a hook of a
-    step sets a pose: it may move a body after the steps that were tried."""
+    """A row for each kinematic body, with the range of its pose over resets and random episodes. Raises
+    NotKnown if a function outside `_RESETS` sets a pose: it may move a body after the steps that were
+    tried."""
     if any(
         _sets_a_pose(function) for _, function in checkup.places.functions() if function.name not in _RESETS
     ):
@@ -235,8 +236,9 @@ def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     ## How it is checked
     The rule compares the poses of all seeds after their reset and of random episodes. It reports a kinematic
     body that the author's files build and that has one pose in all of them. The result is *not known* if a
-    hook of a step, or any function except `_initialize_episode`, sets a pose, since it might do so in an
-    episode that was not seen. It is also *not known* with one seed. Hidden bodies are left out.
+    function sets a pose, except `_load_agent`, `_load_scene`, `_initialize_episode`, `set_state` and
+    `set_state_dict`: it might do so in an episode that was not seen. It is also *not known* with one seed.
+    Hidden bodies are left out.
     """
     if not any(row.names for row in rows):
         raise NotApplicable("the author's files build no visible kinematic body")
@@ -352,11 +354,11 @@ def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    For each mesh file that a body of the author's files collides with as one hull, the rule casts rays from
-    the middle of the hull in 162 directions. The mesh is hollow if the rays meet a wall in most directions
-    and nothing in some, on one side. The result is *not applicable* without such a mesh, and *not known* for
-    meshes of more than 50,000 triangles. Flat plates and rings do not count as hollow. The rule does not know
-    whether the task puts anything into the body.
+    For each mesh file whose convex hull is a collision shape of a body of the author's files, the rule casts
+    rays from the middle of the hull in 162 directions. The mesh is hollow if most rays meet a wall, and the
+    rays that meet nothing are on one side. The result is *not applicable* without such a mesh, and *not
+    known* for meshes of more than 50,000 triangles. Flat plates and rings do not count as hollow. The rule
+    does not know whether the task puts anything into the body.
     """
     files = _mesh_files(checkup, "convex_mesh")
     if not files:
@@ -385,8 +387,8 @@ def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     ## Why
     A convex decomposition takes seconds to minutes for each mesh. The first process on each machine makes it,
     and writes it to a file next to the mesh. On a cluster each node waits for it and several processes write
-    the same file; where the folder is read-only, it is made again each time. It also needs the package coacd
-    on each machine.
+    the same file; where the folder is read-only, the decomposition is made again each time. Making it also
+    needs the package coacd on each machine.
 
     ## Mend
     Make the decomposition once, ship the file that it writes, and load that file.
@@ -539,8 +541,8 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
     the observation, and setting its pose brings the parts back into the view of the sensors for good. The CPU
     backends, stock and batched, do not show this, since they hide an actor by its visibility.
 
-    An articulation, a static actor, an actor with collision shapes, and a merged actor that may have some
-    cannot be hidden at all: every picture of a sensor fails.
+    An articulation, a static actor, an actor with collision shapes, and a merged actor that may have
+    collision shapes cannot be hidden at all: every picture of a sensor fails.
 
     ## Mend
     Hide the merged actor, and declare that it does not collide, since ManiSkill does not find that out by
@@ -553,8 +555,9 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
     ```
 
     ## How it is checked
-    The rule reads `_hidden_objects` after a reset. It reports an entry that cannot be hidden, and an actor
-    whose merged actor is not in the list. The result is *not applicable* if nothing is hidden.
+    The rule reads `_hidden_objects` after a reset. It reports an entry that cannot be hidden, and an entry
+    that is part of a merged actor if the merged actor is not in the list. The result is *not applicable* if
+    nothing is hidden.
     """
     env: Any = checkup.task.env
     hidden = named_to_hide(env)
@@ -592,7 +595,8 @@ def _name_on(env: Any, thing: Any) -> str:
 
 
 def _hiding_line(checkup: Checkup, thing: Any) -> Place | None:
-    """The line that puts a body into ``_hidden_objects``: one that names the body, else the first."""
+    """The line that puts a body into ``_hidden_objects``: the first that names the body; if none does, the
+    first of all."""
     name = _name_on(checkup.task.env, thing)
     lines = [
         (name != "" and name in ast.unparse(statement), module.place(statement))
@@ -632,8 +636,8 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     The rule builds one env for two seeds. It reports a task whose shapes, sizes, colours, frictions or mesh
     files differ between the seeds and whose `reconfiguration_freq` is 0 with one env. The result is *not
-    applicable* if the two builds are equal. Two seeds may be equal by chance, and the rule does not look at
-    what is drawn in a reset.
+    applicable* if the two builds are equal. The builds of two seeds may be equal by chance, and the rule does
+    not look at the random numbers of a reset.
     """
     alone = checkup.alone
     if len(set(alone.shapes.values())) > 1 and not alone.rebuilds:

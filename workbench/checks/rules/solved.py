@@ -28,7 +28,7 @@ _MIN_SOLVED = {
     "reward-against": MIN_EPISODES,
     "success-lost": MIN_EPISODES,
 }
-"""Rules about success, with the minimum number of solved seeds that shows that they are kept."""
+"""Rules about success, each with the number of seeds that must be solved to show that the rule is kept."""
 
 
 @rule("reward-exploited", "warn", "compute_dense_reward", solve=True)
@@ -42,11 +42,11 @@ def reward_exploited(checkup: Checkup) -> Iterator[Found | Note]:
     training ends there: the curve of the return looks perfect, and the success rate stays at 0.
 
     ## Mend
-    Look at the episodes that are named, and let the reward pay for what `evaluate` checks. A cube that is
-    held above the target is near it in x and y only.
+    Look at the episodes that the finding names, and let the reward pay for what `evaluate` checks. A cube
+    that is held above the target is near it in x and y only.
 
     ```python fragment
-    at_goal = torch.linalg.norm(self.cube.pose.p - self.goal.pose.p, dim=1)  # z too
+    at_goal = torch.linalg.norm(self.cube.pose.p - self.goal.pose.p, dim=1)  # in x, y and z
     reward = 1 - torch.tanh(5 * at_goal)
     reward[info["success"]] = 3.0
     ```
@@ -73,12 +73,13 @@ def reward_flat(checkup: Checkup) -> Iterator[Found | Note]:
     The reward gives no direction: training stays where it is flat.
 
     ## Why
-    Where all actions earn the same, no gradient says what to do next. Training stays there, or finds the way
-    on by chance.
+    Where all actions earn the same, no gradient says what to do next. Training stays there, or gets away only
+    by chance.
 
     ## Mend
-    Give the next stage a term that changes from where the robot is. `tanh` of a long distance is flat: scale
-    it to the distances of the task. A sparse reward is flat everywhere, and needs demonstrations.
+    Give the next stage a term that changes as soon as the robot moves. `tanh` of a large number is flat:
+    choose its factor by the distances of the task. A sparse reward is flat everywhere, and needs
+    demonstrations.
 
     ```python fragment
     reach = 1 - torch.tanh(2 * distance)  # not 50 * distance: that is flat beyond 5 cm
@@ -87,9 +88,9 @@ def reward_flat(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
-    reward. The rule reports an unsolved episode if, in each of its last steps (at most ten), the best and the
-    worst rollout differ by less than 1/500 of the range of rewards that were seen, times the length of a
-    rollout. It names the terms of `info["reward_terms"]` that are flat there. It does not see a flat place in
+    reward. The rule reports an unsolved episode if, in each of its last steps (at most ten), the mean rewards
+    per step of the best and the worst rollout differ by at most 1/500 of the range of all rewards that were
+    seen. It names the terms of `info["reward_terms"]` that are flat there. It does not see a flat place in
     which no episode ends.
     """
     yield from _verdict(checkup, "reward-flat", "compute_dense_reward")
@@ -118,9 +119,9 @@ def reward_stuck(checkup: Checkup) -> Iterator[Found | Note]:
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
     reward. In each of the last steps (at most ten) of an unsolved episode, the rule compares the best rollout
     with the better of two: holding still, and the reward of the step before. It reports the episode if the
-    best rollout never gains more per step than 1/500 of the range of rewards that were seen, although the
-    rollouts differ. A task without success never breaks the rule. The rule also reports an action that takes
-    longer than a rollout to pay: try a longer `--horizon`.
+    best rollout never gains more per step than 1/500 of the range of all rewards that were seen, although the
+    rollouts differ. A task without success never breaks the rule. The rule also reports an episode in which
+    progress pays only after the end of a rollout: try a longer `--horizon`.
     """
     yield from _verdict(checkup, "reward-stuck", "compute_dense_reward")
 
@@ -132,11 +133,11 @@ def reward_against(checkup: Checkup) -> Iterator[Found | Note]:
     A policy has to learn against its reward, and most policies turn back.
 
     ## Why
-    Planning looks ahead and goes through a valley of the reward. A policy that is trained from what it tried
+    Planning looks ahead and goes through a valley of the reward. A policy that learns from its own attempts
     comes to the edge of the valley and turns back.
 
     ## Mend
-    Let the reward of each stage start from the end of the stage before, and leave terms of earlier stages in.
+    Let the reward of each stage start from the end of the stage before, and keep the terms of earlier stages.
 
     ```python fragment
     reward = reach
@@ -198,7 +199,7 @@ def failing_pays(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     `workbench check --solve` and [`workbench solve`](../jobs/solve.md) plan episodes with the task's own
     reward. The rule reports a task if more than half of the episodes (three or more) end by `fail` with a
-    mean reward below 0. A rollout is paid nothing after its fail, as in an episode.
+    mean reward below 0. A rollout earns nothing after its fail, since an episode ends there too.
     """
     yield from _verdict(checkup, "failing-pays", "compute_dense_reward")
 
@@ -214,12 +215,13 @@ def _verdict(checkup: Checkup, rule_id: str, hook: str) -> Iterator[Found | Note
 
 
 def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
-    """Evidence for `Checkup.look`: episodes of the first seeds, each to its success, its fail or its time limit.
+    """Evidence for `Checkup.look`: episodes of the first seeds, each to its fail, its time limit, or
+    `STEPS_AFTER_SUCCESS` steps after its success.
 
     Raises:
         NotApplicable, NotKnown: nothing can be planned.
     """
-    # Planning needs several envs: each rollout is one.
+    # Planning needs several envs: each rollout runs in its own.
     checkup.require_several()
     cls, found = checkup.loaded.cls, list[PlannedEpisode]()
     given = {**checkup.loaded.default_kwargs, **checkup.env_kwargs}

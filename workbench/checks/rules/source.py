@@ -57,7 +57,7 @@ def registered(checkup: Checkup) -> Iterator[Found | Note]:
     `gym.make`, ManiSkill's demos, its recording tools and every trainer make a task by its id. A class
     without an id can be opened here and nowhere else: a job on a cluster that is given the id finds nothing.
     Gymnasium's own `register` makes an id that only `gym.make` knows, with a time limit for one env. The rule
-    reports that too; the workbench uses that id and limit.
+    reports such an id too; the workbench uses it and its limit.
 
     ## Mend
     Write the decorator above the class.
@@ -158,7 +158,7 @@ def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## Why
     The first class that registers an id keeps it. Stock ManiSkill logs a line and skips the second class, and
-    `gym.make` makes the first one without an error: a training run goes on for hours on another task. The
+    `gym.make` makes the first one without an error: a training run spends hours on another task. The
     workbench opens the class of the file instead, so the mistake shows on a cluster only.
 
     ## Mend
@@ -287,7 +287,7 @@ def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
     ## Why
     Python sets any attribute on a builder: `builder.inital_pose = ...` raises nothing, and the body is built
     at the origin, in all 4096 envs, inside whatever stands there. A call of a method that does not exist
-    fails only when its line runs, perhaps in a branch that runs first after hours.
+    fails only when its line runs, perhaps after hours, in a branch that seldom runs.
 
     ## Mend
     Write the name that the finding proposes.
@@ -300,9 +300,10 @@ def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
     ## How it is checked
     The rule reads the source of the hooks and of the functions that they call; nothing runs. It looks up
     attributes that are set on variables made by `create_actor_builder` and `create_articulation_builder`, and
-    methods that are called on `self` and `self.scene`. A name counts as known if the files set it, read it on
-    a builder or ask for it with `hasattr`. The rule does not look at builders that a function gets as an
-    argument, nor at objects such as `self.agent`.
+    methods that are called on `self` and `self.scene`. It also accepts an attribute of a builder if the files
+    read an attribute of this name, and a method if the files set its name or contain it as a text, as for
+    `hasattr`. The rule does not look at builders that a function gets as an argument, nor at objects such as
+    `self.agent`.
     """
     checkup.require_source()
     read = {
@@ -509,7 +510,7 @@ def _implemented(cls: type[BaseEnv]) -> tuple[str, ...]:
 
 
 def _builders(function: ast.FunctionDef) -> dict[str, set[str]]:
-    """Names of the attributes of a builder, for each of the function's variables that holds one."""
+    """For each variable of the function that holds a builder: the names of the builder's attributes."""
     found: dict[str, set[str]] = {}
     for node in ast.walk(function):
         if not isinstance(node, ast.Assign):
@@ -523,8 +524,8 @@ def _builders(function: ast.FunctionDef) -> dict[str, set[str]]:
 
 
 def _names_of(checkup: Checkup, cls: type) -> set[str]:
-    """All names that an object of this class may have: those of its classes, those that the author's files assign or name in a
-    string, and those that code outside these files reads or sets."""
+    """All names that an object of this class may have: those of this class and its base classes, those that
+    the author's files assign or name in a string, and those that code outside these files reads or sets."""
     own = {module.file for module in checkup.places.modules}
     names = set(dir(cls))
     for module in checkup.places.modules:

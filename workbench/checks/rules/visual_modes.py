@@ -104,9 +104,9 @@ def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     Two envs observe pictures. The rule moves each body of `_hidden_objects` by some centimetres. It reports a
-    body if an entry of `evaluate()` or the dense reward changes and nothing of `_get_obs_extra` does. The
-    result is *not applicable* without hidden bodies. The rule does not see a goal that the task keeps in a
-    tensor.
+    body if nothing of `_get_obs_extra` changes, although an entry of `evaluate()` or the dense reward does.
+    The result is *not applicable* without hidden bodies. The rule does not see a goal that the task keeps in
+    a tensor.
     """
     bodies = {body: moved for body, moved in checkup.look(followers).items() if moved.hidden}
     if not bodies:
