@@ -272,7 +272,7 @@ class Library:
         """Add tags to recordings and remove tags.
 
         Raises:
-            LibraryError: a file cannot be written; earlier recordings have been changed.
+            LibraryError: a file cannot be written; the recordings before it in `ids` have been changed.
         """
         add, without = clean_tags(tuple(add)), set(clean_tags(tuple(remove)))
         self._annotate(
@@ -312,9 +312,9 @@ class Library:
         """Move all files of these recordings to the trash; returns the name of the deletion for `undo_delete`.
 
         Raises:
-            LibraryError: nothing was moved, because a file also contains recordings that are not in `ids`, or
-                belongs to a LeRobot dataset, or no longer exists; or a file could not be moved, but those
-                before it were.
+            LibraryError: either nothing was moved, because a file contains other recordings too, belongs to a
+                LeRobot dataset, or no longer exists; or a file could not be moved, but the recordings before
+                it were moved.
         """
         with self._changing:
             keys = self._keys_to_delete(ids)

@@ -90,7 +90,8 @@ class LibraryIndex:
         self._do(write, None)
 
     def thumbnails(self, places: Collection[tuple[str, int]]) -> dict[tuple[str, int], bytes]:
-        """JPEGs of these rows, each given as key and row number in its files; rows without one are left out."""
+        """JPEGs of these rows, which are given as (key of the files, row number in them); rows without a JPEG
+        are left out."""
 
         def read(database: sqlite3.Connection) -> dict[tuple[str, int], bytes]:
             found = {}
@@ -155,7 +156,7 @@ def _connect(name: str) -> sqlite3.Connection:
         with database:
             for table in _TABLES:
                 database.execute(f"CREATE TABLE IF NOT EXISTS {table}")
-            # Write once: only a write fails if the folder is read-only.
+            # Try a write: in a read-only folder, everything else succeeds.
             database.execute("DELETE FROM read WHERE key = ''")
     except sqlite3.Error:
         database.close()

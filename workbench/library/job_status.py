@@ -59,8 +59,8 @@ class JobStatus:
     written_at: float = 0.0
     """Unix time in seconds."""
     place: str = ""
-    """Folder that the job records into, relative to the library's folder; empty for that folder. Set by the
-    reader."""
+    """Folder that the job records into, relative to the library's folder; empty for the library's folder
+    itself. Set by the reader."""
 
     @property
     def failed(self) -> int:
@@ -115,8 +115,8 @@ class StatusFile:
 
 
 def read_jobs(folder: Path, now: float, below: Iterable[Path] = ()) -> tuple[JobStatus, ...]:
-    """The jobs of a folder that run or ended within the last hour, newest status first. The files are untrusted: invalid ones
-    are skipped, and texts are cleaned.
+    """The jobs of a folder that run or ended within the last hour, newest status first. The status files are
+    untrusted: invalid files are skipped, and texts are cleaned.
 
     Args:
         below: subfolders of `folder` whose jobs are read too.

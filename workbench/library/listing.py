@@ -181,8 +181,8 @@ def _press(listing: Listing, id: str, toggle: bool = False, to_anchor: bool = Fa
 
 
 def _move(listing: Listing, by: int, to_anchor: bool = False) -> LibraryList:
-    """Move the cursor by `by` rows and select its row. Without a cursor, put it where it was last, or on the
-    shown page."""
+    """Move the cursor by `by` rows and select its row. Without a cursor, put it at its last row number, or at
+    the first row of the shown page if that is further down."""
     listed, ids = listing.list, [row.id for row in listing.rows]
     if not ids:
         return listed
@@ -199,8 +199,8 @@ def _take(listed: LibraryList, ids: list[str], place: int, toggle: bool, to_anch
 
     Args:
         ids: ids of the listed rows.
-        toggle: keep the selection; the row itself is deselected if it was selected.
-        to_anchor: select all rows from the anchor to this one.
+        toggle: keep the selection of the other rows; deselect this row if it was selected.
+        to_anchor: select all rows from the anchor to this row.
     """
     id = ids[place]
     listed = replace(listed, cursor=id, place=place)

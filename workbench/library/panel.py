@@ -161,12 +161,12 @@ class LibraryPanel(PagePart[object]):
         self._list = replace(self._list, selected=frozenset(ids))
 
     def add_action(self, action: Action) -> None:
-        """Add a button for the selected recordings; it runs on the loop and must not block."""
+        """Add a button for the selected recordings. The action runs on the loop and must not block."""
         self._actions = (*self._actions, action)
 
     @property
     def does(self) -> tuple[type[Command], ...]:  # type: ignore[override]
-        """Commands that the panel carries out; the actions are those added so far."""
+        """Commands that the panel carries out, including those of the actions added so far."""
         return (*LIST, *(type(action.command) for action in self._actions))
 
     @on_loop
@@ -406,7 +406,7 @@ class LibraryPanel(PagePart[object]):
                     tell_all(self._server, "This recording is damaged", body, "orange")
 
     def _why_unreadable(self, ids: tuple[str, ...], salvages: bool) -> str:
-        """Reason why none of these recordings can be read; empty if one can be read.
+        """Reason why none of these recordings can be read; empty if at least one of them can be read.
 
         Args:
             salvages: whether the readable part of a damaged recording of the workbench is enough.

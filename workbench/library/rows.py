@@ -199,7 +199,7 @@ def _short_date(when: datetime.datetime, now: datetime.datetime) -> str:
 
 
 def in_words(rows: Sequence[LibraryRow]) -> str:
-    """Text of the numbers and the size, such as ``3 recordings (9 files, 1.2 MB)``."""
+    """Numbers of recordings and files, and the files' size: ``3 recordings (9 files, 1.2 MB)``."""
     files = {path for row in rows for path in row.paths}
     by_files = {row.paths: row.size for row in rows}
     what, of = counted(len(rows), "recording"), counted(len(files), "file")

@@ -30,15 +30,15 @@ class Trash:
 
 
 class TrashError(OSError):
-    """Files could not be moved or deleted; the message names the file and the reason. The recording's other
-    files are where they were; if not, the message says where they are."""
+    """Files could not be moved or deleted; the message names the file and the reason. The other files of
+    the recording were moved back; if that failed, the message says where they are."""
 
 
 def move_to_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | None:
     """Move the files of these recordings, in order; returns the name of the deletion, or None if no file exists.
 
     Raises:
-        TrashError: a file could not be moved; earlier recordings were moved.
+        TrashError: a file could not be moved; the recordings before it were moved.
     """
     if (folder / TRASH).is_symlink():
         raise TrashError(

@@ -100,8 +100,8 @@ class RescoreSetup:
     chunk: int
     use_env_states: bool = False
     elsewhere: bool = False
-    """Whether workers on other machines read the recordings from a shared folder, because they are too large
-    to send."""
+    """Whether workers on other machines read the recordings from a shared folder, because the recordings are
+    too large to send."""
 
     def code_of(self, chunk: Chunk) -> int:
         return self.of_chunk[chunk.numbers[0] // self.chunk]
@@ -131,7 +131,7 @@ def rescore_recordings(
     """Verdicts of the recordings, in the order of the files.
 
     Args:
-        on_progress: called with the number of rescored episodes, of all episodes, and of control steps so far.
+        on_progress: called with three numbers: rescored episodes, all episodes, and control steps so far.
         on_finding: called once for each line at which a rule is broken without stopping the task.
 
     Raises:
@@ -223,7 +223,8 @@ class _Stopped(Exception):
 
 
 def rescore_items(setup: RescoreSetup, queue: ItemQueue) -> None:
-    """Rescore the chunks of one worker. An exception of the author's code becomes the verdict of its recordings."""
+    """Rescore the chunks of one worker. If the author's code raises, the exception becomes the verdict of the
+    chunk's recordings that have none yet."""
     torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # a task may change the working directory
     chunk = queue.next()

@@ -56,8 +56,8 @@ class RescoredPast:
     """Old and new scores of the history, one row per moment, filled as results arrive. Used on the loop.
 
     The bodies' drift from the record is stored for each moment and env, because it decides whether a
-    comparison is reliable. After a reset that is in the history the drift is mostly zero to the last bit,
-    because envs start there with fresh physics (measured: none in PushCube, PickCube and StackCube, 7e-8 m in
+    comparison is reliable. After a reset that is in the history, the drift is exactly zero in most tasks,
+    because envs start there with fresh physics (measured: zero in PushCube, PickCube and StackCube, 7e-8 m in
     PushT, 6e-8 m in PushCube with a restored past moment). The drift may grow if the oldest moment of the
     history is in the middle of an episode, and in tasks whose state does not fit a snapshot (see
     `envs.snapshots.snapshot`).

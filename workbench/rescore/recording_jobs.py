@@ -68,7 +68,8 @@ def group_episodes(
     file: Path | None = None,
     recorded_source: bool = False,
 ) -> tuple[list[RescoreGroup], list[Verdict[Source]]]:
-    """Group episodes by the env that rescores them; also returns verdicts for those that cannot be read.
+    """Group episodes by the env that rescores them. Also returns verdicts for the episodes that cannot be
+    read, or that lack the text that `recorded_source` needs.
 
     Args:
         num_envs: maximum number of envs of a group.
@@ -251,7 +252,7 @@ class Rescorer:
         use_env_states: bool,
     ) -> None:
         """Rescore each group with the code cleared for it, or its recorded text. A failed group does not stop the others: a
-        folder holds recordings of many tasks, one of which may be missing.
+        folder holds recordings of many tasks, and one of these tasks may be missing.
 
         Raises:
             JobFailed: the error of the first group, if all fail.

@@ -106,7 +106,7 @@ def rescore(
     episode, independent of the other envs. Envs without an episode do not move.
 
     Args:
-        use_env_states: restore every recorded state after its step, so that nothing drifts.
+        use_env_states: after every step, restore the recorded state, so that nothing drifts.
         read: reads a file's episode; raises as `read_recording` does.
 
     Raises:
@@ -146,11 +146,11 @@ def opened_code(
     on_activity: Callable[[str], None] = lambda activity: None,
     on_finding: Callable[[Finding], None] = lambda finding: None,
 ) -> Iterator[OpenedTask]:
-    """Context manager that opens the task of `code`; if it cannot be opened with `code.options`, with
-    `code.or_else`.
+    """Context manager that opens the task of `code` with `code.options`, or with `code.or_else` if that
+    fails.
 
     Raises:
-        TaskError: the task cannot be opened with either, or the block raised.
+        TaskError: the task cannot be opened with either of these options.
         CannotEnterRecording: the recorded source cannot be used.
     """
     text = nullcontext(code.task) if code.recorded is None else recorded_source(code.recorded)

@@ -31,15 +31,15 @@ class Scores:
     reward: NDArray
     """(T,); empty if none was recorded."""
     evaluate: Mapping[str, NDArray]
-    """(T + 1,) values of each entry; NaN in a state without it."""
+    """(T + 1,) values of each entry; NaN in states without the entry."""
     has_reward: bool = True
     """False for a task without a reward (``reward_mode="none"``), whose `reward` is zeros."""
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Generic[Of]):
-    """Comparison of one run: T control steps and T + 1 states. It covers the steps that both scores have,
-    also those after a step at which the current code would have ended the episode.
+    """Comparison of one run: T control steps and T + 1 states. It covers the steps that have recorded and new
+    scores, even those after a step at which the current code would have ended the episode.
 
     Rescoring replays the run, so the verdict also has the distance of the replayed states from the recorded
     ones.
@@ -52,7 +52,8 @@ class Verdict(Generic[Of]):
     length: int = 0
     """Control steps."""
     success: tuple[int | None, int | None] = (None, None)
-    """First step of the episode after which success is true, as (recorded, rescored); None if never."""
+    """Step of the episode after which success is true for the first time: (recorded, rescored); None if
+    never."""
     fail: tuple[int | None, int | None] = (None, None)
     has: tuple[str, ...] = ("reward",)
     """Names among reward, success and fail that the record or the current code has."""
@@ -65,7 +66,7 @@ class Verdict(Generic[Of]):
     look_at: int | None = None
     """Step to show: where success or fail differs, else where the reward differs most."""
     differing: tuple[str, ...] = ()
-    """Names of the entries of ``evaluate``, and ``reward``, that differ at any step."""
+    """Names that differ at any step: ``reward``, and entries of ``evaluate``."""
     metres: float | None = None
     """Largest distance in metres of a body from the recorded state; None if there are no states."""
     radians: float = 0.0
@@ -187,7 +188,8 @@ def compare(
 
 
 def by_change(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
-    """Sort by size of change: success, fail, then return; unchanged and unrescored runs come last."""
+    """The runs with the largest change first: a changed success counts most, then a changed fail, then the
+    change of the return. Unchanged runs come after these, and unrescored runs last."""
 
     def key(verdict: Verdict[Of]) -> tuple[bool, bool, int, float]:
         moved = 2 * (verdict.success[0] != verdict.success[1]) + (verdict.fail[0] != verdict.fail[1])

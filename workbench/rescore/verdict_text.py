@@ -21,7 +21,8 @@ _MAX_NAMES = 4
 
 
 def change_text(verdict: Verdict[Any]) -> str:
-    """Text of the change of success and fail, or else of the reward; ``unchanged`` if neither differs."""
+    """Text of the change of success and fail, or else of the reward; ``unchanged`` if none of them
+    differs."""
     if verdict.why_not:
         return f"not rescored: {verdict.why_not}"
     flags = (("success", verdict.success), ("fail", verdict.fail))

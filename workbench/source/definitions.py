@@ -1,4 +1,4 @@
-"""Finds the definition of a name and its other readers in the text of the author's files."""
+"""Finds where a name is defined, and where else it is read, in the text of the author's files."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class Project:
     """The author's files, parsed on demand.
 
     Which branches run depends on the task, so a definition in a branch may or may not hold. Readers are
-    over-counted rather than missed: every file that contains the name counts. A reader too many only means
-    that a new value is written where it is used, not where it is defined.
+    over-counted rather than missed: every file that contains the name counts. If a reader is counted wrongly,
+    the only effect is that a new value is written where it is used, not where it is defined.
     """
 
     def __init__(self, texts: Mapping[str, str]) -> None:
@@ -261,10 +261,10 @@ def reaching(file: SourceFile, bindings: list[Binding], use: ast.AST | None, sco
             continue
         if isinstance(binding.node, (ast.Assign, ast.AnnAssign, ast.AugAssign, ast.NamedExpr)):
             if binding.node in around:
-                continue  # the right-hand side of its own assignment
+                continue  # `use` is on the right-hand side of this assignment
         if use is not None and _exclusive(file, binding.node, use):
             continue
-        # A binding that certainly ran replaces the earlier ones.
+        # A binding that certainly ran replaces the bindings before it.
         certain = isinstance(binding.node, ast.arg) or _block(file, binding.node) in _blocks(file, use, scope)
         found = [binding] if certain else [*found, binding]
     return found

@@ -1,4 +1,5 @@
-"""Parsed source files with text offsets and edits of their spans; positions of the values of a traced call."""
+"""Parsed source files, with offsets and edits of their text; places where a traced call's values are
+written."""
 
 from __future__ import annotations
 
@@ -261,7 +262,8 @@ class SourceFile:
         return "".join([*parts, self.text[at:]])
 
     def added_arguments(self, call: ast.Call, texts: Sequence[str]) -> list[Replacement]:
-        """Add `texts` (``near=0.01``) after the last argument, on separate lines if the other arguments are."""
+        """Add `texts` (``near=0.01``) after the last argument; on separate lines if each argument has its own
+        line."""
         start, close = self.content_span(call)
         items = self.items(call)
         if not texts or not items:
@@ -280,8 +282,8 @@ class SourceFile:
         return [Replacement(end, end, "".join(f", {text}" for text in texts))]
 
     def added_item(self, node: ast.AST, indent: str, text: Callable[[str], str]) -> list[Replacement]:
-        """Add the item `text(indent)` between the brackets, on its own lines; `indent` is the statement's
-        indentation."""
+        """Add an item between the brackets, on its own lines. `indent` is the statement's indentation; `text`
+        returns the item's code for the indentation of the item."""
         start, close = self.content_span(node)
         items = self.items(node)
         own = indent + "    "
@@ -362,7 +364,8 @@ def walk(node: ast.AST) -> Iterator[ast.AST]:
 
 @lru_cache(maxsize=8)
 def parse_file(path: str, text: str) -> SourceFile:
-    """A cached `SourceFile`, which is never modified: successive edits concern the same few files."""
+    """A `SourceFile`, which is never modified. It is cached, because successive edits concern the same few
+    files."""
     return SourceFile(path, text)
 
 
@@ -408,8 +411,8 @@ class TracedValue:
     function: str = ""
     """Name (`KnownFunction.name`) of the called function; empty for other expressions."""
     parts: Mapping[str, TracedValue] = field(default_factory=dict)
-    """Elements of a list by index; arguments of a call by parameter; ``of``: the number within an expression that may be
-    edited instead of the whole expression."""
+    """Elements of a list by index, or arguments of a call by parameter. For any other expression: ``of``, the
+    number within it that may be edited instead of the whole expression."""
     slope: float = 1.0
     offset: float = 0.0
     """value = slope * `parts["of"].value` + offset"""
@@ -434,7 +437,7 @@ class Trace:
 
     at: Place
     function: str
-    """Qualified name of the function that contains it."""
+    """Qualified name of the function that contains the call."""
     parts: Mapping[str, TracedValue]
     """Arguments that could be followed."""
     unknown: Mapping[str, str]

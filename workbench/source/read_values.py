@@ -40,7 +40,7 @@ from workbench.source.parsed import (
 )
 
 _MAX_NAME_CHAIN = 40
-"""Maximum length of a chain of names that is followed; a longer one is a cycle."""
+"""Maximum length of a chain of names that is followed; a longer chain counts as a cycle."""
 _CONDITION_NODES = (
     ast.Name,
     ast.Attribute,
@@ -203,7 +203,7 @@ class ValueReader:
         return self._evaluate(file, node, node, bool)
 
     def _with_editable_number(self, file: SourceFile, node: ast.expr, whole: TracedValue) -> TracedValue:
-        """`whole`, with the number within it to edit as its part, if there is one.
+        """`whole`. If a number within it can be edited instead, that number is its part ``of``.
 
         Examples: the 60 of ``60 * np.pi / 180``; the 0.2 of ``HEIGHT + 0.2``, so that the value still follows
         HEIGHT.
@@ -356,7 +356,7 @@ class ValueReader:
         return binding.file, binding.value, others
 
     def _binding_of_run(self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding]) -> Binding:
-        """The binding whose value equals the running value. Raises Unknown if it is not exactly one."""
+        """The binding whose value equals the running value. Raises Unknown unless there is exactly one."""
         fitting = []
         for binding in bindings:
             try:
@@ -438,7 +438,8 @@ def _concerned_by(binding: Binding) -> Callable[[str, str], bool]:
         return lambda path, owner: True
 
     def concerns(path: str, owner: str) -> bool:
-        # A class that inherits both classes has the attribute in the methods of both.
+        # Objects of `home` and of its subclasses have the attribute, also in methods that they inherit from
+        # `owner`.
         return any((path, owner) in classes_of(cls) for cls in (home, *_subclasses(home)))
 
     return concerns
@@ -535,7 +536,8 @@ class KnownFunction:
     parameters: tuple[str, ...] = ()
     """Parameters in order, of a function whose arguments may be edited."""
     converts: bool = False
-    """Whether the function only converts the type of its first argument, which is edited instead."""
+    """Whether the function only converts the type of its first argument; then the argument is edited, not the
+    call."""
 
 
 @cache

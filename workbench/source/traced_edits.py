@@ -193,7 +193,7 @@ def _chain(value: TracedValue) -> list[TracedValue]:
 
 
 def _outer_value(chain: list[TracedValue], innermost: float) -> float:
-    """The value of the first part of `chain` if the last one is `innermost`."""
+    """The value of the first part of `chain` if the last part has the value `innermost`."""
     for outer in reversed(chain[:-1]):
         innermost = innermost * outer.slope + outer.offset
     return innermost
@@ -213,7 +213,8 @@ def _inner_target(value: TracedValue, requested: float, decimals: int) -> tuple[
 
 
 def number_text(value: float, decimals: int, like: str = "0.0") -> str:
-    """`value` rounded to `decimals`, without trailing zeros. A whole number is an integer if the old text `like` is one."""
+    """`value` rounded to `decimals`, without trailing zeros. A whole number is written as an integer if the
+    old text `like` is an integer or `decimals` is 0."""
     rounded = round(value, decimals)
     if rounded == int(rounded):
         whole = str(int(rounded))

@@ -43,15 +43,15 @@ class blamed:
             # Call no more of the author's code to explain the error: it may hang again.
             files, cls = self._loaded.source_files, self._loaded.cls
             raise TaskError(problem_from_exception(error, self._stage, files, cls)) from error
-        # Also SystemExit and an author's BaseException, which must not end the worker. The problem is made
+        # Convert SystemExit and an author's BaseException too: they must not end the worker. Make the problem
         # here: later, a caller may have restored the previous version and its texts.
         if error is None or isinstance(error, TaskError) or is_ctrl_c(error) or self._is_closed(error):
             return
         raise TaskError(self._problem(error)) from error
 
     def _is_closed(self, error: BaseException) -> bool:
-        """Whether `error` is a GeneratorExit that closes a generator of the workbench, not one that the
-        author's code raised."""
+        """Whether `error` is a GeneratorExit that closes a generator of the workbench; False if the author's
+        code raised it."""
         if not isinstance(error, GeneratorExit):
             return False
         files = {str(file) for file in self._loaded.source_files}
@@ -67,12 +67,13 @@ class blamed:
         dtype = torch.get_default_dtype()
         if problem.line is not None or dtype == _DTYPE_AT_START:
             return problem
-        # A changed default dtype fails in ManiSkill's code, far from the line that changed it.
+        # After the default dtype has changed, ManiSkill's code fails, far from the line that changed it.
         was = f"torch's default dtype is {dtype}, and was {_DTYPE_AT_START} before the task was imported"
         return replace(problem, message=f"{problem.message} ({was})")
 
     def _wrong_return(self, error: BaseException) -> Problem | None:
-        """The problem of ``evaluate``'s return value, if `error` comes from ManiSkill's use of it."""
+        """The problem of ``evaluate``'s return value, if ManiSkill raised `error` on that value; else
+        None."""
         loaded, env = self._loaded, _env_that_reads(error)
         if env is None:
             return None
@@ -84,7 +85,8 @@ class blamed:
 
 
 def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
-    """The check that `TaskEnv` calls with the results of ``evaluate`` and the reward; raises TaskError for wrong shapes."""
+    """The function that `TaskEnv` calls with the result of ``evaluate`` and with the reward. It raises
+    TaskError for a wrong type or shape."""
 
     def check(evaluate: Mapping[str, Any], reward: Any) -> None:
         problem = check_step_returns(loaded.cls, num_envs, evaluate, reward, loaded.source_files)

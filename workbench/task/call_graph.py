@@ -1,4 +1,4 @@
-"""The symbols of two versions of a task, and which of them changed and may reach each other."""
+"""The symbols of two versions of a task: which of them changed, and which may reach which."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Symbol:
     parts: Sequence[ast.AST]
     """The nodes that form `text`; for a class, without its members."""
     nodes: Sequence[ast.AST]
-    """Nodes of the symbol: a property with its setter is one symbol."""
+    """Nodes of the symbol; several, for example, for a property with its setter."""
     short_names: frozenset[str]
     """Names by which other code may mention the symbol."""
     owner: str | None = None
@@ -86,7 +86,7 @@ class Symbol:
 
 
 def read_symbols(path: str, text: str, keep_docstrings: bool = False) -> dict[Key, Symbol]:
-    """The symbols of one file, in order. Raises SyntaxError, as ``compile``."""
+    """The symbols of one file, in order. Raises SyntaxError, as ``compile`` does."""
     tree = parse_python(text, path)
     if not keep_docstrings:
         _remove_docstrings(tree)
@@ -154,7 +154,8 @@ def _defines(statement: ast.stmt, at_top: bool) -> str | None:
 
 
 def _one_import_each(body: list[ast.stmt]) -> Iterator[ast.stmt]:
-    """``from x import a, b`` as two statements, so that adding a name does not change the others."""
+    """``from x import a, b`` as two statements, so that a name can be added without changing the symbols of a
+    and b."""
     for statement in body:
         if isinstance(statement, ast.ImportFrom) and statement.module == "__future__":
             # Skip it: annotations are ignored, and the other features are the default now.
@@ -238,7 +239,7 @@ def _mentions(parts: Iterable[ast.AST]) -> tuple[frozenset[str], str | None]:
 
 
 def _walk_code(node: ast.AST) -> Iterator[ast.AST]:
-    """``ast.walk``, parents first, without annotations, which have no effect."""
+    """Like ``ast.walk``, but parents first, and without annotations, which have no effect."""
     yield node
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns"):
@@ -265,8 +266,8 @@ def _remove_docstrings(tree: ast.Module) -> None:
 
 
 class TwoVersions:
-    """One graph of both versions. A node is a symbol, by file and name, in both versions. An edge leads to
-    every symbol that a name in the node may mean, in either version.
+    """One graph of both versions. A node is a `Key` (file and name): it stands for the symbols of both
+    versions that have this file and name. Its edges lead to every symbol that a name in one of them may mean.
 
     Pure: nothing is imported or executed.
     """
@@ -339,7 +340,7 @@ class TwoVersions:
         }
 
     def siblings(self, family: set[Key]) -> set[Key]:
-        """Other tasks in the files, which have no live env."""
+        """The task classes of the files that are not in `family`; they have no live env."""
         found: set[Key] = set()
         tasks, before = {"BaseEnv", *(name for _, name in family)}, -1
         while before != len(found):
@@ -381,10 +382,10 @@ def _read_all(texts: Mapping[str, str], keep_docstrings: bool) -> dict[Key, Symb
 
 
 def line_in(old: str, new: str, line: int) -> int | None:
-    """The 1-based line of `new` that corresponds to `line` of `old`; None if its function changed.
+    """The 1-based line of `new` that corresponds to `line` of `old`; None if the function around it changed.
 
-    Comments, docstrings and layout do not count. A line outside of functions is compared as a statement of
-    the file. Does not raise, whatever the texts contain.
+    Comments, docstrings and layout do not count as changes. For a line outside of functions, the statement
+    around it is compared. Does not raise, whatever the texts contain.
     """
     try:
         before, after = parse_python(old), parse_python(new)
@@ -430,8 +431,8 @@ def _code_text(node: ast.stmt) -> str:
 
 
 def _matching_line(old: str, new: str, line: int, before: ast.stmt, after: ast.stmt) -> int:
-    """The line of `after` with the same text, the nearest to the same offset from the first line; if no line
-    has the text, the line at that offset."""
+    """The line of `after` that has the text of `line`. If several have it: the one nearest to the place that
+    `line` has within `before`. If none has it: the line at that place."""
     text = old.splitlines()[line - 1].strip()
     at = after.lineno + line - before.lineno
     end = after.end_lineno or after.lineno

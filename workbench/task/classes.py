@@ -1,4 +1,4 @@
-"""Chooses the class of a file to open, or a robot in a scene if there is no task."""
+"""Chooses which class of a file to open: a task, or a robot in a scene if the file has no task."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def choose_task(
     text: str,
     registrations: registry.Registrations,
 ) -> ChosenTask:
-    """The class `requested` of a module that was just executed. If it is None: the last registered task, else
-    the last task, else the last robot.
+    """The class `requested` of a module that was just executed. If `requested` is None: the last registered
+    task, else the last task, else the last robot.
 
     Args:
         text: text of the file.
@@ -67,7 +67,7 @@ def choose_task(
         for value in vars(module).values()
         if registry.is_task(value) and value.__module__ == module.__name__
     ]
-    # Registered ones last, in the order of registration: the last one is the default.
+    # Registered classes last, in the order of registration: the last candidate is the default.
     candidates = [cls for cls in dict.fromkeys(defined) if cls not in registered] + list(registered)
     names = [cls.__name__ for cls in candidates]
     if requested is None:
@@ -94,7 +94,8 @@ def choose_task(
 
 
 def _alternatives(cls: type, candidates: list[type], registered: Collection[type]) -> tuple[str, ...]:
-    """Classes to try if `cls` fails, without its base classes: a base may open and show nothing."""
+    """Classes to try if `cls` fails: the registered ones if `cls` is registered, else the others. Base
+    classes of `cls` are left out: a base may open and show nothing."""
     return tuple(
         other.__name__
         for other in reversed(candidates)

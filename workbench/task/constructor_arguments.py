@@ -23,8 +23,8 @@ def class_arguments(cls: type) -> tuple[str, ...]:
 
 
 def arguments_of(file: SourceFile, path: Path, cls: ast.ClassDef, depth: int = 0) -> tuple[str, ...] | None:
-    """Names of the constructor arguments of an author's class, including those that it passes on to its bases; None if a base
-    is not found."""
+    """Names of the constructor arguments of an author's class, including those that the constructor passes on
+    to base classes; None if a base class is not found."""
     init = next(
         (one for one in cls.body if isinstance(one, ast.FunctionDef) and one.name == "__init__"), None
     )

@@ -32,8 +32,8 @@ class CannotRead(OSError):
 
 @dataclass(frozen=True)
 class TaskContent:
-    """Source code of a task: the texts that a person is asked to trust and that are hashed; for a recording's task,
-    everything that `load_task` executes."""
+    """Source code of a task: the texts that are hashed, and that a person is asked to trust. For a task from
+    a recording, `load_task` executes nothing else."""
 
     main: str
     """Path of the task's own file, or its name in a recording."""
@@ -48,7 +48,7 @@ class TaskContent:
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Paths of the other texts, relative to the task's folder."""
+        """Paths of all texts except the task's own file, relative to the task's folder."""
         return tuple(sorted(self.name(path) for path in self.texts if path != self.main))
 
     @property
@@ -77,8 +77,8 @@ def read_content(file: Path) -> TaskContent:
     folder, so all modules of the folder are then included.
 
     Raises:
-        CannotRead: a file is not an ordinary file of Python text, or is too large, or there are more than
-            `MAX_MODULES`.
+        CannotRead: a file is too large or is not an ordinary file of Python text, or the task has more than
+            `MAX_MODULES` modules.
     """
     file = real_path(file)
     return _ContentReader(file).content()
@@ -192,7 +192,7 @@ def read_text(path: Path) -> str:
 
 
 def source_hash(source: Mapping[str, str], folder: Path) -> str:
-    """sha256 over names relative to `folder` and texts, 12 hex digits."""
+    """sha256 over the texts and their paths (relative to `folder` if they are in it), 12 hex digits."""
     parts: list[str] = []
     for path in sorted(source):
         inside = Path(path).is_relative_to(folder)
@@ -221,7 +221,8 @@ def _read(path: Path) -> tuple[str, str]:
 
 
 def _dynamic(node: ast.AST) -> str | None:
-    """The name in this node that may import or run code that the text does not name."""
+    """The name by which this node may import or run code that the text does not name; None if there is
+    none."""
     if isinstance(node, ast.ImportFrom):
         return next((alias.name for alias in node.names if alias.name in _DYNAMIC), None)
     if isinstance(node, ast.Name) and node.id in _DYNAMIC:

@@ -70,8 +70,9 @@ def copied_text(
 ) -> tuple[str, tuple[tuple[str, str], ...]]:
     """The text of the copy, and pairs of the original's and the copy's id.
 
-    Only what depends on the file's place and ids changes: relative imports become absolute, `__file__` becomes the
-    installed module's (its assets are there), and registered ids get another name. The rest is identical.
+    Only what depends on the file's place and ids changes. Relative imports become absolute. ``__file__``
+    becomes that of the installed module, beside which the assets are. Registered ids get another name.
+    Without `names`, the rest is identical.
 
     Args:
         source: the file of `text`; its packages are found by their ``__init__.py``.

@@ -69,7 +69,8 @@ def command_line(reference: str, options: TaskOptions) -> str:
 
 
 def _argument_text(value: Any) -> str:
-    """The text that ``--env`` parses to this value: JSON, or plain text that is not JSON."""
+    """The text that ``--env`` parses to this value: JSON; for a string that is not JSON, the string
+    itself."""
     if isinstance(value, str):
         try:
             json.loads(value)
@@ -131,7 +132,7 @@ class TaskDescription:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments with which ``gym.make`` makes such an env, as far as JSON can represent them."""
     objects: tuple[ObjectToSee, ...] = ()
-    """Objects that a camera can be measured on."""
+    """Objects of which a camera report can tell what a camera sees."""
     joints: tuple[str, ...] = ()
     """Names of `StepResult.qpos`."""
     notices: tuple[str, ...] = ()
@@ -139,8 +140,8 @@ class TaskDescription:
     parse_cameras: str = "parse_camera_configs"
     """Name of the installed ManiSkill's function that parses what a camera hook returns."""
     outlier_rules: Mapping[str, Finding] = field(default_factory=dict)
-    """The rules that an outlier can break, by id; each value is a finding template at the hook that the rule guards. Rules
-    that are off, or silenced at the hook, are left out."""
+    """The rules that an outlier can break, by id. Each value is a template of a finding, placed at the hook
+    that the rule guards. Rules that are off, or silenced at the hook, are left out."""
     made: HowMade = HowMade()
     """How the envs are made: robot, modes and the task's own keyword arguments."""
 
@@ -159,7 +160,7 @@ class Restored:
     env_idx: tuple[int, ...]
     """The envs that were set."""
     source: tuple[int, ...]
-    """Env of the snapshot whose state each env of `env_idx` got."""
+    """For each env of `env_idx`: the env of the snapshot whose state it got."""
     origin: int
     """The server's number of the restored moment, or `NO_MOMENT`."""
     undoes: int | None
@@ -173,18 +174,18 @@ class Restored:
     number: int = 0
     """Number of the `EnterRecording` that this result answers; 0 for a `Restore`."""
     replayed: tuple[int, ...] = ()
-    """Indices of the envs that were replayed up to the state. Their state is not an exact point, from which
-    the same actions give the same bits; a restored state is one."""
+    """Indices of the envs that were replayed up to the state. A restored state is an exact point: from it,
+    the same actions give the same bits. A replayed state is not."""
 
 
 @dataclass(frozen=True)
 class Stepped:
-    """One reset, control step or restore of the batch, always sent, in order."""
+    """One reset, control step or restore of the batch. Each is sent, in order; none is left out."""
 
     step: StepResult
     reset_mask: NDArray[np.bool_]
-    """(N,) True where this result does not follow from the previous one: the first of a new episode, or a past moment
-    (`restored`)."""
+    """(N,) True for each env whose result does not follow from its previous result: it is the first of a new
+    episode, or a past moment that was restored (see `restored`)."""
     captured: tuple[Picture, ...] = ()
     """Pictures of exactly this step (only while capturing)."""
     seeds: NDArray[np.int64] | None = None

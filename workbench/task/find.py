@@ -52,7 +52,7 @@ class FoundTasks:
     """The result of a search."""
 
     files: tuple[TaskFile, ...] = ()
-    """Files of the folder itself first, then by path."""
+    """Sorted by depth below the folder, the folder's own files first, and then by path."""
     left_out: str = ""
     """Why the search may have missed files, as a sentence; empty if it is complete."""
 
@@ -121,7 +121,7 @@ def read_task_file(path: Path) -> TaskFile | None:
         return None
     try:
         with warnings.catch_warnings():
-            # A text with "\d" would warn in the terminal.
+            # Otherwise a text with "\d" would print a warning in the terminal.
             warnings.simplefilter("ignore")
             tree = parse_python(raw)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:

@@ -69,7 +69,7 @@ def make(
         num_envs: number of envs in the batch.
         backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation, which needs CUDA and
             PhysX's GPU library. ``auto``: the CPU, even if there is a GPU, because the tests of GPU
-            simulation have not passed on any machine so far. Replaces ``sim_backend``.
+            simulation have not passed on any machine so far. `backend` replaces ``sim_backend``.
         max_episode_steps: the time limit in control steps; None for the registered limit, -1 for no limit.
         threads: threads that step the envs on the CPU; None for one per core that the process may use.
         rules: rules of GPU simulation, checked on the CPU: ``stop`` raises if one is broken, ``warn`` warns,
@@ -101,7 +101,8 @@ def make(
         max_episode_steps = limit = None
     else:
         limit = found.max_episode_steps
-        # As ``register_env`` does. This wrapper removes gymnasium's own limit, which gives one bool for all envs.
+        # ``register_env`` adds the same wrapper. It removes gymnasium's own limit, which gives one bool for
+        # all envs.
         entry = "mani_skill.utils.registration:TimeLimitWrapper"
         limits = (WrapperSpec("MSTimeLimit", entry_point=entry, kwargs={"max_episode_steps": limit}),)
     if pictures == "fast":
@@ -130,7 +131,7 @@ _FAST_PICTURES = (
 
 
 class _RaisedInConstructor(Exception):
-    """Carries a TypeError past gymnasium, which would replace it with one that lacks the author's frames."""
+    """Carries a TypeError past gymnasium, which would raise a new TypeError without the author's frames."""
 
     def __init__(self, error: TypeError) -> None:
         super().__init__(error)
@@ -166,7 +167,7 @@ def _built(
                 f"{needs} needs a renderer, and SAPIEN finds no Vulkan driver on this machine: "
                 "`workbench doctor` says which one to install."
             )
-    # gym.make(env.spec, num_envs=2) may change the number.
+    # `num_envs` can differ from `options`: ``gym.make(env.spec, num_envs=2)`` gives another number.
     env = build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
     if isinstance(env, BatchedCpuMixin):
         for finding in findings_of_shaders(list_cameras(env)):

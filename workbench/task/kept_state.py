@@ -1,4 +1,4 @@
-"""Finds code that keeps state of an old version after its code is replaced: memoized values and mutable globals."""
+"""Finds code by which values of an old version outlive that version: memoized values and mutable globals."""
 
 from __future__ import annotations
 
@@ -23,17 +23,21 @@ _HOOK_ARGUMENTS = {"info", "obs", "action"}
 
 
 def memoizing_statement(function: ast.AST, imported: Collection[str]) -> str | None:
-    """Line and text of a statement of `function` that may keep a value beyond a call without rewriting it; None if none does.
+    """Line and text of a statement of `function` by which a value may outlive the call, and which later calls
+    may skip; None if there is no such statement.
 
-    A value written at every call is replaced with the code; one written once is not::
+    A value that every call writes is renewed by the first call of the new code. A value that is written only
+    once is not::
 
         if not hasattr(self, "weights"):
-            self.weights = make_weights()      # edited: a fresh env has other weights, this one never will
+            self.weights = make_weights()  # after an edit: new in a fresh env, old in this env
 
-    This is undecidable, so every write to something that outlives the call (an attribute, an item of anything but a fresh
-    local value, a global) counts if it is conditional: in an ``if``, ``while``, ``try`` or nested function, after a
-    ``return``, or as a value chosen by ``or``. ``hasattr``, ``setdefault`` and decorators that may cache count too, but not
-    accumulators (``self.best = torch.maximum(self.best, d)``), which are episode state.
+    Whether a statement runs only once is undecidable. So a conditional write counts if its target outlives
+    the call: an attribute, or an item of anything but a fresh local value. A write is conditional in an
+    ``if``, ``while``, ``try`` or nested function, after a ``return``, and if ``or`` chooses its value.
+    ``global``, ``nonlocal``, ``hasattr``, ``setdefault``, decorators that may cache, and mutable defaults
+    always count. An accumulator (``self.best = torch.maximum(self.best, d)``), written at every call, does
+    not count: it is episode state.
 
     Args:
         imported: names of libraries in the module (``torch``, ``np``): their functions return new values.
@@ -78,7 +82,7 @@ def _in_block(
 
 
 def _writes(statement: ast.stmt, conditional: bool, fresh: set[str], imported: Collection[str]) -> bool:
-    """Whether `statement` itself, without its inner statements, is a write that may not be repeated."""
+    """Whether `statement` itself, without its inner statements, is a write that a later call may skip."""
     targets: list[ast.expr] = []
     if isinstance(statement, ast.Assign):
         targets = statement.targets
@@ -168,7 +172,7 @@ def _fresh_names(function: ast.FunctionDef | ast.AsyncFunctionDef, imported: Col
 
 
 def _is_new(value: ast.expr, imported: Collection[str]) -> bool:
-    """Whether an expression creates a value without other references."""
+    """Whether an expression creates a new value, to which nothing else refers."""
     if not isinstance(value, ast.Call):
         displays = (ast.Dict, ast.List, ast.Set, ast.Tuple, ast.ListComp, ast.DictComp, ast.SetComp)
         return isinstance(
@@ -214,8 +218,9 @@ def _mentions_options(node: ast.AST) -> bool:
 
 
 _Nature = Literal["fixed", "filled", "object"]
-"""fixed: cannot change. filled: a list, dict or array with elements, a constant unless it is written to explicitly. object:
-starts empty or is of an unknown type, and may change wherever it is passed."""
+"""fixed: cannot change. filled: a list, dict or array with elements; it counts as a constant unless code
+writes to it explicitly. object: starts empty or is of an unknown type; it may change wherever it is
+passed."""
 _WORST: tuple[_Nature, ...] = ("fixed", "filled", "object")
 _READ_ONLY_FUNCTIONS = set(
     "len sorted list tuple dict set frozenset sum min max any all enumerate zip range isinstance float int bool "
@@ -230,10 +235,10 @@ def changed_while_running(
     """A value of a file or class that may be changed while the task runs, and the code that may change it;
     None if there is none.
 
-    Executing a file again creates its values again, which is right for a constant and wrong for a cache.
-    ``MESHES = {}`` that `_load_scene` filled would be empty under an env whose scene is still the old one. A
-    value may be changed if code assigns to its items or attributes, calls a mutating method, or passes it to
-    other code.
+    Executing a file again creates its values again, which is right for a constant and wrong for a cache:
+    after ``MESHES = {}`` has run again, the meshes that `_load_scene` had put into it are missing, while the
+    env still has the old scene. A value counts as changed if code assigns to its items or attributes, calls a
+    mutating method, or passes it to other code.
     """
     values = {symbol.short: symbol for symbol in symbols if symbol.kind == "value"}
     natures: dict[str, _Nature] = {}

@@ -52,7 +52,7 @@ def is_own_file(path: str, folder: Path) -> bool:
 
 def is_library(name: str) -> bool:
     """Whether the top-level module `name` is a library's, even if an author has a file of that name."""
-    # In this order: reading the contents of the distributions takes 0.1 s, once.
+    # The slow check is last: reading the contents of the distributions takes 0.1 s, once.
     if _library_spec(name) is None or name in _INSTALLED_BY_MISTAKE:
         return False
     return name in sys.stdlib_module_names or name in _dependency_names()
@@ -86,7 +86,7 @@ def named_like_library_text(file: Path) -> str:
 
 
 def search_first(folder: Path, permanent: bool = False) -> None:
-    """Put an author's folder first on ``sys.path``, except for the names of libraries.
+    """Put an author's folder first on ``sys.path``, but never find a module there that has a library's name.
 
     As with ``python task.py``, the folder comes first. A ``numpy.py`` or ``queue.py`` in it would replace the library
     for every late import: in the middle of an episode, in the renderer, in the workbench. So names of the standard
@@ -122,8 +122,8 @@ def searched_first(folder: Path) -> Iterator[None]:
 
 
 def remove_library_finder() -> None:
-    """Remove the finder, after the last author's folder has left ``sys.path``. Does nothing if a folder is
-    permanent."""
+    """Remove the `LibraryFinder`; called after the last author's folder has left ``sys.path``. Does nothing
+    if a folder is permanent."""
     if _permanent_folder:
         return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, LibraryFinder)]

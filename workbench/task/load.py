@@ -175,8 +175,8 @@ def with_late_imports(task: LoadedTask) -> LoadedTask:
 def undo_load(task: LoadedTask) -> bool:
     """Undo the load that gave `task`: restore the modules and registrations of the version before it.
 
-    The caller uses this for a class that imports but whose env cannot be built. Only the newest load of a file can be undone:
-    returns False for any other load, and for a task that is not watched.
+    Used when the class could be imported, but its env cannot be built. Only the newest load of a file can be
+    undone: returns False for any other load, and for a task that is not watched.
     """
     load = _load_of(task)
     if load is None or load.unloaded is None or sys.modules.get(load.finder.main) is None:
@@ -262,7 +262,7 @@ def _load_named(name: str, class_name: str, given: dict[str, str]) -> LoadedTask
     file = Path(home.__file__ or found.file)
     if file == found.file or str(file) not in task.source:
         return task
-    # The package only imports the class from another of its modules, which is the one to edit and watch.
+    # The named module only imports the class from another module of the package. Edit and watch that module.
     _revert(_loads[found.file])
     return _load_file(
         file, task.class_name, given, named=dataclasses.replace(place, name=task.cls.__module__)
@@ -283,7 +283,7 @@ def _load_file(
     named: ModuleName | None = None,
 ) -> LoadedTask:
     finder = AuthorFinder(file, given, only_given, named)
-    # Every module of a named package is read again, including the one that defines its task.
+    # In a named package every module is read again, even the main modules of its other tasks.
     package = None if named is None else named.own_folder
     others = {
         load.finder.main

@@ -60,10 +60,11 @@ def hidden_by_libraries(file: Path, search_folder: Path | None = None) -> tuple[
 class AuthorFinder(MetaPathFinder):
     """Finds and executes the modules of one task: its file, and those of its folder.
 
-    `importlib.reload` runs new text in the old namespace, so deleted names live on, and ignores the other modules of the
-    folder. Python's own import trusts a ``.pyc`` whose modification time (in whole seconds) and size match, so it misses the
-    second of two saves within a second that change ``0.1`` to ``0.2``. This finder compiles from text alone and keeps every
-    text it executed, for the watcher, for recordings, and for `linecache`, whose tracebacks must show the text that ran.
+    `importlib.reload` runs new text in the old namespace, so deleted names live on. It also ignores the other
+    modules of the folder. Python's own import trusts a ``.pyc`` whose modification time (in whole seconds)
+    and size match, so it misses a change of ``0.1`` to ``0.2`` that is saved in the same second as the
+    previous text. This finder compiles from text alone and keeps every text it executed: for the watcher, for
+    recordings, and for tracebacks (through `linecache`), which must show the text that ran.
     """
 
     def __init__(
@@ -85,8 +86,8 @@ class AuthorFinder(MetaPathFinder):
         self.given = given
         """Text by path that replaces the file on disk."""
         self.only_given = only_given
-        """Whether to execute no other file of the folder: a recording named the task, and a person approved these
-        texts."""
+        """Whether to execute no file of the folder except those in `given`: a recording named the task, and a
+        person approved these texts."""
         self.texts: dict[str, str] = {}
         """Text by path of the files read so far, in order."""
         self.names: list[str] = []
@@ -130,8 +131,9 @@ class AuthorFinder(MetaPathFinder):
         """The spec for a name that has no given text: an installed module, else a folder of given texts without
         ``__init__.py``.
 
-        Raises ModuleNotFoundError for other files of the folder: if an earlier task, or the code itself, has put the folder
-        on ``sys.path``, Python would continue with `PathFinder` and find them.
+        Raises ModuleNotFoundError for the folder's other files. If this returned None, Python would continue
+        with `PathFinder`, which finds them if an earlier task, or the code itself, has put the folder on
+        ``sys.path``.
         """
         root = str(self.file.parent)
         places = [place for place in (sys.path if path is None else path) if not _is_in(place, root)]
@@ -158,7 +160,7 @@ class AuthorFinder(MetaPathFinder):
 
     @property
     def _is_newest(self) -> bool:
-        """Whether no other task was loaded after this one, so that imports are for this one."""
+        """Whether this is the task that was loaded last; imports are then for this task."""
         return next((f for f in sys.meta_path if isinstance(f, AuthorFinder)), None) is self
 
     def text(self, path: str) -> str:
@@ -169,7 +171,7 @@ class AuthorFinder(MetaPathFinder):
         try:
             return decode(path, raw)
         except SyntaxError:
-            # Keep it, so that the problem's line can be shown.
+            # Keep the text, so that the problem's line can be shown.
             self.add_text(path, raw.decode(errors="replace"))
             raise
 
@@ -197,7 +199,8 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
     """Executes one text. Reads and writes no bytecode files."""
 
     executed = 0
-    """Number of modules with at least one statement that all loaders of this process have begun to execute."""
+    """Number of modules that the loaders of this process have begun to execute, without modules that have no
+    statement."""
 
     def __init__(self, finder: AuthorFinder, name: str, path: str) -> None:
         super().__init__(name, path)
@@ -224,8 +227,8 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
         stem = self.finder.file.stem
         is_main = name == self.finder.main and self.finder.goes_by_stem
         if is_main and stem not in sys.modules and not is_library(stem):
-            # A helper that imports the task by its file's name must get this module: a second one, under another name,
-            # would register its ids twice.
+            # A helper that imports the task by its file's name must get this module: executing the file as a
+            # second module would register its ids twice.
             sys.modules[stem] = module
             self.finder.names.append(stem)
         code = self.get_code(name)
@@ -234,7 +237,8 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
 
 
 def executed_modules() -> int:
-    """Number of authors' modules with at least one statement that this process has begun to execute, over all loads."""
+    """Number of authors' modules that this process has begun to execute in all loads, without modules that
+    have no statement."""
     return _AuthorLoader.executed
 
 
@@ -302,8 +306,8 @@ def unload_modules(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -
     """Remove the author's modules from ``sys.modules``, so that edited helpers are read again.
 
     Removes the modules of the folder, and the helpers of other tasks: if they stayed, ``import helper`` would
-    give the loaded ``helper`` of another folder. Main modules of other tasks stay (`is_other_task` of their
-    name): they are not imported by name, and their classes may be in use.
+    give the loaded ``helper`` of another folder. Main modules of other tasks, for whose names `is_other_task`
+    returns True, stay: they are not imported by name, and their classes may be in use.
     """
     folder = finder.own_folder
     unloaded: dict[str, ModuleType] = {}

@@ -57,7 +57,7 @@ class NewTask:
     env_id: str
     class_name: str
     is_default: bool
-    """Whether the file opens with this class; else its reference must name it."""
+    """Whether the file alone opens this class; else the reference must name the class."""
 
     @property
     def reference(self) -> str:

@@ -71,7 +71,7 @@ class Opening:
     """Callbacks and switches of opening a task."""
 
     on_activity: Callable[[str], None] = lambda activity: None
-    """Called with the next part of the work, for a status line."""
+    """Called before each part of the work with its name, for a status line."""
     on_finding: Callable[[Finding], None] = warn_of
     """Called once for each line at which a rule is broken without stopping the task."""
     begins_anew: bool = False
@@ -86,12 +86,12 @@ def with_advice(
     again: Callable[[], LoadedTask],
     knows_others: bool = False,
 ) -> TaskError:
-    """The error of a task that failed to open, with advice in its message: open another task of the file, or
-    one env.
+    """The error of a task that failed to open, with advice in its message: to open another task of the file,
+    or to open only one env.
 
     Args:
-        again: imports the task again; the failed import was undone.
-        knows_others: give no advice about other tasks of the file.
+        again: imports the task again, because the failed import was undone.
+        knows_others: True: give no advice about other tasks of the file.
     """
     advice: list[str] = []
     if options.num_envs > 1 and _may_be_of_the_batch(error):
@@ -120,8 +120,8 @@ them."""
 
 
 def _may_be_of_the_batch(error: TaskError) -> bool:
-    """Whether one env may avoid the error: a broken rule, or a wrong shape (from torch, numpy or a check).
-    Refusals of the core have their own advice."""
+    """Whether the error may be absent with one env: it is a broken rule, or may be about a shape (from torch,
+    numpy or a check). False for refusals of the core, which have their own advice."""
     cause = error.__cause__
     if isinstance(cause, BrokenRule):
         return True
@@ -268,7 +268,7 @@ def _built(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Opened
 def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
     """Do one reset, one step and one partial reset, and check what they return.
 
-    A task that imports and builds can still fail in these. The failure must be found before the running
+    A task that can be imported and built can still fail here. The failure must be found before the running
     version is replaced.
 
     Raises:
@@ -352,9 +352,9 @@ _SMALL_TASK = "PickCube-v1"
 def warm_up(options: TaskOptions, keep_going: Callable[[], bool]) -> None:
     """Warm up a process: make a small env, render it, and close it. Ends early when `keep_going` returns False.
 
-    The first env of a process and its shapes take 1.2 s with N = 4 on two cores, the second 0.12 s, and the first picture
-    of each kind of camera compiles its shaders. The robot's files, the render system and the shaders are the same for
-    any task.
+    Making the first env of a process (N = 4) and reading its shapes takes 1.2 s on two cores; the second env
+    takes 0.12 s. The first picture of each kind of camera compiles its shaders. The robot's files, the render
+    system and the shaders are the same for any task.
 
     A TaskError of the build is ignored: the author's own load would fail too (no renderer, no GPU), and its
     report is better.

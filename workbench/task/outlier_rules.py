@@ -20,8 +20,8 @@ _OTHER_HOOKS = {
 
 
 def rules_of_outliers(loaded: LoadedTask, choice: Degree | None) -> dict[str, Finding]:
-    """The rules that an outlier can break, by id; each value is a finding template at the hook that the rule guards. Rules that
-    are off, or silenced at the hook, are left out.
+    """The rules that an outlier can break, by id. Each value is a template of a finding, placed at the hook
+    that the rule guards. Rules that are off, or silenced at the hook, are left out.
 
     Args:
         choice: degree of all rules; None for each rule's own degree.

@@ -46,7 +46,7 @@ HOOK_STAGES: dict[str, str] = {
 }
 """Maps a method of `BaseEnv` to the stage that the page names. `get_info`, `get_reward` and
 `_flatten_raw_obs` are ManiSkill's callers of the author's hooks; they raise because of what a hook returned
-(``evaluate()`` giving None in `get_info`)."""
+(for example, `get_info` raises if ``evaluate()`` returned None)."""
 _CALLERS = ("get_info", "get_reward", "_flatten_raw_obs")
 
 
@@ -123,7 +123,8 @@ class TaskError(Exception):
     """The author's code failed in a load, a step or a reset; `problem` has the reason.
 
     Args:
-        classes: task classes of the file that can be opened, this one first; empty if it has no other.
+        classes: names of the classes of the file that can be opened, the failed one first; empty if there is
+            no other.
     """
 
     def __init__(self, problem: Problem, classes: tuple[str, ...] = ()) -> None:
@@ -156,7 +157,8 @@ def problem_from_exception(
     Its line is the first of these that exists:
 
     * the line that one of the core's notes names, unless the author's innermost line raised the exception;
-    * the innermost frame of `exc`, or else of its causes, in `own_files` or another file that is not installed;
+    * the innermost frame of `exc`, or else of its causes, that is in `own_files` or in another file that is
+      not installed;
     * with `cls` (the task's class), the ``def`` of an override that cannot take the failed call's arguments;
     * with `cls`, the ``def`` of the author's hook of the stage, except for the stages ``build`` and ``step``;
     * `otherwise` (file and line).
@@ -234,7 +236,7 @@ def format_traceback(exc: BaseException) -> str:
 
 
 def definition_line(function: object) -> tuple[str, int] | None:
-    """File and 1-based line of the ``def`` of a function, method or property; None for others.
+    """File and 1-based line of the ``def`` of a function, method or property; None for any other object.
 
     The ``def`` is searched, because a code object's first line is that of its first decorator.
     """
@@ -274,13 +276,13 @@ def check_step_returns(
     reward: object | None,
     source_files: Collection[Path],
 ) -> Problem | None:
-    """The first wrong type or shape in what one step of `num_envs` envs of `cls` returned, or None.
+    """The problem of the first wrong type or shape that a step of `num_envs` envs of `cls` returned; or None.
 
     ManiSkill 3.0.1 does not check types and shapes. Some mistakes raise far from their cause (``success`` as
     a Python bool: "'bool' object has no attribute 'clone'", inside `BaseEnv.step`). Others are silent with
     several envs: ``success`` of shape ``()`` gives a ``terminated`` of shape ``()``; a reward of shape
     ``(N, 1)`` or ``()``, or a Python float, is returned and broadcasts against ``(N,)`` into ``(N, N)`` in a
-    trainer. With one env all of them look right.
+    trainer. With one env, all these mistakes look right.
 
     Args:
         evaluate: what ``evaluate()`` returned: a dict with ``success`` and ``fail`` as bool tensors of shape (N,); other
@@ -307,8 +309,8 @@ def check_step_returns(
 def problem_from_return(cls: type, hook: str, message: str, source_files: Collection[Path]) -> Problem:
     """Problem for a wrong return value of `hook` of `cls`; `message` describes it.
 
-    For a reward, file and line are those of the reward hook that the author defined: ManiSkill calls the normalized hook,
-    which may call the author's dense one.
+    For a reward, file and line are those of the reward hook that the author defined: ManiSkill calls the
+    normalized hook, which may call the author's dense hook.
     """
     hooks = _REWARD_HOOKS if hook in _REWARD_HOOKS else (hook,)
     found = hook_definition(cls, hooks, source_files)
@@ -366,7 +368,7 @@ _Line = tuple[str, int]
 
 
 def _place_in(exc: BaseException, own: Collection[str]) -> _Line | None:
-    """The author's innermost line; None if there is none, or it only calls the constructor of a base class."""
+    """The author's innermost line; None if there is none, or if it only calls a base class's constructor."""
     if _is_authors_syntax(exc, own):
         return str(exc.filename), exc.lineno or 1
     if isinstance(exc, CoreRefusal) and exc.place is not None and _is_authors(exc.place[0], own):

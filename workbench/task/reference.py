@@ -24,8 +24,8 @@ _REFERENCE = re.compile(rf"(?P<module>{_NAME.pattern}):(?P<cls>[^\W\d]\w*)")
 class RecordedTask:
     """A task that a recording names, as opposed to a ``str``, which a person gave.
 
-    A separate type, so that a path or module name from a recording is never opened as if a person had given it: only a
-    registered id, or the exact texts that a person approved.
+    A separate type, so that a path or module name from a recording is never opened as if a person had given
+    it. Only a registered id is opened, or the exact texts that a person approved.
     """
 
     env_id: str
@@ -48,7 +48,7 @@ TaskName = str | RecordedTask
 
 
 def file_and_class(reference: str) -> tuple[str, str | None]:
-    """File and class of ``file.py`` or ``file.py:ClassName``; an empty file for any other form."""
+    """File and class of ``file.py`` or ``file.py:ClassName``; ``("", None)`` for any other form."""
     match = _FILE.fullmatch(reference)
     return ("", None) if match is None else (match["file"], match["cls"])
 
@@ -56,8 +56,9 @@ def file_and_class(reference: str) -> tuple[str, str | None]:
 def named_file(reference: TaskName) -> Path | None:
     """The file of ``file.py`` or ``file.py:ClassName`` (which need not exist), or of ``package.module:ClassName``.
 
-    None for an env id and for a module that is not found. Called by the server, which must not import ManiSkill
-    (seconds, and a graphics driver) nor run the author's code, so not even the packages above a module are imported.
+    None for an env id and for a module that is not found. Called by the server, which must neither import
+    ManiSkill (which takes seconds and needs a graphics driver) nor run the author's code. So not even the
+    packages above a module are imported.
     """
     if isinstance(reference, RecordedTask):
         return None if reference.file is None else Path(reference.file)
@@ -150,7 +151,7 @@ def reference_to_class(reference: TaskName, file: Path, class_name: str) -> Task
     module = None if named is None else find_module(named[0])
     if module is None or module.search_folder is None or not file.is_relative_to(module.search_folder):
         return f"{named_file(reference)}:{class_name}"
-    # The named module may only import the class from another one.
+    # The named module may only import the class from another module.
     parts = file.relative_to(module.search_folder).with_suffix("").parts
     return f"{'.'.join(parts[:-1] if parts[-1] == '__init__' else parts)}:{class_name}"
 

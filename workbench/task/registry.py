@@ -123,10 +123,11 @@ def is_robot(value: object) -> bool:
 
 @contextmanager
 def registering(is_own: Callable[[str], bool], registrations: Registrations) -> Iterator[None]:
-    """Context manager that records in `registrations` what files with `is_own(path)` register.
+    """Context manager that records in `registrations` what the files for which `is_own(path)` is true
+    register.
 
     ManiSkill's `@register_env` keeps the old class of a known id ("already registered. Skip"), so a file that
-    is executed on every save would keep its first version, and one with a built-in id would be ignored. So
+    is executed on every save would keep its first version, and a file with a built-in id would be ignored. So
     the two decorators are replaced by decorators that clear the name first. The tables are not reset
     afterwards, whether the body raises or not: see `Registrations.undo`. Registrations of libraries that the
     file imports are left alone, because the libraries stay imported.

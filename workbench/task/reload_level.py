@@ -20,8 +20,9 @@ from workbench.task.kept_state import (
 from workbench.task.problem import hooks_of
 
 Level = Literal["same", "patched", "cameras", "rebuilt"]
-"""same: only comments, docstrings or layout changed. patched: only code that runs at steps and resets changed; the new class
-is put on the live env. cameras: camera configs changed too; the scene stays. rebuilt: everything else."""
+"""same: only comments, docstrings or layout changed. patched: only code that runs at steps and resets
+changed; the new class is put on the live env. cameras: camera configs changed, perhaps with such code; the
+scene stays. rebuilt: anything else changed."""
 
 RESET_HOOKS = frozenset(hooks_of("reset"))
 STEP_HOOKS = frozenset(hooks_of("step"))
@@ -59,8 +60,8 @@ class Inherited:
 
     names: frozenset[str]
     used_at_build: frozenset[str] = frozenset()
-    """Names that the code of these classes (except BaseEnv) uses: it may call their functions while the env
-    is built."""
+    """Names that the code of these classes (except BaseEnv) uses: this code may call functions with these
+    names while the env is built."""
 
 
 @dataclass(frozen=True)
@@ -89,13 +90,14 @@ def find_change(
     """The cheapest reload level that does not mix two versions of a task, given as texts by path.
 
     Building a scene takes a second and loses the current moment, and most saves change a line of the reward. So the two
-    versions are compared symbol by symbol. The new file is executed as a whole at every level; what remains of the old
-    version on a live env is what *building* made: `_load_scene` and the other build hooks, robots and other classes,
-    module-level statements, and everything that those mention, transitively. A change in these means rebuilt. The rest can
-    be replaced unless state may outlive the replacement (`workbench.task.kept_state`): values that hooks keep between
-    calls, module-level dicts and lists that are filled while the task runs, attributes that only the old version writes,
-    objects of the author's classes. If code may reach further than its names (``exec``), nothing is replaced. In doubt the
-    level is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" shows numbers of mixed code.
+    versions are compared symbol by symbol. The new file is executed as a whole at every level. What remains
+    of the old version on a live env is what the *building* code made: `_load_scene` and the other build
+    hooks, robots and other classes, module-level statements, and everything that these mention, transitively.
+    A change in building code means rebuilt. Other code can be replaced unless state may outlive the
+    replacement (`workbench.task.kept_state`): values that hooks keep between calls, module-level dicts and
+    lists that are filled while the task runs, attributes that only the old version writes, objects of the
+    author's classes. If code may reach further than the names in it (``exec``), nothing is replaced. In doubt
+    the level is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" shows numbers of mixed code.
 
     Pure: nothing is imported or executed, and no content of the texts raises.
     """

@@ -1,4 +1,4 @@
-"""Finds the constants and constructor arguments of a task's file from its text alone, and sets them in the text."""
+"""Finds constants and constructor arguments in the text of a task's file, and sets constants in that text."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class TaskText:
         if self._class is not None:
             return classes.get(self._class)
         registered = [node for node in classes.values() if any(map(_registers, node.decorator_list))]
-        # Same choice as in `choose_task`: the last class that is registered, else the last class.
+        # As in `choose_task`: the last registered class, else the last class that has a base class.
         derived = [node for node in classes.values() if node.bases]
         return next(reversed([*derived, *registered]), None)
 

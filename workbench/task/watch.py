@@ -23,18 +23,20 @@ READ_SECONDS = 0.25
 """Interval of reading the files even if their ``stat`` is unchanged: a network mount may update ``stat``
 late, and two saves within one tick of a file system's clock have the same ``stat``."""
 GONE_SECONDS = 0.3
-"""Time for which a file must be missing or empty before that counts as its new content, not as half of a save."""
+"""A file that is missing or empty for a shorter time counts as half of a save, not as new content."""
 STOP_SECONDS = 1.0
 """Maximum wait for the end of the thread: a read on a disk that hangs cannot be cancelled."""
 POLL_SHARE, READ_SHARE = 0.003, 0.001
 """Maximum fractions of one core for ``stat`` and for reading; with hundreds of files both are done less often."""
 NEWEST, TURN = 8, 32
-"""Number of files checked at every poll (those saved last), and number of the others checked in turn."""
+"""Each poll checks the `NEWEST` files that were saved last, and `TURN` of the other files, in turn."""
 
 Content = str | bytes | None
-"""Text; bytes if they are not text; None for a missing or unreadable file (a device, a pipe, too large)."""
+"""A file's text; its bytes if they are not text; None if it is missing or unreadable (device, pipe, too
+large)."""
 Statuses = dict[Path, tuple[int, ...]]
-"""Fields of ``stat`` that change with a file's content, by file, modification time first; empty if there is no file."""
+"""By file: the fields of ``stat`` that change with its content, modification time first; empty for no
+file."""
 
 
 class SourceWatcher:
@@ -42,9 +44,10 @@ class SourceWatcher:
 
     One save is many events of the file system: truncate and write; a temporary file renamed over it; delete and create; a
     formatter that repeats all of it 20 ms later. So the paths are polled 25 times a second by ``stat``, which takes
-    microseconds. Of hundreds of files the most recently saved are polled every time, the others in turn, and all of them
-    after a rename, creation or deletion in their folder (as most editors save). Once ``stat`` is stable the texts are
-    compared: a ``touch``, a ``git checkout`` of the same content or a line-end conversion is no change.
+    microseconds. If there are hundreds of files, those saved last are polled every time, and the others in
+    turn. After a rename, creation or deletion in one of their folders (most editors save in this way), all
+    files are polled. Once ``stat`` is stable the texts are compared: a ``touch``, a ``git checkout`` of the
+    same content or a line-end conversion is no change.
 
     `on_change` may call `follow` and `stop`. An exception of `on_change` is reported, and watching continues.
     """
@@ -67,7 +70,7 @@ class SourceWatcher:
         Args:
             paths: files, which need not exist.
             texts: known texts of these files by path, so that a save between a load and this call is noticed.
-                A file without a text that is not followed yet is read now.
+                A file is read now if it has no text here and was not followed before.
         """
         texts = texts or {}
         followed = [_real(Path(path).expanduser()) for path in paths]
@@ -153,8 +156,8 @@ class SourceWatcher:
 
 
 def _real(path: Path) -> Path:
-    """The file that a link leads to. A link to anything else (a device, by mistake) is watched itself until
-    it leads to a file."""
+    """The file that a link leads to. If a link leads to anything else (by mistake to a device), the link
+    itself is watched until it leads to a file."""
     real = real_path(path)
     return real if os.path.isfile(real) else real_path(path.parent) / path.name
 

@@ -1,4 +1,5 @@
-"""Applies and reverts edits of the author's files, if they have the text for which the edit was planned."""
+"""Applies and reverts edits of the author's files, if a file still has the text for which its edit was
+planned."""
 
 from __future__ import annotations
 
@@ -42,7 +43,7 @@ class SourceEdit(FileChange):
 
     The author may save the same files in an editor meanwhile. So a file must still have `old_text`, is replaced by a
     rename, and keeps its line ends, encoding, byte order mark, permissions and symbolic links. All files are checked before
-    the first is written; if writing one fails, those already written are reverted.
+    the first is written; if writing a file fails, the files written before it are reverted.
     """
 
     notes: tuple[str, ...]
@@ -50,7 +51,7 @@ class SourceEdit(FileChange):
     settings: CameraSettings | None
     """The camera's settings in the new text, rounded as written. None for a removed camera."""
     others: tuple[FileChange, ...] = ()
-    """Changes of further files, applied and reverted together."""
+    """Changes of further files, applied and reverted together with this one."""
 
     @property
     def changes(self) -> tuple[FileChange, ...]:
@@ -123,7 +124,8 @@ def _reverted(change: FileChange, since: str) -> bool:
 
 
 def _replace_text(path: str, expected: str, new_text: str | None, since: str) -> None:
-    """Replace the text `expected` of a file by `new_text`; None only checks that it could be replaced."""
+    """Replace the text `expected` of a file by `new_text`. If that is None, only check that this is
+    possible."""
     if (reason := why_not_writable(path)) is not None:
         raise RefusedEdit(reason)
     real = Path(path).resolve()

@@ -111,8 +111,8 @@ class NotCleared(Exception):
     """Code must not run; the message is the reason.
 
     Attributes:
-        question: The question to which the answer yes would allow the code, if there is one.
-        trust_helps: True if only ``--trust`` would allow the code, and no question.
+        question: The question that would allow the code if the answer were yes; None if there is none.
+        trust_helps: True if ``--trust`` would allow the code, but no answer to a question would.
     """
 
     def __init__(self, why: str, question: TrustQuestion | None = None, trust_helps: bool = False) -> None:

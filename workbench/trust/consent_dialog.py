@@ -24,7 +24,7 @@ DO_NOT, ONCE, ALWAYS = (
     "Run it, and don't ask again unless it changes",
 )
 MAX_TEXT_CHARACTERS, MAX_TOTAL_CHARACTERS = 200_000, 1_000_000
-"""Maximum length of one text, and of all texts, that are sent to the page; the page shows how much is left out."""
+"""Maximum length of one text, and of all texts together, on the page; the page shows how much is left out."""
 _POLL_SECONDS = 0.1
 """Interval at which the dialog checks whether the answer is still needed."""
 
@@ -58,8 +58,8 @@ class TrustDialog:
         return True
 
     def answer(self, command: AnswerTrust) -> None:
-        """Answer the shown question. Raises `Refused` if another question is shown, or if this one is already
-        answered."""
+        """Answer the shown question. Raises `Refused` if another question is shown, or if the shown question
+        is already answered."""
         is_shown = self._waiting and self._waiting[0].name == command.question
         if not is_shown or not self._take(Consent(command.answer)):
             raise Refused("This question was already answered or withdrawn.")
@@ -100,8 +100,8 @@ class TrustDialog:
         self._closed = True
 
     def _keep_shown(self) -> None:
-        """Open the dialog of the first question if it is not open, such as after a page switch has removed
-        it."""
+        """Open the dialog of the first question if it is not open; for example, a page switch may have
+        removed it."""
         if self._window is not None and not self._window.modal.closed:
             return
         pending = self._waiting[0]

@@ -1,4 +1,4 @@
-"""Stores the task texts (`TaskContent.hash`) that may run, per user."""
+"""Stores which task texts this user allows to run, by their hashes (`TaskContent.hash`)."""
 
 from __future__ import annotations
 
@@ -95,8 +95,8 @@ class TrustStore:
         yield from self._read()
 
     def _read(self, repair: bool = False) -> list[_Entry]:
-        """The stored entries. With `repair`, for use before writing: an unreadable store raises OSError, a broken one is
-        renamed."""
+        """The stored entries. With `repair`, which is for use before writing, an unreadable store raises
+        OSError, and a broken store is renamed."""
         try:
             content = read_private(STORE_FILE)
         except OSError as error:
