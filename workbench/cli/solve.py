@@ -75,7 +75,8 @@ class SolveOutput:
     """Lowest degree of a broken rule that makes the exit code 1."""
 
     def fails(self, report: SolveReport) -> bool:
-        """Whether the exit code is 1: the reward breaks a rule of the degree `fail_on`, or no seed was solved."""
+        """Whether the exit code is 1: the reward breaks a rule of the degree `fail_on`, or no seed was
+        solved. Always False if `fail_on` is ``never``."""
         if self.fail_on == "never":
             return False
         return not report.solved or any(self.fails_by(verdict) for verdict in report.verdicts)

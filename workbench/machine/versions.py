@@ -138,7 +138,8 @@ def command_for_tested_versions() -> str:
 
 
 def unmet_requirements() -> list[tuple[Requirement, str | None]]:
-    """Requirements of the workbench that are missing or of another version, each with the installed version.
+    """Requirements of the workbench that the installed packages do not meet, each with the installed version
+    of the package; None if it is missing.
 
     Raises:
         importlib.metadata.PackageNotFoundError: The distribution itself is not installed.
