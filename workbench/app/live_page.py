@@ -523,5 +523,5 @@ def _shown_of(view: SessionView) -> tuple[object, object]:
         view.activity,
         view.pictures_serial,
     )
-    # Every view is new; while no steps are made, each must be drawn at once.
+    # Each view counts as new content. While no steps are made, each must also be drawn at once.
     return object(), (waited_for if steps_go_on else object())

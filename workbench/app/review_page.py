@@ -147,8 +147,8 @@ class ReviewPage:
         """Folds and unfolds rerun's panel."""
         self._other_folded = False
         self._unfolded = "", 0.0
-        """(panel unfolded last: library or rerun, time); ("", 0) once the width of the view has been
-        checked."""
+        """(name of the panel that was unfolded last, time of the unfolding); ("", 0) once the width of the
+        view has been checked."""
         self._told = DrawThrottle(PANELS_PERIOD_SECONDS, clock)
 
         server.gui.main_panel.dock_right()
@@ -274,7 +274,7 @@ class ReviewPage:
             self._parts.add(sweep)
 
     def _open_of_sweep(self, ids: tuple[str, ...]) -> None:
-        # The panel stays open: the user compares several episodes of the sweep.
+        # If there is room, the panel stays open: the user compares several episodes of the sweep.
         self._review.open(ids, library_stays=self._smallest_view() >= MIN_VIEW_BY_SWEEP_PIXELS)
 
     # --- drawing ---------------------------------------------------------------------------------

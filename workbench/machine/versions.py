@@ -26,7 +26,8 @@ TESTED = {
     "viser": ("1.1.1",),
     "rerun-sdk": ("0.41.0",),
 }
-"""Versions with which all tests pass: those of ``constraints.txt``, and further ones of the page on versions."""
+"""Versions with which all tests pass: those in ``constraints.txt``, and further ones that the page on
+versions lists."""
 
 
 @dataclass(frozen=True)

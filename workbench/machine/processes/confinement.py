@@ -22,7 +22,8 @@ _FILE_ONLY_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE
 _TCP_RIGHTS = 0b11
 """Rights to bind and to connect, from version 4 on."""
 _SCOPES = 0b11
-"""Scopes that forbid abstract sockets of, and signals to, other processes, from version 6 on."""
+"""Scopes, from version 6 on: they forbid connections to abstract sockets of other processes, and signals to
+these processes."""
 _PR_SET_NO_NEW_PRIVS = 38
 _SYSTEM_PATHS = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
            "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip

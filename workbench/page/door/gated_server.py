@@ -223,8 +223,8 @@ class _AccessCheck:
 def open_server(options: ServerOptions = ServerOptions(), label: str | None = None) -> GatedServer:
     """Serve viser's page behind the checks of `access`.
 
-    It binds the socket itself, so that the printed address is the bound one. Before it returns, it tests the server with a
-    request that must be refused.
+    This function binds the socket itself, so that the printed address is the bound one. Before it returns, it
+    tests the server with a request that must be refused.
 
     Args:
         options: address and access.

@@ -64,7 +64,7 @@ REFUSED_FROM_CLIENTS = (
     "ShareUrlDisconnect",
     "FileTransferStartUpload",  # no size limit, file name used as sent; we accept no uploads
     "FileTransferPart",
-    "SceneNodeClickMessage",  # none of our nodes handles clicks or drags, no button is held
+    "SceneNodeClickMessage",  # our nodes handle no clicks or drags, our buttons no holding
     "SceneNodeDragMessage",
     "GuiButtonHoldMessage",
 )
@@ -121,8 +121,8 @@ def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
 
 
 def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
-    """Labels (tab, fold) of each tab in a page's tab groups and of each fold, in order of creation; the fold
-    of a tab is empty, and so is the tab of a fold outside tabs."""
+    """Yield (tab, fold), in order of creation: for each tab in a tab group its label and an empty text; for
+    each fold the label of the tab around it (empty outside tabs) and its own label."""
     containers = server.gui._container_handle_from_uuid
     for handle in list(containers.values()):
         if isinstance(handle, viser.GuiTabHandle):

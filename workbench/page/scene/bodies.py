@@ -72,7 +72,8 @@ class SceneView:
         only_env: int | None = None,
         looks: DrawStyle = DrawStyle(),
     ) -> None:
-        """Show this scene instead of the previous one; groups that look the same stay and are not sent again.
+        """Show this scene instead of the previous one; groups that look the same as before stay, and are not
+        sent again.
 
         Args:
             geometry: Geometry of the scene.
@@ -183,7 +184,7 @@ class _DrawnGroup:
         if drawn_as.lighter:
             parts = [(mesh, lightened(material)) for mesh, material in parts]
         glb = as_glb(parts)
-        # One instance far below the ground; the first move follows in the same batch.
+        # Begin with one instance far below the ground; the first call of `draw` follows in the same batch.
         self.handle = server.scene.add_batched_glb(
             f"/envs/{number:03d} {group.name.replace('/', ' ')}",
             glb,

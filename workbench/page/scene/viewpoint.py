@@ -110,8 +110,8 @@ class Framing:
     """Points the open pages at the scene until the user has moved the view.
 
     A page's panels take their places some time after the page has connected (later on a busy machine), and
-    the user opens more panels. Each changes the shape of the view: while the view is untouched, the scene is
-    framed for the new shape.
+    the user opens more panels. Each of these events changes the shape of the view: while the view is
+    untouched, the scene is framed for the new shape.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -266,7 +266,7 @@ class ViewChoice:
     """What the user chose to see. It outlives a page, which is rebuilt with each change between review and live page."""
 
     all_envs: set[str] = field(default_factory=set)
-    """The tasks of which all envs are shown; of the others only the selected one."""
+    """The tasks of which all envs are shown. Of any other task, only the selected env is shown."""
     frustums: bool = True
     """Whether the cameras are drawn in the view."""
     frames: bool = False
