@@ -236,7 +236,7 @@ class GoLive:
             self._transition = None
 
     def can_go_home(self) -> bool:
-        """Whether the live session is another one than the session that the user opened."""
+        """Whether the live session is not the session that the user opened."""
         home = self._shared.home
         return home is not None and self._shared.session is not home
 

@@ -119,9 +119,9 @@ WIDE_PIXELS = 1200
 class Page:
     """The live page of a session.
 
-    Each redraw takes one immutable snapshot of the session, and every part compares it with the one that it
-    drew last. Callbacks of the page run in any thread and order, and only send requests to the session. While
-    no browser shows the page, nothing is drawn or rendered.
+    Each redraw takes one immutable snapshot of the session, and every part compares it with the snapshot that
+    the part drew last. Callbacks of the page run in any thread and order, and only send requests to the
+    session. While no browser shows the page, nothing is drawn or rendered.
 
     Args:
         server: The viser server.

@@ -193,7 +193,7 @@ class Session:
 
     def _happen(self, event: SessionEvent) -> list[Future[None]]:
         """Handle an event; returns the work started off the loop. If an effect fails, the others are still
-        performed. The failure is raised if the event is a command, else reported."""
+        performed. The failure is raised if the event is a command; otherwise, it is reported."""
         before, begun, failure = self._state, list[Future[None]](), None
         self._state, effects = apply(before, event, Now(time.monotonic(), time.time()))
         for effect in effects:

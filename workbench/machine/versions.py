@@ -122,7 +122,7 @@ def package_versions() -> Mapping[str, str]:
 
 
 def maniskill() -> tuple[str, str] | None:
-    """Distribution and version of the installed ManiSkill; None without one."""
+    """Distribution and version of the installed ManiSkill; None if it is not installed."""
     return next(iter(installed_maniskills().items()), None)
 
 

@@ -80,7 +80,7 @@ class ReviewCurves(PagePart[ReviewView]):
         self._offered: dict[str, tuple[str, str]] = {}
         """(entry, line) of each choice; the line is empty if the entry has a single line."""
         self._wish = ""
-        """Last chosen entry, kept while recordings without it are open."""
+        """Last chosen entry; kept while the open recordings lack it."""
 
     def key(self, view: ReviewView) -> object:
         which = view.opened_serial, len(view.opened), view.selected

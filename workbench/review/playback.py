@@ -242,7 +242,7 @@ class Review:
         return Opened(row.id, row.name, episode, find_events(episode)), files
 
     def _give_scenes(self, number: int, job: Job, without: Sequence[Opened], shapes: SharedShapes) -> None:
-        """Make the scenes of recordings without one."""
+        """Make the scenes of recordings that contain none."""
 
         def tell(one: Opened, scene: str, making: bool = False, episode: Episode | None = None) -> None:
             event = SceneTold(number, one.id, scene, making, episode)

@@ -185,7 +185,7 @@ class Worker:
     # --- questions ---------------------------------------------------------------------------------
 
     def _call(self, call: Call) -> None:
-        """Answer a call. It always sends an answer, or the server's thread would wait for ever."""
+        """Answer a call. It always sends an answer: otherwise, the server's thread would wait for ever."""
         answers: list[Answer] = []
         doing = _DOING.get(type(call.request))
         problem = self._task.run(doing, lambda: answers.append(self._answer(call)))

@@ -22,8 +22,8 @@ from workbench.page.widgets.parts import Clock
 NAMES = ("/envs", "/floor")
 """Roots of the nodes in viser's tree."""
 REMOVAL_DELAY_SECONDS = 0.7
-"""Time for which old shapes stay when finer or coarser ones replace them. Without it the view would be empty
-until the page has read the new shapes."""
+"""Time for which old shapes stay when finer or coarser ones replace them. Without this delay the view would
+be empty until the page has read the new shapes."""
 
 
 @dataclass(frozen=True)
