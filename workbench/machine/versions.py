@@ -75,7 +75,8 @@ _STORE, _LOADS = dis.opmap["STORE_ATTR"], (dis.opmap["LOAD_FAST"], dis.opmap["LO
 
 
 def stored_names(code: CodeType, of: str | None = None) -> set[str]:
-    """Attributes that a function and its inner functions assign on any object, or only on the variable `of`.
+    """Attributes that a function and its inner functions assign: on any object or, if `of` is given, only on
+    the variable with this name.
 
     Read from the bytecode: `dis` and sources would take a third of a second for ManiSkill's BaseEnv, at each start.
     """
