@@ -155,7 +155,8 @@ def timed_click(page: Page, label: str, effect: str) -> float:
     # Timed inside the page, so that the latency between this script and Chromium does not count.
     return page.evaluate(
         """([label, effect]) => new Promise((done) => {
-            const find = (text) => [...document.querySelectorAll('button, [role=button]')].find((b) => b.textContent.trim() === text);
+            const nameOf = (button) => button.getAttribute('aria-label') ?? button.textContent.trim();
+            const find = (name) => [...document.querySelectorAll('button, [role=button]')].find((button) => nameOf(button) === name);
             const start = performance.now();
             find(label).click();
             const look = () => find(effect) ? done((performance.now() - start) / 1000) : setTimeout(look, 2);

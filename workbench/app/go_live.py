@@ -66,7 +66,8 @@ class _Transition:
     """Value of `TimelineView.entered` once the env has the recorded state."""
     problems: int = 0
     session: Session | None = None
-    """Session that gets the recorded state; None until the consent is given. Set last."""
+    """Session that gets the recorded state; None until the consent is given. Set last, because `is_over`
+    reads the other fields once it is set."""
 
     def is_over(self) -> bool:
         """Whether to show the live page now: the state is restored, the task failed, or the task has been
@@ -175,7 +176,8 @@ class GoLive:
         meanwhile.
 
         Raises:
-            CannotEnterRecording: the recorded code is not in the recording, or cannot be written to a folder.
+            CannotEnterRecording: the recording does not contain its code, or the code cannot be written to a
+                folder.
             NotCleared: the code must not run.
         """
         info, num_envs = transition.info, NEW_ENVS if self.everywhere else 1
@@ -234,7 +236,7 @@ class GoLive:
             self._transition = None
 
     def can_go_home(self) -> bool:
-        """Whether the live session is another one than the session that the user opened."""
+        """Whether the live session is not the session that the user opened."""
         home = self._shared.home
         return home is not None and self._shared.session is not home
 
@@ -256,7 +258,7 @@ class GoLive:
         """End the session opened here. The pages must have been stopped. Must not be called on the loop."""
         do(self.let_go)
         self._opening.close(_OPEN_TIMEOUT_SECONDS)
-        do(lambda: None)  # let the loop start the end of a session that was opened meanwhile
+        do(lambda: None)  # a session may just have opened: the loop starts to end it before this
         self._ending.close()
 
     def _let_go(self) -> None:

@@ -28,7 +28,8 @@ HEADERS = {
     "Cache-Control": "no-cache",
 }
 _INTRODUCTION_CHARACTERS = 1000
-"""Length of a page's introduction: a search lists pages with the words in their introduction first."""
+"""Number of characters at the start of a page that count as its introduction. A search puts the pages first
+whose introduction contains the words."""
 _LITTLE_WORDS = frozenset("a an and for how i in is it my of on or the to with your".split())
 OVERVIEW = "overview"
 """The topic made of the README."""
@@ -38,7 +39,7 @@ GROUPS = (
     ("reference", "Look something up"),
     ("developers", "Change the workbench"),
 )
-"""Folders of the documents, with a heading that states the reader's goal."""
+"""(folder of documents, its heading in the list of topics): the heading states the reader's goal."""
 RULE_PAGES = "rules"
 """Folder with a page for each rule of `checks`. The list of topics omits them; the topic ``rules`` has a table."""
 FIRST = (
@@ -57,7 +58,7 @@ class Topic:
     group: str
     """One of `GROUPS`, or `RULE_PAGES`."""
     path: str
-    """Path from the root of a checkout. Links on the page are relative to its folder."""
+    """Path from the root of a checkout. Links on the page are relative to the folder of this path."""
     text: str
     """Markdown."""
 
@@ -103,8 +104,8 @@ def _topic(name: str, group: str, path: str, file: Path) -> Topic:
 
 
 def find_topic(name: str) -> Topic | None:
-    """The topic of this name; None if there is none. Case does not matter, and spaces, ``-`` and ``_`` are
-    the same: ``Batched env`` and ``batched-env`` both find ``batched_env``."""
+    """The topic of this name; None if there is none. Case is ignored, and spaces and ``-`` count as ``_``:
+    ``Batched env`` and ``batched-env`` both find ``batched_env``."""
     wanted = _as_named(name.strip().lower().removesuffix(".md"))
     return next((topic for topic in topics() if _as_named(topic.name) == wanted), None)
 
@@ -114,8 +115,9 @@ def _as_named(name: str) -> str:
 
 
 def topics_about(words: str) -> list[Topic]:
-    """Topics whose text contains each of these words, in any case and order. Topics with the words in their
-    introduction come first. Pages of rules are returned only if no other topic matches."""
+    """Topics whose text contains each of these words; upper and lower case and the order of the words are
+    ignored. Topics with the words in their introduction come first. Pages of rules are returned only if no
+    other topic matches."""
     wanted = _words(words)
     if not wanted:
         return []
@@ -141,8 +143,9 @@ def by_path(path: str) -> Topic | None:
 
 
 def reply(path: str, query: Mapping[str, str]) -> tuple[int, str, bytes]:
-    """Status, content type and page of the topic named `path`; of the overview if `path` is empty; or of the topics about
-    the words of the query's ``search``. `path` is only compared with topic names, so a browser cannot read other files."""
+    """Returns (status, content type, page). If the query has a ``search``, the page lists the topics about
+    its words. If not, it shows the topic named `path`; the overview if `path` is empty. `path` is only
+    compared with topic names, so a browser cannot read other files."""
     words = query.get("search", "").strip()
     topic = None if words else find_topic(path or OVERVIEW)
     groups = [(group, [one for one in topics() if one.group == group]) for _, group in GROUPS]
@@ -159,8 +162,8 @@ def reply(path: str, query: Mapping[str, str]) -> tuple[int, str, bytes]:
 
 
 def _first_line_about(topic: Topic, words: str) -> str:
-    """The first line of a topic's text, after its title, that contains one of the words, without marks of Markdown; empty if
-    only the title does."""
+    """The first line below a topic's title that contains one of the words; empty if no line does. Marks of
+    Markdown are removed."""
     wanted = _words(words)
     lines = topic.text.splitlines()[1:]
     line = next((line for line in lines if any(word in line.lower() for word in wanted)), "")
@@ -223,7 +226,8 @@ _PICTURE = (
 
 
 def _breakable(text: str) -> str:
-    """The text as HTML with line-break opportunities in paths and long names: a table is as wide as its longest word."""
+    """The text as HTML with line-break opportunities in paths and long names: without them, a long word makes
+    a table too wide."""
     path = re.sub(r"(?<=\w)([/_])(?=\w)", r"\1<wbr>", html.escape(text, quote=False))
     return re.sub(r"[A-Za-z0-9]{20,}", lambda name: re.sub(r"(?<=[a-z])(?=[A-Z])", "<wbr>", name[0]), path)
 

@@ -99,8 +99,8 @@ DOES: frozenset[type[Command]] = frozenset(
 )
 """Commands that the page itself carries out; the session and the parts of the page carry out the others."""
 PANELS_PERIOD_SECONDS = 0.06
-"""Interval at which the panels are drawn while the envs play: every second frame. Faster numbers cannot be
-read."""
+"""Interval at which the panels are drawn while the envs play: every second frame. Numbers that change faster
+cannot be read."""
 PICTURES_HINT = (
     "Exact pictures are SAPIEN's own. Fast pictures show simplified meshes and take a fraction of the time without a graphics "
     "card. Auto: fast while something moves, exact when it stands still. This page records exact pictures only."
@@ -113,15 +113,15 @@ ENVS_SHARE = 0.2
 """Maximum share of the page's width for the table of envs. The table omits columns that do not fit; the user
 can drag its edge."""
 WIDE_PIXELS = 1200
-"""Minimum width of a page for opening the table of envs by itself."""
+"""Minimum width of a page on which the table of envs opens without an action of the user."""
 
 
 class Page:
     """The live page of a session.
 
-    Each redraw takes one immutable snapshot of the session, and every part compares it with the one that it
-    drew last. Callbacks of the page run in any thread and order, and only send requests to the session. While
-    no browser shows the page, nothing is drawn or rendered.
+    Each redraw takes one immutable snapshot of the session, and every part compares it with the snapshot that
+    the part drew last. Callbacks of the page run in any thread and order, and only send requests to the
+    session. While no browser shows the page, nothing is drawn or rendered.
 
     Args:
         server: The viser server.
@@ -130,7 +130,7 @@ class Page:
         dark: Whether the first theme is dark.
         on_review: Called when the user opens the recordings.
         on_look: Called with the recording that the user opens.
-        stage: The 3-D view; None makes one.
+        stage: The 3-D view; with None the page makes one.
         also: Further commands for the palette, which the caller carries out.
         clock: Clock of all parts of the page.
         editor: URL template that opens a line in the author's editor, from `parse_editor`.
@@ -354,7 +354,8 @@ class Page:
         return None
 
     def _open_file(self, file: str, visitor: Visitor) -> None:
-        """Open a file in the user's editor. Raises `Refused` without one."""
+        """Open a file in the user's editor. Raises `Refused` if no editor is set, or the file is no file of
+        the task."""
         link = self._link(file, None)
         if not link.address:
             raise Refused(f"No editor opens {file}: it is no file of the task, or --editor is none.")
@@ -423,7 +424,8 @@ class Page:
                 len(task.geometry.body_names),
             )
         ):
-            # Between two versions a step of the old one may arrive with the new task.
+            # While one version replaces another, the view may hold the new task with a step of the old
+            # version.
             return
         one = self._icons.only_selected and task.num_envs > 1
         env = min(view.selected_env, task.num_envs - 1)
@@ -521,5 +523,5 @@ def _shown_of(view: SessionView) -> tuple[object, object]:
         view.activity,
         view.pictures_serial,
     )
-    # Every view is new; while no steps are made, each must be drawn at once.
+    # Each view counts as new content. While no steps are made, each must also be drawn at once.
     return object(), (waited_for if steps_go_on else object())

@@ -94,7 +94,7 @@ class Marks(PagePart[SessionView]):
 
 
 def moved_cameras(view: SessionView) -> tuple[CameraKey, ...]:
-    """The cameras whose pose differs from the file's."""
+    """The cameras whose pose differs from their pose in the task's file."""
     return tuple(camera.key for camera in view.of(StudioView).cameras if camera.moved)
 
 

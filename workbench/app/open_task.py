@@ -30,7 +30,7 @@ OpenSession = Callable[[TaskName, TaskOptions, KeptWork | None], Session]
 
 @dataclass(frozen=True)
 class Choices:
-    """Entries of the list of tasks in addition to the tasks that are found, and how a chosen task is opened."""
+    """Recent tasks, which the list shows besides the tasks that it finds; and how a chosen task is opened."""
 
     recents: RecentTasks
     open_session: OpenSession
@@ -45,10 +45,10 @@ _SHOW_TIMEOUT_SECONDS = 10.0
 class OpenTask:
     """Opens the task that the user chooses from the list.
 
-    It opens one task at a time: the user may take minutes to allow the code, and a closing session writes its
-    recordings. The newest request wins: it withdraws the question of an earlier one. The page of the new
-    session is shown first, then the old session is closed as at the end of the program. Call all methods on
-    the loop, except `close`.
+    It opens one task at a time, which may take minutes: it waits until the user allows the code, and until
+    the old session has written its recordings. A newer request withdraws the question that an older request
+    still asks. The page of the new session is shown first, then the old session is closed as at the end of
+    the program. Call all methods on the loop, except `close`.
 
     Args:
         shared: The pages and the open session.
@@ -174,8 +174,7 @@ class OpenTask:
         if old is not None:
             old.do(PauseRun())
             self._kept[self._open_reference] = old.kept_work()
-            # Not the recorded code of a recording: it has the path of a file, but may differ from the file's
-            # code.
+            # Not recorded code: its reference is the path of a file, which may contain other code by now.
             if isinstance(old.reference, str):
                 self._ran.add(self._open_reference)
         kept = self._kept.get(entry.lasting)

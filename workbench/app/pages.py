@@ -226,7 +226,7 @@ class Pages:
 
 
 def next_frame(due: float, began: float) -> float:
-    """Time of the next frame: after a late frame the next wait is shorter, or the delay would accumulate.
+    """Time of the next frame: after a late frame the next wait is shorter, so that delays do not add up.
 
     Args:
         due: Scheduled time of the last frame, in seconds.

@@ -63,7 +63,7 @@ class TaskCommands(PagePart[SessionView]):
 
 
 def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
-    """Label, command, and the text below the label."""
+    """(label, command, text below the label) of each entry."""
     task = view.task
     if task is None:
         return []

@@ -1,4 +1,4 @@
-"""Reports to every open browser, on any page and tab, and to the terminal why something was not recorded."""
+"""Reports why something was not recorded: to every open browser, on any page and tab, and to the terminal."""
 
 from __future__ import annotations
 

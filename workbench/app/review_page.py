@@ -70,15 +70,17 @@ from workbench.start.panel import OpenDialog
 from workbench.sweep.panel import SweepPanel
 
 PANELS_PERIOD_SECONDS = 0.1
-"""Interval at which the panels are drawn while a recording plays. Faster numbers cannot be read."""
+"""Interval at which the panels are drawn while a recording plays. Numbers that change faster cannot be
+read."""
 PANEL_WIDTH_PIXELS = 340
 LIBRARY_WIDTH_PIXELS = 520
 MIN_VIEW_PIXELS = 240
 """Minimum width of the view between the library and another panel."""
 MIN_VIEW_BY_SWEEP_PIXELS = 400
-"""Minimum width of the view for watching an episode of a sweep next to its table; the timeline needs most of it."""
+"""Minimum width of the view at which the table of a sweep stays open while one of its episodes is watched;
+the timeline needs most of this width."""
 NARROW_VIEW_PIXELS = 700
-"""Minimum width of the view for keeping the library open next to it when a recording is opened."""
+"""Minimum width of the view at which the library stays open when a recording is opened."""
 WIDTH_TIMEOUT_SECONDS = 20.0
 """Time within which a page reports the new width of its view."""
 BACK = "Back to the live env"
@@ -145,8 +147,8 @@ class ReviewPage:
         """Folds and unfolds rerun's panel."""
         self._other_folded = False
         self._unfolded = "", 0.0
-        """(panel unfolded last: library or rerun, time); ("", 0) once the width of the view has been
-        checked."""
+        """(name of the panel that was unfolded last, time of the unfolding); ("", 0) once the width of the
+        view has been checked."""
         self._told = DrawThrottle(PANELS_PERIOD_SECONDS, clock)
 
         server.gui.main_panel.dock_right()
@@ -272,7 +274,7 @@ class ReviewPage:
             self._parts.add(sweep)
 
     def _open_of_sweep(self, ids: tuple[str, ...]) -> None:
-        # The panel stays open: the user compares several episodes of the sweep.
+        # If there is room, the panel stays open: the user compares several episodes of the sweep.
         self._review.open(ids, library_stays=self._smallest_view() >= MIN_VIEW_BY_SWEEP_PIXELS)
 
     # --- drawing ---------------------------------------------------------------------------------
@@ -531,7 +533,7 @@ def fixed_values(view: ReviewView) -> dict[str, object]:
     episode = view.opened[view.selected].episode
     reward = np.asarray(episode.reward, np.float64)
     if not episode.info.has_reward:
-        reward = np.full_like(reward, np.nan)  # ManiSkill reports 0 without a reward
+        reward = np.full_like(reward, np.nan)  # ManiSkill reports 0 if the task has no reward
     after, anchor = np.arange(1, len(reward) + 1), view.anchors[view.selected]
     over = column_at(after, reward, anchor, np.arange(view.first, view.last + 1)).astype(np.float32)
     styles = {h.style for _, marks in rows for h in marks}

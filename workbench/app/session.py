@@ -138,7 +138,8 @@ class Session:
         self._enter_numbers = itertools.count(1)
         self._printed = PrintedLog(self._on_lines)
         self._aside = BlockingPool("follow")
-        """Starts to watch files, which reads them first."""
+        """Runs the calls that start to watch files: such a call reads the files, so it must not block the
+        loop."""
         self._watcher = SourceWatcher(self._on_files_changed)
         self._policy_file = PolicyFile(self._on_policy_saved)
         self._worker = make_worker(
@@ -160,7 +161,7 @@ class Session:
         self._policies = PolicySearch(self._happen)
         self._asker = QuestionClient(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
-        # Last: it reports recovered episodes at once.
+        # Create the recorder last: it reports recovered episodes at once.
         self._recorder = LiveRecorder(recordings, self._happen, on_notice)
         self._past_saver = PastSaver(recordings, self._recorder.finisher, self._background, self._happen)
         self._past_rescorer = PastRescorer(self._background, self._happen)
@@ -192,7 +193,7 @@ class Session:
 
     def _happen(self, event: SessionEvent) -> list[Future[None]]:
         """Handle an event; returns the work started off the loop. If an effect fails, the others are still
-        performed. The failure is raised if the event is a command, else reported."""
+        performed. The failure is raised if the event is a command; otherwise, it is reported."""
         before, begun, failure = self._state, list[Future[None]](), None
         self._state, effects = apply(before, event, Now(time.monotonic(), time.time()))
         for effect in effects:
@@ -317,12 +318,12 @@ class Session:
 
     @property
     def episodes_written(self) -> int:
-        """Number of episodes whose files are written, also while the loop is busy."""
+        """Number of episodes whose files are written. Can be read while the loop is busy."""
         return self._recorder.finisher.finished.count
 
     def knows_file(self, path: str) -> bool:
-        """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder. Reads the disk for
-        the last two."""
+        """Whether this absolute path is a file of the task, the policy's file, or a module in the task's
+        folder. The last two are looked up on the disk."""
         run, file = self._run, Path(path)
         if file in [Path(one).absolute() for one in run.own_files]:
             return True

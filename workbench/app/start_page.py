@@ -19,7 +19,7 @@ from workbench.start.panel import TaskList
 
 
 class StartPage:
-    """The list of tasks. There is no scene, so its panel fills the window (``.wb-start`` in page.css).
+    """The list of tasks. There is no scene, so the list's panel fills the window (``.wb-start`` in page.css).
 
     Args:
         shared: The objects that all pages share.

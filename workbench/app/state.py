@@ -63,7 +63,8 @@ DOES: frozenset[type[Command]] = (
 
 @dataclass(frozen=True)
 class State:
-    """State of a session. Parts that an event did not change are the same objects."""
+    """State of a session. An event leaves the parts that it does not change as they are: the next state
+    contains the same objects."""
 
     run: Run
     recording: of_recording.LiveRecording

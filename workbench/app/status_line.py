@@ -133,8 +133,8 @@ MIN_SLOWING_SHARE = 0.3
 
 
 def slowed_by(view: SessionView) -> tuple[str, str] | None:
-    """What slows playing, recording or rendering for the page, as a short and a full text; None if neither
-    takes at least `MIN_SLOWING_SHARE` of the time."""
+    """Why playing is slow: because of recording, or because of rendering for the page. Returns (short text,
+    full text); None if each of them takes less than `MIN_SLOWING_SHARE` of the time."""
     task, recorded, watched = view.task, view.recorded_share, view.watched_share
     if task is None or max(recorded, watched) < MIN_SLOWING_SHARE:
         return None

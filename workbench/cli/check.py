@@ -56,7 +56,8 @@ from workbench.task.problem import Problem, TaskError, place_text
 from workbench.task.reference import named_file
 
 MAX_RULES_PER_LINE = 3
-"""Maximum number of rules that are named before their common reason."""
+"""Maximum number of rules on one line with their common reason. If more rules share a reason, the reason is
+printed first, and the rules on the lines below."""
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ def count_text(count: int, what: str) -> str:
 
 
 def shown_path(file: str, root: Path) -> str:
-    """Path of the file, relative to `root` if it is below it."""
+    """Path of the file: relative to `root` if the file is below `root`, else as given."""
     path = Path(file)
     return str(path.relative_to(root)) if path.is_relative_to(root) else file
 
@@ -168,8 +168,8 @@ def json_text(value: Any) -> str:
 
 
 def as_junit(said: Reported) -> str:
-    """JUnit XML with a test case for each rule, in pytest's format, which GitLab, Jenkins and GitHub Actions read. A finding
-    below ``--fail-on`` appears as output of a passing test."""
+    """JUnit XML with a test case for each rule, in pytest's format, which GitLab, Jenkins and GitHub Actions
+    read. A finding whose degree is below ``--fail-on`` appears as output of a passing test."""
     report = said.report
     root = repository_of(said.root)
     cases = [_case(result, said, root) for result in report.results]

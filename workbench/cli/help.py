@@ -34,7 +34,8 @@ def show_help(name: str) -> int:
     if not out.is_terminal:
         out.print(page, width=width)
         return Exit.DONE
-    # less exits at once if the text fits the window, and keeps colours. The user's own LESS takes precedence.
+    # With these options, less exits at once if the text fits the window, and keeps colours. The user's own
+    # LESS takes precedence.
     os.environ.setdefault("LESS", "FRX")
     with out.pager(styles=shutil.which("less") is not None):
         out.print(page, width=width)

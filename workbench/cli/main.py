@@ -75,7 +75,7 @@ def start(
         address = parse_editor(editor)
     except ValueError as error:
         return refuse(str(error))
-    # Recordings can be reviewed without ManiSkill.
+    # The result is ignored: recordings can be reviewed without ManiSkill.
     lacks_maniskill("start")
     return start_in_terminal(options, at, worker, recordings, past, trust, address)
 
@@ -207,7 +207,7 @@ def review(
             return refuse(f"there is no file {file}")
     from workbench.episodes.reader.reading import start_reading
 
-    # Reads the recordings while the page is imported.
+    # Prepare the processes that read recordings while the page is imported.
     start_reading()
     from workbench.cli.page import review_in_terminal
     from workbench.live.process.memory_limit import parse_memory

@@ -43,7 +43,7 @@ from workbench.sweep.job import SweepOptions, collect_sweep
 
 @dataclass(frozen=True)
 class MergeOutput:
-    """Output in addition to the text. Each command that can run in parts has some of these files; see
+    """Output in addition to the text. Each command that can run in parts writes some of these files; see
     `_WRITES`."""
 
     json_file: Path | None = None
@@ -118,7 +118,7 @@ def _folder_of_point(merged: JobParts) -> Callable[[int], str]:
 
 
 def _copy(rrd: Path, out: Path) -> None:
-    """Copy an episode that is not there yet, its .json last."""
+    """Copy those files of an episode that are not in `out` yet, the .json last."""
     for suffix in (".rrd", ".h5", ".json"):
         source, target = rrd.with_suffix(suffix), out / f"{rrd.stem}{suffix}"
         if not source.is_file() and not target.is_file():

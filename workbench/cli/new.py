@@ -17,7 +17,8 @@ def new_in_terminal(name: str, origin: str) -> int:
 
     Args:
         name: name of the task; empty to ask for it.
-        origin: a template or an id; if empty, asks for it, or uses the first template if a name is given.
+        origin: a template or an id. If empty, the first template is used if a name is given, and else the
+            user is asked.
     """
     folder = Path.cwd()
     if not name:

@@ -35,7 +35,7 @@ from workbench.task.description import ShownPictures, TaskOptions
 from workbench.task.reference import TaskName, named_file
 
 _CLOSING_SECONDS = 1.4
-"""Timeout for closing, restarted by each written episode: a disk may hang."""
+"""Closing is given up after this time without a written episode, because a disk may hang."""
 _Requests = queue.SimpleQueue[Callable[[], object] | int]
 """Queue of functions that the command calls next; an int ends the command with this exit code."""
 
@@ -71,7 +71,8 @@ def open_in_terminal(
     def on_event(event: Event) -> None:
         nonlocal shown
         print_event(event)
-        # A broken file can be fixed and saved; an env id that fails cannot, so it gets no page.
+        # A broken file can be fixed and saved while its page is open. An env id that fails cannot be fixed on
+        # the page, so the command ends.
         if not waits_for_a_file and isinstance(event, TaskFailed) and not event.kept:
             requests.put(1)
         elif not shown and isinstance(event, Loaded):
@@ -176,7 +177,8 @@ class _HowToOpen:
         def on_event_and_note(event: Event) -> None:
             on_event(event)
             if isinstance(event, Loaded):
-                # Not before the task has loaded: reading would delay the task, for which the user waits.
+                # Prepare the reading of recordings only now: earlier, this would delay the task, for which
+                # the user waits.
                 start_reading()
                 made = replace(event.options or options, seed=0)
                 if noted[-1:] != [made]:
@@ -246,7 +248,7 @@ def _serve(
     renew = partial(requests.put, partial(_renew_token, gated_server))
     if gated_server.options.token:
         app.renew_token = renew
-    # Not SIGHUP: a closed terminal sends it to end its processes.
+    # SIGUSR1, not SIGHUP: a terminal that is closed sends SIGHUP to end its processes.
     on_signal(signal.SIGUSR1, renew)
     for number in (signal.SIGINT, signal.SIGTERM):
         on_signal(number, partial(requests.put, 0))

@@ -49,8 +49,8 @@ from workbench.rescore.recording_jobs import hidden_modules_text
 
 
 class RecordBar:
-    """Progress bar that handles Ctrl-C: the first one stops after the current step; a second one, or one before the first
-    episode, stops at once."""
+    """Progress bar that handles Ctrl-C: the first Ctrl-C stops after the current step. A second Ctrl-C, or a
+    first one before any episode has begun, stops at once."""
 
     def __init__(
         self,
@@ -95,8 +95,8 @@ class RecordBar:
         self._bar.update(self._row, description=text, completed=kept)
 
     def _say(self, line: str) -> None:
-        """Print a progress line if stderr is not a terminal: there the bar is drawn only once, at the end,
-        and a log would be silent for hours."""
+        """Print a progress line if stderr is not a terminal: in a file the bar is drawn only once, at the
+        end, so a log would be silent for hours."""
         if not err.is_terminal:
             self._said = time.monotonic()
             err.print(escape(line), soft_wrap=True)
@@ -150,7 +150,8 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
         requested, _ = with_given_actions(what)
         if recovered := recover_confined(what.out):
             err.print(f"recovered {_episodes(len(recovered))} that an earlier recording left unfinished")
-        # Print this before the task is opened: the error of a failed import would not name this cause.
+        # Print this warning before the task is opened: if an import fails because of such a file, its error
+        # does not say so.
         hidden = hidden_modules_text(what.task)
         for notice in hidden:
             warn(notice)

@@ -55,7 +55,7 @@ from workbench.task.reference import RecordedTask, TaskName, named_file
 from workbench.trust.clearance import Clearances, NotCleared, NotTrusted
 
 _MAX_LISTED = 30
-"""Maximum number of recordings for which unchanged ones are listed too."""
+"""Number of recordings up to which the table lists all. If there are more, it omits the unchanged ones."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def _request_of(
         elif isinstance(task, RecordedTask) and task.approved is not None:
             code += sorted(task.approved.values())
         else:
-            # Hash the text instead of the path: each machine may have another folder.
+            # Hash the text instead of the path: the folder may differ between machines.
             code.append(str(task) if file is None or not file.is_file() else read_content(file).hash)
     return RescoreRequest(
         len(files),
@@ -225,7 +225,7 @@ def _require_success(
     groups: Sequence[RescoreGroup], place: Mapping[str, int], results: Sequence[RescoredRecording]
 ) -> None:
     """Raise the error of the first group if all groups failed. One missing task must not hide the results of
-    others."""
+    the other tasks."""
     by_place = {result.place: result for result in results}
     first: RescoredRecording | None = None
     for group in groups:

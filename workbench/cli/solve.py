@@ -75,7 +75,8 @@ class SolveOutput:
     """Lowest degree of a broken rule that makes the exit code 1."""
 
     def fails(self, report: SolveReport) -> bool:
-        """Whether the exit code is 1: the reward breaks a rule of the degree `fail_on`, or no seed was solved."""
+        """Whether the exit code is 1: the reward breaks a rule of the degree `fail_on`, or no seed was
+        solved. Always False if `fail_on` is ``never``."""
         if self.fail_on == "never":
             return False
         return not report.solved or any(self.fails_by(verdict) for verdict in report.verdicts)
@@ -241,8 +242,8 @@ def as_csv(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
 
 def as_junit(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
     """JUnit XML with a test case for each broken rule of `planning.verdicts` and for each seed. The case of a
-    rule fails if its degree fails the command. The case of an unsolved seed is skipped: one unsolved seed is
-    no fault of the task."""
+    rule fails if the rule's degree makes the command fail. The case of an unsolved seed is skipped: one
+    unsolved seed is no fault of the task."""
     cases = [_case(what, f"seed {one.seed}", one.seconds) for one in report.seeds]
     for case, one in zip(cases, report.seeds, strict=True):
         if not one.solved_at:

@@ -84,7 +84,7 @@ def parse_settings(given: Sequence[str]) -> tuple[Setting, ...]:
 
 
 def _values(text: str) -> list[Any]:
-    """Parse comma-separated values: each as JSON, else as text."""
+    """Parse comma-separated values: each as JSON if it is valid JSON, else as text."""
     try:
         # As one JSON list, since nested lists and quoted texts contain commas.
         values = json.loads(f"[{text}]", parse_constant=_no_constant)
@@ -227,7 +227,7 @@ def print_points(results: SweepResults) -> None:
     """Print a row for each point."""
     summaries = results.summaries()
     terms = list(dict.fromkeys(name for one in summaries for name in one.means))
-    # The terms that sum to the reward if the task reports them, else all its terms.
+    # If the task reports the terms that sum to the reward, show only these; else show all its terms.
     terms = [name for name in terms if name.startswith(TERM_PREFIX)] or terms
     cells = [_cells(one, terms) for one in summaries[:_MAX_POINTS]]
     heads = [*results.names, "success (95 %)", "at the end", "return"]

@@ -38,7 +38,8 @@ def can_install_packages() -> bool:
 
 
 def os_release() -> dict[str, str]:
-    """The fields of os-release(5): ``ID`` ("debian"), ``VERSION_CODENAME`` ("bookworm") and so on; empty without it."""
+    """The fields of os-release(5): ``ID`` ("debian"), ``VERSION_CODENAME`` ("bookworm") and so on; empty if
+    there is no such file."""
     try:
         return platform.freedesktop_os_release()
     except OSError:

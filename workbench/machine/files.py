@@ -126,7 +126,7 @@ def new_file(path: Path) -> Iterator[Path]:
             raise
         raise OSError(error.errno, f"Cannot write {path}: {os.strerror(error.errno)}.") from error
     finally:
-        # `path` exists by now, or an error is being raised, which this must not hide.
+        # Either `path` exists by now, or an error is being raised, which a failed removal must not hide.
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 
@@ -182,7 +182,7 @@ def read_regular_file(path: str | os.PathLike[str], most_bytes: int) -> bytes:
     """
     with open_regular_file(path, most_bytes) as file:
         pieces, size = [], 0
-        # In pieces, since one read of `most_bytes` would allocate them all even for a file of ten bytes.
+        # Read in pieces: a single read of `most_bytes` would allocate that many bytes even for a file of ten.
         while piece := file.read(min(_READ_BYTES, most_bytes + 1 - size)):
             pieces.append(piece)
             size += len(piece)

@@ -204,7 +204,7 @@ class CurrentFolder:
         """Context in which this is the current folder; afterwards the previous folder is current again.
 
         Args:
-            stay: keep the folder in which the block ends, unless it raises.
+            stay: the folder that is current at the end of the block stays current, unless the block raises.
         """
         before = os.open(".", _AT_FOLDER)
         leave = True

@@ -13,8 +13,8 @@ from pathlib import Path
 def is_installed(file: str) -> bool:
     """Whether a source file belongs to Python, to an installed package or to the workbench.
 
-    Also True for a name that is not an absolute path: it belongs to an executed string, or to compiled code,
-    which gives relative names of its sources.
+    Also True for a name that is not an absolute path: such a name belongs to an executed string, or to
+    compiled code, which names its sources by relative paths.
     """
     if not os.path.isabs(file) or file.startswith(_roots()):
         return True

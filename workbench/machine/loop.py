@@ -214,7 +214,8 @@ class BlockingPool:
         self._ended = False
 
     def begin(self, work: Callable[[], Value]) -> futures.Future[Value]:
-        """Queue `work` behind earlier work; cancelled at once if the thread has ended. Call it on the loop."""
+        """Queue `work` behind earlier work. After `end`, the returned future is already cancelled. Call it on
+        the loop."""
         made: futures.Future[Value] = futures.Future()
         if self._ended:
             made.cancel()

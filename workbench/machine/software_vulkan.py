@@ -321,7 +321,7 @@ def _install_mesa(probe: RenderProbe) -> RenderProbe:
 
 
 def backports_of_this_machine() -> str | None:
-    """The backports source that a Debian machine may need; None on others."""
+    """The backports source that a Debian machine may need; None on other machines."""
     release = os_release()
     if release.get("ID") != "debian":
         return None

@@ -31,7 +31,8 @@ def rate_text(value: float) -> str:
 
 
 def nonfinite_text(values: ArrayLike) -> str:
-    """Counts of values that are not finite: ``NaN in 3 of 16``, ``NaN in 3, infinite in 1 of 16``; else empty."""
+    """Counts of values that are not finite: ``NaN in 3 of 16``, ``NaN in 3, infinite in 1 of 16``; empty if
+    all are finite."""
     flat = np.asarray(values).reshape(-1)
     counts = {"NaN": int(np.isnan(flat).sum()), "infinite": int(np.isinf(flat).sum())}
     counted = ", ".join(f"{word} in {count}" for word, count in counts.items() if count)
@@ -90,15 +91,15 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def short_line(text: str, longest: int) -> str:
-    """`text` as `plain_text` on one line. If it is longer than `longest` characters, its middle is replaced
-    by ``...``."""
+    """`text`, escaped as `plain_text` does, on one line. If it is longer than `longest` characters, its
+    middle is replaced by ``...``."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
     return plain_text(text)
 
 
 def only_colours(text: str, keep: str = "\n\t") -> str:
-    """`text` as `plain_text`, but with its colour sequences, if all their codes are `HARMLESS`."""
+    """`text`, escaped as `plain_text` does; a colour sequence stays if all its codes are `HARMLESS`."""
     if not _ESCAPED.search(text):
         return text
     parts: list[str] = []

@@ -26,7 +26,8 @@ TESTED = {
     "viser": ("1.1.1",),
     "rerun-sdk": ("0.41.0",),
 }
-"""Versions with which all tests pass: those of ``constraints.txt``, and further ones of the page on versions."""
+"""Versions with which all tests pass: those in ``constraints.txt``, and further ones that the page on
+versions lists."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,8 @@ _STORE, _LOADS = dis.opmap["STORE_ATTR"], (dis.opmap["LOAD_FAST"], dis.opmap["LO
 
 
 def stored_names(code: CodeType, of: str | None = None) -> set[str]:
-    """Attributes that a function and its inner functions assign on any object, or only on the variable `of`.
+    """Attributes that a function and its inner functions assign: on any object or, if `of` is given, only on
+    the variable with this name.
 
     Read from the bytecode: `dis` and sources would take a third of a second for ManiSkill's BaseEnv, at each start.
     """
@@ -121,7 +123,7 @@ def package_versions() -> Mapping[str, str]:
 
 
 def maniskill() -> tuple[str, str] | None:
-    """Distribution and version of the installed ManiSkill; None without one."""
+    """Distribution and version of the installed ManiSkill; None if it is not installed."""
     return next(iter(installed_maniskills().items()), None)
 
 
@@ -138,7 +140,8 @@ def command_for_tested_versions() -> str:
 
 
 def unmet_requirements() -> list[tuple[Requirement, str | None]]:
-    """Requirements of the workbench that are missing or of another version, each with the installed version.
+    """Requirements of the workbench that the installed packages do not meet, each with the installed version
+    of the package; None if it is missing.
 
     Raises:
         importlib.metadata.PackageNotFoundError: The distribution itself is not installed.

@@ -46,7 +46,8 @@ class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     key: ClassVar[str] = ""
     """Key that sends the command with its default values: ``s``, ``shift+arrowleft``, ``ctrl+z``."""
     context: ClassVar[str] = "page"
-    """Where the key works: ``page``, or while an element with this ``data-context`` is visible."""
+    """Where the key works: on every page (``page``), on the pages that name this context (see
+    `keys_and_palette.register`), or while an element with this ``data-context`` is visible."""
     repeats: ClassVar[bool] = False
     """Whether a key that is held down repeats the command."""
 

@@ -62,7 +62,7 @@ class ReviewNumbers(PagePart[ReviewView]):
 
 
 class ReviewCurves(PagePart[ReviewView]):
-    """Charts of one entry each, with one line per aligned recording: the reward and a chosen entry.
+    """Charts of the reward and of a chosen entry, each with one line per aligned recording.
 
     The action and the reward terms have many lines, so they are drawn only for the selected recording.
     """
@@ -80,7 +80,7 @@ class ReviewCurves(PagePart[ReviewView]):
         self._offered: dict[str, tuple[str, str]] = {}
         """(entry, line) of each choice; the line is empty if the entry has a single line."""
         self._wish = ""
-        """Last chosen entry, kept while recordings without it are open."""
+        """Last chosen entry; kept while the open recordings lack it."""
 
     def key(self, view: ReviewView) -> object:
         which = view.opened_serial, len(view.opened), view.selected
@@ -170,10 +170,12 @@ class ReviewCurves(PagePart[ReviewView]):
         """Draw the lines, reduced to their peaks if there are many positions.
 
         Args:
-            chosen: The line whose peaks are drawn exactly; other lines may be off by less than a span.
+            chosen: The line whose peaks are drawn at their exact positions; the peaks of other lines may be
+                off by less than a span of positions.
             at: The present position.
         """
-        # Put the chosen line first: the x values are those of the first line's peaks.
+        # Put the chosen line first: `points` takes its x values from the first line's extremes, so only that
+        # line's peaks are exact.
         ordered = sorted(drawn, key=lambda line: line is not chosen)
         if not ordered:
             self._charts[chart].hide()
@@ -185,7 +187,7 @@ class ReviewCurves(PagePart[ReviewView]):
 
 
 def _mode_of(episode: Episode) -> str:
-    """The reward mode for `number_rows`, which shows only whether there is a reward."""
+    """The reward mode for `number_rows`, which tells only whether there is a reward: ``none`` or empty."""
     return "" if episode.info.has_reward else "none"
 
 

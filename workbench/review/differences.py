@@ -54,7 +54,8 @@ class Difference:
     body: str
     """The body that differs first; empty if none differs."""
     apart: NDArray[np.float64]
-    """(K,) distance in metres between the two poses of the body that differs most, from `begin` on."""
+    """(K,) at each compared state, from `begin` on: the largest distance of any body between the two
+    recordings, as `distances` returns it."""
     begin: int
     """Position of the first compared state."""
     compared: int
@@ -62,10 +63,11 @@ class Difference:
     not_in_both: tuple[str, ...]
     """Bodies that only one of the recordings has."""
     numbers: tuple[FirstDifference, ...]
-    """Action, reward, and the entries of ``evaluate``; differing ones come first, by position."""
+    """Action, reward, and the entries of ``evaluate``; those that differ come first, in the order of their
+    first difference."""
     same_seed: bool
     same_source: bool | None
-    """Whether both have the same source; None if one has none."""
+    """Whether both recordings contain the same source; None if one of them contains none."""
     source: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
     """File, and its changed lines as (``add``, ``del``, ``at`` or ``same``, text)."""
 
@@ -128,8 +130,8 @@ def source_changes(
     pairs = {name: (before.get(name, ""), after.get(name, "")) for name in dict.fromkeys([*before, *after])}
     gone, new_ones = next(iter(before), None), next(iter(after), None)
     if gone is not None and new_ones is not None and gone not in after and new_ones not in before:
-        # The task's own file comes first in both. Compare it with its renamed version, or all its lines would
-        # count as changed.
+        # The task's own file comes first in both. If it was renamed, compare the old file with the new one:
+        # otherwise, all its lines would count as changed.
         del pairs[gone], pairs[new_ones]
         pairs = {f"{gone} → {new_ones}": (before[gone], after[new_ones]), **pairs}
     for name, (old, new) in pairs.items():

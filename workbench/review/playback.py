@@ -82,7 +82,8 @@ class Review:
             read: reads the recording of a row, sharing shapes with other recordings; stops when its last
                 argument returns True; raises OSError or UnreadableRecording with a sentence. None for
                 `read_recording`.
-            make_scene: makes scenes of recordings without one; None leaves them without.
+            make_scene: makes the scenes of recordings that contain none; with None, these recordings stay
+                without a scene.
             clock: returns seconds.
             most_bytes: memory limit for the recordings of one opening; None for `MEMORY_SHARE`.
             memory: returns the bytes that the process has allocated.
@@ -173,7 +174,7 @@ class Review:
             self._changes.notify()
 
     def _wanted(self, event: Asked | Open | OpenFirst) -> None:
-        self._list()  # the page may draw, and send, a row before the loop has handled `Listed`
+        self._list()  # the page may show a row, and ask for it, before the loop has handled `Listed`
         self._happened(event)
 
     def _list(self) -> None:
@@ -241,7 +242,7 @@ class Review:
         return Opened(row.id, row.name, episode, find_events(episode)), files
 
     def _give_scenes(self, number: int, job: Job, without: Sequence[Opened], shapes: SharedShapes) -> None:
-        """Make the scenes of recordings without one."""
+        """Make the scenes of recordings that contain none."""
 
         def tell(one: Opened, scene: str, making: bool = False, episode: Episode | None = None) -> None:
             event = SceneTold(number, one.id, scene, making, episode)

@@ -1,4 +1,4 @@
-"""Makes the 3-D scene of recordings without one (ManiSkill's own) from the env that they name."""
+"""Makes the 3-D scene of recordings that contain none (ManiSkill's own), from the env that they name."""
 
 from __future__ import annotations
 

@@ -39,8 +39,8 @@ GHOST_ALPHA = 0.45
 """Alpha of a ghost. With a lower alpha it vanishes over a white table, with a higher one it hides the bodies
 behind it."""
 MAX_NAMED = 16
-"""Maximum number of recordings side by side with labels. A browser lays out labels in every frame: with sixty its frame
-rate halves (measured)."""
+"""Maximum number of recordings side by side at which each has a label. A browser lays out labels in every
+frame: sixty labels halve its frame rate (measured)."""
 MIN_GHOST_METRES = 5e-4
 """Minimum distance between a ghost and its body for the ghost to be drawn."""
 _SAME_PLACE_METRES = 1e-5
@@ -50,21 +50,22 @@ _SAME_PLACE_METRES = 1e-5
 class ReviewScene:
     """The scene of several open recordings.
 
-    Each recording is an env of one scene, and equal shapes are shared. When overlaid, all but the first are ghosts: tinted
-    and half transparent, drawn only where they differ from the first. Bodies that rest at the same place in both for the
-    whole time are drawn once.
+    Each recording is an env of one scene, and equal shapes are shared. When the recordings are overlaid, all
+    but the first are ghosts: tinted and half transparent, and drawn only where they differ from the first. A
+    ghost omits the bodies that rest for the whole time at the same place as in the first recording.
     """
 
     geometry: SceneGeometry
     layout: EnvLayout
     ghosts: bool
     _poses: tuple[NDArray[np.float32], ...]
-    """(T + 1, number of its bodies, 7) poses of each recording."""
+    """For each recording: (T + 1, B, 7) poses of its B bodies."""
     _bodies: tuple[NDArray[np.int64], ...]
     """Indices of each recording's bodies among all bodies."""
 
     def poses(self, states: Sequence[int]) -> NDArray[np.float32]:
-        """(N, B, 7) poses at this state of each recording; NaN for bodies that a recording lacks."""
+        """(N, B, 7) poses of each recording at its state in `states`; NaN for bodies that a recording
+        lacks."""
         found = _side_by_side(self._poses, self._bodies, len(self.geometry.body_names), states)
         if self.ghosts:
             for ghost in found[1:]:
@@ -142,7 +143,7 @@ def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
 
 
 def bodies_at_rest(first: Opened, other: Opened) -> frozenset[str]:
-    """Bodies that rest at the same place in both for the whole time."""
+    """Bodies that rest for the whole time, at the same place in both recordings."""
     found = []
     a, b = first.episode, other.episode
     if a.geometry is None or b.geometry is None or a.poses is None or b.poses is None:
@@ -270,7 +271,8 @@ class ReviewIn3D:
 
     def _frame_what_is_new(self, view: ReviewView, scene: ReviewScene, in_grid: bool) -> None:
         size = np.round(np.concatenate([scene.layout.low, scene.layout.high]), 0).tobytes()
-        # The live page uses the same key, so switching between the two for one task keeps the view.
+        # The live page uses the same key, so a switch between the review and the live page of the same task
+        # keeps the view.
         task = view.opened[0].episode.info.task
         if self._framing.is_new((task, len(view.opened) if in_grid else 1, size)):
             self._framing.frame_new(self._viewpoint)
@@ -335,7 +337,8 @@ class ReviewIn3D:
 
 
 def solid_recording(view: ReviewView, scene: ReviewScene) -> int:
-    """Index of the recording whose bodies are selected: of overlaid ones the first, since the others are ghosts."""
+    """Index of the recording whose bodies a click selects: the first if the recordings are overlaid, since
+    all others are ghosts; else the selected one."""
     return 0 if scene.ghosts else view.selected
 
 

@@ -44,7 +44,7 @@ class OpeningState:
     """Progress of the present or last opening of recordings."""
 
     number: int = 0
-    """Increases with each opening; results of an older one are dropped."""
+    """Increases with each opening; results of an older opening are dropped."""
     rows: tuple[LibraryRow, ...] = ()
     state: int | None = None
     """Initial state of the first recording."""

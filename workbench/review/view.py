@@ -24,7 +24,7 @@ REWARD = "reward"
 TERMS = "terms of the reward"
 ACTION = "action"
 MAX_LINES = 12
-"""Maximum number of columns of one entry; more cannot be distinguished."""
+"""Maximum number of lines of one entry in a chart; more cannot be distinguished."""
 _MAX_RUNS = 40
 """Maximum number of events of one entry. If there are more, only the first is kept: an entry that changes at
 every step would cover the strip."""
@@ -266,7 +266,7 @@ class PictureReader:
     """Decodes the pictures of one recording at a time. Not thread-safe: used on the page's loop.
 
     A picture takes some milliseconds to decode and an episode with four cameras has thousands. So only the shown picture of
-    each camera is decoded and cached: the page requests the same one thirty times a second.
+    each camera is decoded and cached: the page requests the same picture thirty times a second.
     """
 
     def __init__(self) -> None:

@@ -32,7 +32,8 @@ from workbench.share.commands import CloseRerun, OpenInRerun
 log = logging.getLogger(__name__)
 
 WIDTH_SHARE, MIN_WIDTH_PIXELS = 0.66, 480
-"""Share of the width between the other panels, and minimum width. The scene and the timeline have the rest."""
+"""Width of rerun's panel: its share of the width between the other panels, and its minimum. The scene and the
+timeline have the rest."""
 PLACED_AFTER_SECONDS = 0.3
 """Time from a page's request for the panel's content until the panel is placed."""
 Moments = Mapping[Path, int]
@@ -52,9 +53,10 @@ class RerunPages:
 
     The viewer's address contains the recordings as full addresses, with host and port. Only the browser knows the host
     (behind ``ssh -L`` it differs), so the opened page is a small one of ours that builds the addresses and redirects to
-    rerun. The address cannot contain the step: rerun accepts one only for recordings of its own servers. So a script of
-    ours in its page sends the step (``viewer_control``, rerun 0.41: one hand-written protobuf message) when the recording
-    has been read. A rerun without that message opens at the first step.
+    rerun. The address cannot contain the step: rerun accepts a step only for recordings of its own servers.
+    So a script of ours in rerun's page sends the step (``viewer_control``, rerun 0.41: one hand-written
+    protobuf message) when the recording has been read. A version of rerun without that message opens at the
+    first step.
     """
 
     def __init__(self, gated_server: GatedServer, offers: Downloads) -> None:
@@ -193,8 +195,8 @@ class RerunView:
     def _widen(self) -> None:
         """Set the panel's width once a page has placed it.
 
-        viser gives a panel that is docked next to another 300 pixels and ignores the width given at docking. A request for
-        the panel's content shows that it exists.
+        viser gives 300 pixels to a panel that is docked next to another panel, and ignores the width given at
+        docking. A request for the panel's content shows that it exists.
         """
         if self._panel is not None:
             self._panel.set_width(self._width)

@@ -20,8 +20,8 @@ from workbench.page.widgets.templates import counted, render
 from workbench.review.view import outcome_text
 
 MAX_TRIANGLES = 80_000
-"""Approximate maximum number of triangles. A robot's own meshes have twice that, and the file would be three times
-the size."""
+"""Approximate maximum number of triangles. A robot's own meshes have twice as many; with them the file would
+be three times the size."""
 
 PAUSE_SECONDS = 1.0
 """Time for which the last state is held before the player repeats."""
@@ -90,7 +90,7 @@ def _recorded(
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up, camera.fov = eye.position, eye.look_at, eye.up, eye.fovy
     camera.near, camera.far = 0.05, 300.0
-    # The scene has all envs; the other ones are NaN and not drawn.
+    # The scene has all envs, but the recording has only one: the others are NaN, and are not drawn.
     batch = np.full((geometry.num_envs, *poses.shape[1:]), np.nan, np.float32)
     batch[env] = poses[0]
     scene = SceneView(server)

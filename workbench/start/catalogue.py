@@ -30,7 +30,7 @@ MAX_TEXT_CHARACTERS = 300
 SEARCH_SECONDS = 1.0
 """Pause between two searches of the folder."""
 SEARCH_SHARE = 0.05
-"""Maximum share of the time spent on searches: a slow folder is searched less often."""
+"""Maximum share of the time that searches may take: a slow folder is searched less often."""
 SHOWN_SECONDS = 2.0
 """Time after a call of `Catalogue.view` for which the list counts as shown; a page calls it several times a second."""
 
@@ -48,7 +48,7 @@ class Section(Enum):
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of the list. Its texts are printable, not escaped."""
+    """A row of the list. Its texts contain no control characters, but are not escaped for HTML."""
 
     number: int
     """Number that a page sends to choose the row; never reused while the program runs. 0 if not assigned yet."""

@@ -48,7 +48,8 @@ MAX_PICTURE_BYTES = 64 * 1024
 _POLL_SECONDS = 0.5
 """Interval at which the job checks whether drawing may continue."""
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
-"""Pattern of an id. The cache is untrusted: without a dot, a slash and a colon an id cannot be a file or a module."""
+"""Pattern of an id. The cache is untrusted: an id without dots, slashes and colons cannot name a file or a
+module."""
 Value = TypeVar("Value")
 
 

@@ -12,7 +12,7 @@ from workbench.task.reference import check_task_file, file_and_class, find_modul
 
 _QUOTES = ('""', "''", "``", "“”", "‘’")
 _LINE = re.compile(r"(?<=\.py)(:\d+)+$")
-"""A line and a column, as in ``push.py:88``, which messages and editors append."""
+"""The line number, and sometimes column, that messages and editors append to a path: ``push.py:88``."""
 
 
 class NotAPath(ValueError):

@@ -21,10 +21,11 @@ _MAX_MESSAGE_BYTES = 1 << 12
 _STANDARD_FDS = (1, 2)
 """File descriptors of stdout and stderr."""
 _MAX_PRINTED_BYTES = 1 << 15
-"""Maximum output of the imports that is kept: it must fit into a pipe that is not read yet."""
+"""Maximum number of bytes that are kept of what the imports print: they must fit into a pipe that is not read
+yet."""
 _NUM_FDS = 6
-"""Number of file descriptors of a request: the socket on which the worker's exit is reported, the three of
-`start.run`, and the worker's stdout and stderr."""
+"""Number of file descriptors of a request: the socket on which the worker's exit is reported, the three
+descriptors that `start.run` takes, and the worker's stdout and stderr."""
 
 
 def main() -> None:

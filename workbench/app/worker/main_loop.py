@@ -96,9 +96,10 @@ class Worker:
     """The loop and its state. Only this process steps the env.
 
     It runs in a separate process because SAPIEN holds the GIL while it steps and renders, and because the author's code may
-    loop for ever or crash. A single loop does everything, so that nothing touches the env during a step: handle waiting
-    requests, step if one is due, draw watched cameras, sleep. It writes its activity into shared memory (`heartbeat`), and
-    the author's code can be interrupted (`Interrupts`).
+    loop for ever or crash. A single loop does everything, so that nothing else touches the env during a step.
+    In turn it handles the waiting requests, steps the env if a step is due, draws the watched cameras, and
+    sleeps. It writes its activity into shared memory (`heartbeat`), and the author's code can be interrupted
+    (`Interrupts`).
     """
 
     def __init__(self, connection: int, heartbeat: HeartbeatWriter) -> None:
@@ -184,7 +185,7 @@ class Worker:
     # --- questions ---------------------------------------------------------------------------------
 
     def _call(self, call: Call) -> None:
-        """Answer a call. It always sends an answer, or the server's thread would wait for ever."""
+        """Answer a call. It always sends an answer: otherwise, the server's thread would wait for ever."""
         answers: list[Answer] = []
         doing = _DOING.get(type(call.request))
         problem = self._task.run(doing, lambda: answers.append(self._answer(call)))
@@ -287,7 +288,8 @@ class Worker:
         with self._start_folder.again():
             self._task.requested_file = named_file(request.task)
         running = self._running
-        # A load starts in the initial working directory; if it fails, that of the previous version is restored.
+        # A load starts in the initial working directory; if it fails, the working directory of the previous
+        # version is restored.
         with self._start_folder.again(stay=True):
             opened, report = load_version(
                 request,
@@ -299,7 +301,7 @@ class Worker:
                 ),
             )
         self._task.when_loaded = read_process_state()
-        # No interrupt here: the page would show another task than the one that the worker runs.
+        # An interrupt here would leave the page with another task than the worker runs.
         with self._interrupts.shielded():
             self._replace_task(opened, report, request, send)
             self._send_rules()
@@ -366,7 +368,8 @@ class Worker:
             self._task.guarded(lambda opened: self._reset_envs(opened, request.env_idx, seeds))
 
     def _seeds(self, request: Reset) -> int | list[int] | None:
-        # Random actions restart with the seed, or a reset with that seed would not repeat an episode.
+        # Random actions restart with the seed: otherwise, a reset with this seed would not repeat the
+        # episode.
         if request.seed is not None:
             self._chooser.seed(request.seed)
         count = 0 if request.env_idx is None else len(request.env_idx)
@@ -398,7 +401,8 @@ class Worker:
     def _tell(self, request: SetSliderAction) -> None:
         def tell(opened: OpenedTask) -> None:
             task = opened.env
-            # The page may have sent this before it knew of a version with fewer envs, or of another robot.
+            # The page may have sent this before it knew of a new version, which may have fewer envs or
+            # another robot.
             if max(request.env_idx, default=0) < task.num_envs and max(request.dimensions, default=0) < width(
                 task.parts
             ):
@@ -419,8 +423,8 @@ class Worker:
             self._chooser.use(s.action_source, s.policy, folder)
         except TaskError as error:
             self._task.drop_steps_if_interrupted(error)
-            # Before a task is loaded, this failure would look like a failed load. The first step reports it
-            # then.
+            # Before a task is loaded, this failure would look like a failed load. In that case, the first
+            # step reports it.
             if self._task.opened is not None:
                 self._task.fail(error.problem)
             return False
@@ -470,7 +474,8 @@ class Worker:
         return self._followed.ready(opened, self._steps.number, envs)
 
     def _step_due(self, now: float) -> bool:
-        # Check the plan first: the next one is computed while the last one plays at its pace.
+        # Ask for the plan even if no step is due yet: so the next plan is computed while the last one is
+        # played.
         ready = not self._is_planned or self._plan_ready()
         return self._pacer.due(now) and ready
 
@@ -524,7 +529,8 @@ class Worker:
     def _reset_with_seeds(
         self, task: TaskEnv, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> StepResult:
-        """Reset these envs; recorded ones one by one, so that a seed gives the same start in any batch.
+        """Reset these envs. Envs that are recorded are reset one by one, so that a seed gives the same
+        initial state whatever the other envs are.
 
         Envs that are reset together share torch's generator: their random numbers depend on all of them, and
         on the first seed.

@@ -69,7 +69,8 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
             print(f"workbench: {text}", file=sys.stderr)
         code = 1
     signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)  # from here on the default action would end the process
-    # Without this the interpreter would wait for the task's threads, and the page for this process.
+    # Without this, the interpreter would wait for the task's threads, and the page would wait for this
+    # process.
     others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
     if code or not all(thread.daemon for thread in others):
         try:

@@ -22,12 +22,14 @@ _FILE_ONLY_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE
 _TCP_RIGHTS = 0b11
 """Rights to bind and to connect, from version 4 on."""
 _SCOPES = 0b11
-"""Scopes that forbid abstract sockets of, and signals to, other processes, from version 6 on."""
+"""Scopes, from version 6 on: they forbid connections to abstract sockets of other processes, and signals to
+these processes."""
 _PR_SET_NO_NEW_PRIVS = 38
 _SYSTEM_PATHS = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
            "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
 MAX_WRITTEN_BYTES = 1 << 20
-"""Maximum size of a written file; this limit also holds without Landlock."""
+"""Maximum size of a file that a process confined without `writes` writes; this limit also holds without
+Landlock."""
 MAX_OPEN_FILES = 512
 
 
@@ -43,8 +45,8 @@ def confine(reads: Iterable[Path], most_memory: int, writes: Iterable[Path] = ()
     """Restrict this process and its children: they can read only programs, libraries and files below `reads`.
 
     They can write only below `writes`, open no TCP connection, signal no outside process, and gain no rights
-    from programs that they start. A kernel without Landlock enforces only the last of these, and the limits
-    on memory, file size and open files.
+    from programs that they start. A kernel without Landlock enforces only that they gain no rights, and the
+    limits on memory, open files and (without `writes`) file size.
 
     Args:
         most_memory: maximum bytes that may be allocated.

@@ -120,8 +120,8 @@ def _stop_at_breakpoints(attached: Callable[[], bool], settrace: Callable[..., N
 
 
 def port_for_debugger(wanted: int | None) -> int:
-    """A free port of this machine: `wanted`. If `wanted` is None: `DEFAULT_PORT`, or any other port if that
-    one is taken.
+    """A free port of this machine: `wanted`; if `wanted` is None, `DEFAULT_PORT`, or any other port if
+    `DEFAULT_PORT` is taken.
 
     Raises:
         ValueError: debugpy is not installed, or `wanted` is taken or not a port.

@@ -68,7 +68,8 @@ def proportional_memory(pids: Iterable[int]) -> int:
 
 
 def main_thread_ended(pid: int) -> bool:
-    """Whether the main thread of the process has ended and others have not; also True for a moment during any exit."""
+    """Whether the main thread of the process has ended while other threads still run; also True for a moment
+    during any exit."""
     try:
         return _state_and_parent(pid)[0] == "Z" and len(os.listdir(f"/proc/{pid}/task")) > 1
     except OSError:
@@ -136,7 +137,8 @@ def begin_family(server: int) -> None:
         server: process id of the parent. The keeper ends its family when the parent is gone.
     """
     libc = ctypes.CDLL(None)
-    # Blocked until `_keep` waits for them: otherwise, SIGCHLD is lost, and SIGTERM ends the keeper before the worker.
+    # These signals are blocked until `_keep` waits for them: otherwise, SIGCHLD is lost, and SIGTERM ends the
+    # keeper before the worker.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     signal.signal(
         signal.SIGCHLD, signal.SIG_DFL

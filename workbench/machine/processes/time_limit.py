@@ -55,8 +55,8 @@ def limited(message: str) -> Iterator[None]:
     """Context for native work that may not return, such as waiting for a driver.
 
     Python's own threads and signal handlers do not run meanwhile, so another process watches: at the timeout
-    it prints `message` to stderr and kills this process. It takes 6 MB from the first use on; each use takes
-    20 us.
+    it prints `message` to stderr and kills this process. The other process starts at the first use and takes
+    6 MB; each use takes 20 us.
     """
     watcher = _watcher
     if watcher is None or watcher.within or watcher.pid != os.getpid():

@@ -26,7 +26,8 @@ _READ_BYTES, _COPIED_BYTES = 1 << 18, 1 << 14
 """Size of one read, larger than a socket's buffer; and size below which a message is copied to be sent in one call."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
-"""msgpack extensions: the next array, or a repeated one."""
+"""msgpack extensions: the next of the arrays behind the message; and an array that the message already
+contains, by its number."""
 _ARRAY_KINDS = "biufcSU"
 """Kinds of arrays that may be sent; arrays of objects may not."""
 _MAX_DESCRIPTION_BYTES = 500

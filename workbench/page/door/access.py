@@ -176,9 +176,9 @@ def decide(rules: AccessRules, asked: RequestParts) -> Decision:
     """Decide on one request or handshake. Never raises, for any client input.
 
     Checks, in this order. *Host*: is the name ours? A rebound name cannot fake this. *Origin*: does the requesting page
-    come from exactly this address? *Sec-Fetch-Site*: the same for requests without an Origin (an image or script tag in a
-    foreign page). *Token*: 256 random bits, first in the printed address, afterwards in a cookie that scripts cannot read
-    and that pages of other sites do not send.
+    come from exactly this address? *Sec-Fetch-Site*: does a request without an Origin (as of an image or
+    script tag) come from a foreign page? *Token*: 256 random bits, first in the printed address, afterwards
+    in a cookie that scripts cannot read and that pages of other sites do not send.
 
     Not prevented: cookies ignore ports, so another *server* that the author visits under the same host name gets our cookie
     too. No cookie attribute prevents that; on a shared machine use a Unix socket (`ServerOptions.socket`).

@@ -20,8 +20,8 @@ REMOTE_TRIP_SECONDS = 0.003
 MAX_QUEUE_SECONDS = 0.05
 """Longest time that a message may wait behind others in the connection."""
 ANSWER_TIMEOUT_SECONDS = 0.25
-"""Timeout for an answer, in addition to the shortest round trip. After this time the connection has become
-slower: no message is sent until the answer arrives."""
+"""Timeout for an answer, in addition to the shortest round trip. An answer that takes longer shows that the
+connection has become slower: no message is sent until it arrives."""
 SAMPLES = 20
 """Number of the last answers from which the connection's rate is computed."""
 
@@ -87,7 +87,7 @@ class PageConnection:
             return True
         if self._loop.time() - self._sent[0].at > self._trip + ANSWER_TIMEOUT_SECONDS:
             return False
-        # Allow one message beyond the limit, or two large messages would never be in transit at once.
+        # Allow one message beyond the limit: otherwise, two large messages would never be in transit at once.
         return self.unanswered <= max(self._rates, default=0.0) * (self._trip + MAX_QUEUE_SECONDS)
 
     def _on_answer(self, sent: _Sent, pong: asyncio.Future[float]) -> None:

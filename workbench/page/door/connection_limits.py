@@ -26,7 +26,8 @@ log = logging.getLogger("workbench.door")
 TOKEN_TIMEOUT_SECONDS = 10.0
 """Timeout for a connection to present the token."""
 MAX_WITHOUT_TOKEN = 64
-"""Maximum number of simultaneous connections without a token. A browser has about ten to one host."""
+"""Maximum number of simultaneous connections without a token. A browser opens about ten connections to one
+host."""
 MAX_HEAD_BYTES = 64 * 1024
 """Maximum size of a request's head. The head carries cookies of other programs on the same host name, up to 4 kB each."""
 READ_BYTES = 16 * 1024
@@ -46,10 +47,9 @@ class ConnectionLimits:
 
     A connection costs a task and buffers before its client has presented the token, so until then its
     duration and the size of its head are limited, and so is the number of such connections. If there are too
-    many, the oldest is closed, not the
-    newest: a browser sends its request with the first packet, and idle sockets of an attacker must not lock
-        the browser out.
-    (Chromium holds some idle sockets itself, and opens new ones when they are closed.)
+    many, the oldest is closed, not the newest: a browser sends its request with the first packet, and idle
+    sockets of an attacker must not lock the browser out. (Chromium holds some idle sockets itself, and opens
+    new ones when they are closed.)
     """
 
     def __init__(self, told: RateLimitedLog) -> None:
@@ -164,9 +164,9 @@ async def close_when_stalled(
     queued for it is bounded, but pictures are rendered for it as for any open page, and viser stores every
     removal until each client has read it. The ping of `websockets` would wait behind the unsent bytes.
 
-    The client is stalled if bytes are queued and no check finds fewer bytes than the previous check; new
-    bytes written meanwhile do not matter. A slow client reads some bytes from time to time. A page that wakes
-    up reconnects and gets the present state.
+    The client counts as stalled if bytes are queued and, for `READ_TIMEOUT_SECONDS`, no check finds fewer
+    bytes than the check before it. Bytes that are written meanwhile do not restart this time. A slow client
+    reads some bytes from time to time. A page that wakes up reconnects and gets the present state.
 
     Args:
         unanswered: Returns the bytes that the page has not acknowledged, see `PageConnection.unanswered`.

@@ -159,7 +159,7 @@ class Downloads:
         add_route(PREFIX, self._answer, _POLICY)
 
     def address(self, path: Path, kind: str = "application/octet-stream", download: bool = False) -> str:
-        """The address of a file, from the root of the server; the same for the same file.
+        """The address of a file, from the root of the server. Equal arguments give the same address.
 
         Args:
             kind: Content type of the file.

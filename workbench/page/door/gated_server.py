@@ -99,7 +99,8 @@ class GatedServer:
     ssh_hint: str
     """Command to type on the user's own machine to reach the page over ssh."""
     warning: str | None
-    """Warning for the terminal about a binding wider than loopback or an unknown viser version; None without either."""
+    """Warning for the terminal about a binding wider than loopback or an unknown viser version; None if there
+    is neither."""
     notice: str | None
     """Notice for the terminal that the page is not on its default port; None if it is."""
     _listening: Listening = field(repr=False)
@@ -223,8 +224,8 @@ class _AccessCheck:
 def open_server(options: ServerOptions = ServerOptions(), label: str | None = None) -> GatedServer:
     """Serve viser's page behind the checks of `access`.
 
-    It binds the socket itself, so that the printed address is the bound one. Before it returns, it tests the server with a
-    request that must be refused.
+    This function binds the socket itself, so that the printed address is the bound one. Before it returns, it
+    tests the server with a request that must be refused.
 
     Args:
         options: address and access.

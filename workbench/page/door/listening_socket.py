@@ -214,8 +214,9 @@ def _make_room(place: Path) -> None:
 
 
 def _reach(host: str) -> str:
-    """``host`` for a URL: IPv6 in brackets; for "every interface", the address of the interface with the
-    default route, found by connecting a datagram socket, which sends nothing."""
+    """``host`` as in a URL: an IPv6 address is in brackets. If ``host`` means every interface, returns the
+    address of the interface with the default route, found by connecting a datagram socket, which sends
+    nothing."""
     address = ipaddress.ip_address(host.partition("%")[0])
     if not address.is_unspecified:
         return _in_address(address)

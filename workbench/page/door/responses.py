@@ -90,8 +90,8 @@ async def admitted_reply(
     authority: str,
     told: RateLimitedLog,
 ) -> Response:
-    """The reply to an admitted request: that of the route with the longest matching prefix, else that of
-    viser.
+    """The reply to an admitted request, from the route with the longest matching prefix; from viser if no
+    route matches.
 
     Args:
         authority: the checked Host header, see `access.Admitted`.

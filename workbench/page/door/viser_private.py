@@ -52,7 +52,8 @@ AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 PAGES = {
     "1.1.1": ("5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw=", "o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE="),
 }
-"""sha256 of the two scripts of viser's page, by viser's version: the one in the page, and the one that it decompresses.
+"""sha256 of the two scripts of viser's page, by viser's version: first the script in the page, then the
+script that the first one decompresses.
 
 A browser that allows only these scripts runs no other one that slipped past escaping
 (`responses.page_policy`). To find the second hash of a new version, allow only the first: the browser prints
@@ -64,7 +65,7 @@ REFUSED_FROM_CLIENTS = (
     "ShareUrlDisconnect",
     "FileTransferStartUpload",  # no size limit, file name used as sent; we accept no uploads
     "FileTransferPart",
-    "SceneNodeClickMessage",  # none of our nodes handles clicks or drags, no button is held
+    "SceneNodeClickMessage",  # our nodes handle no clicks or drags, our buttons no holding
     "SceneNodeDragMessage",
     "GuiButtonHoldMessage",
 )
@@ -121,8 +122,8 @@ def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
 
 
 def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
-    """Labels (tab, fold) of each tab in a page's tab groups and of each fold, in order of creation; the fold
-    of a tab is empty, and so is the tab of a fold outside tabs."""
+    """Yield (tab, fold), in order of creation: for each tab in a tab group its label and an empty text; for
+    each fold the label of the tab around it (empty outside tabs) and its own label."""
     containers = server.gui._container_handle_from_uuid
     for handle in list(containers.values()):
         if isinstance(handle, viser.GuiTabHandle):
@@ -361,10 +362,10 @@ def make_viser(
 
     viser serves page and websocket from one ``websockets`` server that it starts in ``viser/infra/_infra.py``, without a
     way to check a request first, choose the socket, refuse a message or suppress output. So while the server is made, the
-    name ``websockets`` in that module is a stand-in whose ``serve`` is ours. It passes viser's arguments on with four
-    changes: the socket, ``process_request``, compression, and the handler, which checks every message first, sends as fast
-    as the page acknowledges and closes stalled clients. `missing_names` is checked before, and `gated_server` tests the
-    result with a forbidden request.
+    name ``websockets`` in that module is a stand-in whose ``serve`` is ours. It passes viser's arguments on,
+    but changes among others the socket, ``process_request``, compression, and the handler, which checks every
+    message first, sends as fast as the page acknowledges and closes stalled clients. `missing_names` is
+    checked before, and `gated_server` tests the result with a forbidden request.
 
     Args:
         listening: bound and listening; the server owns it from here on.

@@ -22,8 +22,8 @@ from workbench.page.widgets.parts import Clock
 NAMES = ("/envs", "/floor")
 """Roots of the nodes in viser's tree."""
 REMOVAL_DELAY_SECONDS = 0.7
-"""Time for which old shapes stay when finer or coarser ones replace them. Without it the view would be empty
-until the page has read the new shapes."""
+"""Time for which old shapes stay when finer or coarser ones replace them. Without this delay the view would
+be empty until the page has read the new shapes."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ class SceneView:
         only_env: int | None = None,
         looks: DrawStyle = DrawStyle(),
     ) -> None:
-        """Show this scene instead of the previous one; groups that look the same stay and are not sent again.
+        """Show this scene instead of the previous one; groups that look the same as before stay, and are not
+        sent again.
 
         Args:
             geometry: Geometry of the scene.
@@ -183,7 +184,7 @@ class _DrawnGroup:
         if drawn_as.lighter:
             parts = [(mesh, lightened(material)) for mesh, material in parts]
         glb = as_glb(parts)
-        # One instance far below the ground; the first move follows in the same batch.
+        # Begin with one instance far below the ground; the first call of `draw` follows in the same batch.
         self.handle = server.scene.add_batched_glb(
             f"/envs/{number:03d} {group.name.replace('/', ' ')}",
             glb,

@@ -73,7 +73,8 @@ def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDA
 def place_of_plane(normal: NDArray, visual: Visual, poses: NDArray, layout: EnvLayout) -> NDArray[np.float32]:
     """(3,) offset of a plane drawn once for the whole grid.
 
-    A floor lies under the middle; a wall is moved behind the last env on its side, or it would cut through the envs.
+    A floor lies under the middle; a wall is moved behind the last env on its side, so that it does not cut
+    through the envs.
     """
     normal = np.asarray(normal, np.float64)
     if abs(normal[2]) > MIN_FLOOR_UP:

@@ -15,7 +15,8 @@ AXIS_METRES, RADIUS_METRES = 0.1, 0.003
 
 
 class BodyFrames:
-    """Axes at the origin of one env, at its bodies that are no links and not fixed, and at the selected body."""
+    """Axes at the origin of one env, at its visible bodies except links and fixed bodies, and at the selected
+    body."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         add = partial(

@@ -25,13 +25,13 @@ TOLERANCE_PIXELS = 0.75
 MIN_TRIANGLES = 25_000
 """Number of triangles in the view below which shapes are not simplified: then pixels, not triangles, take the time."""
 TOLERANCE_FACTOR = 1.6
-"""Minimum ratio of the wanted tolerance to the present one, or the reverse, at which the tolerance changes:
-each change sends new meshes to the pages."""
+"""Minimum factor by which the wanted tolerance must be larger or smaller than the present one before the
+tolerance changes: each change sends new meshes to the pages."""
 AT_REST_SECONDS = 0.4
 """Time without motion of any page's camera after which the view counts as still."""
 REPORT_TIMEOUT_SECONDS = 3.0
-"""Timeout for a page to report that it renders in software. Until then the shapes do not change: a reloaded
-page would first be sent fine shapes and then simple ones."""
+"""Timeout for a page to report that it renders in software. Until the report or the timeout, the shapes do
+not change: otherwise, a reloaded page would first be sent fine shapes and then simple ones."""
 Scene = tuple[SceneGeometry, EnvLayout, bool]
 """A drawn scene, the grid of its envs, and whether a single env is shown."""
 

@@ -110,8 +110,8 @@ class Framing:
     """Points the open pages at the scene until the user has moved the view.
 
     A page's panels take their places some time after the page has connected (later on a busy machine), and
-    the user opens more panels. Each changes the shape of the view: while the view is untouched, the scene is
-    framed for the new shape.
+    the user opens more panels. Each of these events changes the shape of the view: while the view is
+    untouched, the scene is framed for the new shape.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -183,9 +183,11 @@ class Framing:
                 self._point(client, frame)
 
     def _is_untouched(self, client: viser.ClientHandle) -> bool:
-        """Whether the page is at the viewpoint that was last sent to it, or at the initial one of every new page.
+        """Whether the page is at the viewpoint that was last sent to it, or at the initial viewpoint, with
+        which every new page begins.
 
-        The initial viewpoint counts too, since it may reach a new page after the one that was sent.
+        The initial viewpoint counts too, since it may reach a new page after the viewpoint that was sent to
+        this page.
         """
         position, _ = self._pointed.get(client.client_id, (None, None))
         begins = self._server.initial_camera.position
@@ -214,8 +216,8 @@ def aspect_of(client: viser.ClientHandle) -> float:
 def light(server: viser.ViserServer) -> None:
     """Add the lights to the scene; once per server.
 
-    viser's own lights overexpose white plastic and textures; an environment map or shadows would cost a browser without a
-    graphics card time for each pixel.
+    viser's own lights overexpose white plastic and textures; a browser without a graphics card would need
+    time for each pixel of an environment map or of shadows.
     """
     server.scene.configure_default_lights(enabled=False, cast_shadow=False)
     server.scene.configure_environment_map(None)
@@ -266,7 +268,7 @@ class ViewChoice:
     """What the user chose to see. It outlives a page, which is rebuilt with each change between review and live page."""
 
     all_envs: set[str] = field(default_factory=set)
-    """The tasks of which all envs are shown; of the others only the selected one."""
+    """The tasks of which all envs are shown. Of any other task, only the selected env is shown."""
     frustums: bool = True
     """Whether the cameras are drawn in the view."""
     frames: bool = False

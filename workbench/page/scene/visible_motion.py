@@ -39,7 +39,8 @@ def eyes_of(server: viser.ViserServer) -> tuple[Eye, ...]:
 def pixel_sizes(
     eyes: tuple[Eye, ...], positions: NDArray[np.float32], reach: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(R,) size of a pixel in metres at the nearest point of each body, for the page that sees it largest; 0 without an eye.
+    """(R,) size of a pixel in metres at the nearest point of each body, for the page in which the body is
+    largest; 0 if there are no eyes.
 
     Args:
         eyes: Eye points of the pages.
@@ -67,9 +68,10 @@ def displacements(
 class SentPoses:
     """The poses of bodies that were last sent to the pages.
 
-    A pose is sent again only when it is more than a pixel off, and is rounded to a fraction of a pixel. viser
-    sends a whole batch when one pose of it changes; as most values then equal previous ones, compression
-    makes the message small (`door.client_connection`). Bodies at rest are sent exactly.
+    A pose is sent again only when the last sent pose is more than a pixel off, and it is rounded to a
+    fraction of a pixel. viser sends a whole batch when one pose of it changes; as most values then equal
+    previous ones, compression makes the message small (`door.client_connection`). Bodies at rest are sent
+    exactly.
 
     Args:
         reach: (R,) radius of each body around its frame, metres.

@@ -208,7 +208,7 @@ def _encoded(options: Mapping[str, Plain]) -> list[tuple[str, str]]:
 
 
 def _number(kind: type[Command], field: str, entered: type) -> tuple[float | None, float | None, bool] | None:
-    """Minimum, maximum and whether the number is an integer; None for a text.
+    """(minimum, maximum, whether the number is an integer); None for a text.
 
     Args:
         entered: type of this input, for a field with several types.

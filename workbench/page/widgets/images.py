@@ -144,8 +144,8 @@ _NORMAL = "red, green, blue: right, up, towards the camera"
 
 
 def depth_span(before: DepthRange | None, picture: Picture) -> DepthRange | None:
-    """The depth range of the colour scale: `before`, widened to contain this picture. The range never narrows, or a body
-    at rest would change its colour."""
+    """The depth range of the colour scale: `before`, widened to contain this picture. The range never
+    narrows, so that a body at rest keeps its colour."""
     span = None if picture.depth is None else depth_range(picture.depth)
     return before if span is None else span if before is None else before.widened(span)
 

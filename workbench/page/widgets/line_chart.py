@@ -41,7 +41,8 @@ class LineChart:
 
     Args:
         height: Height of the plot in pixels.
-        press: Returns the command of a press on a step, or of a drag along the steps; None for no presses.
+        press: Returns the command for a step that the user presses, or drags to; with None, the chart ignores
+            presses.
         order: Position in the container; by default after the present content.
     """
 
