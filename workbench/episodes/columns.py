@@ -95,11 +95,12 @@ def layout_type(text: str) -> np.dtype:
 
 
 def assemble(runs: Sequence[NDArray]) -> dict[str, NDArray]:
-    """Columns (sum of n, ...) of `runs`, each a structured array (n,); in the order in which names first appear.
+    """Join `runs`, each a structured array (n,), to columns (sum of n, ...), in the order in which their
+    names first appear.
 
-    Entries of ``evaluate()`` come, go and change their type while the author edits; each change is a new layout. A
-    column that every row has in one shape keeps its type. Any other column is floating point, NaN where a row lacks
-    it; rows of differing shape are flattened and padded with NaN.
+    Entries of ``evaluate()`` come, go and change their type while the author edits; each change is a new
+    layout. A column that every row has, always in the same shape, keeps its type. Any other column is
+    floating point, NaN where a row lacks it; rows of differing shape are flattened and padded with NaN.
     """
     names = dict.fromkeys(name for run in runs for name in run.dtype.names or ())
     return {
@@ -109,7 +110,8 @@ def assemble(runs: Sequence[NDArray]) -> dict[str, NDArray]:
 
 
 def _column(parts: Sequence[NDArray | int]) -> NDArray:
-    """One column from its parts: rows, or the number of rows that lack it."""
+    """One column from its parts. Each part is an array of rows, or the number of rows that lack the
+    column."""
     there = [part for part in parts if isinstance(part, np.ndarray)]
     shapes = {part.shape[1:] for part in there}
     if len(there) == len(parts) and len(shapes) == 1:
@@ -158,8 +160,8 @@ class TextEntry(Struct, frozen=True, array_like=True):
 
 
 TextTrack = tuple[tuple[int, TextEntry | None], ...]
-"""First state and value of each change. The value is None if ``evaluate()`` then returned no such entry, or
-numbers."""
+"""(first state, value) of each change. The value is None if ``evaluate()`` returned no such entry from that
+state on, or returned numbers for it."""
 
 
 class TextWriter:

@@ -1,4 +1,5 @@
-"""The ``.json`` of a recording: ManiSkill's fields, ours under the key ``workbench``; checksums, tags and notes."""
+"""The ``.json`` of a recording: ManiSkill's fields, and the workbench's own under the key ``workbench``. Also
+checksums, tags and notes."""
 
 from __future__ import annotations
 
@@ -46,11 +47,11 @@ from workbench.machine.files import (
 FORMAT = 2
 """Version of the format; from 2 on, the ``.json`` ends with a checksum of itself (`with_checksum`)."""
 MAX_BYTES = 64 << 20
-"""Maximum size of a ``.json``; ManiSkill's for 100,000 episodes has 40 MB."""
+"""Maximum size of a ``.json``; a ``.json`` of ManiSkill with 100,000 episodes has 40 MB."""
 _BLOCK_BYTES = 1 << 20
 _ESCAPED_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 MAX_PATH_PARTS = 40
-"""Maximum number of parts of a recorded path; a longer one, from an untrusted file, is not searched for."""
+"""Maximum number of parts of a recorded path. The path is untrusted, and a longer one is not searched for."""
 
 T = TypeVar("T")
 Vector = tuple[float, float, float]
@@ -152,7 +153,8 @@ class Description(Struct, frozen=True, kw_only=True):
     source: Annotated[dict[PathText, str], Entries] | None
     """Text by path relative to the task's folder. None in the ``.rrd``, which holds the texts separately."""
     side_files: Annotated[dict[PathText, Name], Entries] = {}
-    """Hash by path (relative to the task's folder) of other files that the task reads; they are not included."""
+    """Hash by path (relative to the task's folder) of other files that the task reads. The recording does not
+    hold these files."""
     acted_by: ActedBy = ()
     pictures: PictureDegree = "exact"
     moved_cameras: tuple[MovedCamera, ...] = ()
@@ -181,14 +183,14 @@ class Description(Struct, frozen=True, kw_only=True):
     source_path: PathText | None | UnsetType = UNSET
     """Path of the task's file relative to the recording's folder."""
     thumbnail: str | None | UnsetType = UNSET
-    """Base64 of a JPEG; None without cameras."""
+    """Base64 of a JPEG; None if there are no colour pictures."""
     made_here: SealJson | None | UnsetType = UNSET
     """None if no seal could be made."""
     tags: list[str] | UnsetType = UNSET
     note: str | UnsetType = UNSET
 
     def info(self, folder: Path | None = None) -> EpisodeInfo:
-        """The episode's info. Searches the task's file only if the recording's `folder` is given."""
+        """The episode's info. Searches for the task's file only if the recording's `folder` is given."""
         found = None if folder is None else task_file(self.source_path or None, self.task, folder)
         made = self.made_here or None
         files = as_json(self.files or {})
@@ -217,7 +219,8 @@ class ResetJson(Struct, frozen=True):
 
 
 class EpisodeJson(Struct, frozen=True):
-    """An episode as ManiSkill records it; batched envs write a list of one instead of a number."""
+    """An episode as ManiSkill records it; batched envs write a list with one item instead of a single
+    value."""
 
     episode_id: SmallInt
     episode_seed: SmallInt | list[SmallInt] | None = None
@@ -283,7 +286,8 @@ def read_document(path: Path) -> Document:
 
     Raises:
         OSError: it cannot be read.
-        WrongDocument: as `read_json` does, or it was changed since the workbench wrote it.
+        WrongDocument: for the reasons of `read_json`, or because the file was changed after the workbench
+            wrote it.
     """
     content = _read_content(path, MAX_BYTES)
     data = parse_json(content)
@@ -343,14 +347,14 @@ def json_text(value: object, indent: int | None = None) -> str:
 
 
 def seen_otherwise(info: EpisodeInfo) -> dict[str, Any]:
-    """Fields for the metadata of an export, if pictures or observations are not those of the episode's
-    source; else empty."""
+    """Fields for the metadata of an export that say how pictures or observations differ from those of the
+    episode's source; empty if they do not."""
     fields = {"moved_cameras": as_json(info.moved_cameras), "observed_by": info.observed_by}
     return {name: value for name, value in fields.items() if value}
 
 
 def as_json(value: object) -> Any:
-    """`value` as JSON reads it back."""
+    """`value` after writing it as JSON and reading it back."""
     return json.loads(json_text(value))
 
 
@@ -394,8 +398,9 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     """The task's file at `source_path` relative to the recording's `folder`; None if it is not found.
 
     In a copied recording the path is wrong, but the copy is usually opened from the task's folder. So each
-    end of the path is also tried below the current folder, the recording's folder and the folders above it. A
-    file that is found there must contain the task's name.
+    end of the path (of ``a/b/c.py`` also ``b/c.py`` and ``c.py``) is also tried below the current folder,
+    below the recording's folder, and below the folders above the recording's. A file that is found in this
+    way must contain the task's name.
     """
     if not source_path:
         return None
@@ -418,11 +423,11 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
 
 # --- checksums --------------------------------------------------------------------------------------
 #
-# Neither format detects a changed byte: HDF5 has checksums for chunks only, and most columns of an episode
-# are too small to be chunked; rerun has none. Rescoring a changed file would be silently wrong. So the
-# `.json` has the size and hash of the other two files. They are hashed while they are still in the page
-# cache, in a hundredth of the time of writing (measured). The `.json` itself ends with a hash of everything
-# before it.
+# Neither the .h5 nor the .rrd detects a changed byte: HDF5 has checksums for chunks only, and most columns of
+# an episode are too small to be chunked; rerun has no checksums. Rescoring a changed file would be silently
+# wrong. So the `.json` has the size and hash of the other two files. They are hashed while they are still in
+# the page cache, which takes a hundredth of the time of writing them (measured). The `.json` itself ends with
+# a hash of everything before it.
 #
 # Checksums detect damage, not forgery. After you changed an `.rrd` or `.h5` (`rerun rrd optimize`), remove
 # its entry from `workbench.files` in the `.json`; after you changed the `.json`, set its hash to null.
@@ -475,7 +480,7 @@ def check(path: Path, checksums: Mapping[str, Checksum]) -> None:
 
 
 def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str | None:
-    """Problem with a file of `size` bytes; None if it has the recorded size."""
+    """Problem with a file of `size` bytes; None if this is the recorded size, or none was recorded."""
     if suffix not in checksums or checksums[suffix].size == size:
         return None
     return f"it has {size} bytes, and had {checksums[suffix].size} when it was written"
@@ -496,7 +501,8 @@ _NOTES = "workbench_notes"
 
 
 def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
-    """Tags and note by trajectory ("" in a file without trajectories) of a ``.notes``; empty if it cannot be read."""
+    """The tags and the note of each trajectory in a ``.notes``, by trajectory ("" in a file without
+    trajectories); empty if the file cannot be read."""
     try:
         return _notes(path)
     except (OSError, ValueError):

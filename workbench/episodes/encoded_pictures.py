@@ -100,7 +100,8 @@ def decode(modality: Modality, blob: bytes) -> NDArray:
 
 @contextlib.contextmanager
 def open_picture(blob: bytes) -> Iterator[Image.Image]:
-    """Open a JPEG, PNG or WebP of at most `MAX_PIXELS`. Raises OSError if it is invalid, also while the block decodes it."""
+    """Open a JPEG, PNG or WebP of at most `MAX_PIXELS`. Raises OSError if it is invalid, even if this shows
+    only while the block decodes it."""
     try:
         with Image.open(io.BytesIO(blob), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > MAX_PIXELS:
@@ -139,7 +140,7 @@ def encode_depth_png(depth: NDArray[np.float32]) -> bytes:
 
 
 def encode_segmentation_png(ids: NDArray[np.int32]) -> bytes:
-    """(H, W) ids as 16-bit PNG, or as the four bytes of RGBA if one of them is negative or beyond 65535."""
+    """(H, W) ids as 16-bit PNG, or as the four bytes of RGBA if an id is negative or beyond 65535."""
     if ids.min() >= 0 and ids.max() <= 0xFFFF:
         return encode_png16(ids.astype(np.uint16))
     buffer = io.BytesIO()
@@ -152,8 +153,9 @@ def encode_png16(pixels: NDArray[np.uint16]) -> bytes:
     """(H, W), both above 0, as greyscale PNG of 16 bits.
 
     Libraries try five filters per line, byte by byte: 0.2 to 0.5 ms for 128 x 128, more than everything else that
-    recording a step costs, and a step has two such pictures per camera. Here every line is the difference from the line
-    above, in one numpy call: a fifth of the time, smaller files, and zlib releases the GIL.
+    recording a step costs, and a step has two such pictures per camera. Here every line is stored as the
+    difference from the line above, which one numpy call computes. This takes a fifth of the time and makes
+    smaller files, and zlib releases the GIL.
 
     PNG specification (third edition): signature, IHDR, one IDAT, IEND, each chunk with its length and CRC-32
     (section 5); filter type 2, "up", before each line (section 9); numbers big-endian (7.1).

@@ -29,7 +29,7 @@ Seconds = Annotated[float, Meta(ge=1e-4, le=1e3)]
 MAX_ENTRIES = 10_000
 """Maximum length of every list in a recording: entries of ``evaluate()``, files, actions."""
 MAX_BODIES = 20_000
-"""Maximum number of bodies of a scene; a reader takes some seconds for so many."""
+"""Maximum number of bodies of a scene; a reader needs some seconds to read that many."""
 MAX_DEPTH = 32
 """Maximum nesting of keyword arguments and options."""
 Entries = Meta(max_length=MAX_ENTRIES)
@@ -105,9 +105,10 @@ class EpisodeInfo:
     pictures: PictureDegree = "exact"
     """Quality of the camera pictures; exact if the recording does not name one."""
     moved_cameras: tuple[MovedCamera, ...] = ()
-    """Cameras that were not where `source` places them, in order."""
+    """Cameras that were not where `source` places them, in order of time."""
     observed_by: Name = ""
-    """`source_hash` of the version that made the observations and pictures, if it is later than `source`."""
+    """`source_hash` of the version that made the observations and pictures, if that version is later than the
+    one in `source`."""
     seal: Seal | None = field(default=None, compare=False)
     """Set when read from a recording."""
 
@@ -176,7 +177,8 @@ class Episode:
     """T actions and T + 1 states of one env. State 0 is the reset; action t leads to state t + 1.
 
     Stored as whole columns, since every format and every reader uses them; rerun writes columns forty times faster than
-    with one call per step (measured). Only pictures are not plain arrays: an hour of four cameras does not fit into memory.
+    with one call per step (measured). Only pictures are not plain arrays: an hour of pictures from four
+    cameras does not fit into memory.
     """
 
     info: EpisodeInfo
@@ -201,7 +203,8 @@ class Episode:
     env_states: dict[str, NDArray] = field(default_factory=dict)
     """``actors/cube``, ``articulations/panda``, each (T + 1, D) as ManiSkill's ``get_state_dict`` lays it out."""
     obs: dict[str, NDArray] = field(default_factory=dict)
-    """State observations without pictures, (T + 1, ...) each; nested keys joined by ``/``, ``""`` if not a dict."""
+    """State observations without pictures, (T + 1, ...) each; nested keys are joined by ``/``; an observation
+    that is no dict has the key ``""``."""
     batch: dict[str, NDArray] = field(default_factory=dict)
     """(T + 1, ...) numbers that ``evaluate()`` returned for the whole batch."""
     texts: dict[str, TextTrack] = field(default_factory=dict)
@@ -235,7 +238,8 @@ class Episode:
 
     @property
     def means(self) -> dict[str, float]:
-        """Mean of each entry of ``evaluate()`` with one number per state, over the states after the reset that have it."""
+        """Mean of each entry of ``evaluate()`` with one number per state, except ``success`` and ``fail``,
+        over the states after the reset that have the entry."""
         found: dict[str, float] = {}
         for name, values in self.evaluate.items():
             if values.ndim == 1 and name not in ("success", "fail"):
@@ -267,7 +271,7 @@ def read_whole(name: str, read: Callable[[], Episode]) -> Episode:
         name: name of the recording, for messages.
 
     Raises:
-        UnreadableRecording: it cannot be read, or not all of it; the message names the recording.
+        UnreadableRecording: it cannot be read completely; the message names the recording.
     """
     try:
         episode = read()

@@ -10,7 +10,8 @@ SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
 
 
 def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:
-    """Absolute difference; infinite where one is NaN, zero where both are NaN or the same infinity."""
+    """Absolute difference; infinite where only one number is NaN, zero where both are NaN or the same
+    infinity."""
     a, b = np.asarray(old, np.float64), np.asarray(new, np.float64)
     with np.errstate(invalid="ignore"):
         apart = np.abs(b - a)
@@ -32,8 +33,8 @@ def numbers_differ(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> ND
 def too_far(
     old: NDArray, apart: NDArray, least: float = SAME_NUMBER, axis: int | None = None
 ) -> NDArray[np.bool_]:
-    """True where `apart` is too large, relative to the largest magnitude in `old`, or in each of its rows if
-    `axis` is 1."""
+    """True where `apart` is larger than `least` and than `SAME_SHARE` of the largest magnitude in `old` (if
+    `axis` is 1: in the same row of `old`)."""
     if not apart.any():
         return apart > 0
     scale = np.abs(old).max(axis=axis, initial=0.0, where=np.isfinite(old), keepdims=True)

@@ -27,7 +27,7 @@ from workbench.machine.files import new_file, open_regular_file
 from workbench.pictures.camera_conventions import quaternion_from_axes, quaternion_of, triple, upright
 
 MAX_FRAMES = 100_000
-"""Maximum number of frames of one part."""
+"""Maximum number of frames of a part of a film."""
 MAX_BYTES = 1 << 29
 """Maximum size of all encoded frames of one part."""
 FFMPEG_TIMEOUT_SECONDS = 60.0
@@ -36,14 +36,15 @@ FFMPEG_TIMEOUT_SECONDS = 60.0
 
 @dataclass(frozen=True)
 class Encoding:
-    """Settings of an mp4; the default is for watching."""
+    """Settings of an mp4; the defaults are for films that people watch."""
 
     crf: int = 18
     """H.264's quality, lower is better; 18 is visually almost lossless."""
     key_every: int | None = None
     """Interval of key frames, in frames; None for the encoder's default. A long interval makes seeking slow."""
     exact_size: bool = False
-    """Keep an odd width or height, in a pixel format that some players do not support; else pad by a pixel."""
+    """If True, keep an odd width or height, which needs a pixel format that some players do not support. If
+    False, pad it by a pixel."""
 
 
 def write_mp4(
@@ -62,7 +63,7 @@ def write_mp4(
         comment: comment in the file's metadata.
 
     Raises:
-        ValueError: there is no frame, or one has a different size.
+        ValueError: there is no frame, or the frames differ in size.
         OSError: the file cannot be written.
     """
     coming = iter(frames)
@@ -79,10 +80,11 @@ def write_mp4(
 class FilmWriter:
     """Writes frames to an mp4 (H.264) with an ffmpeg process; raises as `write_mp4` does.
 
-    ffmpeg comes with imageio-ffmpeg, a dependency of ManiSkill. As a process it encodes on another core, and its error
-    messages can be read. Frames go through a pipe, so memory use does not grow with the film.
+    ffmpeg comes with imageio-ffmpeg, a dependency of ManiSkill. A separate process encodes on another core,
+    and its error messages can be read. Frames go through a pipe, so memory use does not grow with the film.
 
-    As a context manager it closes at the end of the block, and kills ffmpeg if the block raised.
+    As a context manager, the writer finishes the file at the end of the block, or kills ffmpeg if the block
+    raised.
     """
 
     def __init__(
@@ -214,9 +216,9 @@ class FilmPart:
 def film_frames(film: Path, begin: float, count: int) -> Iterator[NDArray[np.uint8]]:
     """At most `count` frames (H, W, 3) from `begin` seconds on.
 
-    An untrusted ``.mp4`` may be a playlist that names other files and addresses, or claim pictures of any size. So
-    ffmpeg gets a fixed format, may open files only, and has limits on pixels, frames and time. It outputs PPM, which
-    contains the size of each frame.
+    An untrusted ``.mp4`` may be a playlist that names other files and addresses, or claim pictures of any
+    size. So ffmpeg gets a fixed format, may open files but no addresses, and has limits on pixels, frames and
+    time. It outputs PPM, which contains the size of each frame.
 
     Raises:
         OSError: the film cannot be read as MP4, or ffmpeg takes too long.
@@ -276,7 +278,8 @@ def _failure(stderr: BinaryIO, status: int) -> str:
 # --- pictures of an episode's cameras ---------------------------------------------------------------
 
 MIN_SIDE_PIXELS = 256
-"""Minimum side of a film: players blur 128 pixels, a usual size for policies, so pixels are repeated."""
+"""Minimum length of a film's shorter side. Players blur pictures of 128 pixels, a usual size for policies, so
+each pixel of a small picture is repeated."""
 COLUMNS = 8
 CELL_PIXELS = 176
 """Longer side of a picture on the sheet."""
@@ -286,7 +289,7 @@ GOOD, BAD = (43, 138, 62), (201, 42, 42)
 
 
 def cameras_by_name(episode: Episode) -> dict[str, CameraTrack]:
-    """Cameras with colour pictures by `camera_names`, sensors first."""
+    """The cameras with colour pictures by their unique names (`camera_names`), sensors first."""
     seen = [camera for camera in episode.cameras if camera.rgb is not None and len(camera.rgb)]
     seen.sort(key=lambda camera: camera.info.kind != "sensor")
     return dict(zip(camera_names([camera.info for camera in seen]), seen))
@@ -311,7 +314,7 @@ def picture_index(camera: CameraTrack, state: int) -> int:
 
 
 def frames(episode: Episode, camera: CameraTrack) -> Iterator[NDArray[np.uint8]]:
-    """One picture (H, W, 3) per state; a state without one repeats the previous picture."""
+    """One picture (H, W, 3) per state; a state without a picture repeats the previous one."""
     assert camera.rgb is not None, "`cameras_by_name` returns only cameras with colour pictures"
     last, picture = -1, None
     for state in range(episode.length + 1):
@@ -381,7 +384,8 @@ def contact_sheet(episode: Episode, columns: int = COLUMNS) -> Image.Image:
 
 
 def chosen_states(episode: Episode, columns: int) -> list[int]:
-    """At most `columns` evenly spaced states; the first success and the first fail replace their nearest neighbour."""
+    """At most `columns` evenly spaced states. The state of the first success replaces the nearest of them,
+    except the first and the last; so does the state of the first fail."""
     states = sorted(set(np.linspace(0, episode.length, columns).round().astype(int).tolist()))
     for name in ("success", "fail"):
         moment = _first(episode, name)

@@ -1,4 +1,5 @@
-"""Task, options, source and run of a recorded episode, and the changes of its source since."""
+"""Task, options, source and run of a recorded episode, and what has changed in its source since the
+recording."""
 
 from __future__ import annotations
 
@@ -72,7 +73,8 @@ def changed_since(
     """Names of the symbols that differ, such as ``CUBE_HALF_SIZE, evaluate``; empty if none differs or a text
     is missing.
 
-    Compares symbol by symbol, as a save does: comparing lines would also report comments, layout and moved code.
+    Compares symbol by symbol, as the reload after a save does: comparing lines would also report comments,
+    layout and moved code.
 
     Args:
         then_file, now_file: the task's file.
@@ -132,7 +134,7 @@ class CannotEnterRecording(ValueError):
 
 
 def run_of(episode: Episode, state: int | None = None) -> RecordedRun:
-    """The part of an episode to replay, up to `state`; all of it if None.
+    """The part of an episode to replay, up to `state`; the whole episode if `state` is None.
 
     Raises:
         CannotEnterRecording: it has no such state.
@@ -167,7 +169,8 @@ def why_not_enter(task: TaskDescription, info: EpisodeInfo) -> str:
 def reference_of(info: EpisodeInfo) -> RecordedTask:
     """Reference to the current code of a recording's task; `Clearances` decides whether it may be opened.
 
-    Names the task's file if it still exists, with the class; else the id, which may be one of ManiSkill's own.
+    If the task's file still exists, the reference names the file and the class; otherwise it has only the id,
+    which may be the id of one of ManiSkill's own tasks.
     """
     file = None if info.source_file is None else Path(info.source_file)
     if (
@@ -250,7 +253,7 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
 
 def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
     """Link the side files that exist. Where the page offers the recorded text, it warns of missing and
-    changed ones."""
+    changed side files."""
     for name in info.side_files:
         if name.endswith(_IMPORTED):
             continue  # importable, but not among the texts that the person trusted

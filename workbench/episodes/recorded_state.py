@@ -73,8 +73,8 @@ def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
 def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
     """Set controllers and drive targets of these envs' robots to the current joint positions.
 
-    ``get_state_dict`` includes controllers only if they keep their own target. The others would drive a restored robot
-    back to its old position.
+    ``get_state_dict`` includes controllers only if they keep their own target. Without this function, the
+    other controllers would drive a restored robot back to its old position.
     """
     chosen = [int(i) for i in env_idx]
     if env.agent is None or not chosen:
@@ -100,13 +100,14 @@ def new_physics(env: Any, env_idx: Sequence[int]) -> None:
 
 
 def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
-    """(N, D) of every actor and articulation, by the names of a recording; NaN in envs without it."""
+    """(N, D) state of each actor and articulation, by its name in recordings; NaN in envs that lack it."""
     return {name: to_numpy(state) for name, state in present_states(env).items()}
 
 
 def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
-    """Distance of one env's state from a recorded one: metres of the farthest body, and radians of the body or joint
-    (metres of a sliding joint) that turned most. Ignores entries that only one of the two states has.
+    """Distance of one env's state from a recorded one: the distance in metres of the farthest body, and the
+    largest rotation in radians of a body or joint. The displacement of a sliding joint, in metres, counts as
+    a rotation. Ignores entries that only one of the two states has.
 
     Args:
         now, was: (D,) by name.

@@ -47,7 +47,8 @@ class ReplayResult:
     corrected: int = 0
     """Number of steps after which the recorded state was restored."""
     start_differs: bool = False
-    """Whether the reset with the recorded seed gave another state, so that the recorded one was restored."""
+    """Whether the reset with the recorded seed gave a different first state than the recorded one, which was
+    then restored."""
     missed: dict[str, str] = field(default_factory=dict)
     """Name and reason of each part of the state that could not be restored."""
 
@@ -57,7 +58,7 @@ class Beginning:
     """Result of putting an env into the first state of a run."""
 
     differs: bool
-    """Whether the reset gave a different state, so that the recorded one was restored."""
+    """Whether the reset gave a different state than the recorded one, which was then restored."""
     missed: dict[str, str]
     """Name and reason of each part of the state that could not be restored."""
 
@@ -84,7 +85,8 @@ def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]
                 "the recording has no seed, so new random numbers are drawn"
             )
         seed = [run.seed] if run.seed >= 0 else None
-        # One by one: envs that are reset together draw different numbers than each alone.
+        # Reset one env at a time: envs that are reset together draw different random numbers than an env that
+        # is reset alone.
         with blamed("reset", loaded, task):
             task.reset(seed, [i], options)
     now = read_states(env)
@@ -103,7 +105,8 @@ def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]
 def restore_recorded(
     opened: OpenedTask, states: Mapping[int, Mapping[str, NDArray]], action: NDArray[np.float32] | None = None
 ) -> StepResult:
-    """Write a recorded state into each of these envs; returns the task's result for it, as `TaskEnv.rescore` does.
+    """Write a recorded state into each of these envs; returns the task's result for these states, computed by
+    `TaskEnv.rescore`.
 
     Raises:
         TaskError: the task's code raised.
@@ -126,12 +129,13 @@ def replay_to(
     recording holds: contacts, drive targets, the task's own counters. A replay from the recorded seed with
     the recorded actions reproduces these to the last bit if the code is the same; with different code it
     reaches a different state. So the run is replayed, and the bodies are compared with the recording after
-    each step. If they are too far apart, the recorded state is restored; the result counts these steps.
+    each step. If a body is too far from its recorded pose, the recorded state is restored; the result counts
+    the steps after which this happened.
 
     The other envs do not move (`step_only`), and the task's attributes for them are restored afterwards.
 
     Args:
-        state: 0 for the state after the reset, to ``run.length``.
+        state: from 0 (the state after the reset) to ``run.length``.
         on_step: called with the number of replayed steps.
 
     Raises:
@@ -221,7 +225,8 @@ def _is_off(env: object, chosen: list[int], wanted: Mapping[str, NDArray]) -> bo
 def _distance(
     env: object, chosen: list[int], wanted: Mapping[str, NDArray]
 ) -> tuple[float | None, float | None]:
-    """Largest distance of these envs from the state `wanted`, in metres and radians; None if it is empty."""
+    """Largest distances of these envs from the state `wanted`, in metres and in radians; (None, None) if
+    `wanted` is empty."""
     if not wanted:
         return None, None
     now = read_states(env)

@@ -24,7 +24,8 @@ class Source:
     path: Path
     """A file of a workbench recording, ManiSkill's ``.h5``, or the folder of a LeRobot dataset."""
     part: str | None = None
-    """Which recording of several in `path`: ``traj_3``, or the number of the dataset's episode."""
+    """Which of several recordings in `path`: a name such as ``traj_3`` in ManiSkill's ``.h5``, or the number
+    of an episode in a LeRobot dataset. None for a workbench recording."""
     id: str = ""
     """Id that the caller uses for the recording."""
     name: str = ""
@@ -58,7 +59,8 @@ class Facts:
     kind: RecordingKind
     task: str = ""
     trajectory: str | None = None
-    """Name of the recording within a file with several (ManiSkill's) or a LeRobot dataset."""
+    """Name of the recording within ManiSkill's file or a LeRobot dataset, which may hold several; None for
+    other recordings."""
     uid: str = ""
     """The recording's own id; empty if it has none."""
     copy_of: str = ""
@@ -101,11 +103,12 @@ class LibraryRow(Facts):
     """Letters, digits and ``-``; unique in its library and constant while the recording stays there: the recording's own id,
     or an id derived from its path."""
     name: str
-    """Path below the library's folder without suffix, and ``#traj_3`` for a file with several."""
+    """Path below the library's folder without suffix; for a file with several recordings, ``#traj_3`` or the
+    like is appended."""
     place: tuple[str, int]
-    """Key of its files (`scan.RecordingFiles.key`), and its number among the recordings in them."""
+    """Key of its files (`scan.RecordingFiles.key`), and its number among the recordings in these files."""
     paths: tuple[Path, ...]
-    """Its files, the one to open first. *Delete* removes all of them."""
+    """Its files. The first is the one to open; *Delete* removes all of them."""
     size: int
     """Total size of `paths` in bytes."""
 
@@ -160,7 +163,7 @@ def clean_text(value: object, longest: int = 200) -> str:
 
 
 def integer(value: object) -> int | None:
-    """A 64-bit integer; a list of one (a batched env's seed) counts as its item."""
+    """A 64-bit integer; a list with one item (the seed of a batched env) counts as that item."""
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     if isinstance(value, float) and value.is_integer():
@@ -202,7 +205,7 @@ def boolean(value: object) -> bool | None:
 
 
 def unix_seconds(value: object) -> float | None:
-    """Unix seconds of an ISO date, UTC if without a zone."""
+    """Unix seconds of an ISO date; a date without a time zone is in UTC."""
     if not isinstance(value, str):
         return None
     try:

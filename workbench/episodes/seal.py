@@ -21,8 +21,8 @@ log = logging.getLogger(__name__)
 KEY_FILE = "recordings.key"
 _KEY_BYTES = 32
 _COVERED = {*SHARED, "seed", "source"} - {"acted_by", "pictures", "moved_cameras", "observed_by"}
-"""Fields that a seal covers; `_content` adds ``acted_by``. Seals of older versions, which lack the other
-excluded fields, stay valid."""
+"""Fields that a seal covers; `_content` adds ``acted_by``. The other three excluded fields stay uncovered, so
+that the seals of older versions, which do not cover them, stay valid."""
 _logged: set[str] = set()
 
 
@@ -32,15 +32,17 @@ class InstallationSeal(Enum):
 
     The seal covers what decides which code runs when the recording is rescored or entered (task, text, keyword arguments),
     and the checksums of its files. Tags and notes may change, and a moved recording keeps its seal. The path of the task's
-    file has its own hash: a recording that comes back with a different file next to it must not run that file.
+    file has its own hash: a recording that was sent away and comes back with a different file next to it must
+    not run that file.
     """
 
     NO = "no"
-    """It is foreign, was changed, or the key is lost."""
+    """The recording is foreign or was changed, or the key is lost."""
     CONTENT = "content"
     """This installation recorded it, but the task's file is at another path, or missing."""
     CONTENT_AND_PLACE = "content and place"
-    """This installation recorded it, and the task's file is at the recorded path; its text may have changed."""
+    """This installation recorded it, and the task's file is at the recorded path; the text of the file may
+    have changed."""
 
 
 def seal(description: Description, source_file: str | None) -> SealJson | None:

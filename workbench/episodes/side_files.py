@@ -28,13 +28,15 @@ def side_files(task: str | None, source: Mapping[str, str]) -> dict[str, str]:
     """Hash of each side file, by path relative to the task's folder.
 
     A recording holds the task's text but not its meshes, which may be larger than all recordings together. The files that
-    a task reads cannot be observed, since native libraries open many. So this lists the files and folders below the task's
-    folder that appear in strings of the text, and the files that those name in turn (a URDF its meshes). A path that the
-    code composes is missed unless its folder is named, and a named folder includes unread files; so a change is reported
-    and never refused.
+    a task reads cannot be observed, since native libraries open many. So the result has each file below the
+    task's folder that strings of the text name, directly or by a folder above it, and each file that these
+    files name in turn (as a URDF names its meshes). A file is missed if the code composes its path and no
+    string names its folder. If a string names a folder, its files are included even if the task never reads
+    them. So a change of a side file is only reported: it never prevents anything.
 
     Args:
-        task: the task's file; empty result for an installed package, whose version identifies its files.
+        task: the task's file. For a file of an installed package the result is empty: the package's version
+            identifies its files.
         source: texts of its Python files.
     """
     if task is None or not os.path.isabs(task) or _INSTALLED & set(Path(task).parts):

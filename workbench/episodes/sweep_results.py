@@ -43,7 +43,7 @@ class SweepEpisode:
     """Index of the point in `SweepResults.points`."""
     seed: int
     success: bool | None = None
-    """Success in any state; None for a task without ``success``, and without an episode."""
+    """Success in any state; None if the task has no ``success``, or there is no episode."""
     success_at_end: bool | None = None
     """Success in the last state."""
     solved_at: int | None = None
@@ -279,10 +279,11 @@ def _known(kind: Callable[[Any], T], value: Any) -> T | None:
 
 
 def clean_results(results: SweepResults) -> SweepResults:
-    """Validate results from a file: values are converted to those that a sweep writes, and invalid rows are left out.
+    """Validate results from a file: values are converted to values that a sweep could have written, and
+    invalid rows are left out.
 
     Raises:
-        NoSweep: there are no points, too many, or points with different names.
+        NoSweep: there are no points, too many points, or points that set different names.
     """
     if not 0 < len(results.points) <= MAX_POINTS:
         raise NoSweep(f"has {len(results.points)} points, and a sweep has 1 to {MAX_POINTS}")

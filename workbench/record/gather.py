@@ -89,7 +89,7 @@ class GatheredEpisode:
     def set_placed(
         self, placed: Mapping[CameraKey, CameraSettings], in_file: Mapping[CameraKey, CameraSettings] = {}
     ) -> None:
-        """Set the cameras that are placed by hand from the next state on. Raises RecordingError.
+        """From the next state on, these cameras are placed by hand. Raises RecordingError.
 
         Args:
             in_file: settings in the recorded source, for cameras whose settings in the task's description differ.
@@ -107,8 +107,8 @@ class GatheredEpisode:
         columns: Mapping[str, NDArray],
         pictures: Sequence[Picture],
     ) -> None:
-        """Append row `row` of a batch as the next state; the first state is that after a reset. Raises as
-        `EpisodeWriter.append` does."""
+        """Append row `row` of a batch as the next state; the first state must be the one after a reset.
+        Raises as `EpisodeWriter.append` does."""
         if not self.begun:
             self.state_names = frozenset(states_of(columns, row))
             count = len(step.reward)
@@ -149,8 +149,8 @@ class EpisodeGatherer:
         """
         Args:
             on_episode: called with each finished episode, including its writer.
-            ends: ``over`` also ends an episode when it terminates or is truncated; ``reset`` only when its env is reset, for
-                callers that continue after termination.
+            ends: with ``reset``, an episode ends only when its env is reset, for callers that continue after
+                termination; with ``over``, it also ends when it terminates or is truncated.
             one_each: gather only the next episode of each env.
             origin: as in `jobs.scheduler.ItemQueue.origin`, so that episodes name the original paths of the
                 author's files.
@@ -192,7 +192,7 @@ class EpisodeGatherer:
                 self._append([e for e in going_on if e.state_names == names], names, stepped)
         for env in [env for env in self._episodes if reset[env]]:
             self.end(env)
-            # A jump into the middle of an episode begins none: no seed could start a replay there.
+            # A jump into the middle of an episode begins no episode: no seed could start a replay there.
             if env in self._episodes and step.elapsed_steps[env] == 0:
                 self._begin(env, stepped)
 
@@ -350,8 +350,8 @@ class EpisodeFinisher:
     """Writes the files of finished episodes one by one on a thread. Thread-safe.
 
     There is only one thread, because two would compete for the GIL: even at the end, when nothing else needs
-    the GIL, two threads take a quarter longer (measured). A subprocess does not compete; with one, `close`
-    makes files on its own thread too.
+    the GIL, two threads take a quarter longer (measured). A subprocess does not compete for the GIL. If there
+    is a subprocess, `close` also makes files, on the thread that calls it.
     """
 
     def __init__(
@@ -363,10 +363,12 @@ class EpisodeFinisher:
     ) -> None:
         """
         Args:
-            on_change: called when an episode's files are written, or have failed: on the thread, or by `close`.
+            on_change: called when an episode's files are written or could not be written, on the finisher's
+                thread or by `close`.
             first: called once at the start of the thread.
             then: called with the files of each episode, before the episode counts as finished.
-            in_process: make the files in a subprocess, for a caller that needs the GIL; its start takes a second of a core.
+            in_process: make the files in a subprocess, for a caller that needs the GIL. Starting the
+                subprocess keeps one core busy for a second.
         """
         self._on_change, self._then = on_change, then
         self._lock = threading.Lock()
@@ -394,7 +396,7 @@ class EpisodeFinisher:
 
     def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | str]:
         """Queue the episode; returns the future of its files. If they cannot be written, the result is the
-        reason as text, which `finished` also has until another episode is written."""
+        reason as text; `finished.problem` is this reason too, until another episode is written."""
         made: Future[EpisodeFiles | str] = Future()
         with self._lock:
             self._waiting.append((episode, made))

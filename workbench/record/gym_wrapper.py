@@ -37,13 +37,14 @@ from workbench.task.open import describe
 
 logger = logging.getLogger(__name__)
 _MAX_PENDING_STEPS = 2048
-"""Maximum number of pending steps, summed over the envs: 3 MB. The queue is flushed earlier if half a second
-has passed or an episode begins."""
+"""Maximum number of pending steps, summed over the envs; together they take 3 MB. They are gathered earlier
+if half a second has passed or an episode begins."""
 _MAX_PENDING_PICTURE_BYTES = 1 << 25
 """Maximum size of the pictures that wait for the gatherer."""
 
 _SUBPROCESS_ENVS = 4
-"""Env count from which a subprocess makes the files; below it, start-up costs more than it saves."""
+"""Number of recorded envs from which on a subprocess makes the files. With fewer envs, starting it costs more
+time than it saves."""
 
 
 class _PendingStep(NamedTuple):
@@ -74,8 +75,8 @@ class Recorder(gym.Wrapper):
     Writes the same files as the page and ``workbench record``, one set per episode: .rrd, .h5 and .json. An
     episode of an env lasts from one reset to the next, so partial resets, auto-resets and wrappers that
     continue after success work. The Recorder records the env's own state, observation and reward, so it must
-    wrap the env of `make` directly, inside all wrappers that change actions. From four envs on, a subprocess
-    makes the files.
+    wrap the env of `make` directly, inside all wrappers that change actions. If at least four envs are
+    recorded, a subprocess makes the files (on a machine with more than one core).
 
     A full disk must not end a training loop: if the files cannot be written, one warning is given, the
     recording ends, and `problem` has the reason.
@@ -95,13 +96,14 @@ class Recorder(gym.Wrapper):
             env: an env of `workbench.make`.
             folder: created if it is missing. Unfinished files of an earlier recording in it are recovered.
             env_idx: the envs to record; None for all.
-            pictures: record every camera at every step, or only the named cameras; False for none. Sensors that the env
-                observes are rendered already; any other picture takes 25 to 50 ms without a GPU.
+            pictures: cameras whose pictures are recorded at every step: True for all, a sequence of names for
+                these cameras, False for none. Sensors that are part of the observation are rendered anyway;
+                any other picture takes 25 to 50 ms without a GPU.
             acted_by: source of the actions, such as the name of a policy, for readers of the recordings.
 
         Raises:
             TypeError: `env` is not a ManiSkill env, or is already wrapped as a vector env.
-            IndexError: there is no such env.
+            IndexError: `env_idx` has an env that does not exist.
             RecordingError: `folder` cannot be written to.
         """
         if not isinstance(env, gym.Env) or isinstance(env, gym.vector.VectorEnv):
@@ -127,8 +129,8 @@ class Recorder(gym.Wrapper):
         """Files of finished episodes that are being written."""
         self._gatherer: EpisodeGatherer | None = None
         self._pending: deque[_PendingStep] = deque()
-        """Steps that wait for the gatherer. Gathering them one by one, while the env waits and the CPU caches are full of
-        physics, costs twice as much."""
+        """Steps that wait for the gatherer. Gathering each step at once, while the env waits and the CPU
+        caches are full of physics, costs twice as much as gathering many together."""
         self._waiting_pictures = 0
         """Size of the waiting pictures in bytes; approximate, since another thread may gather at the same time."""
         self._gathering = threading.Lock()
@@ -141,7 +143,7 @@ class Recorder(gym.Wrapper):
         self._elapsed = np.zeros(base.num_envs, np.int32)
         self._finished = False
         self.problem: str | None = None
-        """Reason why an error ended the recording; None if no error did."""
+        """The error that ended the recording; None if no error has ended it."""
 
     @property
     def episodes_written(self) -> int:
@@ -166,7 +168,7 @@ class Recorder(gym.Wrapper):
         return obs, info
 
     def _seeds_of_reset(self, seed: Any) -> np.ndarray:
-        """(N,) seeds of a reset; NO_SEED for an env without one.
+        """(N,) seeds of a reset; NO_SEED for an env that was reset without a seed.
 
         A reset without a seed, such as an auto-reset, continues the random generators, while ManiSkill still reports the seed
         of an earlier episode.
@@ -174,7 +176,7 @@ class Recorder(gym.Wrapper):
         task = self._task
         if seed is None and not draws_its_own_seeds(task.env):
             return np.full(task.num_envs, NO_SEED, np.int64)
-        # (N,), or shorter: one for each env of a partial reset, which ManiSkill counts from 0.
+        # (N,); shorter after a partial reset: one seed for each env that was reset, from index 0 on.
         seeds = task.episode_seeds
         return np.concatenate([seeds, np.full(max(0, task.num_envs - len(seeds)), NO_SEED, np.int64)])
 
@@ -235,7 +237,7 @@ class Recorder(gym.Wrapper):
             len(self._pending) * len(reset_mask) > _MAX_PENDING_STEPS
             or self._waiting_pictures > _MAX_PENDING_PICTURE_BYTES
         )
-        # Gather a step that does not continue its episode now: an error is then reported at this step.
+        # If the step does not continue its episode, gather it now: an error is then reported at this step.
         if full or not follows:
             self._gather()
         self._report_failures()

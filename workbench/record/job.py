@@ -25,10 +25,11 @@ from workbench.record.job_worker import (
 )
 
 MAX_CHUNK_STARTS = 2
-"""Number of times that a chunk is started, if its workers die; then its episodes are tried one by one."""
+"""Maximum number of times that a chunk is started, if its workers die; after that, its episodes are tried one
+by one."""
 _LONG_JOB_BATCHES = 256
-"""Length of a job, in batches, from which a chunk holds `_CHUNK_BATCHES` batches instead of one: envs that
-finish early idle only at the end of a chunk."""
+"""From this number of batches on, the chunks of a job hold `_CHUNK_BATCHES` batches instead of one. Envs that
+finish early are idle only at the end of a chunk."""
 _CHUNK_BATCHES = 4
 
 
@@ -39,7 +40,7 @@ class RecordProgress:
     kept: int
     """Episodes kept so far."""
     steps: int
-    """Control steps so far, over all envs with an episode."""
+    """Control steps so far, summed over all envs that run an episode."""
     over: tuple[int, Written | None] | None = None
     """Number of the episode that has just ended, and its files (None if they were not kept); None if no episode has
     just ended."""
@@ -48,7 +49,8 @@ class RecordProgress:
     limit: int = 0
     """Maximum number of control steps of an episode."""
     done: float = 0.0
-    """Episodes kept so far; if every episode is kept, running episodes count as fractions."""
+    """Number of episodes kept so far. If all episodes are kept, not only the successes, each running episode
+    adds the fraction that is done."""
     failures: tuple[Failure, ...] = ()
     """Episodes so far without a result, by number."""
     was_there: bool = False
@@ -70,7 +72,7 @@ class Recorded:
     stopped: bool
     """Whether it was stopped early."""
     start_corrected: int = 0
-    """Episodes with `Written.start_corrected`."""
+    """Number of episodes with `Written.start_corrected`."""
     failures: tuple[Failure, ...] = ()
     """Episodes, by number, in which the author's code failed or whose workers died."""
     missing: int = 0
@@ -78,7 +80,7 @@ class Recorded:
 
 
 def chunk_of(episodes: int, num_envs: int) -> int:
-    """Number of episodes that a worker with `num_envs` envs runs together, out of `episodes` in all."""
+    """Number of episodes in a chunk of a job with `episodes` episodes, for workers with `num_envs` envs."""
     return num_envs * (_CHUNK_BATCHES if episodes >= _LONG_JOB_BATCHES * num_envs else 1)
 
 
@@ -99,15 +101,15 @@ def record(
     episode that ``gym.make(...).reset(seed=seed + k)`` starts.
 
     Args:
-        on_finding: called once for each place where the task breaks a rule that does not stop it.
+        on_finding: called once for each place where the task breaks a rule but can continue.
         stop: called between steps; once it returns True, finished episodes are kept and the others dropped.
         executor: None to run in this process, or in spawned processes if ``what.workers`` is above 1.
         run: as in `RecordSetup`; a resumed job passes the name that it began with.
         on_notice: called once with each notice about the task.
 
     Raises:
-        TaskError: the task cannot be opened, or fails in every chunk of episodes, or in the same way in several consecutive
-            ones.
+        TaskError: the task cannot be opened; or it fails in every chunk of episodes; or it fails in the same
+            way in several consecutive chunks.
         RecordingError: a file cannot be written.
         PoolError: a process that records failed, or processes die repeatedly.
         FileNotFoundError, ValueError: the request is invalid.
@@ -243,8 +245,9 @@ class ToldByWorkers:
 class _Recording:
     """Collects the results of all processes.
 
-    Keeps the K successes with the lowest numbers. With many envs or processes a later episode may succeed before an earlier
-    one has ended; its files are removed once K successes have lower numbers.
+    If K successes are wanted, it keeps those with the lowest numbers. With many envs or processes, a later
+    episode may succeed before an earlier one has ended. The files of the later episode are removed once K
+    successes have lower numbers.
     """
 
     def __init__(

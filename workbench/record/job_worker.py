@@ -51,7 +51,7 @@ from workbench.task.load import undo_load
 from workbench.task.open import OpenedTask, open_task
 
 _TRIES_PER_SUCCESS = 100
-"""Maximum number of episodes that are tried for each requested success, by default."""
+"""Default for the maximum number of episodes that are tried for each requested success."""
 _START_TOLERANCE = 1e-4
 """Maximum distance, in metres or radians, from the demonstration's start state that counts as the same start."""
 
@@ -66,7 +66,7 @@ class RecordOptions(RecordArguments):
     after_success: int = 0
     """Number of control steps that an episode continues after its success."""
     workers: int = 1
-    """Number of processes that record, if no executor is given; the episodes are the same with any number."""
+    """Number of processes that record, if no executor is given. This number does not change the episodes."""
     source: dict[str, str] = field(default_factory=dict)
     """Text by path that replaces the task's files on disk."""
 
@@ -78,13 +78,13 @@ class RecordSetup:
     wanted: tuple[RecordOptions, ...]
     """Options of each recording of the job, as completed by `with_given_actions`."""
     folders: tuple[bytes, ...]
-    """Absolute path of each recording's folder. Bytes, so that it is not relocated on another machine; see
-    `Work.files`."""
+    """Absolute path of each recording's folder. In bytes, so that the path is not relocated on another
+    machine; see `Work.files`."""
     stride: int
     """Item k is episode ``k % stride`` of recording ``k // stride``."""
     run: str
-    """Name of the job. The ids of its episodes derive from it, so that an episode that is recorded again replaces
-    the first one."""
+    """Name of the job. The ids of its episodes derive from this name, so that an episode that is recorded
+    again replaces its first recording."""
     mark: str = ""
     """Name of a file in the folders, by which a worker on another machine checks that it sees the same folders."""
 
@@ -99,11 +99,11 @@ class BatchProgress:
     """Progress of the episodes that one process is running."""
 
     steps: tuple[tuple[int, int], ...]
-    """Number and control steps so far of each episode."""
+    """(number of the episode, its control steps so far) for each episode."""
     limit: int
     """Maximum number of control steps of an episode."""
     made: int
-    """Control steps since the previous message, over all envs with an episode."""
+    """Control steps since the previous message, summed over all envs that run an episode."""
 
 
 @dataclass(frozen=True)
@@ -133,14 +133,15 @@ class Written:
     success: bool | None
     """Success at its last state; None for a task without ``success``."""
     start_corrected: bool = False
-    """Whether the seed gave another start than the demonstration's, so that its first state was restored."""
+    """Whether the seed gave a different start state than the demonstration has, so that the demonstration's
+    first state was restored."""
     planned: PlannedEpisode | None = None
     """Data about the planning, if the actions were planned."""
     address: str = ""
     """Address that its .rrd file was uploaded to, in which case `path` does not exist; empty if it was not
     uploaded."""
     solved_at: int | None = None
-    """Control steps until its first state with success; None without one."""
+    """Control steps until its first state with success; None if no state has success."""
     means: dict[str, float] = field(default_factory=dict)
     """Mean over the episode of each entry of ``evaluate()``, by name; see `episodes.episode.Episode.means`."""
 
@@ -151,8 +152,8 @@ class Written:
 
 
 def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[RecordedRun]]:
-    """The options, completed from the file of actions (number of episodes, control mode), and the file's runs: one for
-    each episode or one for all; empty without a file.
+    """The options, with the number of episodes and the control mode from the file of actions, and the file's
+    runs: one run for each episode, one for all episodes, or none without a file.
 
     Raises:
         FileNotFoundError, ValueError: as `find_actions` does; or the requested numbers are invalid.
@@ -198,8 +199,8 @@ def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedR
     torch.set_num_threads(1)  # see workbench.app.worker.main_loop.work
     here = CurrentFolder()  # the task may change it
     chunk = None
-    # Open a single recording before its first chunk is requested: an error of opening must not count as a
-    # chunk's failure.
+    # If there is only one recording, open it before its first chunk is requested: an error while opening it
+    # must not count as the chunk's failure.
     at = 0 if len(setup.wanted) == 1 else _recording_of(chunk := queue.next(), setup)
     while at is not None:
         what = setup.wanted[at]
@@ -260,7 +261,7 @@ def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> Opened
         for finding in findings_of_shaders(opened.description.cameras):
             queue.send_update(RecordUpdate(finding=finding))
     if isinstance(opened.env.env, BatchedCpuMixin):
-        # Without this an episode depends, in the last bits, on the earlier episodes of the same process.
+        # Otherwise the last bits of an episode would depend on the earlier episodes of the same process.
         opened.env.env.begins_anew = True
     return opened
 

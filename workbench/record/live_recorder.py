@@ -28,8 +28,8 @@ class LiveRecorder:
     """Records the episodes of chosen envs. `close` waits until all files are written.
 
     The loop hands each step to a thread. Encoding a row and writing it to the journal takes a millisecond or
-    less, but a slow disk would block the loop, as would the files of an episode, which take a fraction of a
-    second or more.
+    less, but on a slow disk this would block the loop. So would writing the files of an episode, which takes
+    a fraction of a second or more.
     """
 
     def __init__(

@@ -88,7 +88,8 @@ class RecordPanel(MomentPart):
 
 
 def runs_since(view: SessionView) -> int | None:
-    """Steps of the selected env's episode up to the shown moment; None if it has no step or has ended there."""
+    """Steps of the selected env's episode up to the shown moment; None if the episode has no step yet, or has
+    ended at that moment."""
     step, env = view.step, view.selected_env
     if step is None or view.timeline.moments == 0 or env >= len(step.elapsed_steps):
         return None

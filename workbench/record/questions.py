@@ -1,5 +1,5 @@
-"""The question that captures a past moment's data for a recording. It moves envs: only for a worker that does
-not play."""
+"""The question that captures a past moment's data for a recording. It moves the envs, so only a worker that
+is not playing may be asked."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ from workbench.task.description import TaskDescription
 
 
 def moments_of(episodes: Sequence[PastEpisode]) -> list[tuple[Moment, dict[int, list[PastEpisode]]]]:
-    """All moments of the episodes once, oldest first, each with the episodes that contain it, by env."""
+    """Each moment of the episodes once, oldest first, with the episodes that contain the moment, by env."""
     found: dict[int, tuple[Moment, dict[int, list[PastEpisode]]]] = {}
     for episode in episodes:
         for moment, env in episode.moments:
@@ -185,7 +185,8 @@ class PastSaver:
         return writer
 
     async def _verified_seed(self, episode: PastEpisode) -> int:
-        """Seed of the episode, if a reset of its env alone with this seed gives the first state; else -1.
+        """Seed of the episode, if a reset of its env alone with this seed gives the episode's first state;
+        else -1.
 
         Envs that are reset together share torch's generator, so their random numbers depend on all of them.
         """
@@ -214,8 +215,8 @@ def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:
 
 
 def _cameras_in_source(task: TaskDescription, episode: PastEpisode) -> dict[CameraKey, CameraSettings]:
-    """Camera settings of the version that played, for the cameras whose settings differ in the running
-    version."""
+    """Camera settings of the version that played the episode, for the cameras whose settings differ in the
+    running version."""
     now = {camera.key: camera.settings for camera in task.cameras}
     played = () if episode.played_by is None else episode.played_by.cameras
     return {

@@ -53,8 +53,9 @@ class Saving:
 class PastEpisode:
     """The moments of one env's episode, oldest first; the first is its reset.
 
-    After a jump back, the moments up to the restored one are followed by the new ones. The last moment is the
-    one at which the env terminated or was truncated, or the last one before a reset or a jump.
+    If the env jumped back, the moments up to the restored one are followed by those after the jump. The last
+    moment is the one at which the env terminated or was truncated; without such a moment, it is the last one
+    before the next reset or jump, or the newest one if the episode still runs.
     """
 
     env: int
@@ -78,7 +79,8 @@ class PastEpisode:
 
 @dataclass(frozen=True)
 class SaveRequest:
-    """Past episodes to record, with all that a worker needs: the history changes while the job runs."""
+    """Past episodes to record, with all data that the worker needs, because the history changes while the job
+    runs."""
 
     task: TaskDescription
     load: Load

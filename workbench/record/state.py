@@ -73,7 +73,7 @@ class RunningEpisodes:
 
 @dataclass(frozen=True)
 class LiveRecording:
-    """The running recording, which takes each env's steps from its next reset on, and the results so far."""
+    """The running recording, and the results so far. Each env is recorded from its next reset on."""
 
     folder: str
     chosen: ChosenEnvs = "selected"
@@ -82,7 +82,7 @@ class LiveRecording:
     one_each: bool = False
     """Whether the recording ends after one episode of each env."""
     number: int = 0
-    """Number of the last gatherer; events of older ones are ignored."""
+    """Number of the last gatherer; events of older gatherers are ignored."""
     since: float = 0.0
     episodes: int = 0
     """`since` and `episodes`: as in `RecordingStatus`."""
@@ -126,7 +126,8 @@ class Continues:
     env_idx: tuple[int, ...]
     one_each: bool
     put_back: bool
-    """Whether the load left the envs within their episodes: a reset would lose the current moment."""
+    """Whether the envs are still within their episodes after the load, so that a reset would lose the current
+    moment."""
 
 
 # --- events and effects -----------------------------------------------------------------------------
@@ -138,7 +139,8 @@ class RecordingWanted:
 
     env_idx: tuple[int, ...] | None = None
     next_episode: bool = False
-    """Do not reset; record only the episode of each env that begins with its next reset."""
+    """Do not reset, and record only one episode of each env: the one that begins with the env's next
+    reset."""
 
 
 @dataclass(frozen=True)

@@ -34,11 +34,13 @@ class ExportOptions:
     only_successes: bool = False
     """Leave out episodes without success at any step."""
     only_fitting: bool = False
-    """Leave out, and report, episodes that cannot be read or do not fit the first one; else raise."""
+    """If True, leave out and report episodes that cannot be read or do not fit the first one. If False, such
+    an episode raises an error."""
     instruction: str | None = None
-    """The task's instruction for language-conditioned policies; None is the task's id."""
+    """The task's instruction for language-conditioned policies; None for the task's id."""
     fps: int | None = None
-    """Frames per second; the control rate must be an integer multiple of it. None is the control rate."""
+    """Frames per second; the control rate must be an integer multiple of it. None for the control rate
+    itself."""
 
 
 class DoesNotFit(ValueError):
@@ -75,7 +77,7 @@ def export_lerobot(
         on_progress: called with the number of finished episodes, and the name of the current one.
 
     Raises:
-        UnreadableRecording: an episode cannot be read, or not all of it.
+        UnreadableRecording: an episode cannot be read completely.
         DoesNotFit: an episode lacks a chosen part, or differs from the first one in features or frame rate.
         ValueError: there is no episode to write.
         OSError: the dataset cannot be written.
@@ -182,7 +184,7 @@ class _Writer:
 
         Raises:
             DoesNotFit: the episode cannot be added.
-            UnreadableRecording: the episode cannot be read, or not all of it.
+            UnreadableRecording: the episode cannot be read completely.
         """
         episode = read_whole(name, read)
         if self._options.only_successes and not _succeeds(episode):
@@ -217,7 +219,7 @@ class _Writer:
             key = form.IMAGES + feature_name(camera)
             if key not in self._films:
                 self._films[key] = films = _Films(self._folder, key, self._fps)
-                # Kills ffmpeg on an error; without one `finish` has already closed the films.
+                # Kills ffmpeg on an error; without an error, `finish` has already closed the films.
                 self._stack.callback(films.close, abandoned=True)
             camera_entry, stats[key] = self._films[key].add(frames, camera)
             entry |= camera_entry

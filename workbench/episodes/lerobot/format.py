@@ -47,7 +47,7 @@ Stats = dict[str, NDArray[Any]]
 
 
 def next_file(chunk: int, file: int) -> tuple[int, int]:
-    """Chunk and file that follow these."""
+    """Chunk and file numbers of the file that follows this one."""
     return (chunk + 1, 0) if file == CHUNK_SIZE - 1 else (chunk, file + 1)
 
 
@@ -85,7 +85,8 @@ def sampled(count: int) -> NDArray[np.int64]:
 
 
 def combined_stats(parts: list[Stats]) -> Stats:
-    """Statistics of all episodes, combined from those of each as in lerobot (quantiles are averaged)."""
+    """Statistics of all episodes, combined from the statistics of each episode as lerobot does (quantiles are
+    averaged)."""
     counts = np.array([float(part["count"][0]) for part in parts])
     weights = (counts / counts.sum()).reshape(-1, *[1] * parts[0]["mean"].ndim)
     means = np.stack([part["mean"] for part in parts])
@@ -130,8 +131,8 @@ class Choice:
     """The parts of an episode that go into the dataset."""
 
     state: tuple[str, ...] = ()
-    """Keys of the state observations for ``observation.state``; ``agent`` includes all keys below it. Empty: ``agent``, the
-    robot's own state, or all observations if there is no such key."""
+    """Keys of the state observations for ``observation.state``; ``agent`` includes all keys below it. If no
+    key is given: ``agent`` (the robot's own state), or all observations if there is no such key."""
     environment: tuple[str, ...] = ()
     """Keys for ``observation.environment_state``; empty leaves it out."""
     cameras: tuple[str, ...] | None = None
@@ -195,7 +196,8 @@ def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:
     if not episode.length:
         raise ValueError("has no step")
     states = np.arange(0, episode.length, choice.every)
-    # A frame gets the rewards of the skipped steps after it, and is `done` if one of them is.
+    # A frame gets the sum of the rewards of its step and of the skipped steps after it. It is `done` if the
+    # episode ended in one of these steps.
     rewards = np.add.reduceat(episode.reward.astype(np.float64), states).astype(np.float32)
     done = np.logical_or.reduceat(episode.terminated | episode.truncated, states)
     columns: dict[str, NDArray] = {}

@@ -68,7 +68,8 @@ def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
 def _of_episodes(
     folder: Path, info: dict[str, Any]
 ) -> tuple[dict[int, float] | None, dict[int, float] | None]:
-    """Sum of rewards and number of frames with success by episode; None if the dataset lacks the feature."""
+    """(sum of rewards by episode, number of frames with success by episode); each of the two is None if the
+    dataset lacks its feature."""
     features = [key for key in (form.REWARD, form.SUCCESS) if key in info["features"]]
     if not features:
         return None, None
@@ -97,8 +98,9 @@ def _flat(column: pa.ChunkedArray) -> NDArray[np.float64]:
 def read_lerobot(folder: Path, index: int) -> Episode:
     """Episode `index` of the dataset in this folder, without a scene.
 
-    A dataset lacks the state after the last action, which is NaN here and has no picture. Films are decoded when a camera
-    is first accessed. A dataset is untrusted: its paths must be in its folder, and claimed sizes are bounded.
+    A dataset lacks the state after the last action: the episode has NaN for it, and no picture. Films are
+    decoded when a camera is first accessed. A dataset is untrusted: its paths must be in its folder, and
+    claimed sizes are bounded.
 
     Raises:
         UnreadableRecording: it cannot be read; the message gives the reason.

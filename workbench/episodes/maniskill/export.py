@@ -68,7 +68,7 @@ def export_maniskill(
         on_progress: called with the number of finished episodes, and the name of the current one.
 
     Raises:
-        UnreadableRecording: an episode cannot be read, or not all of it.
+        UnreadableRecording: an episode cannot be read completely.
         OtherDemonstration: an episode has no step, has another task, or was made with other options than the first one.
         ValueError: there is no episode to write, or `file` has another suffix.
         OSError: the files cannot be written.
@@ -143,7 +143,7 @@ def export_maniskill(
 
 
 def _shape(episode: Episode) -> dict[str, Any]:
-    """Values that all episodes of a file have in common, by name for messages."""
+    """Values that must be the same for all episodes of a file, by name for messages."""
     info = episode.info
     return {
         "task": info.task,
@@ -165,7 +165,8 @@ def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
 
 
 def _flat(episode: Episode) -> Episode:
-    """The episode with its state observations joined into one vector, if its `obs_mode` contains it; else unchanged."""
+    """The episode with its state observations joined into one vector, if its `obs_mode` contains ``state``;
+    otherwise the episode is unchanged."""
     mode = episode.info.env_kwargs.get("obs_mode")
     if not episode.obs or not isinstance(mode, str) or _FLAT not in mode.split("+"):
         return episode

@@ -28,7 +28,8 @@ MAX_NODES = 200_000
 MAX_DEPTH = 32
 """Maximum nesting of groups; hard links can form a cycle."""
 ALLOWED_BYTES = 1 << 20
-"""Size that every dataset may claim: an unwritten one has no storage and reads as zeros."""
+"""Size that a dataset may claim without storage: a dataset that was never written has no storage, and reads
+as zeros."""
 MAX_COMPRESSION_RATIO = 1100
 """Maximum compression ratio; deflate's limit is 1032."""
 MAX_CHUNK_BYTES = 16 << 20
@@ -51,9 +52,9 @@ class RefusedH5(ValueError):
     """The file is refused; the message follows the file's name.
 
     HDF5 by default follows external links, external storage and virtual datasets into other files of the machine, loads
-    filter plugins, and allocates the size that a dataset claims (terabytes in a file of 8 kB). The classes of this module
-    only follow hard links, and soft links within the file, only read plain numbers, and compare a dataset's size with its
-    storage before anything is allocated.
+    filter plugins, and allocates the size that a dataset claims (terabytes in a file of 8 kB). The classes of
+    this module follow only hard links and the soft links within the file, read only plain numbers, and
+    compare a dataset's size with its storage before they allocate anything.
     """
 
 

@@ -79,8 +79,8 @@ def put_pictures(episode: Episode, trajectory: h5py.Group) -> None:
 
 
 def _wanted(episode: Episode) -> tuple[list[str], tuple[Modality, ...]]:
-    """Kinds of pictures in the observations: (names of those that no recording keeps, modalities of the
-    others). All recorded modalities if the observation mode is unknown."""
+    """(names of the observed kinds of pictures that no recording keeps, modalities of the other observed
+    kinds). If the observation mode is unknown: (no names, all recorded modalities)."""
     mode = episode.info.env_kwargs.get("obs_mode")
     if not isinstance(mode, str):
         held = {modality for track in _sensors(episode) for modality in track.pictures}

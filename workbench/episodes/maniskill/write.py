@@ -111,8 +111,8 @@ _PLAIN = _plain()
 
 
 def _packed(shape: tuple[int, ...], row: int) -> h5py.h5p.PropDCID:
-    """Storage layout of a dataset whose rows have `row` bytes: compressed if that saves more than the index of its chunks
-    costs.
+    """Compressed storage layout of a dataset whose rows have `row` bytes. For a dataset smaller than
+    `_MIN_COMPRESSED_BYTES`, use `_PLAIN`: the index of its chunks would cost more than the compression saves.
 
     A chunk must fit HDF5's cache of 1 MB, because ManiSkill's replay reads row by row.
     """
@@ -124,7 +124,8 @@ def _packed(shape: tuple[int, ...], row: int) -> h5py.h5p.PropDCID:
 
 
 def write_json(episode: Episode, path: Path, folder: Path, files: Sequence[Path], sealed: bool) -> None:
-    """Write ManiSkill's metadata of the episode, and ours under ``workbench``, to `path`. Raises OSError.
+    """Write ManiSkill's metadata of the episode to `path`, and the workbench's own under the key
+    ``workbench``. Raises OSError.
 
     Args:
         folder: folder of the recording.

@@ -55,8 +55,9 @@ def main() -> None:
     """Run the fork server: ``python -m workbench.episodes.reader.fork_readers SOCKET``.
 
     Forking takes milliseconds, while starting Python takes half a second. The fork server imports what
-    readers need and reads no recording itself. It has only one thread, because a fork copies only one: its
-    environment turns numpy's threads off. When its socket closes, it ends, and its readers with it.
+    readers need and reads no recording itself. It has only one thread, because a fork copies only one;
+    environment variables turn numpy's threads off. When its socket closes, the fork server and its readers
+    end.
     """
     control = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -46,7 +46,8 @@ from workbench.machine.files import NotARegularFile
 
 MAX_STATES = 10_000_000
 MAX_COLUMN_BYTES = 1 << 29
-"""Maximum described size of one column. The file's size is no bound: repeated rows are left out."""
+"""Maximum described size of one column. The size of the file does not limit it, because the file leaves out
+repeated rows."""
 
 
 def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
@@ -54,8 +55,9 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
 
     The ``.json`` describes it, the ``.rrd`` holds meshes, poses, pictures and curves, the ``.h5`` env states, observations
     and actions. A file that is broken or missing is listed in `Episode.broken_files`, and its content is empty: without the
-    .rrd no geometry, poses and pictures, without the .h5 no env states. A lone ``.rrd`` is complete. The geometry is that
-    of this env alone, as env 0 of 1. Pictures stay in the file until they are accessed.
+    .rrd no geometry, poses and pictures, without the .h5 no env states. A lone ``.rrd`` counts as complete:
+    no file is listed as missing. The geometry is that of this env alone, as env 0 of 1. Pictures stay in the
+    file until they are accessed.
 
     Args:
         path: the .rrd, .h5 or .json of the recording.
@@ -72,7 +74,7 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
 
 
 def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode, str | None]:
-    """`read_episode` without searching the task's file; also returns the recorded path of that file.
+    """`read_episode` without searching for the task's file; also returns the recorded path of that file.
 
     Raises the errors of `read_episode`.
     """
@@ -141,7 +143,8 @@ def _broken_file(file: Path, error: Exception, lost: str) -> BrokenFile:
 
 
 def _read_description(file: Path | None) -> tuple[Description | None, Exception | None]:
-    """The description in the .json (None if the workbench did not write it), and the read error."""
+    """The description in the .json (None if the workbench did not write it), and the error of reading it
+    (None if it was read)."""
     if file is None:
         return None, None
     try:

@@ -52,9 +52,10 @@ _MAX_PICTURE_PIXELS = 4096
 def read_found(folder: Path, found: RecordingFiles, only_names: bool = False) -> list[LibraryEntry]:
     """The recordings in these files: none, one, or one per trajectory.
 
-    A broken file becomes a row that states the problem. A ``.json`` of any other kind gives no row. The
-    ``.json`` has everything but rewards and pictures of ManiSkill's trajectories, which are in the ``.h5``. A
-    lone ``.rrd`` must be read completely, which takes a tenth of a second or more.
+    A broken file becomes a row that states the problem. A ``.json`` that does not belong to a recording gives
+    no row. The ``.json`` of a recording has all data of its row; only the rewards and pictures of ManiSkill's
+    trajectories are in the ``.h5``. A lone ``.rrd`` must be read completely, which takes a tenth of a second
+    or more.
 
     Args:
         only_names: skip what is slow: rewards and pictures of trajectories, and the content of a lone ``.rrd``.
@@ -240,7 +241,7 @@ def _episode_or_problem(document: Document, number: int) -> EpisodeJson | str:
 
 
 def _lerobot_entries(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
-    """One row per episode of a LeRobot dataset; its key is ``meta/info``."""
+    """One row per episode of a LeRobot dataset; the key of its files ends in ``meta/info``."""
     # Imported late: Arrow starts threads, which must not exist at a fork.
     from workbench.episodes.lerobot.read import lerobot_rows
 

@@ -166,7 +166,8 @@ class Reader:
         Args:
             seconds: timeout of the answer.
             patience: timeout in seconds of waiting for other requests; None waits forever.
-            process: number of the process that the request refers to, such as one with an open episode.
+            process: number of the process that must answer, such as the one in which an episode is open; None
+                for any process.
             stopped: polled a few times a second; once it returns True, the answer is no longer needed.
 
         Raises:
@@ -188,7 +189,8 @@ class Reader:
         process: int | None = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> list[Answered | ReaderEnded]:
-        """Send several requests at once, each with this timeout; a request that ends the reader does not affect the others.
+        """Send several requests at once, each with a timeout of `seconds`; a request that ends the reader
+        does not affect the others.
 
         A request whose reader dies is retried once: the cause may have been external.
         """
@@ -218,8 +220,8 @@ class Reader:
         return answers
 
     def allow(self, paths: Sequence[Path]) -> None:
-        """Allow the process to read these files too. For new paths the process is replaced, and its episodes
-        are closed."""
+        """Allow the process to read these files too. If a path is new, the process is replaced, and its
+        episodes are closed."""
         with self._turns.hold(None):
             if not self._allowed.issuperset(paths):
                 self._allowed.update(paths)
@@ -278,7 +280,7 @@ class Reader:
 
 
 def _receive(line: MessageSocket, seconds: float, stopped: Callable[[], bool]) -> Answer:
-    """The next answer. Raises TimeoutError, also once `stopped` returns True."""
+    """The next answer. Raises TimeoutError after `seconds`, or once `stopped` returns True."""
     until = time.monotonic() + seconds
     while (left := until - time.monotonic()) > 0 and not stopped():
         if (answer := line.receive(min(left, POLL_SECONDS))) is not None:
@@ -287,7 +289,8 @@ def _receive(line: MessageSocket, seconds: float, stopped: Callable[[], bool]) -
 
 
 class _FairLock:
-    """A fair (first come, first served) lock: Python's own may go back to the thread that just released it."""
+    """A fair lock (first come, first served). Python's own lock may go back to the thread that just released
+    it."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()

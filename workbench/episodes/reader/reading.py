@@ -40,9 +40,10 @@ from workbench.episodes.writing.publish import RecordingError
 ROW_SECONDS = 30.0
 OPEN_SECONDS = 60.0
 PICTURE_SECONDS = 70.0
-"""Timeout of a picture: a film is decoded when its first frame is read."""
+"""Timeout of a picture. It is long, because reading the first frame of a film decodes all frames of the
+episode."""
 RECOVERY_SECONDS = 1800.0
-"""Timeout of a recovery: an hour with four cameras takes some minutes."""
+"""Timeout of a recovery: a recording of an hour with four cameras takes some minutes."""
 PICTURE_WAIT_SECONDS = 0.2
 """Timeout of a picture request that waits while another recording is being opened."""
 MAX_READERS = 4
@@ -75,7 +76,8 @@ def stop_reading() -> None:
 def read_rows(
     folder: Path, found_files: Iterable[RecordingFiles], only_names: bool = False
 ) -> Iterator[tuple[RecordingFiles, list[LibraryEntry]]]:
-    """The recordings in these files of a library's folder, each with its thumbnail; problems become rows.
+    """The recordings in these files of a library's folder, each with its thumbnail. A broken file gives a row
+    that states the problem.
 
     Args:
         only_names: as in `read_rows.read_found`.
@@ -162,7 +164,8 @@ def read_sweep(path: Path) -> SweepResults:
 
 
 def recover_confined(folder: Path) -> tuple[Path, ...]:
-    """Recover recordings from the journals that dead writers left in `folder`; returns the .rrd of each.
+    """Recover recordings from the journals that dead writers left in `folder`; returns the path of each
+    recovered .rrd.
 
     A foreign folder may contain journals, so a confined process reads them. It may write only below `folder`,
     has limits on memory and time, and starts only if there are journals.
@@ -317,8 +320,8 @@ class _OpenEpisode:
 
 
 def find_sources(path: Path) -> list[Source]:
-    """The recordings in a file, or in a folder and the folders below it, ordered by name; damaged ones too,
-    as in the library.
+    """The recordings in a file, or in a folder and the folders below it, ordered by name. As in the library,
+    damaged recordings are included.
 
     Raises:
         UnreadableRecording: a folder cannot be listed.
@@ -363,7 +366,7 @@ def _source(folder: Path, files: RecordingFiles, facts: Facts, number: int) -> S
 
 
 def find_all_sources(paths: Sequence[Path]) -> tuple[Source, ...]:
-    """The recordings in these files and folders, with the folders below them, each once.
+    """The recordings in these files, in these folders and in all folders below them; each recording once.
 
     Raises:
         FileNotFoundError: a path does not exist.

@@ -17,7 +17,7 @@ from workbench.episodes.sweep_results import SweepResults
 
 
 class NewReader(msgspec.Struct, tag=True):
-    """Fork a reader for these paths; sent with the reader's socket. Answered with its process id."""
+    """Fork a reader for these paths; sent with the reader's socket. Answered with the reader's process id."""
 
     paths: list[Path]
     writes: Path | None = None
@@ -31,7 +31,7 @@ class GetExitCode(msgspec.Struct, tag=True):
 
 
 class ReadRows(msgspec.Struct, frozen=True):
-    """Read the rows of the files of one name; answered with `RowsRead`."""
+    """Read the library rows of the files that share one name; answered with `RowsRead`."""
 
     folder: Path
     key: bytes
@@ -60,7 +60,8 @@ class ReadPicture(msgspec.Struct, frozen=True):
     modality: Modality
     index: int
     encoded: bool
-    """Return the picture encoded, as `PictureRead.blob`; else decoded, as `PictureRead.array`."""
+    """True returns the picture encoded, as `PictureRead.blob`; False returns it decoded, as
+    `PictureRead.array`."""
 
 
 class CloseEpisodes(msgspec.Struct, frozen=True):

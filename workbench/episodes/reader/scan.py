@@ -17,15 +17,15 @@ recording."""
 DATASET_KEY = ["meta", "info"]
 """End of the key of a LeRobot dataset."""
 SETTLE_SECONDS = 3.0
-"""Time after a change in which a folder may change again within one tick of its modification time, or a
-recording may get its other files."""
+"""Time after a change of a folder in which a further change may leave its modification time the same (the
+times advance in ticks), and in which a new recording may still get its other files."""
 MAX_ENTRIES = 500_000
 """Maximum number of names that are listed: the folder may be a home folder."""
 
 
 @dataclass(frozen=True)
 class RecordingFiles:
-    """The files of one name; unequal after any of them was written, added or removed."""
+    """The files that share one name. Two values differ if a file was written, added or removed in between."""
 
     key: str
     """Path without suffix, relative to the library's folder, with ``/``."""
@@ -53,7 +53,8 @@ def broken(found: RecordingFiles, problem: str) -> LibraryEntry:
 
 
 def files_named(path: Path) -> RecordingFiles | None:
-    """The files of the recording that `path` belongs to, with its folder as the library; None if there are none."""
+    """The files of the recording that `path` belongs to, with the folder of `path` as the library; None if
+    there are none."""
     stats: dict[str, os.stat_result] = {}
     for suffix in (*SUFFIXES, NOTES):
         try:
@@ -73,9 +74,9 @@ class Scan:
     """Result of `scan_folder`.
 
     A folder's modification time changes when a name in it is added, removed or replaced, which is how
-    recordings are written. So `is_unchanged` only checks the times of folders. These advance in ticks, and a
-    file that is added within the tick of the last scan would be missed, so a folder with a recent time counts
-    as changed (`fresh`).
+    recordings are written. So `is_unchanged` only checks the times of folders. These times advance in ticks,
+    so a file that is added within the tick of the last scan would be missed. Therefore a folder with a recent
+    time counts as changed (`fresh`).
     """
 
     found: dict[str, RecordingFiles] = field(default_factory=dict)

@@ -21,10 +21,11 @@ from workbench.episodes.rerun.entities import (
 )
 
 MAX_SERIES = 32
-"""Maximum number of curves of an ``evaluate()`` entry; one with more is not drawn, or it would hide the
-rest."""
+"""Maximum number of curves of an ``evaluate()`` entry; an entry with more is not drawn, because it would hide
+the other curves."""
 MAX_STACKED = 3
-"""Maximum number of stacked cameras; more are in tabs, because each would be a narrow strip."""
+"""Maximum number of stacked cameras; more cameras are in tabs, because each would be a narrow strip of the
+stack."""
 EYE_DIRECTION = (0.75, 0.85, 0.6)
 """Direction from the scene's centre to the eye, like ManiSkill's render cameras."""
 

@@ -76,7 +76,7 @@ def property_chunk(name: str, values: Mapping[str, Any]) -> Chunk:
 @lru_cache(maxsize=512)
 def series_chunk(entity: str, names: tuple[str, ...], first_color: int = 0) -> Chunk:
     """Name and colour of each number of the batched scalars of `entity`."""
-    # By default rerun gives all series of an entity one colour, and entities of a folder similar ones.
+    # By default rerun gives all series of an entity one colour, and the entities of a folder similar colours.
     colors = [SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))]
     return static_chunk(entity, rr.SeriesLines(names=list(names), colors=colors))
 
@@ -86,7 +86,7 @@ class _Column:
     """Replacement of rerun's ``ComponentColumn`` for an Arrow array.
 
     Rerun's archetypes validate and convert their arguments, which for a few hundred rows takes longer than making the
-    chunk. So they are called only once, for names and Arrow types of the columns.
+    chunk. So they are called only once, to get the names and Arrow types of the columns.
     """
 
     descriptor: rr.ComponentDescriptor
@@ -118,7 +118,7 @@ def _text_columns() -> tuple[tuple[rr.ComponentDescriptor, pa.DataType], ...]:
 
 
 def _lists(numbers: NDArray, kind: pa.DataType, per_row: int) -> pa.Array:
-    """`numbers` as rows of type `kind` with `per_row` elements each, which may be fixed-size lists."""
+    """`numbers` as rows of type `kind` with `per_row` elements each; an element may be a fixed-size list."""
     # Rows of a journal may be unaligned. Arrow would use them without a copy, and rerun would abort the
     # process (observed).
     flat = pa.array(np.require(numbers.reshape(-1), requirements=["C", "A"]))

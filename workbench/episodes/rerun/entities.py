@@ -40,7 +40,7 @@ step."""
 _MAX_PIXELS, _MAX_PICTURES = 1 << 20, 1024
 """Maximum pixels and pictures of one chunk, whose pictures are in memory together."""
 _PNG_RGBA = 6
-"""Colour type of a PNG, its byte 25 (PNG specification, section 11.2.1)."""
+"""RGBA as the colour type of a PNG, which is byte 25 of the file (PNG specification, section 11.2.1)."""
 FRUSTUM_METRES = 0.12
 """Distance from a camera to its picture in the 3-D view."""
 _XYZW = [0, 1, 2, 4, 5, 6, 3]
@@ -62,8 +62,9 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
       ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` and ``/logs/evaluate`` as text.
 
     Timelines are ``step``, the state's number, and ``sim_time``. Row k is the state after k control steps, with the
-    action that led to it and its reward: the action of row k is ``episode.action[k - 1]``, and row 0 has neither. Rows
-    of numbers or poses between two equal ones are left out (`chunks.changed_rows`): the previous row is valid there.
+    action that led to it and its reward: the action of row k is ``episode.action[k - 1]``, and row 0 has
+    neither. A row of numbers or poses that equals both its neighbours is left out (`chunks.changed_rows`):
+    the previous row is valid there.
 
     All data are columns, with one call per entity: forty times faster than one call per row (measured). Rerun uses xyzw
     quaternions and OpenCV cameras (x right, y down, z forward); ManiSkill uses wxyz and x forward, y left, z up.
@@ -118,7 +119,7 @@ def _bodies(episode: Episode) -> dict[int, str]:
 
 
 def _never_moves(poses: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Whether all R of the poses (R, ..., 7) are equal, as (...)."""
+    """Whether all R poses in `poses` (R, ..., 7) are equal, for each body or camera: an array (...)."""
     bits = poses.view(np.int32)  # as bits, so that NaN equals NaN
     return np.asarray((bits == bits[0]).all(axis=(0, -1)))
 
@@ -202,7 +203,8 @@ _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 """Cache of `_mesh_chunk` by the visual's id, for the life of the visual: the next episode of the scene avoids converting
 megabytes of textures."""
 _MAX_ENTITIES = 64
-"""Maximum number of cached entities per visual. A visual has one for each env if body names differ."""
+"""Maximum number of cached entities per visual. A visual has one entity for each env if the names of its
+bodies differ between envs."""
 _encoded: dict[bytes, bytes] = {}
 _MAX_ENCODED_TEXTURES = 256
 _making = threading.Lock()
@@ -339,7 +341,8 @@ def _picture_columns(modality: Modality, blobs: Sequence[bytes], kind: np.dtype)
 
 
 def _numbers(episode: Episode) -> list[tuple[str, list[str], NDArray]]:
-    """(entity, names of its curves, rows of numbers): one row per state, or T rows without the reset."""
+    """(entity, names of its curves, rows of numbers) for each entity; there is one row per state, or T rows
+    if the state after the reset has none."""
     found = [
         ("/action", list(episode.action_names), episode.action),
         ("/reward", ["reward"], episode.reward),
@@ -374,8 +377,8 @@ def _series_names(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 def _series(numbers: Iterable[tuple[str, list[str], NDArray]]) -> Iterator[Chunk]:
     drawn: Counter[str] = Counter()
     for entity, series, _ in numbers:
-        # One view draws all entities of a folder, and /batch together with /evaluate: no two should have one
-        # colour.
+        # One view draws all entities of a folder, and those of /batch together with those of /evaluate: the
+        # curves of a view should have different colours.
         folder = entity.split("/")[1].replace("batch", "evaluate")
         if series:
             yield series_chunk(

@@ -36,9 +36,9 @@ class RerunTable:
     """The content of an ``.rrd`` by entity and component.
 
     Rerun's query engine is an extra of 100 MB. But chunks are Arrow tables, so the columns that `write_rrd`
-    wrote can be read without it. The file is read once, in pieces; pictures are not kept, but read again on
-    access (`pictures`). Every recording of a scene has the scene's meshes, often as the same chunks: a mesh
-    that was loaded from another recording is found by the chunk's id, and not decoded again.
+    wrote can be read without the engine. The file is read once, in pieces; pictures are not kept, but read
+    again on access (`pictures`). Every recording of a scene has the scene's meshes, often as the same chunks:
+    a mesh that was loaded from another recording is found by the chunk's id, and not decoded again.
 
     The file stays open while its pictures may be read, also after it is deleted.
     """
@@ -67,7 +67,8 @@ class RerunTable:
             self._read_what_is_left()
 
     def _read_what_is_left(self) -> None:
-        """Read the intact chunks of a damaged file: most chunks are pictures, and a damaged one must not lose the others."""
+        """Read the intact chunks of a damaged file: most chunks are pictures, and a damaged chunk must not
+        make the other chunks unreadable."""
         for held in (self._timed, self._static, self._pictures, self._static_chunks):
             held.clear()
         pictures = self._file.entities_with(PICTURE_COMPONENTS.values())
@@ -218,8 +219,8 @@ class RerunTable:
             name, *numbers = json.loads(look)
             r, g, b, a, metallic, roughness = map(float, numbers)
             return str(name), Material((r, g, b, a), metallic, roughness, texture)
-        # Files of older versions have a component for the name, and one for all numbers or one for each
-        # number.
+        # Files of older versions have one component for the name, and either one component for all numbers or
+        # one for each number.
         name = str(self._one(entity, "visual", default))
         surface = self._static.get((entity, "surface"))
         if surface is not None:
@@ -383,8 +384,8 @@ class OpenFile:
 class _ChunkCache:
     """Cache of the last used chunks of pictures, for all recordings of the process.
 
-    An episode of ten thousand steps with four cameras is a few hundred megabytes, and a review may have sixty open. A
-    chunk is a few megabytes, and the next picture is usually in the same chunk.
+    An episode of ten thousand steps with four cameras is a few hundred megabytes, and a review may have sixty
+    episodes open. A chunk is a few megabytes, and the next picture is usually in the same chunk.
     """
 
     def __init__(self) -> None:

@@ -36,9 +36,10 @@ def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> bytes:
 
 
 def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: Iterable[Chunk]) -> None:
-    """Write `chunks` as one recording to `path`, after `blueprint`, which becomes the active and the default one.
+    """Write `blueprint` to `path`, as the active and the default blueprint, and then `chunks` as one
+    recording.
 
-    ``LazyChunkStream.write_rrd`` is faster, but writes only one store, and a blueprint is a second one.
+    ``LazyChunkStream.write_rrd`` is faster, but writes only one store, and a blueprint is a second store.
 
     Raises:
         OSError: `path` cannot be written.
@@ -46,12 +47,14 @@ def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: I
     """
     with _one_at_a_time, path.open("wb", buffering=0) as file, _copied_to(file) as copy:
         with _rerun_enabled():
-            # A new id, because rerun's default is one per process: two episodes of one process would become one.
+            # A new id, because rerun's default is one per process: two episodes of one process would become
+            # one recording.
             stream = rr.RecordingStream(application_id, recording_id=uuid.uuid4().hex, send_properties=False)
         try:
             stream.save(copy.path)
             stream.log_file_from_contents("blueprint.rbl", blueprint)
-            # Write the blueprint first. A viewer that reads the file from its beginning uses its own layout until then.
+            # Write the blueprint first. A viewer that reads the file from its beginning uses its own layout
+            # until it has read the blueprint.
             stream.flush()
             for chunk in chunks:
                 copy.check()
@@ -67,7 +70,8 @@ def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: I
 
 @contextmanager
 def _rerun_enabled() -> Iterator[None]:
-    """Override the user's ``RERUN=off``, which is for logging in their code: with it rerun silently writes nothing."""
+    """Override the user's ``RERUN=off``, which is meant for logging in the user's code: with this setting
+    rerun silently writes nothing."""
     entries = os.environ.get("RERUN")
     if entries is None:
         yield
@@ -80,8 +84,10 @@ def _rerun_enabled() -> Iterator[None]:
 
 
 def _end_threads(application_id: str) -> None:
-    """End the threads of disconnected streams. Without this each leaves two threads for the life of the process."""
-    # Not with a global recording, which this would turn off: the user's code may log to it.
+    """End the threads of disconnected streams. Otherwise each stream leaves two threads for the life of the
+    process."""
+    # Do nothing if there is a global recording: `rr.init` would turn it off, and the user's code may log to
+    # it.
     if rr.get_global_data_recording() is None and rr.get_thread_local_data_recording() is None:
         rr.init(application_id, init_logging=False)
 

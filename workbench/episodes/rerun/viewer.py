@@ -39,8 +39,9 @@ VIEWER_POLICY = (
     "connect-src 'self'; img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; "
     "frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
 )
-"""Content-Security-Policy that restricts rerun's page to its own server: by default it loads fonts and release notes
-and sends usage statistics. It needs inline scripts and ``wasm-unsafe-eval`` to start its program (rerun 0.41)."""
+"""Content-Security-Policy that restricts rerun's page to its own server: by default the page loads fonts and
+release notes and sends usage statistics. The page needs inline scripts and ``wasm-unsafe-eval`` to start its
+program (rerun 0.41)."""
 _packing = threading.Lock()
 
 
@@ -50,8 +51,8 @@ _packing = threading.Lock()
 def rerun_command() -> list[str]:
     """The command of the rerun version that this interpreter imports.
 
-    A ``rerun`` on PATH may have another version, and file and viewer must match. ``python -m rerun_cli`` loses the exit
-    status (rerun 0.41), and killing it leaves its program running.
+    A ``rerun`` on PATH may have another version, but file and viewer must be of the same version. ``python -m
+    rerun_cli`` loses the exit status (rerun 0.41), and killing it leaves its program running.
     """
     for folder in rerun_cli.__path__:
         if (program := Path(folder, "rerun")).is_file():
@@ -62,8 +63,8 @@ def rerun_command() -> list[str]:
 def quiet_environment() -> dict[str, str]:
     """Environment in which rerun's command sends no usage statistics.
 
-    Rerun has no variable for that alone; with ``CI`` set it neither sends nor asks, and keeps the user's settings (rerun
-    0.41, crate re_analytics).
+    Rerun has no variable for that alone; with ``CI`` set, rerun neither sends statistics nor asks about them,
+    and keeps the user's settings (rerun 0.41, crate re_analytics).
     """
     environment = child_environment(CI="true")
     environment.pop("FORCE_RERUN_ANALYTICS", None)
@@ -202,9 +203,9 @@ def viewer_file(name: str) -> Path:
 def web_viewer_folder() -> Path:
     """Folder of the web viewer's files ``<name>.gz``; the first call creates them, in about ten seconds.
 
-    The files are embedded in rerun's command, which only serves them, uncompressed (43 MB). So the command is
-    started once per version of rerun, on loopback (by default it binds to every address), and the files are
-    stored as gzip (14 MB) in the user's cache. `share.rerun_panel` serves them.
+    The files are embedded in rerun's command, which can only serve them, uncompressed (43 MB). So the command
+    is started once per version of rerun, on loopback (by default it binds to every address), and the files
+    are stored as gzip (14 MB) in the user's cache. `share.rerun_panel` serves them.
 
     Raises:
         RuntimeError: rerun did not serve the files, or they cannot be stored.

@@ -35,7 +35,7 @@ def write_rrd(episode: Episode, path: Path) -> None:
         ValueError: rerun refuses a value.
     """
     application_id = _application_id(episode.info)
-    # Without strict mode rerun drops a mesh that it refuses, with a warning.
+    # Without strict mode, rerun only warns and drops a mesh that it refuses.
     with catch_and_log_exceptions(strict=True):
         blueprint = _blueprint(application_id, arrangement(episode))
         everything = chain(_property_chunks(episode), chunks(episode))

@@ -51,8 +51,8 @@ class EpisodeWriter:
     moment. So `append` only checks a row and queues it in a `Journal`; pictures go to `encode_async`.
     `finish` makes the files.
 
-    Only one thread at a time may use a writer; another thread may call `finish`. `len()` is the number of
-    control steps.
+    Only one thread at a time may use a writer; `finish` may run on another thread than `append`. `len()` is
+    the number of control steps.
     """
 
     def __init__(
@@ -116,11 +116,12 @@ class EpisodeWriter:
         pictures: Sequence[Picture] = (),
         others: Mapping[str, OtherEntry] = NO_OTHERS,
     ) -> None:
-        """Add a state as packed by `BatchPacker`: first the state after the reset, then each with the action that led to it.
+        """Add a state as packed by `BatchPacker`: the first call adds the state after the reset, each later
+        call a state with the action that led to it.
 
         Args:
-            pictures: pictures of this env alone; each camera keeps the modalities of its first picture. They are encoded in
-                the background: do not modify them afterwards.
+            pictures: pictures of this env alone; later pictures of a camera must have the modalities of its
+                first picture. The pictures are encoded in the background: do not modify them afterwards.
             others: entries of ``evaluate()`` that are not rows, each as returned by `OtherEntry.of_env`.
 
         Raises:
@@ -149,7 +150,7 @@ class EpisodeWriter:
         self._states += 1
 
     def acted_by(self, what: str) -> None:
-        """Set the source of the actions from the next one on.
+        """Set the source of the actions from the next action on.
 
         Raises:
             RecordingError: as `append` does.
@@ -162,7 +163,7 @@ class EpisodeWriter:
     def placed(
         self, key: CameraKey, used: CameraSettings | None, in_file: CameraSettings | None = None
     ) -> None:
-        """Record the placement of a camera from the next state on.
+        """Record how a camera is placed from the next state on.
 
         Args:
             used: its settings; None for those in the task's description.
@@ -181,7 +182,8 @@ class EpisodeWriter:
             raise self._failed(error) from error
 
     def finish(self, process: FilesProcess | None = None) -> EpisodeFiles:
-        """Make the files of the episode, in `process` if possible. After an error call it again, or call `close`.
+        """Make the files of the episode, in `process` if possible. After an error, call `finish` again, or
+        call `close`.
 
         Raises:
             ValueError: there is no state yet.

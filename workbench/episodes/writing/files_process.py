@@ -47,15 +47,16 @@ class _Made:
 
 @dataclass(frozen=True)
 class _NotMade:
-    """Export failed in the subprocess. The caller retries in-process to get the real error."""
+    """Export failed in the subprocess. The caller tries again in its own process, to get the real error."""
 
 
 class FilesProcess:
-    """Makes files from journals in a subprocess. One thread may call `make`, any thread `is_ready`.
+    """Makes files from journals in a subprocess. Only one thread may call `make`; any thread may read
+    `is_ready`.
 
     A thread would compete for the GIL with the env, whose calls of PhysX hold it. Starting the process takes
-    a second of a core and 110 MB. The process has normal priority: the lowest one was no faster, and with it
-    journals would pile up while all cores are busy.
+    a second of a core and 110 MB. The process has normal priority: with the lowest priority nothing was
+    faster, and journals would pile up while all cores are busy.
     """
 
     def __init__(self) -> None:

@@ -50,7 +50,7 @@ def make_files(
     """Write the episode in `journal` to `folder`; the journal stays.
 
     Args:
-        states: expected number of states, if given.
+        states: number of states that the journal must have; None for any.
         again: whether another process may have begun to make the files, and died; files that it published are
             used.
 
@@ -132,12 +132,13 @@ def recover(folder: Path) -> list[EpisodeFiles]:
     """Recover recordings from all journals in `folder` whose writer is dead (their lock is free).
 
     A writer may die while recording, while making files, and between publishing two files of one recording; its journal
-    exists in each case. A journal without a control step is deleted, a damaged one is kept under another name. If one
-    journal fails, the error is raised after the others are done.
+    exists in each case. A journal without a control step is deleted, a damaged one is kept under another
+    name. If one journal fails, the error is raised after the other journals are done.
 
     Raises:
-        RecordingError: files cannot be written, or the folder or a journal cannot be read completely; the journals stay.
-        MemoryError: a journal needs too much memory; the others are done.
+        RecordingError: files cannot be written, the folder cannot be read, or a journal cannot be read
+            completely; the journals stay.
+        MemoryError: a journal needs too much memory; the other journals are done.
     """
     folder = Path(folder)
     if (folder / FOLDER).is_symlink():
@@ -167,7 +168,7 @@ def recover(folder: Path) -> list[EpisodeFiles]:
 
 
 def _recover(journal: Path, folder: Path) -> list[EpisodeFiles]:
-    """Recover one journal, a damaged one up to the damage. Raises as `recover` does."""
+    """Recover one journal; of a damaged journal, the states before the damage. Raises as `recover` does."""
     descriptor = claim(journal)
     if descriptor is None:
         return []

@@ -31,7 +31,7 @@ class Header:
     action_names: tuple[str, ...]
     cameras: tuple[CameraInfo, ...]
     made_here: bool = True
-    """Whether this installation recorded it; False for a journal in a foreign folder."""
+    """Whether this installation recorded the episode; False for a journal that another installation wrote."""
 
     @property
     def bodies(self) -> int:

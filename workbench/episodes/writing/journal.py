@@ -58,8 +58,9 @@ class Journal:
     need whole columns), and the task's code may hang, exhaust the memory or crash before that. So every row goes into a
     journal, from which the writer or the next process makes the files (`finish_or_recover.recover`).
 
-    It is an Arrow stream of one table, ``kind``, ``number`` and ``value``, that may end anywhere. A state's pictures come
-    before its row, so a state is complete or missing:
+    The journal is an Arrow stream of one table with the columns ``kind``, ``number`` and ``value``; the
+    stream may end anywhere. A state's pictures come before its row, so a state is complete or missing. The
+    kinds of entries, each with the meaning of its number and of its value:
 
     - ``header``: JSON; the scene's meshes are in a file next to it (`write_scene`);
     - ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: one or several consecutive rows of that layout;
@@ -107,7 +108,8 @@ class Journal:
     def append(self, *items: JournalItem) -> None:
         """Queue the entries of a state, its row last.
 
-        Pending entries keep their place; the writing thread waits for them, not the caller.
+        Entries that are still being encoded keep their place in the queue. The writing thread waits for them;
+        the caller does not.
 
         Raises:
             OSError: an earlier entry could not be written or encoded; this state is not queued.
@@ -196,7 +198,8 @@ class Journal:
             self.close()
 
     def _put(self, content: pa.Buffer) -> None:
-        # After a partial write overwrite at the same offset: a reader stops at an incomplete batch.
+        # After a partial write, the next call overwrites the incomplete batch: `_size` is unchanged. A reader
+        # stops at an incomplete batch.
         view, end = memoryview(content), self._size
         while view:
             written = os.pwrite(self._descriptor, view, end)
@@ -223,7 +226,8 @@ def _resolve(items: Sequence[JournalItem]) -> tuple[list[JournalEntry], int, OSE
 
 
 def _rows_joined(entries: Iterable[JournalEntry]) -> Iterator[JournalEntry]:
-    """Join consecutive rows of a layout to one entry: a hundred entries take as long as making the files from them."""
+    """Join consecutive rows of a layout to one entry: processing a hundred separate entries takes as long as
+    making the files from them."""
     for (kind, number), run in groupby(entries, key=itemgetter(0, 1)):
         if kind == "row":
             yield JournalEntry(kind, number, b"".join([entry.value for entry in run]))
@@ -320,7 +324,8 @@ def before_writing(flush: Callable[[], None]) -> None:
 
 
 class _BoundedFile:
-    """A file for Arrow whose reads are limited to its size: a damaged length would allocate the size that it claims."""
+    """A file for Arrow whose reads are limited to its size: otherwise Arrow would allocate the size that a
+    damaged length claims."""
 
     mode = "rb"
 
@@ -367,9 +372,9 @@ class JournalReader:
                 raise
 
     def lost_bytes(self) -> int:
-        """Number of bytes from the batch that ended the last iteration, if a complete batch follows it: then
-        the journal is damaged, not cut short. 0 if only the batch that was being written is lost. Raises
-        OSError."""
+        """Number of bytes from the incomplete batch at which the last iteration stopped to the end of the
+        file. 0 if no complete batch follows the incomplete one: then the journal is not damaged, only cut
+        short while that batch was being written. Raises OSError."""
         size, at = self._file.size, self._end
         while (at := self._find_batch(at + 1, size)) < size:
             try:
@@ -458,7 +463,8 @@ def write_scene(geometry: SceneGeometry, path: Path) -> None:
         if _last is not None and _last[0]() is geometry and _last[1].parent == path.parent:
             try:
                 os.link(_last[1], path)
-                # Keep the newest name, which is deleted last: the next batch begins while the files of this one are made.
+                # Keep the newest name, which is deleted last: the next batch of episodes begins while the
+                # files of this batch are made.
                 _last = (_last[0], path)
                 return
             except OSError:  # that episode's file is deleted, or the filesystem does not support links

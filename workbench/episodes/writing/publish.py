@@ -61,11 +61,11 @@ def publish(temporaries: Sequence[Path], folder: Path, stem: str) -> list[Path]:
     """Link finished files (``<id>.rrd``, ``<id>.h5`` ...), in order, to the first stem that is free for all
     of them.
 
-    The .json comes last: **a recording without a .json does not exist.** Racing processes get different names. The
-    temporaries stay if the filesystem supports links.
+    The .json comes last: **a recording without a .json does not exist.** Racing processes get different
+    names. If the filesystem supports hard links, the temporaries also stay under their old names.
 
     Raises:
-        OSError: publishing failed; no file has a name.
+        OSError: publishing failed; none of the files has its final name.
     """
     for candidate in candidates(stem):
         paths = [folder / f"{candidate}{temporary.suffix}" for temporary in temporaries]

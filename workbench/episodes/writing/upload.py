@@ -37,7 +37,7 @@ def require_place(address: str) -> None:
 
 
 def upload_episode(files: EpisodeFiles, address: str) -> None:
-    """Upload the files of an episode, and delete them here.
+    """Upload the files of an episode, and delete them on this machine.
 
     Raises:
         RecordingError: the upload failed; without its .json, the episode does not exist at the address.
@@ -56,7 +56,7 @@ def upload_episode(files: EpisodeFiles, address: str) -> None:
 
 
 def upload_file(file: Path, address: str) -> None:
-    """Upload a file and keep it here. Raises RecordingError."""
+    """Upload a file, and keep it on this machine. Raises RecordingError."""
     system, path = _place(address)
     try:
         _make_place(system, path)
