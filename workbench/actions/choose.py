@@ -37,8 +37,9 @@ from workbench.task.reference import find_module, named_file, split_reference
 class ActionChooser:
     """Chooses the action of every control step for the page's batch.
 
-    Random actions and the seeds of new episodes come from one generator for the whole batch, so that a reset with the
-    session's seed repeats everything after it. So the actions of one env depend on the number of envs.
+    Random actions and the seeds of new episodes come from one generator for the whole batch, so that a reset
+    with the session's seed makes all later actions and seeds repeat. The random actions of one env therefore
+    depend on the number of envs.
     """
 
     def __init__(self, folder: CurrentFolder) -> None:
@@ -53,11 +54,11 @@ class ActionChooser:
         self._task_folder: Path | None = None
         self._rng = np.random.default_rng(0)
         self._sliders: NDArray[np.float32] | None = None
-        """(N, A) slider values; NaN where no slider was set. Used for deltas and velocities; joint targets come from
-            `_targets`."""
+        """(N, A) slider values; NaN where no slider was set. Used for deltas and velocities; joint targets
+        come from `_targets`."""
         self._targets: NDArray[np.float32] | None = None
-        """(N, A) the last action of each env, or the slider value set after it, used for joint targets; NaN
-        from a reset until the first action."""
+        """(N, A) values for joint targets: each env's last action, overwritten by slider values that were set
+        after that action. NaN from a reset until the first action or slider value."""
 
     @property
     def name(self) -> str:
@@ -76,7 +77,7 @@ class ActionChooser:
         """Set the source of the actions.
 
         Args:
-            policy: as in `load_policy`; None or an empty name raises only at the next action.
+            policy: the `reference` of `load_policy`. If it is None or empty, only `next_action` raises.
             task_folder: as in `load_policy`.
 
         Raises:
@@ -90,7 +91,7 @@ class ActionChooser:
             pass
 
     def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
-        """(N, A) action of the next control step; within the bounds, unless a policy returns it.
+        """(N, A) action of the next control step. Only the action of a policy may be outside of the bounds.
 
         Raises:
             TaskError: the policy raised, returned no action, or cannot be imported. The next call imports it again.
@@ -109,8 +110,8 @@ class ActionChooser:
         return actions.hold_action(task.parts, task.num_envs)
 
     def slider_action(self, task: TaskEnv) -> NDArray[np.float32]:
-        """(N, A) action from the sliders: joint targets keep their last value; other dimensions without a
-        slider value hold still."""
+        """(N, A) action from the sliders. A joint target keeps its last value (action or slider), a delta or
+        velocity its slider value. A dimension without such a value holds still."""
         low, high = actions.bounds(task.parts)
         action = actions.hold_action(task.parts, task.num_envs)
         is_target = actions.is_target(task.parts)
@@ -122,7 +123,8 @@ class ActionChooser:
     def tell(
         self, task: TaskEnv, env_idx: Sequence[int], dimensions: Sequence[int], values: Sequence[float]
     ) -> None:
-        """Set `dimensions` of these envs' actions to slider `values`; without any, the envs hold still."""
+        """Set `dimensions` of these envs' actions to slider `values`. If `dimensions` is empty, clear the
+        values of these envs, so that they hold still."""
         shape = task.num_envs, actions.width(task.parts)
         if self._sliders is None or self._targets is None:
             self._sliders = np.full(shape, np.nan, np.float32)
@@ -133,14 +135,14 @@ class ActionChooser:
             array[np.ix_(env_idx, dimensions)] = values
 
     def acted(self, action: NDArray[np.float32]) -> None:
-        """Record the action of a control step, from any source."""
+        """Store the action (N, A) of a control step, from any source, as the joint targets."""
         self._targets = action.copy()
 
     def begin(
         self, env_idx: Sequence[int] | None, led: Mapping[int, NDArray[np.float32]] | None = None
     ) -> None:
-        """Forget the joint targets of these envs (all if None), which were reset or restored. `led` has the
-        action (A,) that led to the restored state, by env."""
+        """Forget the joint targets of these envs (all if None), which were reset or restored. `led` maps an
+        env to the action (A,) that led to its restored state; this action becomes its joint targets."""
         if self._targets is None:
             return
         self._targets[slice(None) if env_idx is None else list(env_idx)] = np.nan
@@ -157,8 +159,8 @@ class ActionChooser:
 
     @contextmanager
     def _imported(self) -> Iterator[Policy]:
-        """Yield the policy. An exception inside the block becomes the policy's TaskError, and the next call imports
-        the policy again."""
+        """Yield the policy, and import it first if necessary. An exception of the import or of the ``with``
+        block becomes a TaskError about the policy, and the next call imports the policy again."""
         try:
             if self._policy is None:
                 with self._folder.again():
@@ -196,7 +198,7 @@ class RecordActionChooser:
         """Begin an episode in this env; returns the name of its source of actions for the recording.
 
         Args:
-            given: run of a file, whose actions are replayed; None for another source.
+            given: run of a file; its actions are replayed. None if the actions do not come from a file.
         """
         self._rng[env] = np.random.default_rng(seed)
         self._given.pop(env, None)
@@ -213,7 +215,8 @@ class RecordActionChooser:
         self._rng.pop(env, None)
 
     def next_action(self, task: TaskEnv, steps: Mapping[int, int]) -> NDArray[np.float32]:
-        """Actions (N, A); `steps` maps each env with an episode to its number of steps so far.
+        """Actions (N, A); `steps` maps each env that has an episode to the number of steps that this episode
+        has so far.
 
         Raises:
             TaskError: the policy raised, or returned no action; or the task raised in a rollout.
@@ -244,8 +247,8 @@ class RecordActionChooser:
 
 
 class PlannedActions:
-    """Plans the actions of a batch's episodes, each independently of the others, and records the returns of
-    the rollouts."""
+    """Plans the actions of a batch, each episode independently of the other episodes, and records the returns
+    of the rollouts."""
 
     def __init__(
         self, loaded: LoadedTask, task: TaskEnv, env_kwargs: Mapping[str, Any], plan: PlanOptions
@@ -275,7 +278,7 @@ class PlannedActions:
         self._logs[env] = EpisodeLog(seed, self._planner.horizon)
 
     def next_action(self, env_idx: Sequence[int]) -> NDArray[np.float32]:
-        """Actions (N, A), planned for these envs; the others hold still.
+        """Actions (N, A): planned for these envs; all other envs hold still.
 
         Raises:
             TaskError: the task raised in a rollout.
@@ -368,8 +371,8 @@ def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Need
     """Files and folders that a job needs and that are not installed.
 
     Args:
-        task: as in `RecordArguments.task`; needs the folder of its file, or of its package.
-        actions: as in `RecordArguments.actions`; needs the file or policy that it names.
+        task: as in `RecordArguments.task`; the job needs the folder of the task's file or package.
+        actions: as in `RecordArguments.actions`; the job needs the file or policy that is named there.
         imports: as in `TaskOptions.imports`.
     """
     folders: list[Path] = []
@@ -405,7 +408,7 @@ def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Need
 
 
 MAX_BYTES = 2**30
-"""Maximum size of a NumPy file, also unpacked: 20 million steps of a Panda."""
+"""Maximum size of a NumPy file, packed and unpacked; enough for 20 million steps of a Panda."""
 SUFFIXES = (".npy", ".npz", ".h5")
 
 
@@ -413,11 +416,12 @@ def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
     """Read a file of actions: a run for each episode, and the keyword arguments that the env needs, such as
     the control mode.
 
-    ``.npy``: (T, A) for all episodes, or (E, T, A), one (T, A) for each. ``.npz``: an array (T, A) for each
-    episode. ``.h5``: trajectories of ManiSkill, or a recording of the workbench; their runs also have a seed
-    and env states, which correct a replay if the same actions lead to another state (another machine or
-    version, or a GPU batch that was seeded as a whole). An episode of a file does not stop at success or at
-    the time limit, as in ManiSkill's ``replay_trajectory``.
+    ``.npy``: one array (T, A) for all episodes, or an array (E, T, A) with one (T, A) per episode. ``.npz``:
+    an array (T, A) per episode. ``.h5``: trajectories of ManiSkill, or a recording of the workbench; their
+    runs also have a seed and env states. The states correct a replay in which the actions lead to other
+    states than the recorded ones, as on another machine, in another version, or in a GPU batch that was
+    seeded as a whole. As in ManiSkill's ``replay_trajectory``, an episode of a file does not stop at success
+    or at the time limit.
 
     Raises:
         FileNotFoundError: there is no such file.

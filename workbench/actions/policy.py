@@ -29,11 +29,11 @@ from workbench.task.problem import Problem, definition_line, problem_from_except
 from workbench.task.watch import SourceWatcher
 
 Policy = Callable[[Any], Any]
-"""Takes the task's observation (batched, as in its ``obs_mode``); returns an array or tensor (N, A), one action (A,) for all
-envs, or a dict for several robots."""
+"""Takes the task's batched observation in the task's ``obs_mode``. Returns an array or tensor: (N, A), or one
+action (A,) for all envs. For several robots it returns a dict."""
 
 _warned: set[Path] = set()
-"""Files with a library's name for which the warning was printed."""
+"""Files named like a library, for which a warning was printed."""
 
 
 class NoPolicy(ValueError):
@@ -44,7 +44,7 @@ def find_policy(reference: str, task_folder: Path | None = None) -> tuple[str | 
     """The module name or file path, and the function name, in `reference`. Imports nothing.
 
     Args:
-        task_folder: the task's folder, searched for a relative file after the current folder.
+        task_folder: the task's folder. A relative file is looked up in the current folder first, then here.
 
     Raises:
         NoPolicy: the reference is not of the form ``module:function`` or ``file.py:function``, or the file
@@ -83,7 +83,7 @@ def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
         with searched_first(path.parent):
             spec.loader.exec_module(module)
     elif importlib.util.find_spec(package := name.partition(".")[0]) is None:
-        # A module that is not installed is searched in the current folder.
+        # A module that is not installed is searched for in the current folder.
         with searched_first(Path.cwd()):
             if importlib.util.find_spec(package) is None:
                 raise NoPolicy(f"there is no module {package}: it is neither installed nor in {Path.cwd()}")
@@ -115,14 +115,16 @@ class _PolicyLoader(importlib.machinery.SourceFileLoader):
         return read_regular_file(path, MAX_SOURCE_BYTES)
 
     def path_stats(self, path: str) -> Mapping[str, Any]:
-        # The bytecode cache compares the size and whole seconds: it would miss a second save within a second.
+        # The bytecode cache compares only a file's size and the second of its last change: it would miss a
+        # save of the same size within that second.
         raise OSError("no bytecode is kept")
 
 
 def policy_problem(
     error: BaseException, reference: str, task_folder: Path | None = None, policy: Policy | None = None
 ) -> Problem:
-    """The problem of a policy, at a line of its module or of another file of the author's that it calls.
+    """The problem of a policy, at a line of its module or of another file of the author's that the policy
+    calls.
 
     Args:
         task_folder: as in `load_policy`.
@@ -191,7 +193,8 @@ def list_policies(here: Path, task_folder: Path | None) -> tuple[str, ...]:
     folders = [here.resolve()] if task_folder is None else [here.resolve(), task_folder.resolve()]
     for folder in folders if folders[0] != folders[-1] else folders[:1]:
         for file in _python_files(folder):
-            # Same lookup as in `find_policy`: a file of the first folder hides one of the same name.
+            # Same lookup as in `find_policy`: a file of the first folder hides a file of the same name in the
+            # second.
             name = str(file) if file.name in taken else file.name
             taken.add(file.name)
             found += [(not likely, f"{name}:{function}") for function, likely in _functions_that_fit(file)]
@@ -207,7 +210,8 @@ def _python_files(folder: Path) -> list[Path]:
 
 
 def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
-    """Names of public functions with one required parameter, and whether it is named ``obs...``."""
+    """Names of public functions with one required parameter, and whether that parameter's name begins with
+    ``obs``."""
     try:
         tree = parse_python(read_regular_file(file, _MAX_FILE_BYTES))
     except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
@@ -225,12 +229,12 @@ def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
 
 
 class PolicyFile:
-    """Watches the file of the current policy, like the task's file. Thread-safe."""
+    """Watches the file of the current policy for changes. Thread-safe."""
 
     def __init__(self, on_save: Callable[[], None]) -> None:
         """
         Args:
-            on_save: called on the watcher's thread.
+            on_save: called on the watcher's thread when the file has changed.
         """
         self._on_save = on_save
         self._watcher: SourceWatcher | None = None

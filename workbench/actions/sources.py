@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy", "solve"]
-"""``solve``: planned by rollouts of the task, outside of `ActionChooser`."""
+"""The actions of ``solve`` are planned by rollouts of the task; `ActionChooser` does not choose them."""
 SOURCES: dict[str, ActionSource] = {
     "hold still": "hold",
     "zero": "zero",

@@ -98,7 +98,7 @@ def apply(studio: Studio, event: object, run: Run, now: Now) -> Change:
     """
     studio, effects = _apply(studio, event, run, now)
     if studio.is_open and not studio.was_chosen and studio.selected is None and run.task is not None:
-        # Choose the first sensor camera. The user may then choose none.
+        # Choose a camera once, a sensor if there is one. Afterwards the user may choose none.
         cameras = sorted(run.task.cameras, key=lambda camera: camera.kind != "sensor")
         if cameras:
             studio, _ = _select(studio, cameras[0].key, run)
@@ -186,7 +186,7 @@ def _place(studio: Studio, placed: CameraPlaced, run: Run, now: Now) -> Change:
 
 
 def _moved(studio: Studio, placements: Placements, key: CameraKey) -> Change:
-    """Send the placement of this camera, if it changed."""
+    """Replace the placements, and send the placement of this camera if it changed."""
     before, studio = studio.placements.placed, replace(studio, placements=placements)
     return (studio, []) if placements.placed.get(key) == before.get(key) else _send(studio, key)
 
@@ -220,7 +220,7 @@ def _take_suggestion(studio: Studio, number: int, run: Run, now: Now) -> Change:
 
 
 def _draw_preview(studio: Studio, run: Run) -> Change:
-    """Draw a preview, if one is wanted and something has changed since the last."""
+    """Draw a preview if one is wanted and its step or question has changed since the last preview."""
     key, step = studio.selected, shown_step(run)
     settings = None if key is None else studio.placements.now(key)
     if studio.preview_scale == 1.0 or key is None or settings is None or refusal(run, key):
@@ -234,7 +234,8 @@ def _draw_preview(studio: Studio, run: Run) -> Change:
 
 
 def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
-    """Handle a loaded version: update cameras and placements, and compare it with a written edit.
+    """Handle a loaded version: update cameras and placements, and compare the version with the edit that was
+    written or reverted.
 
     Args:
         scene_changed: whether more than the cameras changed in this version, so that reports are outdated.
@@ -252,7 +253,7 @@ def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
             f"{names} {'was' if one else 'were'} changed in the file and now {'follows' if one else 'follow'} "
             "it; Undo restores your placement."
         )
-    # Select the camera of the previous session again; none if the camera is gone.
+    # Keep the selected camera, or select that of the previous session again; none if the camera is gone.
     selected = studio.selected or studio.select_when_loaded
     if selected is not None and info_of(run, selected) is None:
         selected = None
@@ -294,8 +295,9 @@ def _failed(studio: Studio, lane: Lane, why: str) -> Studio:
 class StudioJobs:
     """Runs the jobs of the studio. Used on the loop.
 
-    A temporary camera with the same lens (`pictures.temporary_camera`) renders the preview: 1280 x 720 takes long without a
-    GPU, 64 x 64 shows little, and resizing the env's camera would change the observation.
+    A temporary camera (`pictures.temporary_camera`) renders the preview, with the lens of the env's camera
+    but at another size: 1280 x 720 takes long without a GPU, and 64 x 64 shows little. Resizing the env's
+    camera instead would change the observation.
     """
 
     def __init__(
@@ -307,7 +309,7 @@ class StudioJobs:
     ) -> None:
         """
         Args:
-            asker, background: ask questions of the worker that plays, and of the background process.
+            asker, background: the first asks the worker that plays, the second the background process.
             on_change: called when `progress` has changed.
             happen: handles the resulting events.
         """
@@ -320,7 +322,7 @@ class StudioJobs:
 
     @property
     def progress(self) -> JobProgress | None:
-        """Progress of a measurement, search or comparison; None while there is none."""
+        """Progress of a measurement, search or comparison; None while none of these runs."""
         return self._lanes["background"].progress or self._lanes["live"].progress
 
     def perform(self, effect: StudioEffect) -> None:

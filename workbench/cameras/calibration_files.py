@@ -36,8 +36,8 @@ MAX_YAML_CHARACTERS = 20_000
 """Limit for YAML: a calibration has about 2,000, and Python's YAML parser takes 20 ms for 1,000
 characters."""
 # ManiSkill's `intrinsic_cv` counts pixels from the outer edge of the first pixel (the middle of a picture is
-# W / 2), OpenCV's calibration counts from the first pixel's centre. Files name every convention, since an
-# ``extrinsic`` without one may be any of four matrices.
+# W / 2), but OpenCV's calibration counts from the first pixel's centre. Files name every convention, since an
+# ``extrinsic`` without a named convention may be any of four matrices.
 PIXELS = "pixels from the outer edge of the top left pixel; OpenCV's own calibration gives half a pixel less"
 CONVENTIONS = {
     "length": "metres",
@@ -77,7 +77,8 @@ class FoundPose:
     """A matrix in a text that may be a camera's pose.
 
     A matrix does not contain its convention: camera to world and world to camera both look plausible, as do the three
-    conventions of camera axes. So the user has to choose, except for our own JSON, which names them.
+    conventions of camera axes. So the user has to choose direction and axes, unless the text is our own JSON,
+    which names them.
     """
 
     label: str
@@ -210,8 +211,8 @@ def _one_line(text: str) -> str:
 def find_poses(text: str) -> tuple[FoundPose, ...]:
     """Candidates for a camera's pose in untrusted text: our JSON, other JSON or YAML, or a pasted matrix.
 
-    Finds 4 x 4 and 3 x 4 matrices and pairs of rotation and translation (``rvec`` and ``tvec``, ``R`` and ``t``) in maps of
-    any depth. `camera_pose` checks that a candidate is a rotation.
+    Searches nested maps and lists for 4 x 4 and 3 x 4 matrices, and for pairs of a rotation and a translation
+    (``rvec`` and ``tvec``, ``R`` and ``t``). `camera_pose` checks that a candidate's rotation is valid.
 
     Raises:
         ValueError: nothing is found, or the text cannot be read; the message says what was expected.
@@ -243,7 +244,8 @@ def camera_pose(
     direction: Direction | None = None,
     metres_per_unit: float = 1.0,
 ) -> Floats:
-    """(7,) pose of the camera in the env's frame (or in its mount's frame, if that is what was calibrated).
+    """(7,) pose of the camera in the env's frame or, if the calibration is relative to the camera's mount, in
+    the frame of the mount.
 
     Args:
         convention: camera axes of the calibration. Required unless the text names them.

@@ -36,11 +36,12 @@ from workbench.task.write_edits import apply, revert
 
 
 class _Stopped(Exception):
-    """The answer is no longer needed."""
+    """The answer is no longer needed, or did not arrive in time."""
 
 
 class FileEdits:
-    """Plans, writes and reverts edits, on a separate thread. Used on the loop.
+    """Plans, writes and reverts edits. All public methods except `close` are called on the loop; the work is
+    done on a separate thread.
 
     Args:
         asker: asks questions of the worker that plays.

@@ -51,7 +51,8 @@ NOTHING = EditState()
 class CameraChange:
     """The diff of a change with its buttons and its result, in the present container.
 
-    The tab has one at each of the two places where changes are requested; the buttons of a new diff are scrolled into view.
+    The tab has two of these, one at each place where changes are requested. The buttons of a new diff are
+    scrolled into view.
 
     Args:
         folder: Folder for a copy of the task.
@@ -166,7 +167,8 @@ NEW = CameraSettings(
     far=100.0,
     shader_pack="minimal",
 )
-"""Settings, except the pose, of the first camera of a kind: those of ManiSkill's own tasks."""
+"""Settings of a new camera if the task has no camera of its kind, as in ManiSkill's own tasks. The pose is
+replaced."""
 NEW_NAMES = {"sensor": "side_camera", "human": "render_camera"}
 PREVIEW_PIXELS = 256
 """Longer side of the new camera's picture."""
@@ -175,10 +177,11 @@ FromViewer = Callable[[viser.ClientHandle, CameraSettings], CameraSettings]
 
 
 class WriteToFile(PagePart[SessionView]):
-    """The button that writes the chosen camera's placement, and the folder to add, copy, rename and remove cameras.
+    """The button that shows the change of the file for the chosen camera, and the page's folder to add, copy,
+    rename and remove cameras.
 
     Args:
-        above: folder for the button and its change.
+        above: the page's folder for the button and its change.
         from_viewer: returns settings with the pose of a page's viewpoint, in the env's frame.
     """
 
@@ -256,10 +259,10 @@ class WriteToFile(PagePart[SessionView]):
         self._ask(EditRequest("add", key, settings, about=words))
 
     def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
-        """The typed name, or a free one like `like`.
+        """The typed name; if no name is typed, a free name that begins with `like`.
 
         Raises:
-            Refused: the name is invalid or taken.
+            Refused: the name is invalid or taken, or no name is typed and `like` is empty.
         """
         name = self._name.strip()
         if not name and like:
@@ -307,7 +310,8 @@ def is_stale(studio: StudioView) -> bool:
 
 
 def lens_of_siblings(studio: StudioView, kind: CameraKind) -> CameraSettings:
-    """The file's settings of the first camera of this kind without a mount; `NEW` if there is none."""
+    """The file's settings of the first camera of this kind without a mount. If there is none, `NEW`, with 512
+    x 512 pixels for a human camera."""
     for camera in studio.cameras:
         if camera.key[0] == kind and camera.info.mount is None and camera.info.settings is not None:
             return camera.info.settings
@@ -323,10 +327,10 @@ def free_name(studio: StudioView, kind: CameraKind, like: str) -> str:
 
 # --- initial pose of a new sensor -------------------------------------------------------------------
 
-# A user who adds a camera looks at a whole table, or at a grid of sixteen envs, from metres away: in a
-# picture of 128 x 128, a cube would be four pixels wide. So the direction of the page's view is kept, and the
-# eye moves along it to where the objects of all envs fill the picture. If the page's viewpoint is already
-# near there, it is the eye.
+# A user who adds a camera looks at a whole table, or at a grid of sixteen envs, from metres away: from there,
+# a cube would be four pixels wide in a picture of 128 x 128. So the new camera keeps the direction of the
+# page's view, but its eye is put where the objects of all envs fill the picture. If the page's viewpoint is
+# already near that place, it becomes the eye.
 
 MARGIN_METRES = 0.1
 """Margin around the origins of the objects."""
@@ -335,7 +339,7 @@ DISTANCE_FACTOR = 1.25
 MIN_DISTANCE_METRES = 0.6
 """Minimum distance: a hand that reaches for one small object must be in the picture too."""
 KEEP_VIEW_FACTOR = 1.5
-"""Factor on the wanted distance up to which the page's viewpoint is kept."""
+"""The page's viewpoint is kept if its distance is at most this factor times the wanted distance."""
 MIN_TARGET_METRES = 0.1
 MAX_NAMES = 3
 
@@ -370,7 +374,7 @@ def first_place(
 
 def distance_to(settings: CameraSettings, places: NDArray[np.float64]) -> float | None:
     """Distance in metres along the line of sight to the point nearest to the median of `places` (K, 3); None
-    without places, or if that is less than `MIN_TARGET_METRES`."""
+    if there are no places, or if the distance is less than `MIN_TARGET_METRES`."""
     if not len(places):
         return None
     pose = pose_of(settings)

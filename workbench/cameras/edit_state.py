@@ -185,7 +185,8 @@ def _begin(studio: Studio, asked: EditAsked, run: Run) -> Change:
 
 def _change_file(studio: Studio, edit: SourceEdit, stage: EditStage, message: str) -> Change:
     edits = studio.edits
-    # Before the file is written: the version with the edit may be loaded before the write is reported as done.
+    # Set the stage before the file is written: the version with the edit may be loaded before the write is
+    # reported as done.
     studio = _with_stage(studio, message.format(file=edit.names), stage, loading=True)
     done = edits.done[:-1] if stage == "undone" else (*edits.done, studio.edits.shown)
     studio = with_edits(studio, done=done, before=(edits.shown, edits.done), busy=True)
@@ -209,7 +210,8 @@ def _plan_found(studio: Studio, found: PlanFound, run: Run) -> Change:
 
 
 def _drop(studio: Studio, run: Run) -> Change:
-    """Drop the plan and show the newest written edit again; if one is shown already, drop all of them."""
+    """Drop the shown plan, and show the newest edit in the file again. If an edit in the file is shown
+    already, forget all edits, which stay in the file."""
     done = () if studio.edits.shown.stage in IN_FILE else studio.edits.done
     shown = done[-1] if done else EditState()
     studio = with_edits(studio, done=done, shown=shown, copied=None, just_copied="")
@@ -222,7 +224,8 @@ def edit_loaded(studio: Studio, task: TaskDescription) -> tuple[Studio, frozense
     """Compare the running version with the written or reverted edit.
 
     Returns:
-        The studio, and the cameras that the edit changed; none if this is not the version after the edit.
+        The studio, and the cameras that the edit changed; no cameras if the running version is not the one
+        after the edit.
     """
     request, edit = studio.edits.shown.request, studio.edits.shown.edit
     if request is None or edit is None or not _is_in(studio.edits, task, edit):
@@ -249,7 +252,8 @@ def edit_loaded(studio: Studio, task: TaskDescription) -> tuple[Studio, frozense
 
 
 def _is_in(edits: Edits, task: TaskDescription, edit: SourceEdit) -> bool:
-    """Whether this is the expected version: with a written edit, or without a reverted one."""
+    """Whether an edited file is being loaded and `task` is the expected version: with the edit if it was
+    written, without the edit if it was reverted."""
     written = edits.shown.stage == "written"
     return edits.shown.loading and all(
         task.source.get(change.file) == plain_line_ends(change.new_text if written else change.old_text)
@@ -258,7 +262,7 @@ def _is_in(edits: Edits, task: TaskDescription, edit: SourceEdit) -> bool:
 
 
 def plan_in_copy(studio: Studio, run: Run) -> Change:
-    """Plan the refused request in the copy of the task, if this is the copy."""
+    """Plan the refused request in the copy of the task, if the running task is that copy."""
     edits = studio.edits
     if edits.copied is None or run.task is None or run.task.file != str(edits.copied):
         return studio, []
@@ -269,7 +273,8 @@ def plan_in_copy(studio: Studio, run: Run) -> Change:
 def _with_placements(
     studio: Studio, request: EditRequest, in_file: CameraSettings | None
 ) -> tuple[Studio, bool]:
-    """Update the placements after an edit was written or reverted, and keep those that are not in the file.
+    """Update the placements after an edit was written or reverted; placements that are not in the file are
+    kept.
 
     Args:
         in_file: the camera's settings in the loaded version; None if there is no such camera.

@@ -27,8 +27,8 @@ Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]
 the moment of the history, None unless the camera is measured over steps."""
 
 Lane = Literal["live", "background", "preview", "new camera"]
-"""Each lane has one job at a time; a new one replaces it. ``live`` uses the worker that plays, ``background`` the background
-process."""
+"""Each lane has one job at a time; a new job replaces the running one. ``live`` uses the worker that plays,
+``background`` the background process."""
 
 # --- requests of a page that are not commands ----------------------------------------------------
 
@@ -75,7 +75,8 @@ class SuggestionsWanted:
     """Names of objects, or of single links of them (``TaskDescription.objects``)."""
     low: Triple
     high: Triple
-    """Corners of the box for the eye; metres, in the frame of the camera's mount, or the env's."""
+    """Corners of the box for the eye, in metres: in the frame of the camera's mount, or in the env's frame if
+    the camera has no mount."""
     seeds: int
     """Number of episodes, at most one per env."""
 
@@ -119,13 +120,13 @@ class ReportMade:
     settings: CameraSettings | None
     """The camera's settings when it was measured."""
     seeds: int
-    """Number of fresh episodes; 0 for envs at known moments."""
+    """Number of fresh episodes; 0 if the report is over envs at the shown moment or over steps."""
     moments: tuple[MeasuredMoment, ...]
 
 
 @dataclass(frozen=True)
 class Measuring:
-    """A measurement has begun or ended, complete or not."""
+    """A measurement has begun (`on`) or ended, whether complete or not."""
 
     on: bool
 
@@ -178,7 +179,7 @@ class PlanFound:
 
 @dataclass(frozen=True)
 class NewCameraDrawn:
-    """The job for the preview of a new camera has ended; its picture is None if it was not drawn."""
+    """The job for the preview of a new camera has ended; `picture` is None if nothing was drawn."""
 
     request: EditRequest
     picture: Picture | None

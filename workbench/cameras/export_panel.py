@@ -40,7 +40,8 @@ CONVENTIONS: dict[str, Convention] = {
     "OpenGL, Blender": "opengl",
     "ManiSkill, ROS body": "maniskill",
 }
-"""Conventions by label. In ROS, x is forward in the frame of a camera's body, and z in its optical frame (REP 103)."""
+"""Conventions by label. In ROS (REP 103), the forward axis is x in the frame of a camera's body, and z in the
+camera's optical frame."""
 AXES = {
     "opencv": "x right, y down, z forward",
     "opengl": "x right, y up, z backward",
@@ -52,7 +53,8 @@ DIRECTIONS: dict[str, Direction] = {
 }
 FORMS: dict[str, Form] = {"JSON": "json", "OpenCV YAML": "opencv", "ROS CameraInfo": "ros"}
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
-"""Length in metres of each unit: calibrations are often in the unit of the calibration board."""
+"""Length in metres of each unit of a pasted calibration, which is often in the unit of the calibration
+board."""
 WHICH = {"this camera": False, "all cameras": True}
 CONVENTION_HINT = (
     "The convention of the camera's axes, in the matrix shown below and in a pasted calibration."
@@ -197,7 +199,7 @@ class CameraExport(PagePart[SessionView]):
 def calibration_text(cameras: Sequence[StudioCamera], form: Form) -> str:
     """The text of a calibration file: cameras as placed, at the shown moment of the selected env.
 
-    ROS's format has one camera per file; several become YAML documents in one text.
+    ROS's format has one camera per file; several cameras become YAML documents in one text.
 
     Raises:
         ValueError: a camera cannot be exported; the message is for the user.
@@ -223,9 +225,10 @@ def calibrated_pose(
     convention: Convention | None,
     metres_per_unit: float = 1.0,
 ) -> frames.Floats:
-    """(7,) pose from a calibration, in the frame of the camera's mount, or the env's if it has none.
+    """(7,) pose from a calibration, in the frame of the camera's mount, or in the env's frame if the camera
+    has no mount.
 
-    Our own JSON names its direction and convention; for other texts, the arguments do.
+    Our own JSON names its direction and convention; for other texts, the arguments are used.
 
     Raises:
         ValueError: the text has no usable pose; the message is for the user.
@@ -275,6 +278,6 @@ def aligned(matrix: NDArray[np.float64]) -> str:
 
 
 def as_lists(matrix: NDArray[np.float64]) -> str:
-    """The matrix as Python and JSON lists, for copying, with nine digits."""
+    """The matrix for copying, with nine digits: nested lists that are both Python and JSON."""
     rows = (", ".join(f"{number + 0.0:.9g}" for number in row) for row in matrix)
     return "[" + ", ".join(f"[{row}]" for row in rows) + "]"

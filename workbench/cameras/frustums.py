@@ -20,7 +20,8 @@ CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 )
 MAX_IMAGE_PIXELS = 128
-"""Maximum longer side of the picture on a frustum."""
+"""Target for the longer side of a frustum's picture. A larger picture is shrunk by a whole factor, so that it
+stays below twice this."""
 SMALL_METRES, LARGE_METRES = 0.07, 0.14
 """Depth of a frustum: small for one env, large for a view of the whole grid."""
 COLOURS: dict[CameraKind, tuple[int, int, int]] = {"sensor": (245, 159, 0), "human": (132, 94, 247)}
@@ -30,14 +31,15 @@ THIN_PIXELS, THICK_PIXELS = 2.0, 4.0
 
 @dataclass(frozen=True)
 class PlacedFrustum:
-    """A camera that is being placed. It is drawn at its present pose, since its newest picture may have an
-    earlier one."""
+    """A camera that is being placed. It is drawn at its present pose, since its newest picture may be from an
+    earlier pose."""
 
     pose: NDArray[np.float64]
     """(7,) pose in the view."""
     settings: CameraSettings
     hidden: bool = False
-    """Whether to hide the frustum: a page's viewpoint is at the camera and would see only its picture."""
+    """Whether to hide the frustum, because a page's viewpoint is at the camera, where the frustum's picture
+    would fill the view."""
 
 
 class CameraFrustums:
@@ -60,7 +62,7 @@ class CameraFrustums:
 
         Args:
             cameras: The task's cameras.
-            pictures: Pictures by camera; empty shows none.
+            pictures: Pictures by camera.
             offset: (3,) offset of the selected env in the view.
             size: Depth of a frustum in metres.
             placed: Cameras that are being placed, with or without a picture.
@@ -173,7 +175,8 @@ def small_image(picture: Picture) -> NDArray[np.uint8] | None:
 
 
 def frustum_pose(pose: NDArray, offset: NDArray) -> tuple[NDArray, NDArray]:
-    """wxyz and position in the view for a camera's pose (7,), in OpenCV's frame (z forward, y down)."""
+    """wxyz and position of a frustum in the view, for a camera's pose (7,). The frustum has OpenCV's axes (z
+    forward, y down)."""
     turned = viser.transforms.SO3(pose[3:].astype(np.float64)) @ CAMERA_TO_OPENCV
     return turned.wxyz, (pose[:3] + offset).astype(np.float64)
 
@@ -181,11 +184,11 @@ def frustum_pose(pose: NDArray, offset: NDArray) -> tuple[NDArray, NDArray]:
 def without_the_viewpoint(
     pictures: dict[CameraKey, Picture], seen: Mapping[CameraKey, Picture]
 ) -> dict[CameraKey, Picture]:
-    """The pictures to draw while one env is alone in the view: those that are not near a human camera's
-    picture in `seen`.
+    """The pictures to draw while one env is alone in the view: those whose camera is not near a human camera
+    of `seen`.
 
-    The view then starts at the task's human camera (`viewpoint`). The frustum's picture of this camera, or of
-    a sensor at the same place, would fill the view.
+    The view then starts at the task's human camera (`viewpoint`). The frustum of this camera, or of a sensor
+    at the same place, would fill the view with its picture.
     """
     eyes = [picture.pose[:3] for (kind, _), picture in seen.items() if kind == "human"]
     return {

@@ -33,7 +33,8 @@ from workbench.page.widgets.notices import refusals_told
 from workbench.pictures.camera_conventions import axes_of, intrinsic_of, target_of, vertical_fov
 
 RELEASE_TIMEOUT_SECONDS = 60.0
-"""Time without movement after which a gizmo counts as released, without an event (its page was closed)."""
+"""Time without movement after which a gizmo counts as released: if its page was closed, no release event
+arrives."""
 GIZMO_PIXELS = 76.0
 TARGET_PIXELS = 44.0
 """Sizes of the gizmos on the screen."""
@@ -57,10 +58,11 @@ class _Taken:
 class CameraGizmo:
     """A gizmo to move and rotate the chosen camera, or two gizmos for its eye and its target, in the view of one page.
 
-    viser's gizmo uses its own axes and cannot snap. To rotate about the world's axes, the gizmo is aligned
-    with them when a drag begins, and its rotation since then is applied to the camera. With snap steps, the
-    camera jumps while the gizmo follows the pointer, and the gizmo returns to the camera on release. During a
-    drag the server never writes the gizmo's pose, which would pull the gizmo away from the pointer.
+    viser's gizmo moves along its own axes and cannot snap. To rotate about the world's axes, the gizmo is
+    aligned with them when a drag begins, and its rotation since then is applied to the camera. With snap
+    steps, the camera moves in steps while the gizmo follows the pointer; on release the gizmo returns to the
+    camera. During a drag the server does not write the gizmo's pose: that would pull the gizmo away from the
+    pointer.
 
     Args:
         snap: returns the chosen snap steps.
@@ -78,7 +80,7 @@ class CameraGizmo:
     ) -> None:
         self._placing = placing
         self._snap, self._own_axes, self._look_at = snap, own_axes, look_at
-        # Fixed size on the screen: in a grid of sixteen envs 10 cm would be a dot.
+        # Fixed size on the screen: in a grid of sixteen envs, a gizmo of 10 cm would be a dot.
         add = partial(page.scene.add_transform_controls, fixed=True, depth_test=False, visible=False)
         self._camera = add("/studio/camera", GIZMO_PIXELS)
         self._eye = add("/studio/eye", GIZMO_PIXELS, disable_rotations=True)
@@ -101,7 +103,8 @@ class CameraGizmo:
         return self._start is not None and time.monotonic() - self._held_at < RELEASE_TIMEOUT_SECONDS
 
     def draw(self, camera: StudioCamera | None) -> None:
-        """Draw the gizmos at this camera, unless one is being dragged; None hides them."""
+        """Draw the gizmos at this camera, unless a gizmo is being dragged. If `camera` is None, hide the
+        gizmos."""
         if self.held:
             if camera is not None:
                 self._draw_line(camera)
@@ -152,7 +155,7 @@ class CameraGizmo:
             self._start = None
         return start if phase == "update" else None
 
-    # Async: callbacks in viser's thread pool would arrive in any order.
+    # Async, since viser runs callbacks that are not async in its thread pool, in any order.
     async def _on_camera(self, event: viser.TransformControlsEvent) -> None:
         pose = np.concatenate([event.target.position, event.target.wxyz])
         post(partial(self._drag_camera, event.client, event.phase, pose))
@@ -205,9 +208,11 @@ def _move(handle: viser.TransformControlsHandle, position: Floats, wxyz: Floats)
 MAX_FOV_RADIANS = math.radians(150)
 """Maximum field of view that the page can draw."""
 BAR_PIXELS = 48
-"""Height of the folded timeline at the lower edge of the view: the picture's border is above it."""
+"""Height of the folded timeline at the lower edge of the view. The picture's border must stay above the
+timeline."""
 BORDER_METRES = 0.15
-"""Distance of the border from the eye: close to the page's near plane, or bodies would hide it."""
+"""Distance of the border from the eye: close to the page's near plane, since otherwise bodies would hide the
+border."""
 BORDER_COLOUR = (245, 159, 0)
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 
@@ -222,13 +227,14 @@ class _Looking:
     up: Floats
     fov: float
     shown: tuple[CameraSettings, bytes] | None = None
-    """Settings and pose in the view to which the page was last moved."""
+    """The camera's settings, and its pose in the view, when the page was last moved to it."""
 
 
 class LookThrough:
-    """Moves a page's viewpoint to the chosen camera, with its field of view, and back. The state is per page.
+    """Moves a page's viewpoint to the chosen camera, with the camera's field of view, and back. Each page has
+    its own state.
 
-    While a page looks through the camera, it follows the camera's changes (typed numbers, undo).
+    A page that looks through the camera follows the camera's changes (typed numbers, undo).
     """
 
     def __init__(self, server: viser.ViserServer, placing: Placing) -> None:
@@ -302,7 +308,8 @@ class LookThrough:
             return
         looking.shown = shown
         _, left, up = axes_of(pose[3:])
-        # The page orbits about its up axis: with the camera's own up axis, a drag would tilt a level horizon.
+        # The page's view orbits about the page's up axis. If this were the camera's own up axis, a drag would
+        # tilt a level horizon.
         level = abs(left[2]) < 1e-3 and up[2] > 0.05
         eye = client.camera
         aspect = (

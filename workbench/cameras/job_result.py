@@ -20,7 +20,8 @@ NEW_SECONDS = 1.0
 class NewResult:
     """Detects that a result has just replaced an older one, so that it is scrolled into view once.
 
-    It counts as new only for a moment (``into_sight.html``): a tab that is reopened redraws its HTML and must not scroll.
+    A result counts as new only for a moment (``into_sight.html``): a tab that is reopened redraws its HTML
+    and must not scroll.
     """
 
     def __init__(self) -> None:
@@ -46,8 +47,9 @@ BAR_DELAY_SECONDS = 0.5
 class JobResult:
     """A progress bar with a Stop button, then the result, in the present container.
 
-    Each folder has one under its own button, and only the one that was used last shows the running job: a single bar at the
-    top would push the pressed button away, and one at the end would not be visible.
+    Each folder has a `JobResult` under its own button. Only the one whose button was pressed last shows the
+    running job. A single bar for all folders would push the pressed button away if it were at the top, and
+    would not be visible at the end.
     """
 
     _asked_last: ClassVar[JobResult | None] = None
@@ -73,7 +75,7 @@ class JobResult:
 
         Args:
             result: the result, if there is one.
-            other: other values that the HTML shows, compared to find out whether it changed.
+            other: all other values that the HTML shows; the HTML is rendered again if they change.
             html: renders the result, given whether it is new.
         """
         self._draw_bar(running)

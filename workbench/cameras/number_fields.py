@@ -60,7 +60,7 @@ RPY, WXYZ, AXES = ROTATIONS = get_args(RotationForm)
 FOV, INTRINSIC = LENSES = get_args(LensForm)
 XYZ, ANGLES = get_args(Axis), get_args(Angle)
 UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
-"""Number of digits of the shown numbers, by kind."""
+"""Number of decimals of the shown numbers: metres, radians and directions; degrees; quaternions; pixels."""
 LENS = "Lens and image"
 ROTATION = "Rotation"
 GOES_ALONG = "The target moves with the position. To keep it fixed, set Handles to eye and target."

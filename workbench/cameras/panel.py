@@ -239,7 +239,7 @@ class CamerasPanel:
         return camera
 
     def wanted(self, seen: ShownCameras | None) -> tuple[CameraRequest, ...]:
-        """The pictures that the panel shows."""
+        """Requests for the pictures that the panel shows."""
         if seen is None:
             return ()
         return tuple(
@@ -299,8 +299,8 @@ class CamerasPanel:
 class StudioPicture:
     """The chosen camera's picture in the present container, in any modality; overlays go into `folder`.
 
-    Depth and segmentation are offered because they show first that a far plane is too near, or that a gripper
-    hides the cube.
+    Depth and segmentation are offered because they are the first to show that a far plane is too near, or
+    that a gripper hides the cube.
     """
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:

@@ -36,10 +36,10 @@ class PlacementChange:
 class Placements:
     """Placements of cameras, with undo and redo. Methods that change something return a new value.
 
-    An undo step has a camera's full settings before and after, so it can be undone even if the file has
-    changed since. A gesture (a drag has a hundred positions) is one step. When a new version is loaded,
-    placements that are not in the file stay, except for cameras whose settings changed in the file: the
-    author's change wins, and Undo restores the placement.
+    An undo step has a camera's full settings before and after the step, so it can be undone even if the file
+    has changed since. A gesture is one step, such as a drag through a hundred positions. When a new version
+    is loaded, placements that are not in the file stay, except for cameras whose settings changed in the
+    file: the author's change wins, and Undo restores the placement.
     """
 
     in_file: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
@@ -49,7 +49,7 @@ class Placements:
     done: tuple[PlacementChange, ...] = ()
     """Steps that can be undone, the newest last."""
     undone: tuple[PlacementChange, ...] = ()
-    """Steps that can be redone, the next last."""
+    """Steps that can be redone; the step to redo next is the last."""
 
     def now(self, key: CameraKey) -> CameraSettings | None:
         """A camera's present settings; None if there is no such camera, or `CameraSettings` cannot describe
@@ -131,8 +131,8 @@ class Placements:
     def edit_undone(
         self, key: CameraKey, written: CameraSettings, in_file: CameraSettings
     ) -> Placements | None:
-        """Handle a revert of a written placement: use the file's settings, and let Undo restore the placement. None if the
-        camera was placed elsewhere since.
+        """Handle a revert of a written placement: use the file's settings, and let Undo restore the
+        placement. Returns None if the camera was placed elsewhere since it was written.
 
         Args:
             written: the settings that were removed from the file.
@@ -215,8 +215,8 @@ def _step_label(key: CameraKey, before: CameraSettings, after: CameraSettings) -
 
 
 def usual_distance(pose: ArrayLike) -> float:
-    """Default distance in metres from a camera's pose (7,) to its target: to where its optical axis meets the
-    plane z = 0, if that is within the limits, else `DEFAULT_TARGET_METRES`."""
+    """Default distance in metres from a camera's pose (7,) to its target: the distance to the point where its
+    optical axis meets the plane z = 0 if that distance is within the limits, else `DEFAULT_TARGET_METRES`."""
     p = np.asarray(pose, np.float64)
     forward = axes_of(p[3:])[0]
     distance = -float(p[2] / forward[2]) if abs(forward[2]) >= 1e-6 else DEFAULT_TARGET_METRES

@@ -37,7 +37,8 @@ from workbench.pictures.camera_conventions import (
 Floats = NDArray[np.float64]
 
 SAME = 1e-7
-"""Tolerance in metres and for components of a unit quaternion: rounding of viser's 32-bit numbers."""
+"""Tolerance for positions in metres and for components of a unit quaternion, which viser rounds to 32
+bits."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Snap:
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of a camera's numbers (its mount's or the env's) in the 3D view."""
+    """The frame in which a camera's pose is given (its mount's, else the env's), as placed in the 3D view."""
 
     mount: NDArray[np.float32] | None
     """(7,) pose of the link that carries the camera, in the env's frame; None for a camera without a mount."""
@@ -66,12 +67,13 @@ class Frame:
     def from_view(
         self, settings: CameraSettings, pose: ArrayLike, distance: float | None = None
     ) -> CameraSettings:
-        """`settings` moved to this pose (7,) in the view, with the present distance to the target, or
-        `distance` metres."""
+        """`settings` moved to this pose (7,) in the view. The target's distance becomes `distance` metres;
+        None keeps the present distance."""
         there = np.array(pose, np.float64)
         there[:3] -= self.offset
         moved = with_pose(settings, there if self.mount is None else relative_to(self.mount, there))
-        # The conversion to the view and back rounds: unchanged numbers keep their exact values.
+        # The conversion to the view and back rounds. A position or rotation that did not change keeps its
+        # exact numbers.
         if np.allclose(moved.position, settings.position, rtol=0, atol=SAME):
             moved = replace(moved, position=settings.position)
         if np.allclose(moved.quaternion, settings.quaternion, rtol=0, atol=SAME):
@@ -115,7 +117,8 @@ def snapped(start: ArrayLike, pose: ArrayLike, snap: Snap, own_axes: bool, origi
     """(7,) the dragged pose of a gizmo, snapped to whole steps.
 
     Along the world's axes the position snaps to a grid, so that round numbers are written; along the camera's own axes it
-    moves in steps from the start of the drag. The rotation always has steps from the start of the drag.
+    moves in steps from the start of the drag. The rotation always changes in steps from the start of the
+    drag.
 
     Args:
         origin: (3,) origin of the grid.
@@ -126,7 +129,7 @@ def snapped(start: ArrayLike, pose: ArrayLike, snap: Snap, own_axes: bool, origi
     if snap.metres and own_axes:
         p[:3] = s[:3] + was @ (np.round(was.T @ moved / snap.metres) * snap.metres)
     elif snap.metres:
-        # A coordinate that was not dragged stays unchanged, also off the grid.
+        # A coordinate that was not dragged stays unchanged, even if it is off the grid.
         grid = np.asarray(origin, np.float64)
         on_grid = np.round((p[:3] - grid) / snap.metres) * snap.metres + grid
         p[:3] = np.where(np.abs(moved) > 1e-6, on_grid, p[:3])
@@ -143,14 +146,15 @@ def nudged(pose: ArrayLike, step: Sequence[float]) -> Floats:
 
 
 def panned(pose: ArrayLike, left: float, up: float) -> Floats:
-    """(7,) pose rotated in place, in degrees: to the left about the vertical, and up."""
+    """(7,) pose rotated in place: `left` degrees to the left about the vertical, and `up` degrees upwards."""
     p = np.asarray(pose, np.float64)
     about_z, about_left = SO3.from_z_radians(math.radians(left)), SO3.from_y_radians(-math.radians(up))
     return make_pose(p[:3], quaternion_of((about_z @ SO3(p[3:]) @ about_left).as_matrix()))
 
 
 def viewer_pose(position: ArrayLike, wxyz: ArrayLike) -> Floats:
-    """(7,) pose of a page's viewpoint, whose rotation is in OpenCV's frame."""
+    """(7,) pose of a page's viewpoint, in ManiSkill's convention. `wxyz` is the rotation of a camera with
+    OpenCV's axes."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation_matrix(wxyz), np.asarray(position, np.float64)
     return pose_from_matrix(matrix, "opencv", "camera_to_world")
@@ -177,7 +181,7 @@ def rounded(numbers: ArrayLike, digits: int) -> tuple[float, ...]:
 
 
 def _in_steps(rotation: Floats, step: float) -> Floats:
-    """(3, 3) rotation about the same axis by a whole number of steps."""
+    """(3, 3) `rotation` with its angle rounded to a whole number of steps (radians)."""
     turn = SO3(quaternion_of(rotation)).log()
     angle = float(np.linalg.norm(turn))
     whole = round(angle / step) * step
@@ -252,7 +256,7 @@ def chosen_camera(session: LiveSession) -> tuple[StudioCamera, CameraSettings]:
     """The chosen camera and its present settings.
 
     Raises:
-        Refused: none is chosen, or it cannot be placed.
+        Refused: no camera is chosen, or the chosen camera cannot be placed.
     """
     camera = session.view().of(StudioView).chosen
     if camera is None or camera.now is None:

@@ -25,7 +25,7 @@ class DrawCamera(Question[Picture]):
     key: CameraKey
     settings: CameraSettings | None
     """Settings for this picture only; None for the current ones. Required for a camera that the env does not
-    have: it is drawn without a mount, as if `scale` were not 1."""
+    have; such a camera is drawn without a mount, by a temporary camera (see `scale`)."""
     env: int
     modalities: tuple[str, ...] = ("rgb",)
     """Requested modalities; those that the camera's shader does not provide are left out."""

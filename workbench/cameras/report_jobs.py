@@ -48,7 +48,7 @@ class CameraReports:
     ) -> None:
         """
         Args:
-            asker, background: ask questions of the worker that plays, and of the background process.
+            asker, background: the first asks the worker that plays, the second the background process.
             happen: handles the resulting events.
         """
         self._live, self._background, self._happen = asker, background, happen
@@ -61,7 +61,8 @@ class CameraReports:
         reports: list[CameraReport] = []
 
         async def measure() -> None:
-            """Measure the seeds without a report: a job of higher rank may have interrupted this one."""
+            """Measure the seeds that have no report yet; some have a report if a job of higher rank
+            interrupted this job."""
             num_envs = await self._background.ensure(job, _for_measuring(wanted.load))
 
             for seed in range(begun := len(reports), wanted.seeds):
@@ -148,7 +149,7 @@ def _for_measuring(load: Load) -> Load:
     options = load.options
     kwargs = dict(options.env_kwargs)
     if kwargs.get("obs_mode", "state") not in ("state", "state_dict", "none"):
-        kwargs["obs_mode"] = "state"  # with pictures every reset would render all cameras of all envs
+        kwargs["obs_mode"] = "state"  # with pictures, every reset would render all cameras of all envs
     envs = min(options.num_envs, MAX_ENVS)
     return replace(load, options=replace(options, num_envs=envs, env_kwargs=kwargs))
 

@@ -161,7 +161,8 @@ class CameraReportPanel(PagePart[SessionView]):
         self._report.draw(studio.progress, report, other, html)
 
     def _report_html(self, studio: StudioView, camera: StudioCamera, report: CameraReport, new: bool) -> str:
-        """HTML of the object table, the depth histogram and suggested planes; `new`: scroll it into view."""
+        """HTML of the object table, the depth histogram and suggested planes. If `new`, the page scrolls it
+        into view."""
         results, depth, lens = studio.results, report.depth, camera.now or camera.info
         moments = [
             {
@@ -256,7 +257,7 @@ class CameraReportPanel(PagePart[SessionView]):
 # its worst object.
 
 MIN_HIDDEN_SHARE = 0.1
-"""Share of an object from which on it is reported as hidden."""
+"""An object is reported as hidden if more than this share of it is hidden."""
 SMALL_PIXELS = 30.0
 """Number of pixels below which an object counts as small."""
 
@@ -270,7 +271,7 @@ class Histogram:
     low: float
     high: float
     near: float | None
-    """Position of the near plane, in bars from the left; None if it is outside."""
+    """Position of the near plane, in bars from the left; None if the plane is outside of the bars."""
     far: float | None
     """Position of the far plane, as for `near`."""
 
@@ -299,7 +300,7 @@ def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]
     (cut, or much hidden), ``bad`` (not visible), ``none`` (absent).
 
     Args:
-        unit: unit of the report: envs, steps.
+        unit: what the report counts: ``envs`` or ``steps``.
     """
     rows: list[dict[str, Any]] = []
     wanted = report.wanted_objects()

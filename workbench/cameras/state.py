@@ -53,7 +53,7 @@ class Edits:
     busy: bool = False
     """Whether an edit is in progress."""
     left: EditRequest | None = None
-    """Request of the plan that was shown before the current one."""
+    """Request of the plan that was shown before the current plan."""
     before: tuple[EditState, tuple[EditState, ...]] = EditState(), ()
     """`shown` and `done` before the current change of the file."""
     closed: bool = False
@@ -63,17 +63,18 @@ class Edits:
 class Studio:
     """State of the studio. The descriptions of the cameras are in ``Run.task``.
 
-    A placement is here (with undo), in the worker's live cameras, and finally in the author's file. This state is
-    authoritative: after each load it is sent to the worker again, so that neither a reload nor a crash moves a camera. If
-    the author changed the camera in the file, the file wins.
+    A placement is stored here (with undo), in the worker's live cameras, and finally in the author's file.
+    The state here is authoritative: after each load it is sent to the worker again, so that neither a reload
+    nor a crash moves a camera. If the author changed the camera in the file, the file wins.
     """
 
     placements: Placements = Placements()
     selected: CameraKey | None = None
     was_chosen: bool = False
-    """Whether the user has chosen a camera, or "none"."""
+    """Whether a camera or "none" was chosen, by the user or automatically."""
     is_open: bool = False
-    """Whether a page has opened the studio; from then on, a camera is selected before the user chooses."""
+    """Whether a page has opened the studio. From then on, a camera is chosen automatically if no choice was
+    made yet."""
     select_when_loaded: CameraKey | None = None
     """The camera that was selected in the previous session."""
     problem: str = ""
@@ -178,7 +179,7 @@ def selected_camera(studio: Studio, run: Run) -> StudioCamera | None:
 
 def settings_in_file(placements: Placements, run: Run) -> dict[CameraKey, CameraSettings]:
     """Settings of the running version's cameras, as in the file. A camera without a target in the file keeps
-    its present target distance, or gets `usual_distance`.
+    its present target distance; if it has none, it gets `usual_distance`.
 
     Args:
         placements: placements before the version was loaded.

@@ -100,8 +100,8 @@ IN_ITS_EYE = "Your view is at the camera's position. Move the view to see the ha
 class StudioPanel(PagePart[SessionView]):
     """The Studio. Only the chosen camera has gizmos and numbers; it is chosen here or by clicking its frustum.
 
-    From the top: the button that shows the change of the file; the picture, in which every movement is checked; the
-    frequently used tools (look through, undo); the pose; the lens, folded.
+    From the top: the button that shows the change of the file; the picture, in which the user checks every
+    movement; the frequently used tools (look through, undo); the pose; the lens, folded.
     """
 
     does = (
@@ -174,9 +174,11 @@ class StudioPanel(PagePart[SessionView]):
     # --- in the view -------------------------------------------------------------------------------------
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> dict[CameraKey, PlacedFrustum]:
-        """Draw the gizmos at the chosen camera; returns its frustum by key, empty if it cannot be placed.
+        """Draw the gizmos at the chosen camera. Returns the camera's frustum by the camera's key; empty if
+        the camera cannot be placed.
 
-        The frustum is at the camera's present pose: that of its newest picture would lag behind the pointer.
+        The frustum is at the camera's present pose: the pose of the newest picture would lag behind the
+        pointer.
 
         Args:
             offset: (3,) position of the selected env in the view, metres.
@@ -213,8 +215,8 @@ class StudioPanel(PagePart[SessionView]):
             self._gizmos[page].draw(camera)
 
     def _is_in_eye(self, pose: Floats) -> bool:
-        """Whether a page's viewpoint is within 0.1 m of the camera's pose (7,): the frustum's picture would
-        fill that view."""
+        """Whether any page's viewpoint is within 0.1 m of the camera's pose (7,), so that the frustum's
+        picture would fill that page's view."""
         near = (
             float(np.linalg.norm(c.camera.position - pose[:3])) for c in self._server.get_clients().values()
         )
@@ -372,7 +374,7 @@ class StudioPanel(PagePart[SessionView]):
 
     def _by_key(self, command: Command) -> None:
         """Move the camera by a key. The arrow keys without modifiers belong to the timeline."""
-        # Only with this tab open: nothing on other tabs shows that a camera moves.
+        # Only while a page has this tab open: nothing on the other tabs shows that a camera moves.
         if self._placing.camera is None or not self._pages():
             raise Refused("Choose a camera on the Cameras tab first.")
         if (step := MOVES.get(type(command))) is not None:

@@ -37,9 +37,11 @@ from workbench.pictures.camera_report import OfferedPlacement
 from workbench.task.description import TaskDescription
 
 BOX_METRES, MOUNTED_BOX_METRES = 0.3, 0.1
-"""Distance from the eye to each side of the initial box; a mounted camera must stay near its body."""
+"""Distance from the eye to each side of the initial box; less for a mounted camera, which must stay near its
+body."""
 MAX_LINKS = 12
-"""Maximum number of links of an object whose links are offered too; with more, only the object is offered."""
+"""If an object has at most this many links, the links are offered too; otherwise only the object is
+offered."""
 FIRST_ROBOT_LINKS = 4
 """Number of a robot's links that are offered at first, those of its hand; the others are offered on demand."""
 PICTURE_PIXELS = 160

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 from workbench.live.process.background_jobs import JobProgress
 
 EditStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
-"""``planned``: shown, not written. ``written``: in the file, before its reload. ``checked``: the new env's camera equals the
-edit. ``mismatch``: it does not. ``undone``: reverted in the file."""
+"""``planned``: shown, not written. ``written``: in the file, which is not loaded again yet. ``checked``: the
+new env's camera equals the edit. ``mismatch``: the new env's camera does not equal the edit. ``undone``:
+reverted in the file."""
 
 
 EditKind = Literal["edit", "add", "duplicate", "rename", "remove"]
@@ -35,7 +36,8 @@ class EditRequest:
     key: CameraKey
     """The camera that is changed, copied, renamed, removed or added."""
     settings: CameraSettings | None = None
-    """New settings (for a removal, the present ones); None for the placement at the time of the request."""
+    """New settings (for a removal, the present ones); None stands for the camera's placement when the request
+    is made."""
     name: str = ""
     """The new name."""
     about: str = ""
@@ -55,11 +57,13 @@ class StudioCamera:
     info: CameraInfo
     """Description of the live camera; its `settings` are those of the file."""
     now: CameraSettings | None
-    """Settings as placed; equal to ``info.settings`` without a placement. None only if ``info.settings`` is None."""
+    """Settings as placed; equal to ``info.settings`` if the camera is not placed. None only if
+    ``info.settings`` is None."""
     moved: bool
     """Whether the placement differs from the file."""
     mount_pose: NDArray[np.float32] | None
-    """(7,) p and wxyz of its mount in the selected env's frame, at the shown moment. None for a camera without a mount."""
+    """(7,) p and wxyz of its mount in the selected env's frame, at the shown moment. None if the camera has
+    no mount, or if the shown step does not have the mount."""
     refused: str = ""
     """Reason why the camera cannot be placed, as a clause; empty if it can."""
 
@@ -129,9 +133,9 @@ class StudioResults:
     report_settings: CameraSettings | None = None
     """The camera's settings when it was measured."""
     report_seeds: int = 0
-    """Number of fresh episodes; 0 for a report over the envs at the shown moment."""
+    """Number of fresh episodes; 0 for a report over the envs at the shown moment or over steps."""
     report_moments: tuple[MeasuredMoment, ...] = ()
-    """Moment of each of ``report.envs`` in a report over steps; else empty."""
+    """In a report over steps, the moment of each entry of ``report.envs``; empty in other reports."""
     outdated: bool = False
     """Whether the report is of an earlier version."""
     measuring: bool = False
@@ -140,7 +144,7 @@ class StudioResults:
     """Suggested placements, best first."""
     suggestions_of: CameraKey | None = None
     compared: tuple[Picture, Picture] | None = None
-    """The camera as placed, and with the settings of `ComparisonWanted`."""
+    """Pictures of the camera as placed, and with the settings of `ComparisonWanted`."""
     picked: PickedPixel | None = None
     sheet: tuple[Picture, ...] = ()
     """The selected camera's picture in every env, the worst env first if a report covers these envs."""
@@ -161,7 +165,7 @@ class StudioView:
     cameras: tuple[StudioCamera, ...] = ()
     selected: CameraKey | None = None
     was_chosen: bool = False
-    """Whether the user has chosen a camera, or "none"."""
+    """Whether a camera or "none" was chosen, by the user or automatically."""
     undo: str | None = None
     """Text: the change that `UndoCamera` would undo (``moved base_camera``); None if there is none."""
     redo: str | None = None

@@ -81,7 +81,8 @@ class _Begun:
     """Number of the moment that the pictures show."""
     at: float
     ready_at: float
-    """Time at which they should be ready; like `at`, in seconds of `time.monotonic`."""
+    """Time at which the pictures should be ready. Like `at`, the time of their start, in seconds of
+    `time.monotonic`."""
 
 
 class WorkerCameras:
@@ -91,10 +92,11 @@ class WorkerCameras:
     scene, `settle` finishes the current picture and places the waiting cameras.
 
     A picture takes 25 to 90 ms on a software renderer; drawn synchronously between two steps it would halve the step rate.
-    So a picture is started, steps continue, and it is fetched when it should be ready, judging by the last ones (see
-    `begin_pictures`). Sensors come before human cameras, since the two see different objects and cannot be drawn at once,
-    and each kind is sent as soon as it is ready. At most 15 rounds a second, each with a proportional pause, leave CPU time
-    for a browser on the same machine. A camera that is being dragged is drawn next, alone and without a pause.
+    So a picture is started, steps continue, and the picture is fetched when it should be ready, estimated
+    from the last pictures (see `begin_pictures`). Sensors and human cameras see different objects and so
+    cannot be drawn at once: the sensors come first, and the pictures of each kind are sent as soon as they
+    are ready. At most 15 rounds a second, each with a proportional pause, leave CPU time for a browser on the
+    same machine. A camera that is being dragged is drawn next, alone and without a pause.
     """
 
     def __init__(self, task: GuardedTask, on_first: Callable[[bool], None]) -> None:
@@ -122,10 +124,10 @@ class WorkerCameras:
         """Whether the loop may block until a picture is ready, because no step is due."""
         self._degree: ShownPictures = "exact"
         self._exact_at: float | None = None
-        """Time at which the shown fast pictures are redrawn exactly; None if the shown pictures are exact."""
+        """Time at which the shown fast pictures are redrawn exactly; None if no exact pictures are due."""
         self._fast_scene: Any = None
-        """Scene for which `_simplifying` makes, or has made, the missing simplified meshes; exact pictures are drawn
-        meanwhile."""
+        """Scene for which `_simplifying` makes, or has made, the missing simplified meshes. Until they are
+        made, pictures are exact."""
         self._may_be_fast = False
         self._simplifying = threading.Thread()
         self._placed = PlacedCameras()
@@ -138,15 +140,15 @@ class WorkerCameras:
         # Called for every `Settings` message, whether or not it changes the cameras.
         before, of_degree = self._watched, self._degree
         self._watched, self._degree = (env, cameras), degree
-        # From exact to auto, finished and pending pictures stay valid: if redrawn, they would be fast ones
-        # for a moment.
+        # On a change from exact to auto, finished and pending pictures stay valid: if they were redrawn, the
+        # page would show fast pictures for a moment.
         stay = degree == of_degree or (of_degree == "exact" and degree == "auto")
         if before != (env, cameras) or not stay:
             self.update_watched()
 
     def place(self, request: PlaceCamera) -> None:
-        # Not placed at once: if it interrupted the current picture, a drag faster than the renderer would
-        # never show one.
+        # Not placed at once: if each placement interrupted the current picture, a drag that is faster than
+        # the renderer would never show a picture.
         self._to_place.pop(request.key, None)
         self._to_place[request.key] = request
 
@@ -207,7 +209,7 @@ class WorkerCameras:
     # --- changes of the scene ------------------------------------------------------------------------
 
     def update_watched(self) -> None:
-        """Watch the requested cameras that the version has; call it when request or version may have
+        """Watch the requested cameras that the version has; call it when the request or the version may have
         changed."""
         self.settle()
         opened = self._task.opened
@@ -336,7 +338,8 @@ class WorkerCameras:
         return "fast" if self._has_fast(env.env.scene) else "exact"
 
     def _has_fast(self, scene: Any) -> bool:
-        """Whether fast pictures can be drawn now; for a new scene, starts to simplify the missing meshes."""
+        """Whether fast pictures can be drawn now; for a new scene, starts to make the missing simplified
+        meshes."""
         if scene is not self._fast_scene:
             self._fast_scene, meshes = scene, list[Mesh]()
             # A GPU draws exact pictures just as fast.
@@ -404,7 +407,7 @@ class WorkerCameras:
 
 
 def _simplify(meshes: Sequence[Mesh]) -> None:
-    """Simplify meshes on a separate thread, which leaves the cores to the simulation."""
+    """Simplify meshes. Runs on a thread of its own, whose low priority leaves the cores to the simulation."""
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 15)
     for mesh in meshes:
         levels_of(mesh)
@@ -532,8 +535,8 @@ def run_cameras(opened: OpenedTask, question: RunCameras) -> HookCameras:
 def _with_classes_of(
     env: Any, before: LoadedTask, after: LoadedTask, texts: Mapping[str, str]
 ) -> Iterator[None]:
-    """Context in which the env and its robots have the new text's classes, and the attributes that their
-    constructors set."""
+    """Context in which the env and its robots have the classes of the new texts, and the new values of the
+    attributes that the new texts change."""
     agents = [] if env.agent is None else getattr(env.agent, "agents", [env.agent])
     classes = [(agent, type(agent)) for agent in agents]
     task, kept = maniskill_private.task_class(env), [(owner, dict(vars(owner))) for owner in (env, *agents)]
@@ -559,7 +562,8 @@ def _with_classes_of(
 def _changed_attributes(before: Mapping[str, str], after: Mapping[str, str], owner: Any) -> dict[str, Any]:
     """The attributes of `owner` that the new text sets to another value, with the new values.
 
-    The attributes of a live env come from the text that built it, and a camera's pose may depend on one.
+    The attributes of a live env come from the text that built it, and a camera's pose may depend on an
+    attribute.
     """
     old, new = Project(before), Project(after)
     edited = [path for path, text in after.items() if before.get(path) != plain_line_ends(text)]

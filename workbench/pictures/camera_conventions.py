@@ -22,7 +22,8 @@ Convention = Literal["maniskill", "opencv", "opengl"]
 * ``opencv`` (also ROS's optical frames, COLMAP): x right, y down, z forward;
 * ``opengl`` (also Blender, NeRF): x right, y up, z backward.
 
-All conversions go through one pose: ``[x, y, z, qw, qx, qy, qz]``, camera to world, in the first of these.
+All conversions go through one pose: ``[x, y, z, qw, qx, qy, qz]``, camera to world, in the convention
+``maniskill``.
 """
 Direction = Literal["camera_to_world", "world_to_camera"]
 
@@ -33,9 +34,10 @@ _AXES: dict[str, Floats] = {
     "opengl": np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
 }
 VERTICAL_SINE = 1e-6
-"""Sine of the angle to the vertical below which a camera looks straight down or up: it has no "upright"."""
+"""A camera counts as looking straight down or up if the sine of the angle between its line of sight and the
+vertical is below this. "Upright" is not defined for such a camera."""
 ROTATION_TOLERANCE = 1e-3
-"""Largest deviation of a matrix from a rotation: calibrations are printed with four digits."""
+"""Largest accepted deviation of a matrix from a rotation: calibrations are printed with four digits."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +49,10 @@ class LookAt:
     target: tuple[float, float, float]
     """Any point on the optical axis in front of the eye."""
     roll: float = 0.0
-    """Radians about the line of sight; positive turns the camera clockwise as seen from behind it. At 0 the
-    camera is upright. If it looks straight down, the top of the picture at 0 is towards +x, straight up
-    towards -x: an upright camera at smaller x than its target ends like this when it is tilted."""
+    """Radians about the line of sight; positive turns the camera clockwise as seen from behind it. At roll 0
+    the camera is upright. At roll 0, the top of the picture of a camera that looks straight down is towards
+    +x, and of a camera that looks straight up, towards -x. An upright camera that looks along +x gets these
+    orientations when it is tilted down or up."""
 
 
 # --- rotations ---------------------------------------------------------------------------------------------------
@@ -152,9 +155,10 @@ def quaternion_from_axes(forward: ArrayLike, up: ArrayLike) -> Floats:
 def rpy_of(quaternion: ArrayLike) -> tuple[float, float, float]:
     """Roll, pitch and yaw in degrees: R = Rz(yaw) Ry(pitch) Rx(roll).
 
-    URDF's and ROS's fixed-axis convention, transforms3d's ``sxyz``. For a camera in ManiSkill's frame: yaw turns
-    it to the left, a positive pitch looks down, roll turns it clockwise as seen from behind. Straight down or up, roll
-    and yaw are the same rotation, which is returned as yaw.
+    URDF's and ROS's fixed-axis convention, transforms3d's ``sxyz``. For a camera in ManiSkill's frame: yaw
+    turns it to the left, a positive pitch makes it look down, roll turns it clockwise as seen from behind. If
+    it looks straight down or up, roll and yaw have the same axis: roll is returned as 0, and yaw has the
+    whole rotation.
     """
     r = rotation_matrix(quaternion)
     flat = math.hypot(r[0, 0], r[1, 0])
@@ -198,7 +202,8 @@ def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Floats:
 
 
 def target_of(settings: CameraSettings) -> Floats:
-    """(3,) the target of a camera, in the frame of its mount; one metre ahead without a target distance."""
+    """(3,) the target of a camera, in the frame of its mount; one metre ahead of the camera if the settings
+    have no target distance."""
     return settings.position + (settings.distance or 1.0) * axes_of(settings.quaternion)[0]
 
 
@@ -221,8 +226,8 @@ def relative_to(mount: ArrayLike, world: ArrayLike) -> Floats:
 
 
 def pose_from_look_at(look_at: LookAt) -> Floats:
-    """(7,) pose from eye, target and roll. Equals ManiSkill's ``look_at``, except straight down and up, where
-    ManiSkill's quaternion is not of unit length.
+    """(7,) pose from eye, target and roll. With roll 0 it equals ManiSkill's ``look_at``, except for a camera
+    that looks straight down or up: there, ManiSkill's quaternion is not of unit length.
 
     Raises:
         ValueError: eye and target are one point.

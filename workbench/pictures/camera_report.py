@@ -13,10 +13,11 @@ from workbench.envs.camera_data import CameraKey, CameraKind, CameraSettings, Pi
 from workbench.pictures.camera_conventions import intrinsic_of
 
 DEPTH_EDGES_METRES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
-"""(41,) ten bins per decade, the same for every camera, so that histograms can be compared; values outside count in the
-first or last bin."""
+"""(41,) edges of depth bins, ten bins per decade. They are the same for every camera, so that histograms can
+be compared; depths outside of the edges count in the first or last bin."""
 LARGE_ENOUGH_PIXELS = 100.0
-"""Pixels below which an object counts as small: a cube of ten by ten pixels still shows its rotation."""
+"""Number of pixels below which an object counts as small: a cube of ten by ten pixels still shows its
+rotation."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +42,17 @@ class ObjectSummary:
     seen: float
     """Share of these envs in which at least one pixel of the object is in the picture."""
     median_pixels: float
-    """Median of the visible pixels in these envs."""
+    """Median over these envs of the number of visible pixels of the object."""
     cut: float
     """Share of these envs in which the border of the picture cuts the object."""
     hidden: float
-    """Share of the object that the robot covers, averaged over the envs where it would be seen without the robot."""
+    """Share of the object that the robot covers, averaged over the envs in which the object would be seen
+    without the robot."""
     wholly_hidden: float
     """Share of these envs in which the object is visible only without the robot."""
     covered: float
-    """Share of the object that other things than the robot cover, averaged over the envs where it is in the picture."""
+    """Share of the object that things other than the robot cover, averaged over the envs in which the object
+    would be in the picture if nothing covered it."""
 
 
 @dataclass(frozen=True)
@@ -84,15 +87,16 @@ class ObjectSeen:
 
     @property
     def covered_share(self) -> NDArray[np.float32]:
-        """(E,) share of the object that things other than the robot cover; NaN outside of the picture."""
+        """(E,) share of the object that things other than the robot cover; NaN where the object is outside of
+        the picture."""
         return _share_lost(self.unhindered, self.alone)
 
     def marks(self) -> NDArray[np.float32]:
         """(E,) mark from 0 (not seen) to 1 (whole, uncovered, large enough); NaN where the object is absent.
 
-        Product of the share that nothing covers, one half if the border cuts the object, and for small
-        objects the square root of their share of `LARGE_ENOUGH_PIXELS` (a ratio of lengths: twice as far away
-        is half as good).
+        Product of three factors: the share of the object that nothing covers; 1/2 if the border cuts the
+        object, else 1; the square root of the object's pixels divided by `LARGE_ENOUGH_PIXELS`, at most 1.
+        The root is a ratio of lengths: a small object at twice the distance gets half the mark.
         """
         size = np.sqrt(np.clip(self.alone / LARGE_ENOUGH_PIXELS, 0, 1))
         open_share = np.clip(self.pixels / np.maximum(self.alone, 1e-6), 0, 1)
@@ -121,15 +125,17 @@ class DepthReport:
     """Depth of everything that the camera sees, including the robot."""
 
     counts: NDArray[np.int64]
-    """(E, 40) pixels of the measured pictures between `DEPTH_EDGES_METRES`, without background."""
+    """(E, 40) number of pixels of the measured picture in each bin of `DEPTH_EDGES_METRES`, without
+    background."""
     background: NDArray[np.float32]
     """(E,) share of the picture where a ray meets nothing (depth 0)."""
     beyond: NDArray[np.float32]
     """(E,) share of the picture that is farther away than robot and objects: far floor and walls."""
     nearest: NDArray[np.float32]
-    """(E,) metres; NaN where the picture is all background."""
+    """(E,) smallest depth in metres; NaN where the picture is all background."""
     farthest_object: NDArray[np.float32]
-    """(E,) metres, of robot and objects without scenery; NaN where none is seen."""
+    """(E,) largest depth of robot and objects in metres, without scenery; NaN where neither robot nor objects
+    are seen."""
 
     @property
     def suggested_near(self) -> float | None:
@@ -153,8 +159,8 @@ class CameraReport:
     size: tuple[int, int]
     """Width and height of the camera's own picture."""
     measured_size: tuple[int, int]
-    """Width and height of the measured pictures. If they are smaller, objects smaller than one of their
-    pixels are missed."""
+    """Width and height of the measured pictures. If these are smaller than the camera's own, objects smaller
+    than one measured pixel are missed."""
     envs: tuple[int, ...]
     """(E,) an env may occur several times: at several moments, or with several seeds."""
     objects: tuple[ObjectSeen, ...]
@@ -167,7 +173,7 @@ class CameraReport:
         """(E,) the mark of the worst object in each env; see `ObjectSeen.marks`. NaN without objects.
 
         Args:
-            wanted: names of the objects that must be seen; None for all that are drawn, without scenery.
+            wanted: names of the objects that must be seen; None for all drawn objects except scenery.
 
         Raises:
             ValueError: there is no such object.
@@ -185,7 +191,7 @@ class CameraReport:
         )
 
     def wanted_objects(self, wanted: Collection[str] | None = None) -> tuple[ObjectSeen, ...]:
-        """The objects of these names; None for all that are drawn, without scenery.
+        """The objects of these names; None for all drawn objects except scenery.
 
         Raises:
             ValueError: there is no such object.
@@ -206,16 +212,16 @@ class SearchSpace:
     objects: tuple[str, ...]
     """Names of actors, articulations and single links (``cabinet/handle``) that must be seen."""
     low: tuple[float, float, float]
-    """Lower corner of the box for the eye, in metres, in the frame of the mount, or in the env's frame
-    without a mount."""
+    """Lower corner of the box for the eye, in metres, in the frame of the mount, or in the env's frame if
+    there is no mount."""
     high: tuple[float, float, float]
     """Upper corner of the box."""
     lens: CameraSettings
-    """Settings of the camera. The pose is used only on a mount, where its orientation decides which way is up
-    in the picture."""
+    """Settings of the camera. The pose is used only for a mounted camera: its orientation decides which way
+    is up in the picture."""
     kind: CameraKind = "sensor"
     candidates: int = 100
-    """Placements that the first round draws."""
+    """Number of random placements in the first round."""
     best: int = 5
     """Maximum number of placements that are offered."""
     apart: float | None = None
@@ -244,7 +250,7 @@ class OfferedPlacement:
     """One of the best placements of a search."""
 
     settings: CameraSettings
-    """In the frame of the camera's mount, or the env's if it has none."""
+    """In the frame of the camera's mount, or in the env's frame if the camera has no mount."""
     target: tuple[float, float, float]
     """A point on its line of sight, for a look-at."""
     score: float

@@ -55,8 +55,8 @@ SUFFICIENT_SCORE = 0.995
 ROUNDS = 2
 """Number of rounds of samples around the best candidates."""
 MAX_EYE_ATTEMPTS = 50
-"""Maximum attempts to sample an eye clear of the robot. After them any eye is used, so a box within the robot
-is searched too."""
+"""Maximum attempts to sample an eye clear of the robot. After these attempts any eye is used, so that a box
+within the robot can be searched too."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
 
@@ -71,9 +71,9 @@ def suggest_cameras(
 ) -> tuple[OfferedPlacement, ...]:
     """Search for placements in envs that are already reset; returns the best first. The envs stay unchanged.
 
-    Returned placements keep a distance from each other, since five neighbours would be one suggestion. There
-    are fewer than `SearchSpace.best` if no more are found, or if the search is cancelled. The same seed gives
-    the same result.
+    The returned placements keep a distance from each other, since five neighbours would be no more than one
+    suggestion. Fewer than `SearchSpace.best` are returned if no more are found, or if the search is
+    cancelled. The same seed gives the same result.
 
     Args:
         progress: called after each measured view with the number so far and the maximum; keep it cheap.
@@ -89,10 +89,11 @@ def suggest_cameras(
 
 
 def score_of(report: CameraReport, objects: Sequence[str]) -> float:
-    """Score of a placement: the mean of the average env's mark and the worst env's, 0 to 1.
+    """Score of a placement, 0 to 1: halfway between the average of the envs' marks and the mark of the worst
+    env.
 
-    An env's mark is the mark of its worst object (`ObjectSeen.marks`), which is reduced by up to a fifth near
-    the border, and further if something is right in front of the lens.
+    An env's mark is the lowest mark of its objects (`ObjectSeen.marks`, reduced by up to a fifth for an
+    object near the border). It is reduced further if something is right in front of the lens (`FREE_METRES`).
     """
     marks = []
     for thing in report.wanted_objects(objects):
@@ -108,10 +109,11 @@ def score_of(report: CameraReport, objects: Sequence[str]) -> float:
 class _Search:
     """One run of `suggest_cameras`.
 
-    The space is small and the score has no gradient, so it is sampled: eyes spread over the box, each looking at a point
-    near the objects, then `ROUNDS` smaller samples around the best. Nearly all of a picture's cost is the robot's meshes
-    (software driver: 2 ms without them, 30 ms with them). So every sample is measured without the robot, which bounds
-    its score from above, and only the best of these with it.
+    The space is small and the score has no gradient, so it is sampled: first with eyes spread over the box,
+    each looking at a point near the objects; then in `ROUNDS` smaller rounds around the best samples. Nearly
+    all of a picture's cost is the robot's meshes (software driver: 2 ms without them, 30 ms with them). So
+    every sample is measured without the robot, which bounds its score from above, and only the best samples
+    are measured with the robot.
     """
 
     def __init__(
@@ -166,7 +168,8 @@ class _Search:
             yield self._suggestion(score, candidate, report)
 
     def _measure_best_of(self, candidates: list[_Candidate], keep: int) -> None:
-        """Score all candidates without the robot, which bounds the score from above, then the best `keep` with it."""
+        """Score all candidates without the robot, which bounds the score from above, then the best `keep`
+        candidates with the robot."""
         bare = self._measure(candidates)
         scores = [score_of(join_reports(row), self.space.objects) for row in bare]
         order = np.argsort([-score for score in scores], kind="stable").tolist()
@@ -182,7 +185,8 @@ class _Search:
     def _measure(
         self, candidates: list[_Candidate], bare: list[list[CameraReport]] | None = None
     ) -> list[list[CameraReport]]:
-        """Reports of each candidate in each env: with the robot if `bare` is given, else without. Empty if cancelled."""
+        """Reports of each candidate in each env: with the robot if `bare` (the reports without the robot) is
+        given, else without the robot. Empty if cancelled."""
         measured: list[list[CameraReport]] = [[] for _ in candidates]
         key: CameraKey = (self.space.kind, "suggested")
         local = [self._pose(candidate) for candidate in candidates]
@@ -270,7 +274,7 @@ class _Search:
         """(7,) pose of a candidate, in the mount's or the env's frame."""
         if self.mounts is None:
             return pose_from_look_at(LookAt(triple(candidate[0]), triple(candidate[1])))
-        # A link's frame has no "up" direction: the picture keeps its present orientation.
+        # A link's frame has no "up" direction: the picture keeps the up direction of the present camera.
         eye, target = candidate
         forward, up = target - eye, self.up[1]
         if abs(float(forward @ up)) > 0.999 * float(np.linalg.norm(forward)):

@@ -29,18 +29,20 @@ class _PlacedCamera:
     config: Any
     """The task's own config."""
     poses: list[sapien.Pose]
-    """Local poses of the envs' components before the placement, since the task's code may have moved them."""
+    """Local pose of the camera's component in each env before the placement. It is stored since the task's
+    code may have moved the components away from the config's pose."""
     settings: CameraSettings
 
 
 class PlacedCameras:
     """The cameras of one env whose pose, lens, size or shader differ from the task's.
 
-    Pose and lens are set on SAPIEN's camera components. Size and shader are fixed when a component is made, so a new
-    component takes its place on the same entity. Bodies and physics are untouched. ManiSkill's objects around the
-    components are updated (config, cached matrices, camera group): observations and ``get_params`` are those of an env
-    that was built with such a config. Resets and snapshots keep a placement, but a reset that rebuilds the scene does not:
-    call `put_back` after it.
+    Pose and lens are set on SAPIEN's camera components. Size and shader are fixed when a component is made,
+    so a new component replaces the old one on the same entity if they change. Bodies and physics are
+    untouched. ManiSkill's objects around the components are updated (config, cached matrices, camera group):
+    observations and ``get_params`` are those of an env that was built with such a config. Resets and
+    snapshots keep a placement, but a reset that rebuilds the scene does not: call `put_back` after such a
+    reset.
     """
 
     def __init__(self) -> None:
@@ -188,8 +190,8 @@ def settings_of(config: Any) -> CameraSettings | None:
     """A ``CameraConfig`` as plain numbers; if poses differ between envs, the pose of the first env.
 
     The quaternion is normalised (``look_at`` straight down gives one that is not of unit length). `distance`
-    is the distance to the target if ``look_at`` made the pose. None if the lens, near or far differs between
-    envs, or the pose is invalid.
+    is the distance to the target if ``look_at`` made the pose. Returns None if the lens, near or far differs
+    between envs, or if the pose is invalid.
     """
     pose = rows_of_pose(config)[0].astype(np.float64)
     length = float(np.linalg.norm(pose[3:]))

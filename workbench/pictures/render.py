@@ -125,12 +125,13 @@ def take_pictures(
         poses: (B, 7) where to draw the env's bodies, as `read_poses` returns them; None for where they are. Only the
             drawn bodies move, so a past moment can be rendered without changing the simulation. A camera moves with its
             mount; colours and lights are the present ones.
-        degree: None for the degree that the env was made with. Fast pictures need a batch on the CPU; all others are exact.
+        degree: None for the degree that the env was made with. Only a batch on the CPU can draw fast
+            pictures; all other envs draw exact ones.
 
     Raises:
         IndexError: there is no such env.
         ValueError: there is no such camera, or it cannot give the requested modalities.
-        CannotDraw: the renderer failed, a RuntimeError.
+        CannotDraw: the renderer failed; the exception is a RuntimeError.
     """
     pictures: dict[int, Picture] = {}
     for kind in KINDS:
@@ -286,7 +287,7 @@ def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]
     ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by visibility, in GPU
     simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back for
     pictures of human cameras. If something else has moved an object back meanwhile, sensors see it, as the policy does.
-    Both changes are undone afterwards, so a picture does not change the simulation.
+    Visibility and poses are restored afterwards, so a picture does not change the simulation.
     """
     slot_of = scene_index(env).slot_of
     true = (
@@ -356,7 +357,7 @@ def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component
     ManiSkill's standard is int16 millimetres. Where the texture holds float positions in metres, as
     in the default and ray tracing shaders, they are used directly. The minimal shader's texture is
     int16 itself: depth beyond 32.767 m is clamped to -32768 (measured on lavapipe; a driver may
-    also wrap around) and read from the depth buffer instead.
+    also wrap around) and is therefore read from the depth buffer.
     """
     if texture == "Position" and np.issubdtype(data.dtype, np.floating):
         # A background of -0.0 would be printed as "-0.0 m".
@@ -390,9 +391,10 @@ def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[Request, ...]:
 def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Request]) -> list[Picture]:
     """Pictures of the requested cameras, of the last observed state, env by env.
 
-    A picture takes 25 to 50 ms on a software renderer, so pictures in the observation are reused: they are the same
-    (tested), with depth and segmentation as ManiSkill's int16 millimetres and ids. Only other pictures, depth
-    beyond 32.767 m, and shaders with more precision than millimetres are rendered. Raises as `take_pictures`.
+    A picture takes 25 to 50 ms on a software renderer, so pictures in the observation are reused: they equal
+    rendered pictures (tested), but have depth and segmentation as ManiSkill's int16 millimetres and ids.
+    Pictures are rendered only if they are not in the observation, if they have depth beyond 32.767 m, or if
+    their shader is more precise than millimetres. Raises as `take_pictures`.
     """
     if not requests:
         return []
@@ -406,7 +408,7 @@ def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Requ
 
 
 def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[Picture] | None:
-    """Pictures of each env from its last observation; None if they must be rendered."""
+    """One picture of each env, from the env's last observation; None if the pictures must be rendered."""
     name, kind, modalities = request
     seen: Any = task.obs.get("sensor_data", {}) if isinstance(task.obs, Mapping) else {}
     images = seen.get(name) if kind == "sensor" else None

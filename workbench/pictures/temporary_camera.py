@@ -63,14 +63,16 @@ def temporary_camera(
 ) -> Iterator[TemporaryCamera]:
     """Context with a camera in one env. Within it, change nothing in the env and take no other picture.
 
-    The camera is in a second, empty ``sapien.Scene`` that shares the sub-scene's render system. An entity in the sub-scene
-    would change the order on which tables, snapshots and PhysX's packed state rely, and use up a segmentation id.
-    (Measured with sapien 3.0.3: entities, packed poses, ids and pictures of the other cameras are equal before and after.)
+    The camera is in a second, empty ``sapien.Scene`` that shares the sub-scene's render system. An entity in
+    the sub-scene would change the order of entities, on which tables, snapshots and PhysX's packed state
+    rely, and use up a segmentation id. (Measured with sapien 3.0.3: entities, packed poses, ids and pictures
+    of the other cameras are equal before and after.)
 
     Args:
         kind: sensors do not see what the task hides from them.
         settings: the camera's lens; the pose is an argument of `look`.
-        size: width and height of the pictures, which show the same view; None for the size in `settings`.
+        size: width and height of the pictures, which show the view of `settings`; None for the size in
+            `settings`.
         poses: (B, 7) where to draw the env's bodies; None for where they are.
 
     Raises:

@@ -43,9 +43,10 @@ class SceneObject:
     """Columns of the scene's index: one for an actor, one for each link of an articulation."""
     robot: bool
     scenery: bool
-    """The ground, a static body, or a kinematic one of ManiSkill's scene builders (its table)."""
+    """Whether the object is the ground, a static body, or a kinematic body made by a scene builder of
+    ManiSkill (such as a table)."""
     hidden: bool
-    """Whether the task hides it from the sensors."""
+    """Whether the task hides the object from the sensors."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,8 @@ def list_objects(env: Any) -> tuple[SceneObject, ...]:
                 robot=linked and name in robots,
                 scenery=name == "ground"
                 or kinds == {"static"}
-                # Scene builders also place objects that are to be picked up, so only kinematic and static ones count.
+                # Scene builders also place objects that are to be picked up, so only kinematic and static
+                # bodies count as scenery.
                 or (kinds <= {"kinematic", "static"} and all(id(entity) in built for entity in entities)),
                 hidden=all(index.hidden[body] for body in bodies),
             )
@@ -106,7 +108,8 @@ def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
     """Names of a robot's drawn links: its hand, then the others by their distance from the tool centre point.
 
     In ManiSkill's agents with a hand, the tool centre point is the link ``tcp``; the hand is the drawn link
-    that carries ``tcp``, although the fingers may be nearer. Without a ``tcp`` the last link comes first.
+    that carries ``tcp``, even if the fingers are nearer to ``tcp``. Without a ``tcp`` the last link comes
+    first.
     """
     names, entities = scene_index(env).names, scene_index(env).entities[0]
     drawn = [body for body in reversed(robot.bodies) if is_drawn(entities[body])]
@@ -123,7 +126,7 @@ def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
 
 
 def _carrier(entity: Any) -> Any:
-    """The nearest drawn link from this one towards the root; None if there is none."""
+    """This link if it is drawn, else the nearest drawn link towards the root; None if there is none."""
     while entity is not None and not is_drawn(entity):
         link = entity.find_component_by_type(sapien.physx.PhysxArticulationLinkComponent)
         parent = None if link is None else link.parent
@@ -164,7 +167,8 @@ def measure_placement(
 
     Args:
         poses: (B, 7) where to draw the bodies, as `read_poses` returns them; None for their present poses.
-        size: size of the measured pictures, with the same view (`small_size`); None for the camera's own.
+        size: width and height of the measured pictures, which show the camera's view (see `small_size`); None
+            for the camera's own size.
 
     Raises:
         ValueError: the lens is not valid, or there is no such mount.
@@ -338,7 +342,7 @@ def _depths(
 
 
 def entities_of(thing: SceneObject, e: int, index: SceneIndex) -> list[Any]:
-    """The ``sapien.Entity`` of each body of an object that env `e` has."""
+    """The ``sapien.Entity`` of each body of an object, without bodies that env `e` does not have."""
     return [entity for entity in index.entities[e, list(thing.bodies)] if entity is not None]
 
 
@@ -363,7 +367,7 @@ def _margin(mask: NDArray[np.bool_]) -> float:
 
 
 def _built_by_scene_builders(env: Any) -> set[int]:
-    """``id`` of every entity of ManiSkill's scene builders: tables and rooms."""
+    """``id`` of every entity that the env's ManiSkill scene builders made: tables and rooms."""
     entities: set[int] = set()
     for builder in vars(env).values():
         if not isinstance(builder, SceneBuilder):

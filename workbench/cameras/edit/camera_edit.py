@@ -53,11 +53,11 @@ class CameraEdit(Changes):
         return CameraCall(file, node, key, arguments(node, PARAMETERS), run, run.trace)
 
     def verified(self, first: SourceFile, key: CameraKey | None, expected: CameraKey | None) -> SourceEdit:
-        """The edit with all replacements. The new text is run to verify that only the camera `key` changes,
-        and becomes `expected`.
+        """All replacements as one edit. Runs the new text to verify that the camera `key` becomes `expected`,
+        and that no other camera changes.
 
         Args:
-            first: the file to name first if several change.
+            first: the file to name first if several files change.
             key: the camera to change; None if one is added.
             expected: key of the resulting camera; None if it is removed.
 
@@ -104,7 +104,8 @@ def planning(
     settings: CameraSettings | None = None,
     more: Sequence[str] = (),
 ) -> Iterator[CameraEdit]:
-    """Context with a `CameraEdit`; a RefusedEdit within it gets the camera of `settings` as text to copy."""
+    """Context with a `CameraEdit`. If a RefusedEdit is raised in it, the exception gets text to copy: the
+    camera with `settings`."""
     try:
         yield CameraEdit(sources, run)
     except RefusedEdit as refused:

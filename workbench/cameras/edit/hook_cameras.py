@@ -28,8 +28,8 @@ class HookCamera:
     """One camera that a hook made."""
 
     made: CameraSettings | None
-    """Settings of its ``CameraConfig`` call; None if the call was not recorded, or `CameraSettings` cannot
-    describe it."""
+    """Settings in the ``CameraConfig`` call; None if the call was not recorded, or if `CameraSettings` cannot
+    describe them."""
     settings: CameraSettings | None
     """Settings of the config that the hook returned; None if `CameraSettings` cannot describe it."""
     mount: str
@@ -49,7 +49,8 @@ class HookCameras:
 
 
 RunHooks = Callable[[Mapping[str, str]], HookCameras]
-"""Runs the hooks with these texts, by path, in place of the author's files. Raises RefusedEdit with the reason."""
+"""Runs the hooks as if the author's files had these texts (path to text). Raises RefusedEdit with the reason
+if that fails."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,7 @@ class CameraCall:
 
     @property
     def key(self) -> ast.expr | ast.keyword | None:
-        """Key of the call in a dict; None if the call is no value of a dict."""
+        """The dict key or ``dict(...)`` keyword that has the call as its value; None if there is none."""
         outer = self.file.parents[self.node]
         if isinstance(outer, ast.Dict):
             return outer.keys[outer.values.index(self.node)]
@@ -90,14 +91,14 @@ class CameraCall:
 
     @property
     def loop(self) -> ast.AST | None:
-        """The loop or comprehension around the call, within the same function; None without one."""
+        """The loop or comprehension around the call, in the call's own function; None if there is none."""
         scope = self.file.scopes(self.node)[0]
         outers = self.file.ancestors(self.node)
         return next((o for o in outers if isinstance(o, LOOPS) and scope in self.file.ancestors(o)), None)
 
 
 def changed_fields(a: CameraSettings, b: CameraSettings) -> list[str]:
-    """Names in `FIELDS` of the settings that differ."""
+    """The names of `FIELDS` in which `a` and `b` differ."""
     apart = differences(a, b, _SAME)
     return [
         name
@@ -107,6 +108,6 @@ def changed_fields(a: CameraSettings, b: CameraSettings) -> list[str]:
 
 
 def with_fields(settings: CameraSettings, other: CameraSettings, names: list[str]) -> CameraSettings:
-    """`settings` with the fields `names` of `other`."""
+    """`settings`, with the fields `names` taken from `other`."""
     fields = [f for name in names for f in (("position", "quaternion") if name == "pose" else (name,))]
     return replace(settings, **{name: getattr(other, name) for name in fields})

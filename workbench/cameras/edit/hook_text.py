@@ -1,4 +1,4 @@
-"""A camera as Python text, and edits that add it to a camera hook or add the hook."""
+"""A camera as Python text, and edits that add this text to a camera hook, or add a hook with it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ def needed_imports(settings: CameraSettings, pose: str = "") -> dict[str, str]:
 
 
 def returned_expression(file: SourceFile, function: Function) -> ast.expr:
-    """The single expression that a hook returns. Raises RefusedEdit."""
+    """The expression that a hook returns; if it returns a name, the list or dict that is assigned to the
+    name. Raises RefusedEdit unless the hook has exactly one return with a value."""
     found = [
         node for node in walk(function) if isinstance(node, ast.Return) and file.scopes(node)[0] is function
     ]
@@ -50,7 +51,8 @@ def returned_expression(file: SourceFile, function: Function) -> ast.expr:
 def append_camera(
     file: SourceFile, value: ast.AST, uid: str, text: Callable[[str], str]
 ) -> list[Replacement]:
-    """Add `text(indent)` to the cameras of `value`. Raises RefusedEdit."""
+    """Add the camera `text(indent)` to `value`, the expression with the cameras of a hook. Raises RefusedEdit
+    if `value` is neither a config nor a list, tuple or dict."""
     start, end = file.inner_span(value)
     indent = file.indent(start)
     called = file.code(value.func) if isinstance(value, ast.Call) else ""
@@ -85,7 +87,8 @@ def new_hook(
     hook: str,
     text: Callable[[str], str],
 ) -> Replacement:
-    """Add the hook, which returns the camera `text(indent)`. Raises RefusedEdit."""
+    """Add the hook, which returns the camera `text(indent)`. Raises RefusedEdit if the class inherits the
+    hook."""
     owner, where = hook_cameras.owners.get(hook, ("", ""))
     if where in project.texts:
         raise RefusedEdit(
@@ -117,7 +120,8 @@ def class_named(file: SourceFile, name: str) -> ast.ClassDef:
 def at_end_of_class(
     file: SourceFile, cls: ast.ClassDef, hook: str, text: Callable[[str], str]
 ) -> Replacement:
-    """Add `text(indent)`, the whole hook, at the end of the class. Raises RefusedEdit."""
+    """Add `text(indent)`, the whole hook, at the end of the class. Raises RefusedEdit if the class is written
+    in one line."""
     first = file.inner_span(cls.body[0])[0]
     if file.line_at(first) == file.line(cls):
         raise RefusedEdit(f"the class {cls.name} is written in one line, so {hook} cannot be added to it")
@@ -132,7 +136,7 @@ def snippet(
 ) -> str:
     """``CameraConfig(...)`` with one argument per line and the further arguments `more`.
 
-    Needs ``import sapien`` unless `pose` is given, and numpy as np for an intrinsic.
+    The text needs ``import sapien`` unless `pose` is given, and ``import numpy as np`` for an intrinsic.
     """
     quaternion = ", ".join(quaternion_texts(settings.quaternion))
     pose = pose or f"sapien.Pose(p={list_text(settings.position, 4)}, q=[{quaternion}])"

@@ -36,12 +36,14 @@ def plan_add(
 ) -> SourceEdit:
     """Add a fixed camera to the camera hook of `class_name`; adds the hook if the class has none.
 
-    A hook returns one config, a list or tuple of them, or a dict; one config becomes a list. The pose is written as a
-    ``look_at`` if another camera in the file uses one and it can express the pose.
+    A hook returns one config, a list or tuple of configs, or a dict; one config is changed to a list. The
+    pose is written as a ``look_at`` if another camera in the file has a ``look_at`` and a ``look_at`` can
+    express the pose.
 
     Raises:
         RefusedEdit: the hook returns anything else (a name, a concatenation, a call of the parent's hook) or has several
-            returns. As in all plans here, the exception has the reason and the text to copy.
+            returns. As in all plans of this module except a removal, the exception has the reason and the
+            text to copy.
     """
     check_camera(settings)
     kind, uid = key
@@ -68,7 +70,8 @@ def plan_add(
 def plan_duplicate(
     sources: Mapping[str, str], key: CameraKey, new_uid: str, settings: CameraSettings, run: RunHooks
 ) -> SourceEdit:
-    """Add a copy of a camera next to it, with `settings`, on the same mount and in the same form. Raises RefusedEdit."""
+    """Add a copy of a camera's call next to it, under the name `new_uid`. Raises RefusedEdit, with `settings`
+    as text to copy."""
     new_key: CameraKey = (key[0], new_uid)
     with planning(sources, run, new_uid, settings) as edit:
         call = _single_call(edit, key)
@@ -98,7 +101,8 @@ def plan_duplicate(
 def plan_rename(
     sources: Mapping[str, str], key: CameraKey, new_uid: str, settings: CameraSettings, run: RunHooks
 ) -> SourceEdit:
-    """Rename a camera, with a note that observations and `sensor_configs` use the name. Raises RefusedEdit."""
+    """Rename a camera, with notes that its observations get the new name, and in how many other places of the
+    file the old name occurs. Raises RefusedEdit, with `settings` as text to copy."""
     new_key: CameraKey = (key[0], new_uid)
     with planning(sources, run, new_uid, settings) as edit:
         call = _single_call(edit, key)
@@ -136,7 +140,8 @@ def override_text(
     """Text of a hook that returns the parent's cameras with one of them replaced.
 
     Args:
-        parse: ManiSkill's function for a hook's result, `TaskDescription.parse_cameras`.
+        parse: name of ManiSkill's function that turns a hook's result into a dict
+            (`TaskDescription.parse_cameras`).
         more: further arguments of the camera, such as its mount.
     """
     hook, inner = HOOK_OF[kind], indent + "    "
@@ -215,7 +220,8 @@ def _is_in_hook(call: CameraCall) -> bool:
 
 
 def _look_at_name(edit: CameraEdit, file: SourceFile, kind: CameraKind) -> str:
-    """Name by which a camera in this file, preferably of this kind, calls look_at; empty if none does."""
+    """The name under which this file calls look_at for a camera, preferably one of this kind; empty if no
+    camera in the file uses look_at."""
     for key in sorted(edit.hook_cameras.cameras, key=lambda key: key[0] != kind):
         trace = edit.hook_cameras.cameras[key].trace
         pose = None if trace is None else trace.parts.get("pose")
@@ -231,7 +237,7 @@ def _look_at_name(edit: CameraEdit, file: SourceFile, kind: CameraKind) -> str:
 
 
 def _renaming(call: CameraCall, new_uid: str) -> list[Replacement]:
-    """Edits that rename the camera, only at its call: an equal constant may name other things too."""
+    """Edits that rename the camera, only at its call: elsewhere, an equal string may name something else."""
     file, key, uid = call.file, call.key, call.arguments.get("uid")
     found: list[Replacement] = []
     if isinstance(key, ast.keyword):

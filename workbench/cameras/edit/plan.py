@@ -29,16 +29,16 @@ def plan_edit(
 ) -> SourceEdit:
     """Plan the edit that changes a camera from `before`, its settings in the running env, to `after`. Nothing is written.
 
-    It runs the files, finds the ``CameraConfig(...)`` call of the camera and changes the arguments that
-    differ. Then it runs the new text, and checks that this camera has the new settings and that no other
+    This function runs the files, finds the ``CameraConfig(...)`` call of the camera and changes the arguments
+    that differ. Then it runs the new text, and checks that this camera has the new settings and that no other
     camera changed.
 
     Args:
         sources: the author's files on disk, by path.
 
     Raises:
-        RefusedEdit: the edit is not possible, or the settings of the call differ from `before`: then other code sets them,
-            and an edit would have no effect.
+        RefusedEdit: the edit is not possible, or the settings of the call differ from `before`: in that case
+            other code sets them, and an edit would have no effect.
     """
     check_camera(after)
     mount: list[str] = []
@@ -169,7 +169,8 @@ def _write_lens(changes: Changes, call: CameraCall, after: CameraSettings) -> li
 def _check_asked(
     found: CameraSettings | None, fields: list[str], made: CameraSettings, after: CameraSettings
 ) -> CameraSettings:
-    """Check that the edited camera has the `fields` of `after` and the others of `made`; returns `found`."""
+    """Check that `found`, the edited camera, has the `fields` of `after` and all other fields of `made`;
+    returns `found`. Raises RefusedEdit."""
     if found is None:
         raise RefusedEdit("the settings of the edited camera cannot be read")
     as_requested = not set(changed_fields(made, found)) - set(fields)

@@ -89,7 +89,8 @@ def _override_edit(
     run: RunHooks,
 ) -> SourceEdit:
     """The edit that adds a hook to the task's own class to replace an inherited camera. If the edit is
-    refused, the RefusedEdit has the hook as snippet, if there is one."""
+    refused, the snippet of the RefusedEdit is this hook, or only the camera if no hook of a task makes the
+    camera. For a removal there is no snippet."""
     if request.settings is None or request.what == "remove":
         raise RefusedEdit(owner_text)
     (kind, _), (_, uid), site = request.key, request.result, info.site

@@ -27,7 +27,8 @@ _MANISKILL_POSE = ("mani_skill.utils.structs.Pose", "mani_skill.utils.structs.po
 _STILL_AT_TARGET = 3e-5
 _MIN_DISTANCE_METRES = 0.1
 _DECIMALS = (4, 5, 6)
-"""Decimals of metres to try: 0.1 mm, and more if the target is so close that 0.1 mm would rotate the camera."""
+"""Numbers of decimals to try for lengths in metres: 4 (0.1 mm), then more, since 0.1 mm would rotate a camera
+whose target is very close."""
 
 
 def why_not_a_pose(changes: Changes, pose: TracedValue) -> str | None:
@@ -67,10 +68,11 @@ def _is_vector(part: TracedValue, length: int) -> bool:
 def write_pose(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
     """Edit `pose` to the pose of `after`: in its written form if possible, else with a quaternion.
 
-    A ``look_at`` stays one while the camera is level and does not look along `up`. Its target is kept if the
-    camera still looks at it; if not, the target is put on the new line of sight, at the distance of `after`,
-    or at the old distance. Straight down or up, ManiSkill's ``look_at`` returns no unit quaternion (its
-    `left` is the zero vector there), so those poses get a quaternion.
+    A ``look_at`` remains a ``look_at`` if the camera is level and does not look along `up`. The target is
+    kept if the camera still looks at it. Otherwise the target is put on the new line of sight, at the
+    distance of `after`, or at the old distance if `after` has none. For a camera that looks straight down or
+    up, ManiSkill's ``look_at`` returns no unit quaternion (its `left` is then the zero vector), so such a
+    pose is written with a quaternion.
     """
     if pose.function == "look_at":
         if not _look_at(changes, pose, after):
@@ -131,7 +133,7 @@ def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool
     eye, target = pose.parts["eye"], pose.parts["target"]
     up = pose.parts["up"].numbers if "up" in pose.parts else (0.0, 0.0, 1.0)
     forward = rotation_matrix(after.quaternion)[:, 0].tolist()
-    # This close to `up`, moving the target by 0.1 mm rotates the picture.
+    # If the line of sight is this close to `up`, moving the target by 0.1 mm rotates the picture.
     if abs(_cosine(forward, up)) > math.cos(1e-3):
         return False
 
@@ -207,7 +209,8 @@ def _as_quaternion(changes: Changes, pose: TracedValue, after: CameraSettings) -
 
 
 def pose_call(changes: Changes, file: SourceFile) -> str:
-    """The name of a pose class in `file`; adds ``import sapien`` if it has none."""
+    """The expression that `file` calls to make a pose, such as ``sapien.Pose``; adds ``import sapien`` if the
+    file imports no pose class."""
     for name, bindings in changes.project.bindings(file, file.module).items():
         dotted = bindings[-1].dotted
         if f"{dotted}.Pose" in _SAPIEN_POSE:
@@ -223,8 +226,8 @@ def pose_call(changes: Changes, file: SourceFile) -> str:
 def look_at(
     eye: Sequence[float], target: Sequence[float], up: Sequence[float] = (0, 0, 1)
 ) -> NDArray[np.float64] | None:
-    """The orientation of ManiSkill's ``look_at`` as a quaternion (wxyz); None along `up`, where it has
-    none."""
+    """The orientation of ManiSkill's ``look_at`` as a quaternion (wxyz); None if the line of sight is along
+    `up`, where ``look_at`` has no orientation."""
     # ManiSkill computes in float32, whose rounding rotates the picture if the eye is nearly above its target.
     seen = np.asarray(target, np.float32).astype(float), np.asarray(eye, np.float32).astype(float)
     forward, upward = np.subtract(*seen), np.asarray(up, float)
@@ -244,7 +247,7 @@ def to_euler(quaternion: ArrayLike, near: Sequence[float]) -> tuple[float, float
         yaw = math.atan2(m[1, 0], m[0, 0])
         candidates = [(roll, pitch, yaw), (roll + math.pi, math.pi - pitch, yaw + math.pi)]
     else:
-        # Along z only the sum or difference of roll and yaw matters: keep yaw.
+        # If the camera looks along z, only the sum or difference of roll and yaw matters: keep yaw.
         pitch = math.copysign(math.pi / 2, -m[2, 0])
         whole = math.atan2(m[0, 1], m[1, 1]) if pitch > 0 else math.atan2(-m[0, 1], m[1, 1])
         candidates = [(whole + near[2] if pitch > 0 else whole - near[2], pitch, near[2])]
