@@ -30,7 +30,7 @@ class ActionPart:
     """The slice of the flat action that one controller of one robot reads."""
 
     robot: str | None
-    """Key of the action dict for several robots, else None."""
+    """The robot's key in the action dict; None unless there are several robots."""
     controller: Any
     """A ManiSkill BaseController."""
     names: tuple[str, ...]
@@ -85,7 +85,7 @@ def width(parts: tuple[ActionPart, ...]) -> int:
 def action_of(
     parts: tuple[ActionPart, ...], num_envs: int, rows: Mapping[int, NDArray]
 ) -> NDArray[np.float32]:
-    """(N, A) action with these rows (A,), by env index; zeros for all other envs."""
+    """(N, A) action from `rows`: (A,) numbers by env index; zeros for all other envs."""
     action = np.zeros((num_envs, width(parts)), np.float32)
     for env, row in rows.items():
         action[env] = row
@@ -140,7 +140,7 @@ def by_robot(parts: tuple[ActionPart, ...], action: torch.Tensor) -> Any:
 
 
 def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> NDArray[np.float32]:
-    """(N, A) from a policy's action: an array or tensor (A,) or (N, A), or a dict with one for each robot.
+    """(N, A) from a policy's action: an array or tensor (A,) or (N, A), or a dict of these by robot.
 
     Raises:
         WrongAction: the action is something else, its shape does not fit, or a value is not finite.

@@ -61,7 +61,7 @@ def why_no_gpu_simulation() -> str | None:
 def find_renderer() -> Renderer | None:
     """The device and backend that SAPIEN renders with; None if it finds no device.
 
-    Cached: a process can have one render device only, and a second one under another name raises.
+    Cached: a process can have only one render device, and to ask for it by another name raises.
 
     Raises:
         BackendUnavailable: a material that was made earlier holds the device under another name.

@@ -35,7 +35,7 @@ _BASE_ENV, _OUTERMOST = "mani_skill.envs.sapien_env", ("step", "reset")
 anyway."""
 
 Frame = tuple[FrameType, int, int]
-"""A frame, with its last instruction and its line at the time of the call."""
+"""A frame, with the instruction and the line at which it was when it was noted."""
 Occasion = Literal["step", "reset"]
 _Key = tuple[str, Hashable]
 """Id of a rule, and the line or subject at which it was broken."""
@@ -112,7 +112,7 @@ class BrokenRules:
         """
         Args:
             degrees: degree of each rule; see `gpu_rules.degrees_of`.
-            on_finding: called once for each place where a rule that does not stop is broken.
+            on_finding: called once for each place where a rule that does not stop the task is broken.
         """
         self._degrees, self._on_finding = degrees, on_finding
         self._rows: dict[_Key, _KeptFinding] = {}
@@ -145,11 +145,12 @@ class BrokenRules:
         place: Place | None = None,
         subject: Hashable = None,
     ) -> None:
-        """Raise or note a breach, by the rule's degree.
+        """Raise or note a breach, as the rule's degree says.
 
         Args:
-            frames: frames at fault, which become the innermost of the traceback. An empty sequence means
-                the frames of the present call; None means that no line is at fault, or only `place` is known.
+            frames: frames at fault, which become the innermost of the traceback. An empty sequence means the
+                frames of the present call. None means that there are no frames: no line is at fault, or only
+                its `place` is known.
             subject: breaches with the same subject share a row; None: breaches at the same line share a row.
         """
         degree = self._degrees[rule]
@@ -210,11 +211,14 @@ class BrokenRules:
 
     @contextmanager
     def during(self, occasion: Occasion, confirms: bool = True) -> Iterator[None]:
-        """Context in which breaches belong to `occasion`; drops the occasion's unconfirmed rows that do not
-        break again.
+        """Context in which breaches belong to `occasion`.
+
+        At its end, those rows of the occasion are dropped whose rules were not broken again since the file
+        was edited.
 
         Args:
-            confirms: whether every rule of this occasion could have been broken.
+            confirms: whether every rule of this occasion can be broken in the context; if not, no row is
+                dropped.
         """
         before, self._now = self._now, occasion
         try:
@@ -230,7 +234,7 @@ class BrokenRules:
         """Continue with another version of the file: drop rows whose function changed, mark the others unconfirmed.
 
         Args:
-            place_now: file and line of a row in the new version; None where its function changed.
+            place_now: returns file and line of a row in the new version; None if the row's function changed.
         """
         rows, self._rows, self._silenced = self._rows, {}, {}
         self.serial += 1
@@ -278,7 +282,7 @@ def place_of_hook(task: type, hook: str) -> Place | None:
 
 
 def place_of_class(cls: type) -> Place | None:
-    """Where a class is defined; None for one without a file."""
+    """Where a class is defined; None for a class without a file."""
     try:
         return inspect.getfile(cls), inspect.getsourcelines(cls)[1], cls.__name__
     except (TypeError, OSError):
@@ -286,7 +290,7 @@ def place_of_class(cls: type) -> Place | None:
 
 
 def place_of(frames: Sequence[Frame]) -> Place | None:
-    """The first line outside installed packages; else the first outside ManiSkill's general code."""
+    """The first line in `frames` outside `_GENERAL_CODE`; a line outside installed packages is preferred."""
     general = None
     for frame, _, line in frames:
         code = frame.f_code
@@ -336,8 +340,8 @@ def find_assignment(task: type, path: str) -> Place | None:
 
 
 def find_entry(task: type, hook: str, name: str) -> Place | None:
-    """The line in a hook with the entry `name` of its return value, as a key or a keyword; else the hook's
-    ``def``."""
+    """The line of a hook that names the entry `name` of its return value, as a key or a keyword; else the
+    line of the hook's ``def``."""
     function = inspect.unwrap(getattr(task, hook))
     for node, line in _nodes(function):
         key = getattr(node, "value", None) if isinstance(node, ast.Constant) else getattr(node, "arg", None)

@@ -89,8 +89,8 @@ def setting_text(value: object) -> str:
 
 @dataclass(frozen=True)
 class MovedCamera:
-    """A change of a camera in a recorded episode: to settings that differ from the task's file, or back to
-    it."""
+    """A change of a camera in a recorded episode: to settings that differ from those in the task's file, or
+    back to those in the file."""
 
     state: int
     """State index from which on the settings hold; 0 is the start."""
@@ -102,7 +102,8 @@ class MovedCamera:
 
 
 def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
-    """Such as ``base_camera: position (0.3, 0, 0.6), in the file (0.3, 0, 0.5)``; empty if none was moved."""
+    """Text such as ``base_camera: position (0.3, 0, 0.6), in the file (0.3, 0, 0.5)``; empty if none was
+    moved."""
     texts = []
     for one in moved:
         from_step = f" from step {one.state} on" if one.state else ""
@@ -116,7 +117,7 @@ def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
 
 
 def _value(settings: CameraSettings, what: str) -> object:
-    """The setting with this name in `differences`."""
+    """The setting that `differences` calls `what`."""
     return getattr(settings, "quaternion" if what == "orientation" else what)
 
 
@@ -164,9 +165,9 @@ def why_no_camera(settings: CameraSettings) -> str | None:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """One camera of the task; only its pose may differ between envs.
+    """One camera of the task; where envs differ, its size and lens are those of env 0.
 
-    Poses are ManiSkill's camera frame: x forward, y left, z up, quaternion wxyz.
+    Poses are those of ManiSkill's camera frame: x forward, y left, z up, quaternion wxyz.
     """
 
     name: str
@@ -178,14 +179,14 @@ class CameraInfo:
     near: float
     far: float
     intrinsic: NDArray[np.float32]
-    """(3, 3) OpenCV intrinsic matrix in pixels (env 0's, where they differ)."""
+    """(3, 3) OpenCV intrinsic matrix in pixels."""
     mount: str | None
     """Name of the body that the camera is mounted on; None if it is fixed."""
     modalities: tuple[str, ...]
     """Modalities of the camera's shader, among ``rgb depth segmentation position normal albedo``."""
     settings: CameraSettings | None = None
-    """Settings in the task's own config, even if the camera was moved since then; env 0's if the envs differ.
-    None if `CameraSettings` cannot express them (a lens that differs between envs)."""
+    """Settings in the task's own config, even if the camera was moved later; env 0's if the envs differ. None
+    if `CameraSettings` cannot express them (a lens that differs between envs)."""
     varies: bool = False
     """The camera's pose differs between envs or from its config: the task's code moves the camera."""
     site: CallSite | None = None
@@ -212,14 +213,13 @@ class Picture:
     rgb: NDArray[np.uint8] | None = None
     """(H, W, 3)"""
     depth: NDArray[np.float32] | None = None
-    """(H, W) metres along the optical axis; 0 where the ray met nothing. ManiSkill's own observation has
-    whole millimetres as int16, up to 32.767 m, and `step_pictures` does not convert it. All other depth is
-    unlimited."""
+    """(H, W) metres along the optical axis, without a limit; 0 where the ray met nothing. If `step_pictures`
+    took the picture from ManiSkill's observation, these are whole millimetres: int16, up to 32767."""
     segmentation: NDArray[np.int32] | None = None
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""
     position: NDArray[np.float32] | None = None
-    """(H, W, 3) metres, in the camera's OpenGL frame (x right, y up, z backward), as ManiSkill observes it in whole
-    millimetres; 0 where the ray met nothing. The minimal shader's own numbers end at 32.767 m."""
+    """(H, W, 3) metres, in the camera's OpenGL frame (x right, y up, z backward); 0 where the ray met
+    nothing. ManiSkill observes whole millimetres. The minimal shader's numbers end at 32.767 m."""
     normal: NDArray[np.float32] | None = None
     """(H, W, 3) of unit length, in the same frame; 0 where the ray met nothing."""
     albedo: NDArray[np.uint8] | None = None

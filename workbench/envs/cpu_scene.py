@@ -78,7 +78,7 @@ from workbench.envs.snapshots.task_state import note_constructed, note_scene
 from workbench.envs.strict import StrictMixin
 
 _UNIT_TOLERANCE = 1e-3
-"""Largest difference of a quaternion's length from 1."""
+"""A quaternion counts as one of unit length if its length differs from 1 by at most this."""
 SIM_BACKEND = "physx_cpu_batched"
 """Name of this backend. It is not in ManiSkill's ``CPU_SIM_BACKENDS``, for which ManiSkill refuses more than
 one env."""
@@ -224,8 +224,9 @@ class BatchedCpuScene(ManiSkillScene):
     def prepare_fast(
         self, env: int, key: CameraKey, textures: Collection[str], places: Places = NOWHERE_ELSE
     ) -> None:
-        """Choose the shapes of a fast picture, and move the fast camera to the present pose of this camera;
-        makes both if they are missing.
+        """Choose the shapes of a fast picture, and move the fast camera to the present pose of this camera.
+
+        Makes the shapes and the fast camera if they are missing.
 
         Args:
             places: poses at which bodies of the env are drawn instead of their simulated poses.
@@ -356,7 +357,7 @@ class BatchedCpuScene(ManiSkillScene):
 
 
 class BatchedCpuMixin:
-    """Mixin for batched CPU simulation; the first base of a task class.
+    """Mixin for batched CPU simulation; among the bases it stands before the author's class.
 
     ManiSkill 3.0.1 refuses ``num_envs > 1`` on the CPU in four places: the name of the simulation backend,
     one ``is_cuda()``, the scene that ``_setup_scene`` builds, and the groups of cameras. This mixin replaces
@@ -376,7 +377,7 @@ class BatchedCpuMixin:
     begins_anew = False
     """Whether each reset is an exact point, from which an episode can be repeated to the last bit."""
     _to_begin: list[int] | None = None
-    """During a reset: the initialised envs, to become exact points."""
+    """During a reset with `begins_anew`: initialised envs, which will become exact points. Else None."""
     _sim_freq: int
     _sim_steps_per_control: int
     _set_scene_config: Any
@@ -758,7 +759,11 @@ def refuse_unbuilt_agent(agent: Any) -> None:
 
 
 def _culprit(cls: type, base: type, silent: bool) -> tuple[type, Place | None]:
-    """The first class with a constructor; with `silent`, preferably one whose constructor calls no other."""
+    """The class at fault, and the place of its constructor.
+
+    It is the first class before `base` that has a constructor; with `silent`, preferably one whose
+    constructor calls no other.
+    """
     every = cls.__mro__[: cls.__mro__.index(base)]
     own = [owner for owner in every if hasattr(vars(owner).get("__init__"), "__code__")]
     named = [owner for owner in own if "__init__" in vars(owner)["__init__"].__code__.co_names]

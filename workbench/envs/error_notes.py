@@ -64,7 +64,7 @@ class RefusedMember(CoreRefusal, NotImplementedError):
 
 
 class WrongAction(ValueError):
-    """An action that does not fit the task. `problem` continues a sentence that starts with the action's source."""
+    """An action that does not fit the task. `problem` is a sentence without its subject: the action."""
 
     def __init__(self, problem: str) -> None:
         super().__init__(f"the action {problem}")
@@ -108,7 +108,9 @@ _running = _Running()
 
 
 def chain_of(error: BaseException, suppressed: bool = False) -> Iterator[BaseException]:
-    """The error, its cause, and so on. A refusal of the core ends the chain: its text explains its cause.
+    """The error, its cause, the cause of that, and so on.
+
+    A refusal of the core is the last one: its text already explains what caused it.
 
     Args:
         suppressed: include what ``raise ... from None`` hides.

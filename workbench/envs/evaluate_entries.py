@@ -20,7 +20,8 @@ FLAGS = ("success", "fail")
 MAX_TEXT_CHARACTERS = 400
 """Maximum length of a value's text."""
 MAX_KEPT_NUMBERS = 1024
-"""Largest whole-batch value that is kept as numbers; of a larger one only type and shape are kept."""
+"""Maximum count of numbers in a whole-batch value that is kept as numbers. Of a larger value only type, shape
+and count are kept."""
 MAX_ENTRIES = 1000
 """Maximum number of leaves; the others are only counted."""
 _MAX_NAME_CHARACTERS = 200
@@ -45,7 +46,9 @@ _short.maxstring = _short.maxlong = _short.maxother = MAX_TEXT_CHARACTERS
 
 
 def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDArray], dict[str, OtherEntry]]:
-    """Split `info` into entries of real numbers with a row for each env, (N, ...) each, and the others. All are copies.
+    """Split `info` into entries of real numbers with a row for each env, (N, ...), and all other entries.
+
+    All are copies.
 
     ManiSkill reads only ``success`` and ``fail`` and passes the rest on: None, a string, ``progress.mean()``, an object. A
     tensor, array or list has rows if its first dimension is N. With one env, shape (1,) has a row and () has none, except
@@ -101,7 +104,8 @@ def _key(key: Any) -> str:
 
 
 def _name(path: str, columns: Mapping[str, Any], others: Mapping[str, Any]) -> str:
-    """`path`, made unique and fit for a file: ``a/b`` may be a key, and also ``b`` of the dict ``a``."""
+    """`path`, made unique and fit for a file: ``a/b`` may stand for the key ``a/b``, and for ``b`` in the
+    dict ``a``."""
     name = plain = _clean_name(path)
     number = 2
     while name in columns or name in others:
@@ -182,7 +186,7 @@ def _other(value: Any, num_envs: int) -> OtherEntry:
 
 
 def _rows_of(value: Any) -> list[Any] | tuple[Any, ...] | NDArray | None:
-    """The value as a sequence whose items may be one for each env; None if it is not a sequence."""
+    """The value as a sequence, which may have one item for each env; None if it is not a sequence."""
     if isinstance(value, (list, tuple)):
         return value
     if isinstance(value, torch.Tensor) and value.is_complex():
@@ -251,8 +255,11 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
 
 
 def wrong_flags(evaluate: object) -> str | None:
-    """What is wrong if ``success`` or ``fail`` is a tensor that is not bool, or None. ManiSkill's step
-    accepts such a tensor, its wrappers do not."""
+    """What is wrong with ``success`` or ``fail``: it is a tensor, but not of bools. None if neither is such a
+    tensor.
+
+    ManiSkill's step accepts such a tensor, its wrappers do not.
+    """
     for name in FLAGS:
         value = evaluate.get(name) if isinstance(evaluate, Mapping) else None
         if isinstance(value, torch.Tensor) and value.dtype != torch.bool:
@@ -273,7 +280,7 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
 
 
 def no_reward(reward: object, num_envs: int) -> str | None:
-    """Why a reward cannot be drawn and recorded, or None. It must be a tensor (N,) of numbers or bools."""
+    """Why a reward cannot be drawn and recorded; None if it can. It must be a tensor (N,), not complex."""
     if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs) or reward.dtype.is_complex:
         return f"returned {describe(reward)}; {_floating(num_envs)}"
     return None
@@ -303,7 +310,7 @@ def wrong_observation(obs: object, num_envs: int) -> str | None:
 
 
 def without_rows(value: object, num_envs: int) -> Iterator[tuple[str, str]]:
-    """Name and description of each tensor or array in nested dicts that has no row for each env."""
+    """Name and description of each tensor or array, in nested dicts too, that lacks a row for each env."""
     for name, held in flat_entries(value):
         if isinstance(held, torch.Tensor | np.ndarray) and held.shape[:1] != (num_envs,):
             if num_envs > 1 or held.ndim:  # ManiSkill accepts shape () for a single env

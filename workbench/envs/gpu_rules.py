@@ -15,8 +15,9 @@ from typing import Literal, get_args
 from workbench.machine.parse_python import parse_python
 
 Degree = Literal["stop", "warn", "off"]
-"""*stop* raises at the line that broke the rule; *warn* reports the line, and the operation continues as without rules, to the
-last bit. By default a rule stops where the state of other envs is overwritten, since every number after that is wrong."""
+"""*stop* raises at the line that broke the rule; *warn* reports the line, and the operation continues as
+without rules, to the last bit. By default a rule stops if its breach makes every later number wrong, as when
+the state of other envs is overwritten."""
 DEGREES: tuple[Degree, ...] = get_args(Degree)
 FailOn = Literal["stop", "warn", "never"]
 """The lowest degree of a finding that makes a command's exit code 1."""

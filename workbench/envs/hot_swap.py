@@ -38,8 +38,11 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
 
 
 def can_exchange_cameras(env: BaseEnv) -> bool:
-    """Whether `exchange_cameras` is possible. It is not in GPU simulation, whose camera groups cannot be
-    undone; nor if a sensor is not an ordinary camera; nor if ManiSkill lacks a private name that it needs."""
+    """Whether `exchange_cameras` is possible.
+
+    It is impossible in GPU simulation, whose camera groups cannot be undone; if a sensor is not an ordinary
+    camera; and if ManiSkill lacks a private name that the exchange needs.
+    """
     if maniskill_private.why_not(maniskill_private.EXCHANGING):
         return False
     plain = all(
@@ -69,8 +72,8 @@ def exchange_cameras(env: BaseEnv) -> None:
 def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
     """Call hooks of resets and steps as ManiSkill does, to check that they work, and undo their effects.
 
-    Their writes are not applied, so PhysX continues as before, to the last bit. If a hook applies or steps on its own, the
-    state is restored from a snapshot.
+    The hooks' writes are not applied, so PhysX continues as before, to the last bit. If a hook itself applies
+    its writes, or steps the simulation, the state is restored from a snapshot.
 
     Args:
         hooks: ``_initialize_episode`` (called with all envs, and with one) and hooks without arguments.

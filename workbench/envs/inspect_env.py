@@ -66,7 +66,7 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
 
 
 def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
-    """The last observation; a flattened one (N, D) split by the names of its entries."""
+    """The last observation. If it is flattened, (N, D), it is split into its entries again, by name."""
     leaves: list[Leaf] = []
     for name, value in flat_entries({} if task.obs is None else task.obs):
         # With pictures, ManiSkill's flattened part is called "state".
@@ -79,7 +79,7 @@ def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
 
 
 def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
-    """``get_state_dict()``; the 13 numbers of a body, and 13 + 2 J of an articulation, split by name."""
+    """``get_state_dict()``, split into named parts: 13 numbers of a body, 13 + 2 J of an articulation."""
     structs = scene_index(task.env).states
     leaves: list[Leaf] = []
     for name, value in env_states(task.env).items():
@@ -94,7 +94,7 @@ def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
 
 
 def read_joints(task: TaskEnv, env: int) -> tuple[JointReadings, ...]:
-    """Every articulation of this env, in the order of building."""
+    """Every articulation of this env that has active joints, in the order of building."""
     found = []
     for name, articulation in task.env.scene.articulations.items():
         at = np.flatnonzero(np.asarray(maniskill_private.envs_of(articulation)) == env)
@@ -193,8 +193,9 @@ def _floats(value: torch.Tensor) -> NDArray[np.float32]:
 class Contact:
     """One pair of collision shapes in the last substep, with K points; float32, the env's own world frame.
 
-    PhysX lists two shapes that are nearer than their contact offsets (1 cm each by default). So a pair of bodies may come
-    more than once, and a positive `separation` without an impulse means near, not touching.
+    PhysX lists every two shapes that are nearer than their contact offsets (1 cm each by default). So a pair
+    of bodies may be listed more than once, and two shapes with positive `separations` and no impulse do not
+    touch.
     """
 
     bodies: tuple[str, str]

@@ -41,9 +41,9 @@ class JointReadings:
     velocity: NDArray[np.float32]
     """(J,) rad/s or m/s."""
     target: NDArray[np.float32]
-    """(J,) targets of the position drives; NaN for a joint without one (no stiffness)."""
+    """(J,) targets of the position drives; NaN for a joint without a position drive (no stiffness)."""
     low: NDArray[np.float32]
-    """(J,) lower limits; infinite for a joint without one."""
+    """(J,) lower limits; infinite for a joint without a limit."""
     high: NDArray[np.float32]
 
 

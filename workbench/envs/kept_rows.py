@@ -27,7 +27,7 @@ from workbench.envs.snapshots.task_state import is_per_env, version_of
 from workbench.machine.library_files import is_installed
 
 MAX_TRACED_LINES = 2000
-"""Maximum number of the author's lines in one reset after which values are compared."""
+"""In one reset, values are compared after each of the author's lines, up to this number of lines."""
 _ROUNDING_TOLERANCE = 1e-5
 """Tolerance for values computed again from the same poses; rotations were seen to differ by 1e-7."""
 _ITEM = re.compile(r"\[(\d+)\]")
@@ -37,8 +37,8 @@ class KeptRows:
     """Copy of the values that a task keeps for each env, to find rows that a partial reset changed for other
     envs.
 
-    A partial reset must change the rows of ``env_idx`` only, in tensors, arrays, lists and Poses on the task,
-    in dicts and in objects of its own. Nothing raises if it changes others: ``self.target =
+    A partial reset must change only the rows of ``env_idx``, in the task's tensors, arrays, lists and Poses,
+    and in those inside its dicts and own objects. Nothing raises if other rows change: ``self.target =
     torch.rand((self.num_envs, 2))`` gives every env another target in the middle of its episode. Values are
     compared, so a value computed again with the same result is no fault.
 
@@ -55,8 +55,10 @@ class KeptRows:
         self.before = {path: _copy(value) for path, value in self._read(walk).items()}
 
     def changed_envs(self) -> dict[str, tuple[int, ...]]:
-        """Paths (without ``self.``) whose rows of other envs changed, each with these envs; with an empty
-        tuple if only rows for the envs being reset are left."""
+        """The other envs whose rows changed, by path (without ``self.``); only paths with a change.
+
+        The tuple is empty if the value now has rows for the envs being reset only.
+        """
         now = self._read(walk_task_values(self.env))
         found = {path: self._difference(before, now.get(path)) for path, before in self.before.items()}
         return {path: envs for path, envs in found.items() if envs is not None}
@@ -65,7 +67,8 @@ class KeptRows:
         """The paths whose rows of other envs changed.
 
         Args:
-            seen: values at the last call, updated here: only tensors that were written since are compared.
+            seen: values at the last call; this call updates them. A tensor that was not written since the
+                last call is not compared again.
         """
         now = self._read(walk_task_values(self.env))
         for path, before in self.before.items():
@@ -78,7 +81,7 @@ class KeptRows:
         return {path for path, (_, _, differs) in seen.items() if differs}
 
     def _read(self, walk: Walk) -> dict[str, Any]:
-        """The values at the paths; a list where each env has its own value."""
+        """The present value at each path; for a group of paths, the list of their values."""
         now = {leaf.path: leaf.value for leaf in walk.leaves}
         read = {path: now[path] for path in self._single if path in now}
         for path, each in self._groups.items():
@@ -165,8 +168,9 @@ def _same(a: Any, b: Any) -> bool:
 class _Lines:
     """Compares the rows after each line of the author's code, and keeps the line after which they differ.
 
-    Lines are traced in the first partial reset of a class, and again after a reset whose line was not found.
-    If a debugger is already tracing, `find_assignment` reads the line from the source instead.
+    Lines are traced in the first partial reset of a class, and in the reset after one that changed a value at
+    a line that was not found (`_MAX_TRACED_RESETS` in all). If a debugger is already tracing,
+    `find_assignment` reads the line from the source instead.
     """
 
     def __init__(self, rows: KeptRows) -> None:
@@ -183,7 +187,7 @@ class _Lines:
             return  # a debugger or coverage is tracing
         self._files = files_of_task(task_class(self.rows.env))
         frame: FrameType | None = sys._getframe(1)
-        while frame is not None:  # callers of the reset continue after it, as the task's own `reset` does
+        while frame is not None:  # the reset's callers, such as the task's own `reset`, continue after it
             if self._runs_task_code(frame):
                 frame.f_trace = self._traced
                 self._at = self._at or (frame, frame.f_lasti, frame.f_lineno)
@@ -266,7 +270,7 @@ class ResetWatch:
             self._lines.start()
 
     def go_on(self, env: BaseEnv) -> None:
-        """Start again within the same reset, after code that may change rows."""
+        """Start again within the same reset, after code that is allowed to change rows of all envs."""
         assert self._task is not None
         self.start(env, self._task, self._chosen)
 

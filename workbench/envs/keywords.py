@@ -29,7 +29,7 @@ _BASE_PARAMETERS = frozenset(
 """Parameters that tasks pass on to `BaseEnv`."""
 _ABSENT: Any = object()
 _ANY_TEXTURES = "any_textures"
-"""ManiSkill's word for every combination of pictures."""
+"""Entry of ManiSkill's ``SUPPORTED_OBS_MODES`` that stands for every combination of pictures."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ class Keyword:
     value: str
     """Value in effect, in JSON; the ``repr`` of a value that JSON cannot hold."""
     default: str = ""
-    """Value without the user's argument, in JSON: the registration's, else the class's (``null`` if it has
-    none); empty if JSON cannot hold it, and for `MODES`."""
+    """Value that holds without the user's argument, in JSON: that of the registration, else that of the class
+    (``null`` if the class has none). Empty for `MODES`, and if JSON cannot hold the value."""
     choices: tuple[str, ...] = ()
     """Allowed values of kind ``choice``, in JSON."""
     optional: bool = False
-    """``null`` is a value too."""
+    """Whether the keyword also takes ``null``."""
     fixed: str = ""
     """Why the value cannot be changed here; empty if it can."""
 
@@ -56,7 +56,7 @@ class HowMade:
     """How the envs of a task are made."""
 
     robot: str = ""
-    """Names of the robots; empty without one."""
+    """Names of the robots; empty without a robot."""
     modes: tuple[Keyword, ...] = ()
     """Keywords in `MODES` that the task has."""
     own: tuple[Keyword, ...] = ()
@@ -93,7 +93,7 @@ def _agents_of(env: Any) -> Sequence[Any]:
 
 
 def control_mode_of(env: Any) -> str | None:
-    """The control mode as ``gym.make`` takes it; None if several robots have different ones, or there is no robot."""
+    """The control mode as ``gym.make`` takes it; None without a robot, or if robots have different modes."""
     if getattr(env, "agent", None) is None:
         return None
     # With several robots this is a dict, which ``gym.make`` does not take.
@@ -101,7 +101,10 @@ def control_mode_of(env: Any) -> str | None:
 
 
 def one_mode(mode: object) -> str | None:
-    """The control mode from a string, or the one that all robots in a dict share; None for anything else."""
+    """The control mode: `mode` if it is a string; if it is a dict by robot, the mode that all robots share.
+
+    None for anything else.
+    """
     modes = set(mode.values()) if isinstance(mode, dict) else {mode}
     (first, *others) = modes or {None}
     return first if isinstance(first, str) and not others else None
@@ -123,7 +126,7 @@ def _modes(cls: Any, env: Any) -> Iterator[Keyword]:
 
 
 def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
-    """A keyword with the present value among its choices, whether the class lists it or not."""
+    """A keyword whose choices include its present value, even if the class does not list that value."""
     now = as_json(value)
     texts = dict.fromkeys(text for one in choices if (text := as_json(one)) is not None)
     if now is None:
@@ -134,7 +137,7 @@ def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
 
 
 def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parameter]]:
-    """Named parameters of the class's ``__init__``, and of its base classes' as long as each passes keywords on.
+    """Named parameters of ``__init__`` of the class, then of its bases, up to the first without ``**kwargs``.
 
     Args:
         stop: the base class at which to stop: its parameters and those of its bases are left out.
@@ -193,7 +196,7 @@ def _plain(value: Any) -> Any:
 
 
 def _kind_of(annotation: Any, default: Any) -> tuple[KeywordKind, tuple[str, ...], bool]:
-    """Kind, choices, and whether None is a value; by the annotation, else by the type of the default."""
+    """Kind, choices, and whether None is allowed: from the annotation, else from the type of the default."""
     optional = False
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         parts = [one for one in typing.get_args(annotation) if one is not type(None)]
@@ -215,7 +218,7 @@ def _kind_of(annotation: Any, default: Any) -> tuple[KeywordKind, tuple[str, ...
 
 
 def as_json(value: Any) -> str | None:
-    """The value in JSON; None if JSON cannot hold it or reads it back as another value, or the text is too
+    """The value in JSON (a tuple as a list); None if JSON cannot hold it unchanged, or the text is too
     long."""
     try:
         text = json.dumps(value, allow_nan=False)

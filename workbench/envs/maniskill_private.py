@@ -91,7 +91,8 @@ PRIVATE_NAMES = (
     *_all(_ENV, WRITING, "_default_sensor_configs _default_human_render_camera_configs"),
     *_all("mani_skill.agents.base_agent:BaseAgent", WRITING, "_sensor_configs"),
 )
-"""Private names that the workbench uses. If a name that disables no single feature is missing, no task can be opened."""
+"""Private names that the workbench uses. If a name is missing, its feature is off; if the name has no feature
+(""), no task can be opened."""
 
 
 @cache
@@ -145,8 +146,9 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     """Let ManiSkill's structs find their rows in a batched CPU system.
 
     Structs ask a body for ``gpu_pose_index`` and an articulation for ``gpu_index``, which raise for a CPU
-    system. ManiSkill's builders make the structs, so their cached properties of these indices are replaced,
-    once per process; for a stock scene they run the original code. Safe to call again.
+    system. ManiSkill's builders make the structs, so the structs' cached properties of these indices are
+    replaced, once per process; for a stock scene the new properties run the original code. Safe to call
+    again.
 
     Args:
         batched_system: returns the system of a batched scene, None for any other scene.
@@ -172,8 +174,11 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
             _set_ee_action_of_each_env(self, action)
 
     def check_frame(stock: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Skip ManiSkill's check of frames that GPU simulation does not support. To detect GPU simulation, nightly builds read
-        ``scene.gpu_sim_enabled``; release 3.0.1 reads the device."""
+        """Skip ManiSkill's check for a controller's ``frame`` that GPU simulation does not support.
+
+        To detect GPU simulation, nightly builds read ``scene.gpu_sim_enabled``; release 3.0.1 reads the
+        device.
+        """
 
         @wraps(stock)
         def check(self: Any) -> None:
@@ -295,11 +300,13 @@ def substeps_are_unwatched(env: Any, task: type) -> bool:
 
 @cache
 def install_base_env_hooks() -> None:
-    """Replace ``BaseEnv``'s constructor and ``_setup_scene``, once per process: for an env of the batched CPU
-    simulation, they use the arguments of `base_arguments` and the env's ``_make_scene``.
+    """Replace ``BaseEnv``'s constructor and ``_setup_scene``, once per process.
 
-    Overriding them in a subclass does not work: a task's own versions, which call those of ``BaseEnv``, would
-    be skipped or get arguments that they do not take.
+    For an env of the batched CPU simulation, the new constructor takes the arguments of `base_arguments`, and
+    the new ``_setup_scene`` calls the env's ``_make_scene``.
+
+    Overriding the two in a subclass does not work: a task's own versions, which call those of ``BaseEnv``,
+    would be skipped or get arguments that they do not take.
     """
     stock_init, stock_setup = BaseEnv.__init__, BaseEnv._setup_scene
 
@@ -384,8 +391,8 @@ _NEED_LINK_POSES = {
 def asks_for_a_gpu(caller: FrameType) -> bool:
     """Whether the caller of ``env.gpu_sim_enabled`` asks for a GPU, not for the code path to take.
 
-    Only ``CPUGymWrapper`` does: it refuses GPU simulation, but works on a batched CPU env of one. All other callers use
-    the answer to decide whether to apply and fetch.
+    Only ``CPUGymWrapper`` does: it refuses GPU simulation, but works on batched CPU simulation with
+    ``num_envs=1``. All other callers use the answer to decide whether to apply and fetch.
     """
     return caller.f_code is CPUGymWrapper.__init__.__code__
 
@@ -434,7 +441,8 @@ def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: Any) -> None:
 
 
 def set_reset_mask(env: BaseEnv, env_idx: list[int]) -> None:
-    """Set ``scene._reset_mask``, the envs that ManiSkill's setters write; between resets it holds all envs."""
+    """Set ``scene._reset_mask``: True for envs that ManiSkill's setters write; between resets, for all
+    envs."""
     mask = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     mask[env_idx] = True
     env.scene._reset_mask = mask
@@ -451,7 +459,8 @@ def last_observation(env: BaseEnv) -> Any:
 
 
 def scene_of(env: Any) -> Any | None:
-    """The scene; None before it is built and after it is closed (nightly builds do not set it before)."""
+    """The scene; None before it is built (in nightly builds ``env.scene`` does not exist then) and after it
+    is closed."""
     return getattr(env, "scene", None)
 
 
@@ -523,7 +532,7 @@ def agents(env: Any) -> list[Any]:
 
 
 def tool_of(agent: Any) -> Link | None:
-    """The link of a robot's tool centre point, ``tcp``; None if its class has none, or it is not a link."""
+    """The link of a robot's tool centre point, ``tcp``; None if there is no ``tcp``, or it is not a link."""
     try:
         tool = getattr(agent, "tcp", None)
     except Exception:  # a property of the author's, which ManiSkill itself never reads
@@ -584,7 +593,7 @@ def forget_cameras(env: Any) -> None:
 
 
 def set_up_sensors(env: Any) -> None:
-    """Make configs and cameras, as ``_reconfigure`` does last."""
+    """Make configs and cameras, as the last step of ``_reconfigure`` does."""
     env._setup_sensors({"reconfigure": True})
 
 

@@ -22,8 +22,9 @@ MAX_DROP_METRES = 0.5
 """Maximum drop in metres since the start of the episode, of a body that is not part of an articulation: more than the height
 of a block, less than that of a table."""
 REWARD_RANGES: dict[str, tuple[float, float]] = {"sparse": (-1.0, 1.0), "normalized_dense": (-1.0, 1.0)}
-"""Range of the reward modes for which ManiSkill defines one: sparse is success minus fail, normalized is divided by its maximum
-(some tasks take penalties, so it may be negative). A plain dense reward has no range."""
+"""Range of the rewards of each mode for which ManiSkill defines one. A sparse reward is success minus fail. A
+normalized reward is the dense reward divided by its maximum; it is negative where a task subtracts penalties.
+A plain dense reward has no range."""
 ROUNDING = 1e-4
 """Tolerance of the range: 3.0000002 / 3 is not out of range."""
 
@@ -311,7 +312,8 @@ class OutlierWatch:
             say: Callable[[int, int], str],
             most: NDArray | None = None,
         ) -> OutlierSighting:
-            """`say` gets the env and the body: the one with the largest value in `most`, or the first one."""
+            """`say` gets the env and one of its bodies: the one with the largest value in `most`; without
+            `most`, the first that is wrong."""
 
             def body(env: int) -> int:
                 return int(wrong[env].argmax() if most is None else np.nanargmax(most[env]))
@@ -366,8 +368,7 @@ def lowest_still_point(geometry: SceneGeometry, poses: NDArray[np.float32]) -> f
 
 
 def _numbers(step: StepResult) -> list[tuple[OutlierKind, str, NDArray]]:
-    """Kind, name and values of the numbers that the author's code computes: reward, float entries of ``evaluate``, and a policy's
-    action."""
+    """Kind, name and values of the numbers to check: reward, float entries of ``evaluate``, and action."""
     action = (
         []
         if step.action is None or not step.action.size

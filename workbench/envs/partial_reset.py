@@ -52,11 +52,12 @@ def active_controllers(env: Any) -> list[BaseController]:
 
 
 TARGET_FLAGS = ("sets_target_qpos", "sets_target_qvel")
-"""Attributes that ManiSkill reads from a controller in each step, on the GPU only: which drive targets it sets."""
+"""Attributes that say which drive targets a controller sets. ManiSkill reads them in each step, on the GPU
+only."""
 
 
 def without_target_flags(env: Any) -> list[BaseController]:
-    """The robots' controllers that lack an attribute of `TARGET_FLAGS`, as ``BaseController`` does."""
+    """The robots' controllers that lack an attribute of `TARGET_FLAGS`: ``BaseController`` has neither."""
     controllers = [agent.controller for agent in agents(env)]
     return [one for one in controllers if not all(hasattr(one, flag) for flag in TARGET_FLAGS)]
 
@@ -68,8 +69,8 @@ def untouched_envs(env: Any, options: dict[str, Any] | None) -> list[int]:
 
 
 def _chosen(env: Any, options: Mapping[str, Any]) -> list[int] | None:
-    """The named envs to reset; None for all. As in ManiSkill, -1 is the last env, and a mask with a row for each env names
-    those where it is True."""
+    """The envs to reset that `options` names; None for all. As in ManiSkill, -1 is the last env, and a mask
+    with a row for each env names those where it is True."""
     named = options.get("env_idx")
     if named is None:
         return None
@@ -85,14 +86,15 @@ def in_ascending_order(
 ) -> tuple[dict[str, Any], list[int] | None]:
     """Options of a partial reset with the envs, and the rows that belong to them, in ascending order.
 
-    ManiSkill's setters give rows to the envs of a mask, lowest first, and a task writes ``self.x[env_idx]``: only in
-    ascending order both mean the same.
+    ManiSkill's setters give the first row to the lowest env that is reset; ``self.x[env_idx] = rows`` gives
+    it to the first env of ``env_idx``. Only in ascending order are these the same env.
 
     Args:
         seeds: the ``seed`` argument of ``reset``.
 
     Returns:
-        The options, and the seeds if there is one for each env of a partial reset.
+        The options; and the seeds in the same order, or None unless `seeds` has one for each env of a partial
+        reset.
 
     Raises:
         TypeError, IndexError, ValueError: ``env_idx`` is a mask of the wrong length, or names an unknown env,
@@ -134,7 +136,8 @@ def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
 
 @contextmanager
 def note_what_was_reset(env: Any, untouched: list[int]) -> Iterator[None]:
-    """Add notes to an exception of a partial reset: which envs it was for, and the buffers that have fewer rows now.
+    """Add notes to an exception of a partial reset: which envs were being reset, and which buffers have fewer
+    rows now.
 
     If a hook replaces a buffer of N rows by one of ``len(env_idx)`` rows, another hook, which has no mistake,
     fails with torch's message about sizes.

@@ -33,11 +33,11 @@ class RecordedRun:
     """(T, A)"""
     env_states: dict[str, NDArray]
     """``actors/cube``, ``articulations/panda`` ..., (T + 1, D) each, as ManiSkill's ``get_state_dict`` lays them out;
-    empty where none were recorded."""
+    empty if no states were recorded."""
     evaluate: dict[str, NDArray] = field(default_factory=dict)
     """(T + 1, ...) every entry that ``evaluate`` returned."""
     reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
-    """(T,); empty where the task had none."""
+    """(T,); empty if the task had no reward."""
 
     @property
     def length(self) -> int:
@@ -60,10 +60,12 @@ class RecordedRun:
 
 
 def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance of poses: (...) metres and (...) radians.
+    """Distances between the poses `a` and `b`: (...) in metres and (...) in radians.
+
+    Both are 0 where both poses are NaN, and infinite where only one pose is NaN.
 
     Args:
-        a, b: (..., 7) position in metres and quaternion wxyz. The distance is 0 if both poses are NaN, infinite if one is.
+        a, b: (..., 7) position in metres and quaternion wxyz.
     """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     lacks = ~np.isfinite(a).all(-1), ~np.isfinite(b).all(-1)
@@ -87,7 +89,7 @@ STATE, OBS = "state/", "obs/"
 
 
 def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
-    """One env's states, without bodies that it lacks (NaN in the columns)."""
+    """States of one env, by actor or articulation; without those that the env lacks (their rows are NaN)."""
     rows = {name[len(STATE) :]: column[env] for name, column in columns.items() if name.startswith(STATE)}
     return {name: row for name, row in rows.items() if not np.isnan(row).all()}
 
@@ -100,9 +102,10 @@ RUN_KEYWORDS = frozenset({"num_envs", "sim_backend", "render_backend", "render_d
 
 
 def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Keywords of ``gym.make`` that make `env` again: `given` and the env's modes, if JSON can hold them.
+    """Keywords of ``gym.make`` that make `env` again: `given` and the env's modes.
 
-    ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. The replay chooses `RUN_KEYWORDS`.
+    Leaves out values that JSON cannot hold, and `RUN_KEYWORDS`: ManiSkill's ``replay_trajectory``, which
+    calls ``gym.make(env_id, **env_kwargs)``, chooses these itself.
     """
     modes: dict[str, Any] = {"obs_mode": env.obs_mode, "reward_mode": env.reward_mode}
     if (mode := control_mode_of(env)) is not None:

@@ -1,4 +1,5 @@
-"""Adds notes to robot-loading errors: the robot's file, the line and link in it, and the line of the class that names it."""
+"""Adds notes to robot-loading errors: line and link in the robot's file, and the line of the class that names
+the file."""
 
 from __future__ import annotations
 
@@ -31,9 +32,10 @@ _LOADERS = tuple(
     for module, folder in ((sapien, "wrapper"), (mani_skill, "utils/building"))
 )
 _FILE_ARGUMENTS = ("urdf_file", "mjcf_file", "asset_path")
-"""Names of the variable with the robot's file, in the loaders and in ``BaseAgent._load_articulation``."""
+"""Names of the variables that hold the robot's file, in the loaders and in
+``BaseAgent._load_articulation``."""
 _ELEMENTS = ("origin_node", "node", "geom", "mesh", "texture", "material", "body")
-"""Names of the variable with an element of the file, in the loaders' functions."""
+"""Names of the variables that hold an element of the file, in the loaders' functions."""
 _LOOP_NAMES = ("mimic", "joint", "x", "link")
 """Names of loop variables, which are read only in the innermost frame: further out, they may be stale."""
 
@@ -223,7 +225,7 @@ def _gives(node: ast.AST, name: str) -> bool:
 
 
 def _find_line(cls: type, fits: Callable[[ast.AST], bool]) -> Place | None:
-    """The first fitting node in the source of a class or of its base classes."""
+    """Place of the first node that `fits`, in the source of a class, else of its base classes."""
     for owner in cls.__mro__:
         if owner is BaseAgent or not issubclass(owner, BaseAgent):
             continue

@@ -45,7 +45,7 @@ class StateReading:
 
     rows: StateRows | None
     asked: dict[str, Any]
-    """Further columns, and flattened observations."""
+    """Columns that are not made from `rows`, and flattened observations."""
     flat: dict[str, Any]
     """Parts of each flattened observation, from `flat_names`."""
     num_envs: int
@@ -81,8 +81,8 @@ def env_states(env: BaseEnv) -> dict[str, Any]:
     """(N, D) by name: ``actors/cube``, ``articulations/panda``, and ``controller/...`` where a controller has a state.
 
     Copies: tensors, or arrays on the CPU. Equal to ManiSkill's ``get_state_dict`` to the last bit (tested),
-    which reads each actor and articulation in turn (75 us for the four of PickCube). A task's own
-    ``get_state_dict`` is called."""
+    which reads each actor and articulation in turn (75 us for the four in PickCube). If the task has its own
+    ``get_state_dict``, that is called."""
     rows, asked = _read(env)
     return asked if rows is None else {**rows.states(), **asked}
 
@@ -98,7 +98,8 @@ def _read(env: BaseEnv) -> tuple[StateRows | None, dict[str, Any]]:
 
 
 def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
-    """Entries of the last observation with a row for each env, without pictures: ``obs/...`` and (N, ...)."""
+    """Name ``obs/...`` and value (N, ...) of each entry of the last observation that has a row for each env;
+    no pictures."""
     for name, value in flat_entries(task.obs):
         shape = () if name.partition("/")[0] in _PICTURES else getattr(value, "shape", ())
         if len(shape) > 0 and shape[0] == task.num_envs:

@@ -12,9 +12,9 @@ TERM_PREFIX = "reward_terms/"
 """Prefix of the entries of a `StepResult` that are terms of a dense reward.
 
 ``compute_dense_reward`` puts them into ``info["reward_terms"]``, a dict of tensors (N,). The key is the
-workbench's own, since ManiSkill has none for reward terms; it passes ``info`` on unchanged, nested dicts
-included, so the task's file also runs in stock ManiSkill. A term that is not one number per env is listed in
-the table of numbers, without a curve.
+workbench's own, since ManiSkill has none for reward terms. ManiSkill passes ``info`` on unchanged, nested
+dicts included, so the task's file also runs in stock ManiSkill. A term that is not one number per env is
+listed in the table of numbers, without a curve.
 """
 
 
@@ -27,13 +27,14 @@ class OtherEntry:
     texts: tuple[str, ...] = ()
     """Value as text, one for the batch or, with `per_env`, one for each env; empty if there are `numbers`."""
     numbers: NDArray | None = None
-    """(...) booleans or real numbers of the whole batch; None if it is not numeric or too large."""
+    """(...) booleans or real numbers of the whole batch; None if the value is not numeric, or is too
+    large."""
     per_env: bool = False
     whole: bool = True
     """False if `texts` is shortened."""
 
     def of_env(self, env: int) -> OtherEntry:
-        """The part of one env; the whole entry if it is not per env."""
+        """The entry with only the text of one env; unchanged if it is not `per_env`."""
         return replace(self, texts=(self.texts[env],)) if self.per_env else self
 
     @property
@@ -59,7 +60,7 @@ class StepResult:
     poses: NDArray[np.float32]
     """(N, B, 7) pose of every body: position in metres, quaternion wxyz, env's own frame."""
     action: NDArray[np.float32] | None = None
-    """(N, A) that led here; None right after a reset."""
+    """(N, A) action that led to this state; None right after a reset."""
     sound_obs: NDArray[np.bool_] | None = None
     """(N,) whether the env's observation, without pictures, is finite; None if unknown."""
     qpos: NDArray[np.float32] | None = None

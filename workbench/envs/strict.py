@@ -48,15 +48,16 @@ class StrictMixin:
 
     * state set but not applied; state applied or read without a fetch after a step; links read before their
       articulation's new qpos reached them (`strict_system`);
-    * what the GPU refuses: state touched while the scene is built, static actors moved, masses set later (`accessors`);
+    * what the GPU refuses: state touched while the scene is built, static actors moved, masses set once it
+      is built (`accessors`);
     * SAPIEN's own setters, which the GPU ignores (`accessors`);
     * in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or changed (here,
       and `kept_rows`);
     * return values of ``evaluate``, the reward and the observation hooks that lack a row for each env
       (`evaluate_entries`).
 
-    Values are compared, so only actual differences are reported; ``tests/envs/test_strict.py`` lists the ManiSkill tasks
-    that break a rule.
+    Values are compared, so only actual differences are reported. ``tests/envs/test_strict.py`` lists the
+    ManiSkill tasks that break a rule.
     """
 
     num_envs: int

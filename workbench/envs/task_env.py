@@ -58,8 +58,8 @@ class EnvOptions:
     pictures: PictureDegree = "exact"
     """Degree of the pictures that the env itself draws: observations and ``render``."""
     rules: Degree | None = None
-    """The degree of all rules of GPU simulation (on the CPU); None: each rule has its own degree, see
-    `gpu_rules`."""
+    """One degree for all rules of GPU simulation, which are checked on the CPU; None: each rule has its own
+    degree, see `gpu_rules`."""
     on_finding: Callable[[Finding], None] = warn_of
     """Called once for each place where a rule that does not stop the task is broken."""
     kwargs: Mapping[str, Any] = field(default_factory=dict)
@@ -99,7 +99,7 @@ def make_env(
     asset_ids: Sequence[str] = (),
     default_kwargs: Mapping[str, Any] | None = None,
 ) -> BaseEnv:
-    """Make the task class with N envs, unwrapped, with the best reward mode that it implements.
+    """Make the task class with N envs, unwrapped, in the class's `default_reward_mode`.
 
     Raises:
         MissingAssets: the task or its robot needs a download; the message has its name and the command.
@@ -120,8 +120,8 @@ def build_env(
 ) -> BaseEnv:
     """Make the task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` does; raises like `make_env`.
 
-    The class decides what the keyword arguments leave open. Without ``reward_mode`` it is the first of
-    ``SUPPORTED_REWARD_MODES``, implemented or not.
+    The class decides what the keyword arguments leave open. Without ``reward_mode`` it takes the first of its
+    ``SUPPORTED_REWARD_MODES``, even if it does not implement that mode.
     """
     if moved := maniskill_private.why_not(""):
         raise BackendUnavailable(moved)
@@ -160,8 +160,8 @@ _NO_FAST_PICTURES = (
 def default_reward_mode(task: type[BaseEnv]) -> str:
     """The richest reward mode that the class implements.
 
-    ManiSkill's own default is ``normalized_dense`` whether or not the class has one, and the first
-    step of a task without a dense reward then raises a bare NotImplementedError.
+    ManiSkill's own default is ``normalized_dense``, even for a class without a dense reward: the first step
+    of such a task then raises a bare NotImplementedError.
     """
     wanted = ("normalized_dense", "dense", "sparse", "none")
     method = {"normalized_dense": "compute_normalized_dense_reward", "dense": "compute_dense_reward"}
@@ -220,8 +220,9 @@ class TaskEnv:
 
         A reset of all envs is ManiSkill's own ``reset(seed=[...])``. For a subset ManiSkill seeds torch with
         the seed of env 0, so a seed given for env 3 has no effect. Here a partial reset draws from the seed
-        of the lowest env: ``reset(seed=7, env_idx=[3])`` starts the same episode as ``reset(seed=7)`` of a
-        single stock env. Listing the envs, with their seeds, in another order makes no difference.
+        of the lowest env in `env_idx`: ``reset(seed=7, env_idx=[3])`` starts the same episode as
+        ``reset(seed=7)`` of a single stock env. Listing the envs, with their seeds, in another order makes no
+        difference.
 
         Args:
             seed: one seed (the i-th env that is reset gets ``seed + i``), or one for each env that is reset; None
@@ -281,7 +282,8 @@ class TaskEnv:
         """Compute ``evaluate``, observation and reward of the present state, without a step.
 
         Args:
-            action: (N, A) that led here, for the reward; None gives rewards of zero, as after a reset.
+            action: (N, A) action that led to this state, for the reward; None gives rewards of zero, as after
+                a reset.
         """
         reward: Any = None
         with remembering(self.env):
@@ -375,7 +377,7 @@ def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
 
 
 def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
-    """(N, ...) copy of `value`; a single value (from a task written for one env) is repeated for each env."""
+    """(N, ...) copy of `value`; a value without a row for each env is repeated for each env."""
     array = np.array(value.numpy(force=True) if isinstance(value, torch.Tensor) else value, dtype)
     if num_envs == array.size == 1:
         return array.reshape(1)

@@ -75,10 +75,11 @@ def note_shader(camera: sapien.render.RenderCameraComponent) -> None:
 
 @contextmanager
 def made_again(camera: sapien.render.RenderCameraComponent) -> Iterator[None]:
-    """Context in which the camera's shader (see `note_shader`) is selected; add the camera to a scene within it.
+    """Context in which the camera's shader (see `note_shader`) is selected. Add the camera to a scene in this
+    context.
 
-    Without it, a task with a minimal sensor and a default human camera would get a default sensor, which lacks
-    ``PositionSegmentation``.
+    Without the context, a task with a minimal sensor and a default human camera would get a default sensor,
+    which lacks ``PositionSegmentation``.
     """
     before, own = _Selection.now(), _made_with.get(camera)
     if own is None or own == before:
@@ -95,8 +96,9 @@ def made_again(camera: sapien.render.RenderCameraComponent) -> Iterator[None]:
 
 
 def drawable(config: CameraConfig) -> CameraConfig:
-    """`config`; or, if it is ray traced and this machine cannot trace rays, a copy with the default shader, which has the
-    same textures. ``shader_pack`` of the copy keeps the requested name.
+    """`config`; or, if it is ray traced and this machine cannot trace rays, a copy with the default shader.
+
+    The default shader has the same textures. ``shader_pack`` of the copy keeps the requested name.
     """
     asked = config.shader_config
     if asked is None or not is_ray_traced(asked.shader_pack) or why_no_ray_tracing() is None:

@@ -1,5 +1,4 @@
-"""Cameras that draw the pictures of SAPIEN's minimal shader, without shader work that does not change
-them."""
+"""Cameras that draw the pictures of SAPIEN's minimal shader, but skip shader work that changes no picture."""
 
 from __future__ import annotations
 

@@ -41,8 +41,8 @@ _MIN_DISTANCE_METRES = 0.02
 """Smallest distance that tolerances assume: no camera stays nearer for long, and a camera inside its own mount would
 forbid any simplification."""
 _TOLERANCE_UNIT_METRES = 1e-4
-"""Unit of the tolerances: they are this times powers of the fourth root of two, so that similar poses give the same
-meshes."""
+"""A larger tolerance is rounded down to this times a power of the fourth root of two, so that similar poses
+give the same meshes."""
 
 _MIN_LEAN_PIXELS = 256 * 256
 """In a picture with fewer pixels, leaving out textures saves less time than checking whether the author
@@ -75,10 +75,11 @@ def shown(bodies: Bodies) -> Iterator[None]:
 class FastShapes:
     """The simplified shapes of a scene: hidden components next to the exact ones, made at each camera's first fast picture.
 
-    How much a body is simplified depends on its distance from the camera at that moment, on the lens and on the size in
-    pixels. Bodies outside the camera's view are not drawn; a body that the camera is fixed to, whose triangles are mostly
-    out of view, is cut to those in view. The shapes share the materials of the exact ones, so that a later change of colour
-    changes both; a body's id in segmentation pictures is that of its entity.
+    How much a body is simplified depends on its distance from the camera at that moment, on the lens and on
+    the size in pixels. Bodies outside the camera's view are not drawn. A body that the camera is fixed to is
+    cut to the triangles in view, since most of its triangles never come into view. The shapes share the
+    materials of the exact ones, so that a later change of colour changes both; a body's id in segmentation
+    pictures is that of its entity.
     """
 
     def __init__(self, sub_scenes: Sequence[sapien.Scene]) -> None:
@@ -94,7 +95,8 @@ class FastShapes:
         ]
         """(B, 2, 3) bounding boxes of each env, in the frames of its bodies."""
         self._components: dict[Hashable, tuple[Any, Any]] = {}
-        """Simplified components, each with the exact one (kept alive), by the id of the exact one and the simplification."""
+        """Each exact component (kept alive), with the simplified one. The key is the id of the exact one, and
+        the tolerance or the camera to whose view it is cut."""
         self._tolerances: dict[Hashable, dict[str, float]] = {}
         """Tolerances by camera and name of the body."""
         self._cut: dict[tuple[Hashable, str], _Cut] = {}
@@ -310,7 +312,8 @@ def _bodies(sub_scene: sapien.Scene) -> Iterator[Any]:
 
 
 def unknown_meshes(sub_scenes: Sequence[sapien.Scene]) -> list[Mesh]:
-    """Meshes of heavy bodies that were not simplified on this machine yet: that takes seconds for a robot."""
+    """Meshes of heavy bodies that were not simplified on this machine yet. Simplifying those of a robot takes
+    seconds."""
     found: dict[int, Mesh] = {}
     for sub_scene in sub_scenes:
         for body in heavy_bodies(sub_scene):

@@ -45,8 +45,13 @@ def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
 def outside_and_inside(
     boxes: NDArray[np.float32], planes: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(B,) whether boxes (B, 2, 3) are entirely outside one of the planes (B, 5, 4), each in the frame of its box; and (B,)
-    whether they are entirely inside all."""
+    """(B,) whether each box is entirely outside one of its planes; and (B,) whether it is entirely inside all
+    of them.
+
+    Args:
+        boxes: (B, 2, 3) lowest and highest corner.
+        planes: (B, 5, 4) the view planes in the frame of each box.
+    """
     sides = planes[:, :, None, :3] * boxes[:, None]
     farthest = sides.max(axis=2).sum(axis=-1) + planes[..., 3]
     nearest = sides.min(axis=2).sum(axis=-1) + planes[..., 3]
@@ -54,12 +59,14 @@ def outside_and_inside(
 
 
 def is_outside(points: NDArray[np.float64], planes: Planes) -> bool:
-    """Whether points (P, 3), and so everything between them, are entirely outside one of the planes of the same frame."""
+    """Whether all points (P, 3), and so everything between them, are outside one plane. All are in one
+    frame."""
     return bool((planes[:, :3] @ points.T + planes[:, 3:]).max(axis=1).min() < 0)
 
 
 def corners_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(P, 3) corners of the points' convex hull, or of their box if they have no hull (in one plane, or not finite)."""
+    """(P, 3) corners of the points' convex hull. If they have none (they lie in one plane, or are not
+    finite), the corners of the box around them."""
     try:
         return np.asarray(hull_points(points), np.float64)
     except (QhullError, ValueError):
@@ -87,7 +94,7 @@ def cut_to_view(mesh: Mesh, planes: Planes) -> Mesh:
 
 
 def fixed_to(entity: sapien.Entity) -> set[int]:
-    """Ids of the entities of an articulation that never move relative to this one."""
+    """Ids of the entities that never move relative to `entity`: itself, and links that are fixed to it."""
     link: Any = entity.find_component_by_type(physx.PhysxArticulationLinkComponent)
     found, left = {id(entity)}, [] if link is None else [link]
     while left:

@@ -1,4 +1,4 @@
-"""Draws bodies without constant metallic textures, which SAPIEN's shaders would look up for every pixel."""
+"""Replaces constant metallic textures by numbers: SAPIEN's shaders look a texture up for every pixel."""
 
 from __future__ import annotations
 
@@ -36,8 +36,10 @@ class LeanBody:
     """Values of these materials when they were copied."""
 
     def is_like_exact(self) -> bool:
-        """Whether the exact materials are unchanged. SAPIEN does not draw every change of a material that was made while it was
-        hidden, so a body whose materials change must be drawn exactly."""
+        """Whether the exact materials are unchanged. If not, the exact body must be drawn.
+
+        SAPIEN does not draw every change that is made to a material while its body is hidden.
+        """
         now = [_read(material) for material in self._exact]
         return all(map(_equal, now, self._copied))
 
@@ -53,9 +55,12 @@ class LeanMaterials:
         """Number of texels read so far."""
 
     def lean_copy(self, body: Any) -> LeanBody | None:
-        """A copy of a body without constant metallic textures; None if no metallic texture is constant, or a
-        mesh is not from a file: SAPIEN shares the materials of such meshes with their copies, and makes the
-        tangents of normal maps only from files."""
+        """A copy of a body without its constant metallic textures; None if it has none, or has a mesh that is
+        not from a file.
+
+        SAPIEN shares the materials of meshes that are not from a file with their copies, and makes the
+        tangents of normal maps only from files.
+        """
         parts = [part for shape in body.render_shapes for part in shape.parts]
         if all(self._metallic(part.material) is None for part in parts):
             return None
@@ -85,7 +90,7 @@ class LeanMaterials:
             to.metallic_texture, to.metallic = None, metallic
 
     def _metallic(self, material: Any) -> float | None:
-        """The value that replaces the metallic texture of a material, if that is constant; else None."""
+        """The value that replaces a material's metallic texture; None if that texture is not constant."""
         texture = material.metallic_texture
         if texture is None:
             return None
@@ -109,7 +114,8 @@ def _constant(texture: Any) -> float | None:
 
 
 def _from_file(shape: Any) -> Any:
-    """Copy of the shape with its own materials; None where the shape no longer equals its file."""
+    """Copy of a shape, with materials of its own; None if the shape is not from a file, or differs from its
+    file."""
     if not isinstance(shape, sapien.render.RenderShapeTriangleMesh) or not shape.filename:
         return None
     try:

@@ -209,7 +209,11 @@ def deviation(exact: Mesh, reduced: Mesh) -> float:
 def _points_on(
     mesh: Mesh, count: int, random: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (P, 3) on the surface, and their triangles: one on each triangle, then `count` by length, then `count` by area."""
+    """Random points (P, 3) on the surface, and their triangles.
+
+    One is on each triangle; `count` are on triangles drawn by their longest edge, and `count` on triangles
+    drawn by area.
+    """
     triangles = mesh.vertices[mesh.faces].astype(np.float64)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(across, axis=1) + 1e-30

@@ -23,11 +23,11 @@ _NEIGHBOURS = 8
 """Number of nearest points on the exact surface that are searched for one that faces the same way."""
 _MIN_FACING_COSINE = 0.3
 _SHARED_DEGREES = 20.0
-"""Angle between normals of a coarse mesh's faces at a vertex below which they share one normal: a seventh fewer
-vertices, for a twentieth of the shading error."""
+"""Faces of a coarse mesh share one normal at a vertex if their normals there differ by less than this.
+Sharing saves a seventh of the vertices, at the price of a twentieth of the shading error."""
 _OWN_WEIGHT = 0.02
-"""Weight of a vertex's own normal relative to the normals of the surface around it: it matters only where
-they determine no normal."""
+"""Weight of a vertex's own normal, relative to the normals of the exact surface around it. The own normal
+matters only where the surface determines none."""
 
 
 def with_normals(mesh: Mesh) -> Mesh:
@@ -119,7 +119,8 @@ class ShadedSurface:
     def normals_at(
         self, points: NDArray[np.float64], facing: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """(P, 3) normals near `points` (P, 3) on the side that faces along `facing` (P, 3); and (P,) whether there is one."""
+        """(P, 3) for each of `points` (P, 3) a normal of the surface near it, if possible one that faces
+        along `facing` (P, 3); and (P,) whether it does."""
         count = min(_NEIGHBOURS, self._tree.n)
         near = np.asarray(self._tree.query(points, k=count)[1]).reshape(-1, count)
         candidates = self._normals[near]
@@ -135,10 +136,11 @@ class ShadedSurface:
         """Copy of `coarse`, which must have normals, with the normals that shade its triangles most like this
         surface. Vertices with nearly the same normal are merged.
 
-        The normals minimise the squared difference between the interpolated normal of a triangle and the normal of the surface,
-        over points sampled by area. So a vertex at the end of a large flat face takes the normal of the face, although the
-        surface bends right there. (Normals of the nearest vertices shade such faces as if they were round: twice as many
-        pixels are off as for simpler outlines.)
+        The normals minimise the squared difference between the interpolated normal of a triangle and the
+        normal of the surface, over points sampled by area. So a vertex at the end of a large flat face takes
+        the normal of the face, although the surface bends right there. (The normals of the nearest vertices
+        would shade such a face as if it were round, and make twice as many pixels wrong as the simpler
+        outline does.)
         """
         coarse = share_smooth(coarse, _SHARED_DEGREES)
         assert coarse.normals is not None

@@ -56,8 +56,8 @@ def read_geometry(env: Any, max_faces: int = MAX_FACES, max_texels: int = MAX_SI
     Panda cost little more than one. Reduced meshes of files are cached for the life of the process, for the next reload.
 
     Bodies that are hidden now are included; `SceneGeometry.body_hidden` marks those that the task
-    hides from its sensors. Without a render device the collision shapes are returned, in grey; bodies without any (goal
-    markers) are then missing.
+    hides from its sensors. Without a render device the collision shapes are returned, in grey; bodies without
+    collision shapes (goal markers) are then missing.
     """
     index = scene_index(env)
     walk = _RenderWalk(max_faces, max_texels, maniskill_private.hidden_objects(env))

@@ -23,7 +23,8 @@ _HIDDEN_METRES = 5e4
 
 
 def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
-    """Cache ``find(env)`` on the env's scene: it is called once per scene, and again when bodies are added or removed."""
+    """Cache ``find(env)`` on the env's scene: `find` is called once per scene, and again after bodies were
+    added or removed."""
     name = f"_workbench {find.__module__}.{find.__qualname__}"
 
     @wraps(find)
@@ -60,10 +61,10 @@ class SceneIndex:
     states: dict[str, Any]
     """ManiSkill's structs by their names in its state dict: ``actors/cube`` (no static ones), ``articulations/panda``."""
     actors: tuple[tuple[Any, NDArray[np.int64]], ...]
-    """Every Actor, merged ones and their parts, with the slots of its entities: positions in the flattened (N * B) array
-    of bodies, -1 if absent."""
+    """Every Actor (merged ones, and their parts too), each with the slots of its entities: their positions in
+    the flattened (N * B) array of bodies, -1 for an entity that is not there."""
     fixed: NDArray[np.float32]
-    """(N, B, 7) poses of static bodies; NaN elsewhere. Only used with `rows`."""
+    """(N, B, 7) poses of static bodies; NaN for all other bodies. Not needed where `rows` is None."""
     rows: Any
     """(K,) row of each moving (env, body) in ``px.cuda_rigid_body_data``, for `rows_of`; None on a stock CPU env."""
     slots: NDArray[np.int64]
@@ -196,7 +197,8 @@ def joints_of_scene(env: Any) -> tuple[tuple[str, Any], ...]:
 
 
 def joint_names(env: Any) -> tuple[str, ...]:
-    """(J,) names of the joints of `read_joints`, with the articulation's name where there are several."""
+    """(J,) names of the joints that `read_joints` reads: ``joint``, or ``articulation/joint`` if there are
+    several articulations."""
     found = joints_of_scene(env)
     return tuple(
         joint.name if len(found) == 1 else f"{name}/{joint.name}"
@@ -227,7 +229,9 @@ def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float
 
 
 def present_states(env: Any) -> dict[str, Any]:
-    """State (N, D) of each of `SceneIndex.states`, laid out as by ``get_state()``; NaN for an env without it.
+    """State (N, D) of each of `SceneIndex.states`, laid out as by ``get_state()``.
+
+    The row is NaN for an env that lacks the actor or articulation.
 
     Copies: tensors, or arrays on the CPU.
     """
@@ -238,7 +242,7 @@ class StateRows(NamedTuple):
     """Copies of the tensors (one call for each) from which the states of a moment are made."""
 
     still: list[int]
-    """Columns B of `data` for kinematic bodies, whose velocity is set to zero."""
+    """Positions of kinematic bodies along B of `data`; their velocity is set to zero."""
     places: dict[str, tuple[Any, int | None, Any, int]]
     data: Any
     """(N, B, 13)"""
@@ -280,8 +284,13 @@ def state_rows(env: Any) -> StateRows:
 
 @once_a_scene
 def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, int | None, Any, int]]]:
-    """Rows (N, B) of ``cuda_rigid_body_data``; the columns B of kinematic bodies, which have no velocity; and for each state
-    its struct, its column if all envs have it, and for an articulation its rows (N,) and number of joints."""
+    """Where `state_rows` finds each state.
+
+    Returns:
+        Rows (N, B) of ``cuda_rigid_body_data``. Positions along B of kinematic bodies, which have no
+        velocity. And by state: its struct; its position along B (None if an env lacks it); for an
+        articulation, its rows (N,) in the joint tensors and its number of joints.
+    """
     every, rows, still = np.arange(env.num_envs), [], []
     places: dict[str, tuple[Any, int | None, Any, int]] = {}
     for name, struct in scene_index(env).states.items():
@@ -303,7 +312,11 @@ def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, in
 
 
 def in_every_env(env: Any, struct: Any, value: Any) -> Any:
-    """(N, ...) from a struct's value for the envs that have it, NaN in the others; all NaN if the struct is unknown."""
+    """`value` with a row for each env, NaN where an env lacks the struct; all NaN if the struct is unknown.
+
+    Args:
+        value: a value of `struct`, with a row for each env that has the struct.
+    """
     if not isinstance(value, torch.Tensor) or len(value) == env.num_envs:
         return value
     whole = value.new_full((env.num_envs, *value.shape[1:]), torch.nan)

@@ -43,7 +43,7 @@ class Material:
 
     @property
     def srgb_color(self) -> tuple[float, float, float, float]:
-        """`base_color` as in CSS: RGB sRGB encoded, alpha unchanged."""
+        """`base_color` as in CSS: R, G and B encoded as sRGB, alpha unchanged."""
         r, g, b = srgb(np.array(self.base_color[:3])).tolist()
         return r, g, b, self.base_color[3]
 
@@ -116,7 +116,7 @@ class SharedShapes:
         self._known: dict[str, tuple[Mesh, Material]] = {}
         self._marked: dict[Hashable, tuple[str, Mesh, Material]] = {}
         self._kept: dict[tuple[int, int], tuple[Mesh, Material]] = {}
-        """Shared shapes by the ids of mesh and material, for which no digest is needed."""
+        """Shared shapes by the ids of their mesh and material, so that these need no digest again."""
 
     def share(self, geometry: SceneGeometry) -> SceneGeometry:
         """Copy of the scene that uses earlier meshes and materials where they look the same."""

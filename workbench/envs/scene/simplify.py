@@ -16,8 +16,8 @@ from workbench.envs.scene.normals import ShadedSurface, with_normals
 from workbench.envs.scene.shapes import Mesh
 
 _DENSE_FACES = 60_000
-"""A mesh with more faces is a CAD assembly, whose vertices are first snapped to a grid: quadric collapse alone takes
-seconds and gets stuck."""
+"""A mesh with more faces counts as a CAD assembly: its vertices are first snapped to a grid, because quadric
+collapse alone would take seconds and get stuck."""
 _CLUSTER_CELLS = 64
 _COARSEST_CELLS = 16
 _WELD_CELLS = 1_000_000
@@ -29,15 +29,16 @@ costly ones."""
 
 
 def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
-    """`mesh` with about `max_faces` triangles; unchanged if it has no more than that.
+    """`mesh` with about `max_faces` triangles; `mesh` itself if it has no more than `max_faces`.
 
-    ManiSkill's Panda has 136,000 triangles and its wrist camera 425,000; a browser that draws in software manages some
-    200,000 in all. Quadric edge collapse (fast_simplification, Garland and Heckbert) does not move borders, and exporters give
-    every triangle its own three vertices. So vertices at one place are welded first (with a texture only where the uv agrees),
-    and normals are computed again, sharp at edges and smooth elsewhere.
+    ManiSkill's Panda has 136,000 triangles and its wrist camera 425,000; a browser that draws in software
+    manages some 200,000 in all. Quadric edge collapse (fast_simplification, Garland and Heckbert) does not
+    move borders, and where every triangle has its own three vertices, as exporters write them, all edges are
+    borders. So vertices at one place are welded first (in a textured mesh only if their uvs agree), and
+    normals are computed again, sharp at edges and smooth elsewhere.
 
-    A mesh of many loose pieces may keep up to twice as many triangles, and a textured mesh more, because the
-    borders of the pieces of its texture stay.
+    A mesh of many loose pieces may keep up to twice `max_faces` triangles. A textured mesh may keep even
+    more, because the borders of the pieces of its texture stay.
     """
     reduced = collapse_mesh(mesh, max_faces)
     if reduced is mesh:
@@ -69,7 +70,7 @@ def collapse_mesh(mesh: Mesh, max_faces: int) -> Mesh:
 
 def coarsen_mesh(mesh: Mesh, max_faces: int, by_pieces: bool = False) -> Mesh:
     """`mesh` with about `max_faces` triangles, or more if so few cannot keep the shape. Slower than
-    `reduce_mesh` and nearer to the surface; the normals are computed from the faces of the result.
+    `reduce_mesh`, and nearer to the surface of `mesh`; the normals are computed from the faces of the result.
 
     Args:
         by_pieces: collapse each connected piece by itself, so that small pieces are not lost.
@@ -120,9 +121,10 @@ def share_vertices(mesh: Mesh) -> Mesh:
 
 
 def rounded(mesh: Mesh) -> Mesh:
-    """`mesh` with positions on a grid of some 4000 cells along each axis, and normals within a degree of their own.
+    """`mesh` with positions on a grid of some 4000 cells along each axis, and normals turned by up to 1
+    degree.
 
-    Files compress the numbers to two thirds.
+    In compressed files the rounded numbers take two thirds of the space.
     """
     extent = np.ptp(mesh.vertices, axis=0)
     cell = np.exp2(np.floor(np.log2(np.where(extent > 0, extent, 1.0) / 4096)))
@@ -201,7 +203,7 @@ def _collapse(
     max_faces: int,
     how: Literal["fast", "as a whole", "by pieces"] = "fast",
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32] | None]:
-    # The method's thresholds are absolute: a mesh of a few centimetres would be collapsed in any order.
+    # The method's thresholds are absolute: unscaled, a mesh of a few centimetres would collapse in any order.
     extent = float(np.ptp(vertices, axis=0).max())
     points = vertices.astype(np.float64) / extent
     triangles = np.ascontiguousarray(faces, dtype=np.int32)

@@ -246,11 +246,12 @@ def _stock_write(
 def _rows(struct: Any, value: Any, name: str, chosen: NDArray[np.int64]) -> NDArray[np.float32]:
     """(k, ...) float32: the rows that a setter writes to the struct's objects `chosen`.
 
-    Stock ManiSkill on the CPU takes the first row of a batch of the wrong size. Here a batch with a row for each object gives
-    the rows of `chosen`. A struct with one object takes the first row. Both report `refused-by-gpu`.
+    If a batch has the wrong size, stock ManiSkill on the CPU takes its first row. Here the first row is taken
+    if the struct has one object. If the batch has a row for each object, its rows of `chosen` are taken. Both
+    cases report `refused-by-gpu`.
 
     Raises:
-        ValueError: a batch of any other size.
+        ValueError: the batch has any other size.
     """
     given: Any = vectorize_pose(value) if name == "pose" else common.to_tensor(value)
     numbers = np.asarray(given.detach().cpu(), np.float32)
@@ -325,7 +326,7 @@ def _of_chosen(stock: Callable[..., Any], name: str) -> Callable[..., Any]:
 
 
 def _some(struct: Any, chosen: NDArray[np.int64]) -> Any:
-    """Copy of the struct with only these of its objects; the struct itself for all."""
+    """Copy of the struct with only the objects `chosen`; the struct itself if all are chosen."""
     if len(chosen) == len(struct._objs):
         return struct
     some = copy.copy(struct)
@@ -483,7 +484,8 @@ GUARDED: dict[type, dict[str, str]] = {
 """Properties (and their ``set_...``) and methods of SAPIEN, each with ManiSkill's method to use instead."""
 
 _systems: weakref.WeakSet[BatchedCpuSystem] = weakref.WeakSet()
-"""Systems of batched scenes; their scenes are read at each call, since a restored snapshot gives an env another scene."""
+"""Systems of batched scenes. Each call of a guarded setter reads their scenes, since a restored snapshot
+gives an env another scene."""
 
 
 def guard_scenes(system: BatchedCpuSystem) -> None:
@@ -533,7 +535,7 @@ def _guarded(stock: Any, called: str, instead: str) -> Callable[..., Any]:
 
 
 def _system_of(owner: Any) -> tuple[BatchedCpuSystem | None, int]:
-    """The laid-out system and the env of a physical body; None if there is no such system."""
+    """The laid-out system and the env of a physical body; (None, 0) if it is in no such system."""
     entity = _entity(owner)
     if entity is not None and entity.scene is not None:
         for system in _systems:

@@ -45,7 +45,7 @@ class ImpulseQuery:
 
 @dataclass
 class ContactReader:
-    """Answers queries about the last substep of the systems; `invalidate` after each substep.
+    """Answers queries about the last substep of the systems; call `stepped` after each substep.
 
     Reading the points of a PhysX contact takes microseconds in Python. So the lists are walked at most once a
     step, for any number of queries, and points are read only for contacts that a query counts. (PickCube, 64
@@ -85,7 +85,8 @@ class ContactReader:
         self._cache = None
 
     def stepped(self, but: Collection[int] = ()) -> None:
-        """Note that all systems except `but` made a substep, so their own lists are valid again."""
+        """Note that all systems except those in `but` made a substep: PhysX's lists of their contacts are
+        valid again."""
         self._cache = None
         self._carried = {env: touching for env, touching in self._carried.items() if env in but}
 

@@ -71,8 +71,8 @@ class BatchedCpuSystem:
       envs; a Python getter takes 2 us *per body*.
     * ManiSkill's setters write through (`wrote`), and its getters return the current state (`refresh`), as on a stock CPU
       env: a task that neither applies nor fetches behaves as on a stock CPU env.
-    * An apply writes only the other numbers that differ from the last fetch: a partial reset wakes no body of
-      another env.
+    * An apply writes only numbers that differ from the last fetch and were not written through: a partial
+      reset wakes no body of another env.
     * Link velocities, joint accelerations and joint forces are fetched only when they are read, which few tasks do.
 
     Shapes: R bodies (dynamic and kinematic actors, then links, env after env), A articulations,
@@ -173,7 +173,7 @@ class BatchedCpuSystem:
             self.freeze_envs(frozen)
 
     def freeze_envs(self, envs: Collection[int]) -> None:
-        """Stop stepping these envs in PhysX; an empty collection steps all again."""
+        """Stop stepping these envs in PhysX, and step all other envs again."""
         self.catch_up()
         self._apply_targets()
         self.stepper.forget()
@@ -610,7 +610,8 @@ class BatchedCpuSystem:
             mirror.apply()
 
     def apply_changes(self) -> None:
-        """Apply the tensors of ``ManiSkillScene._gpu_apply_all``, but only where they differ from the last fetch."""
+        """Apply the tensors that ``ManiSkillScene._gpu_apply_all`` applies, only where they differ from the
+        last fetch."""
         own = self._mirrors
         for mirror in (
             own.bodies,

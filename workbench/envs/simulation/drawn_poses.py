@@ -22,8 +22,8 @@ NOWHERE_ELSE: Places = {}
 def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callable[[], None]]:
     """Context in which entities and their cameras are drawn at `places`; the entities stay where they are.
 
-    Yields a function that moves the drawn bodies: call it after ``update_render``, which resets them to their entities.
-    The cameras are moved when the context begins.
+    Yields a function that moves the drawn bodies: call it after each ``update_render``, which moves them back
+    to their entities. The cameras are moved when the context begins.
 
     Args:
         components: cameras that may be on one of the entities.
@@ -56,7 +56,7 @@ def temporarily(changes: Iterable[tuple[Any, str, Any]]) -> Iterator[None]:
 
 
 def camera_pose(component: Any, places: Places) -> sapien.Pose:
-    """Pose of a camera in its env's frame, with its entity drawn at `places`."""
+    """Pose of a camera in its env's frame, when the camera's entity is drawn at its pose in `places`."""
     if id(component.entity) not in places:
         return component.get_global_pose()
     pose = places[id(component.entity)][1]

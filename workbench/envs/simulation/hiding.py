@@ -24,7 +24,8 @@ def install_hiding() -> None:
 
     Stock ManiSkill does so on the CPU too. In GPU simulation it moves an actor 99999 m away and stores its
     pose. If another struct (an actor that it was merged into) then moves or reads the actor, poses are wrong
-    and the actor is visible again (ManiSkill #1447). In all other scenes the stock code runs.
+    and the actor is visible again (ManiSkill #1447). In scenes that are not batched, the stock code still
+    runs.
     """
     stock: property = Actor.__dict__["pose"]
     Actor.pose = property(  # type: ignore[assignment]

@@ -111,7 +111,7 @@ class Mirror:
 
         Raises:
             ValueError: a number is NaN or infinite, and all known state of the env is finite. Writes that
-                were not applied are discarded, or every later apply would raise again.
+                were not applied are discarded; otherwise every later apply would raise again.
         """
         if np.isfinite(values).all():
             return True
@@ -137,8 +137,9 @@ class DriveTargets(Mirror):
 
     Setting a target wakes a sleeping articulation even if the value stays, and ManiSkill's CPU controllers
     set targets at every control step. So targets that were set since the last apply are written even if they
-    have not changed, or a robot at rest would fall asleep here but not in stock ManiSkill. These are 1200
-    calls per control step for 64 Pandas, so the thread that steps an env makes them, just before the step.
+    have not changed; otherwise a robot at rest would fall asleep here but not in stock ManiSkill. These are
+    1200 calls per control step for 64 Pandas, so the thread that steps an env makes them, just before the
+    step.
     """
 
     def __init__(

@@ -68,7 +68,7 @@ class StateLayout:
 def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:
     rows: list[Any] = []  # the component of each row
     env_of_row, body_at, joints_at = [], [], []
-    roots: dict[int, tuple[int, Any]] = {}  # row and articulation of the first link of each
+    roots: dict[int, tuple[int, Any]] = {}  # of each articulation: row of its first link, and itself
     packed = 0
     parts: list[list[slice]] = []
     for env, system in enumerate(systems):

@@ -29,8 +29,9 @@ class Stepper:
     use its SAPIEN objects directly. One system for all envs with PhysX's own threads would need the envs metres apart, which
     costs float precision.
 
-    *In a row*: a Panda, table and cube touch some hundreds of kB, which a walk through all envs evicts from the cache.
-    ManiSkill runs hooks between substeps, so their order changes only when no hook can notice it (`merging`).
+    *In a row*: a Panda, table and cube touch some hundreds of kB, which a walk through all envs evicts from
+    the cache. ManiSkill runs hooks between substeps, so an env's substeps are done in a row only when no hook
+    can notice (`merging`).
 
     The thread that stepped an env also packs it, while it is in that core's cache (12 us cold, 3 us warm).
     """
@@ -76,7 +77,8 @@ class Stepper:
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
-        """Context that does `substeps` calls of `step` together, at the last call or when state is read."""
+        """Context that does `substeps` calls of `step` together: at the last call, or earlier if state is
+        read."""
         self._in_a_row = substeps
         try:
             yield
@@ -84,8 +86,8 @@ class Stepper:
             self._in_a_row = 1
 
     def write_before_step(self, write: Callable[[int], None]) -> None:
-        """Call ``write(env)`` for each env before the env's next substep, in the thread that steps it, or
-        before a pack."""
+        """Call ``write(env)`` for each env before its next substep, in the thread that steps the env; or
+        before its state is packed, if that is earlier."""
         self._writes.append(write)
 
     def write_now(self) -> None:
@@ -171,12 +173,12 @@ PLATFORM_ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
 class NativeStep:
     """The C++ method behind ``PhysxCpuSystem.step()``, and the means to find the address of its object.
 
-    ``step()`` holds the interpreter lock, so threads over independent systems gain nothing. SAPIEN's shared library exports
-    the C++ method, and ctypes releases the lock while it runs: the same code on the same object. The object's address comes
-    from ``_pybind11_conduit_v1_`` (pybind11 2.14, "Allowing extensions of one binding to use another's objects"), which
-    checks ABI and C++ type. The exported names are those of sapien 3.0.3 on Linux
-    (``tests/envs/simulation/test_native_step.py``). If one is missing, `why_not_native` returns its name, and SAPIEN's own
-    binding steps the systems one after the other.
+    ``step()`` holds the interpreter lock, so threads over independent systems gain nothing. SAPIEN's shared
+    library exports the C++ method, and ctypes releases the lock while it runs: the same code on the same
+    object. The object's address comes from ``_pybind11_conduit_v1_`` (pybind11 2.14, "Allowing extensions of
+    one binding to use another's objects"), which checks ABI and C++ type. The exported names are those of
+    sapien 3.0.3 on Linux (``tests/envs/simulation/test_native_step.py``). If one is missing, `why_not_native`
+    names it, and SAPIEN's own binding steps the systems one after the other.
     """
 
     call: Callable[[int], None]

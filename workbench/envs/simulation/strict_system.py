@@ -103,19 +103,20 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._stale: set[Group] = set()
         """Groups that moved since they were fetched."""
         self._moved_unfetched: dict[Group, str] = {}
-        """For each stale group that was refreshed since then, the name of a body that had moved."""
+        """For each group that was refreshed since it became stale, the name of a body that had moved."""
         self._frames_of_step: tuple[Frame, ...] = ()
         """Frames of the last step that the task itself made; empty if ManiSkill made it."""
         self.being_reset: torch.Tensor | None = None
         """(N,) bool while ``_initialize_episode`` runs for some envs only."""
         self.reported_elsewhere: set[str] = set()
-        """Names of bodies whose write in other envs was already reported in the present partial reset."""
+        """Names of bodies whose writes in envs that are not being reset were already reported in this partial
+        reset."""
         self._outdated: set[int] = set()
         """Indices of articulations whose link poses in a GPU's tensor would be older than a write of qpos or
         root pose."""
         self._not_updated: set[int] = set()
-        """Indices of articulations whose qpos or root pose was applied after a GPU would last have computed
-        link poses."""
+        """Indices of articulations whose qpos or root pose was applied, and whose link poses a GPU would not
+        have computed since then."""
         super().__init__(scenes, *args, **kwargs)
 
     def gpu_init(self) -> None:
@@ -192,7 +193,7 @@ class StrictCpuSystem(BatchedCpuSystem):
                 self._held[id(mirror.now)] = mirror.now.copy()
 
     def _unapplied(self, mirror: Mirror) -> NDArray[np.bool_]:
-        """(K, W) True where a number was written and, on a GPU, would not be applied."""
+        """(K, W) True where a number was written and, on a GPU, would not be in the simulation yet."""
         held = self._held.get(id(mirror.now))
         differs = mirror.differs()
         return differs if held is None else differs | differ(mirror.now[mirror.at], held[mirror.at])
@@ -351,7 +352,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     # --- partial resets --------------------------------------------------------------------------------
 
     def refuse_unapplied_writes(self, reset: torch.Tensor) -> None:
-        """Report a breach if a write to an env that is not in the mask `reset` (N,) was never applied."""
+        """Report a breach if a write to an env where the mask `reset` (N,) is False was never applied."""
         for mirror in self._mirrors.all:
             if mirror.group == "targets":
                 continue
@@ -372,7 +373,8 @@ class StrictCpuSystem(BatchedCpuSystem):
         return self.layout_version, [mirror.now[mirror.at].copy() for mirror in self._mirrors.all]
 
     def refuse_changes_elsewhere(self, before: tuple[int, list[Floats]], reset: torch.Tensor) -> None:
-        """Report a breach if an env that is not in the mask `reset` (N,) differs from `before`."""
+        """Report a breach if the state of an env where the mask `reset` (N,) is False differs from
+        `before`."""
         version, states = before
         if version != self.layout_version:
             return  # the rows now belong to other bodies

@@ -37,7 +37,7 @@ class PackedPart:
 
     @property
     def size(self) -> int:
-        """Number of float32."""
+        """Count of numbers (float32) of the part in the packed state."""
         return BODY + (0 if self.joints is None else 4 * len(self.joints))
 
     def __str__(self) -> str:
@@ -54,8 +54,9 @@ class CpuState:
 
     ``PhysxCpuSystem.pack()`` has pose and velocity of every body, qpos, qvel and drive targets. In addition:
 
-    * *Names*: bytes of two envs mean the same only if the envs have the same parts, which `Contents` lists. Where the
-      parts differ, the bytes are assembled from the target's and the source's.
+    * *Names*: bytes of two envs mean the same only if the envs have the same parts, which `Contents` lists.
+      Where the parts differ, the bytes to write are assembled from those of the env that is restored and
+      those of the snapshot.
     * *Sleep*: writing a pose wakes a body, which then moves by micrometres. Bodies that slept are put to
       sleep again. Each body is queried (2 us each), because a velocity in the pack does not mean that the
       body is awake (cubes of StackCube sleep with some velocity left).
@@ -78,7 +79,7 @@ class CpuState:
     impulses: NDArray[np.float32]
     """(T, 3) newton seconds on the first body of each contact."""
     statics: tuple[dict[str, tuple[float, ...]], ...]
-    """(n,) poses (7,) of static actors, by name; empty where none was ever moved."""
+    """(n,) poses (7,) of static actors, by name; empty if no static actor was ever moved."""
 
     def articulations(self, k: int) -> slice:
         """Rows of `qf` of env k's articulations."""
@@ -254,8 +255,9 @@ def write_cpu_state(
 def make_cpu_exact_point(env: Any, env_idx: list[int]) -> None:
     """Give these envs a new PhysX scene with their present state.
 
-    Restoring a snapshot taken now and repeating the actions then gives the same run to the last bit. If PhysX returns an
-    articulation's root pose with other last bits than were set, those bits are changed until it returns the same.
+    Restoring a snapshot taken now and repeating the actions then gives the same run to the last bit. If PhysX
+    returns an articulation's root pose with other last bits than were set, these bits are changed until PhysX
+    returns what is set.
     """
     left, state, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
     positions = list(range(len(env_idx)))

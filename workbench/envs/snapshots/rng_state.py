@@ -32,7 +32,7 @@ class SharedRng(NamedTuple):
 
     torch_cpu: np.ndarray
     torch_device: np.ndarray | None
-    """State of the CUDA generator, for an env whose tensors are on that device."""
+    """State of the CUDA generator of the env's device; None for an env on the CPU."""
     numpy: RngState
     python: Any
 
@@ -57,7 +57,7 @@ class RngReader:
     is read only if its position or words 1 to 4 of its key changed. These bytes are compared in memory (0.2
     us, at numpy's public ``BitGenerator.ctypes.state_address``; the whole keys of many envs do not fit into a
     core's cache). One exception: numpy caches every second normal number, and drawing it changes none of
-    these bytes. While one is cached, all generators are read.
+    these bytes. While a normal number is cached, all generators are read.
     """
 
     def __init__(self) -> None:

@@ -116,18 +116,21 @@ def restore_snapshot(
     ``restore_snapshot(env, s)`` restores every env; ``restore_snapshot(env, s, [7], source=3)`` puts env 3's state into
     env 7; ``restore_snapshot(env, s, range(env.num_envs), source=3)`` into all.
 
-    The env may be another, made again or of an edited task. Then actors and articulations are matched by name,
-    articulations also by the names of their joints, and attributes of the task by name and shape. What the task keeps for a
-    whole batch (counters, a controller's step) is restored only if all envs are. The process's random generators are
-    restored only if, in addition, each env gets its own state back and the snapshot's env had as many envs.
+    `env` may be another env than that of the snapshot: the same task made again, or an edited task. Then
+    actors and articulations are matched by name, articulations also by the names of their joints, and
+    attributes of the task by name and shape. What the task keeps for a whole batch (counters, a controller's
+    step) is restored only if all envs are restored. The process's random generators are restored only if, in
+    addition, each env gets its own state back and the env of the snapshot had as many envs as `env`.
 
-    Afterwards the tensors, poses and contact queries are those of the restored moment. ``env._last_obs`` is not: call
-    ``env.get_obs(env.get_info())``, or use `TaskEnv.restore`, which does.
+    Afterwards the tensors, poses and contact queries are those of the restored moment, but ``env._last_obs``
+    is not. Call ``env.get_obs(env.get_info())`` for the observation, or use `TaskEnv.restore`, which observes
+    too.
 
     Args:
         env_idx: the envs to restore; None for those of the snapshot.
-        source: the snapshot's env whose state all of them get, or one env for each. None: each gets its own
-            state; if the snapshot has a single env, all get the state of that env.
+        source: the env in the snapshot whose state all envs of `env_idx` get, or a list with one such env for
+            each. None: each env gets its own state; if the snapshot has a single env, all get the state of
+            that env.
         fresh_physics: give the envs a new PhysX scene, so that they continue identically, to the last bit.
             Without it, a restore is several times as fast, and later contacts may be solved in another order
             (`renew_physics`).
@@ -209,7 +212,7 @@ def restore_memory(
     """Put entry ``positions[k]`` of `memory` into env ``env_idx[k]``; returns what was carried and what was not.
 
     Args:
-        whole: each env gets its own state back: restore the process's random generators too.
+        whole: whether each env gets its own state back; if so, restore the process's random generators too.
     """
     steps = env.elapsed_steps
     steps[env_idx] = steps.new_tensor(memory.elapsed_steps[positions])
@@ -275,10 +278,10 @@ def _pairs(
 def step_only(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iterator[None]:
     """Context in which control steps move these envs only.
 
-    The task's hooks run for all envs or for none, but on the CPU PhysX has a scene per env, and the others
-    are not stepped. What hooks changed in the others (a counted step, targets, a buffer) is restored from
-    `others`. The physics of an env is restored only if a hook wrote to it: writing even the present state
-    wakes sleeping bodies. In GPU simulation all envs step, and the others are restored.
+    The task's hooks run for all envs or for none. But on the CPU PhysX has a scene per env, and the scenes of
+    the other envs are not stepped. What hooks changed in those envs (a counted step, targets, a buffer) is
+    restored from `others`. The physics of an env is restored only if a hook wrote to it: writing even the
+    present state wakes sleeping bodies. In GPU simulation all envs step, and the others are restored.
 
     Args:
         others: a snapshot of all other envs, restored at the end; None if their state does not matter.

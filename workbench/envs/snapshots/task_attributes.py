@@ -51,7 +51,7 @@ class Walk:
 
     env: BaseEnv
     author: str
-    """Module of the task's class: objects of classes from it are entered."""
+    """Module of the task's class: objects whose class is from this module are entered."""
     leaves: list[TaskValue] = field(default_factory=list)
     omitted: dict[str, str] = field(default_factory=dict)
     entered: dict[int, Any] = field(default_factory=dict)
@@ -163,8 +163,8 @@ def _has_members(cls: type, author: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def _is_ignored(cls: type, author: str) -> bool:
-    """Whether objects of this class are skipped without a report: upstream packages' objects and
-    callables."""
+    """Whether objects of this class are skipped without a report: callables, and objects of upstream
+    packages."""
     if issubclass(cls, _ENTERED_TYPES) or _has_members(cls, author):
         return False
     return cls.__module__.split(".")[0] in _SKIPPED_PACKAGES or any(

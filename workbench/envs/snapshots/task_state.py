@@ -35,8 +35,9 @@ class Buffer(NamedTuple):
 class TaskState(NamedTuple):
     """State that a task, its robots and their controllers keep, and that ManiSkill's ``get_state_dict`` lacks.
 
-    *Rows*: a tensor, array or list of plain values whose first dimension is N has a row per env, and the rows of chosen envs
-    are copied. Everything else (a counter, a threshold) holds for the whole batch, and is restored only when all envs are.
+    *Rows*: a tensor, array or list of plain values whose first dimension is N has a row per env, and the rows
+    of chosen envs are copied. Everything else (a counter, a threshold) holds for the whole batch, and is
+    restored only when all envs are restored.
 
     *State or scene*: ``self.peg_half_sizes`` has a row per env too, but describes pegs that were built. What has not changed
     since the scene was built (`note_scene`) belongs to the scene: it is not copied, and a restore gives it the value that it
@@ -136,7 +137,7 @@ def write_task_state(
 ) -> tuple[dict[str, None], dict[str, str]]:
     """Put row ``positions[k]`` of every buffer into env ``env_idx[k]``.
 
-    A value that holds for the whole batch is restored only if all envs are.
+    A value that holds for the whole batch is restored only if all envs are restored.
 
     Returns:
         Paths that were carried, and paths that were not carried, with the reason.
@@ -207,7 +208,7 @@ def write_task_state(
 def _with_rows(
     value: Any, kept: Buffer, env: BaseEnv, env_idx: list[int], positions: list[int], all_envs: bool
 ) -> Any:
-    """A copy of `value` with the rows written, or the reason why there is none."""
+    """A copy of `value` with the rows written, or the reason why they cannot be written."""
     listed = isinstance(kept.values, list)
     rows: Any = [kept.values[k] for k in positions] if listed else kept.values[positions]
     kind: Any = list if listed else np.ndarray if kept.dtype is None else torch.Tensor
