@@ -34,7 +34,7 @@ from workbench.live.process.heartbeat import Busy
 from workbench.live.process.supervisor import ProcessMemory
 from workbench.live.run import PastLoad
 from workbench.live.view import SessionView
-from workbench.page.commands import ToggleTable
+from workbench.page.commands import TellOpenTab, ToggleTable
 from workbench.planning.seeds_report import SolvedSeed, SolveReport
 from workbench.record.saving_state import SaveStatus
 from workbench.record.state import RecordingStatus
@@ -251,3 +251,18 @@ def test_a_page_after_many_changes_shows_the_same_as_a_new_one(live: Live) -> No
             page.again()
         assert difference(new.everything(), live.everything()) == "", last
         new.server.stop()
+
+
+def test_a_tab_that_no_page_shows_is_not_redrawn_until_a_page_opens_it(live_page: Live) -> None:
+    """Else every browser would receive curves and pictures that it does not show."""
+    reward = live_page.part("Reward")
+
+    def show(count: int) -> str:
+        live_page.show(replace(running(count), step_serial=count))
+        return reward.html("wb-numbers")
+
+    before = show(2)
+    live_page.do(TellOpenTab(tab="Run"))
+    assert show(3) == before
+    live_page.do(TellOpenTab(tab="Reward"))
+    assert show(3) != before

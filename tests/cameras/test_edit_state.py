@@ -159,7 +159,9 @@ def test_a_change_is_not_reverted_in_a_file_that_was_edited_since(session: Sessi
     edited = task_file.read_text() + "# more\n"
     task_file.write_text(edited)
     session.do(RevertCameraChange())
-    view = wait_until(session, in_studio(lambda s: s.edit_state.message.startswith("The file was not changed")), "why not")
+    view = wait_until(
+        session, in_studio(lambda s: s.edit_state.message.startswith("The file was not changed")), "why not"
+    )
     assert (
         "was edited since" in view.of(StudioView).edit_state.message
         and view.of(StudioView).edit_state.stage == "checked"

@@ -112,7 +112,7 @@ def drop_viser(gated_server: GatedServer) -> None:
 
 def forget_what_was_drawn(parts: Parts[Any]) -> None:
     """Force every part of a page to redraw with the next view."""
-    for _, due in parts._parts:
+    for _, due, _ in parts._parts:
         due._drawn = None
 
 

@@ -106,7 +106,7 @@ PICTURES_HINT = (
     "card. Auto: fast while something moves, exact when it stands still. This page records exact pictures only."
 )
 PANEL_WIDTH_PIXELS = 372
-ENVS_TAB, LOG, ALL_PICTURES = "Envs", "Log", "All pictures"
+ENVS_TAB, REWARD, LOG, ALL_PICTURES = "Envs", "Reward", "Log", "All pictures"
 ENVS_WIDTHS_PIXELS = 220, 640
 """Minimum and maximum width of the table of envs."""
 ENVS_SHARE = 0.2
@@ -200,6 +200,9 @@ class Page:
         floating = self._envs, self._record, self._timeline, log, self._icons, banner, busy_banner
         opening = () if self._opening is None else (self._opening,)
         self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
+        for part in self._reward:
+            self._parts.add(part, lambda: self._open_tabs.may_show(REWARD))
+        self._parts.add(self._studio, lambda: self._open_tabs.may_show(CAMERAS))
 
         self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
         self._frames, self._frustums = BodyFrames(server), CameraFrustums(server)
@@ -215,7 +218,7 @@ class Page:
         return isinstance(self._session.reference, str) and self._session.knows_file(file)
 
     def _add_tabs(self, dark: bool) -> list[PagePart[SessionView]]:
-        """Add the tabs of the right dock; returns their parts."""
+        """Add the tabs of the right dock; returns their parts, except those of the Cameras and Reward tabs."""
         server, session, clock = self._server, self._session, self._clock
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Run", viser.Icon.PLAYER_PLAY):
@@ -231,15 +234,18 @@ class Page:
                 self._degree = choice(
                     server, "Pictures", ChoosePictures, "pictures", degrees, "auto", hint=PICTURES_HINT
                 )
-                self._cameras = CamerasPanel(server, studio_shows=lambda: self._studio.shows, clock=clock)
-        with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
-            reward = [
+                self._cameras = CamerasPanel(
+                    server,
+                    studio_shows=lambda: self._studio.shows,
+                    is_shown=lambda: self._open_tabs.may_show(CAMERAS),
+                    clock=clock,
+                )
+        with tabs.add_tab(REWARD, viser.Icon.CHART_LINE):
+            self._reward = (
                 NumbersPanel(server),
                 RescoredAbove(server),
                 CurvesPanel(server, session),
-            ]
-            self._rescored = PastRescorePanel(
-                server, session, lambda name, env: session.rescored_curve(name, env)
+                PastRescorePanel(server, session, lambda name, env: session.rescored_curve(name, env)),
             )
         with tabs.add_tab(INSPECT, viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, self._open_tabs, clock)
@@ -250,8 +256,7 @@ class Page:
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, checks_tab, self._link)
         of_run = self._run, version, options, self._view_panel
-        of_reward = *reward, self._rescored
-        return [*of_run, self._studio, *of_reward, self._inspect, self._solve, seeds, profile, checks]
+        return [*of_run, self._inspect, self._solve, seeds, profile, checks]
 
     def _add_left_dock(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)

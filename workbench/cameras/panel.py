@@ -122,6 +122,7 @@ class CamerasPanel:
     Args:
         no_camera: The note for a task without cameras.
         studio_shows: Returns the modality that the Studio shows of the camera that is being placed.
+        is_shown: Returns whether a page may show the pictures of the panel and of the Studio; otherwise none is sent.
     """
 
     does = (ShowPictures,)
@@ -131,9 +132,10 @@ class CamerasPanel:
         server: viser.ViserServer,
         no_camera: str = "This task has no camera yet.",
         studio_shows: Callable[[], str] = lambda: COLOUR,
+        is_shown: Callable[[], bool] = lambda: True,
         clock: Clock = time.monotonic,
     ) -> None:
-        self._no_camera, self._studio_shows = no_camera, studio_shows
+        self._no_camera, self._studio_shows, self._is_shown = no_camera, studio_shows, is_shown
         self._server, self._clock = server, clock
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._ticked: dict[tuple[CameraKind, str, str], bool] = {}
@@ -165,7 +167,7 @@ class CamerasPanel:
         for camera in self._cameras.values():
             for image in camera.images.values():
                 image.settle()
-        if not self._due.is_due((seen.pictures_serial, seen.env)):
+        if not self._is_shown() or not self._due.is_due((seen.pictures_serial, seen.env)):
             return
         for key, camera in self._cameras.items():
             picture = seen.pictures.get(key)
@@ -265,7 +267,7 @@ class CamerasPanel:
         """The ticked modalities; for the camera in the Studio also `rgb` and the Studio's modality, unless
         the Studio draws a preview."""
         wanted = self._wanted(camera)
-        if seen.preview or key != seen.placed:
+        if seen.preview or key != seen.placed or not self._is_shown():
             return wanted
         return tuple(m for m in modalities_of(camera.info) if m in (COLOUR, self._studio_shows(), *wanted))
 

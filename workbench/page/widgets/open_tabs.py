@@ -20,6 +20,11 @@ class OpenTabs:
         here = self._visitors.all()
         return frozenset(one.client.client_id for one in here if self._open.get(one.name) == name)
 
+    def may_show(self, name: str) -> bool:
+        """Whether a page has this tab open, or has not reported yet which it has open."""
+        here = self._visitors.all()
+        return not here or any(self._open.get(one.name, name) == name for one in here)
+
     def shows(self, where: ShownOn, name: str) -> bool:
         """Whether to draw in the view what belongs to this tab, if the user chose to show it `where`."""
         return where == "on all tabs" or (where == "on this tab" and bool(self.pages_at(name)))

@@ -87,14 +87,18 @@ class Parts(Generic[View]):
 
     def __init__(self, parts: Iterable[PagePart[View]], clock: Clock = time.monotonic) -> None:
         self._clock = clock
-        self._parts: list[tuple[PagePart[View], DrawThrottle]] = []
+        self._parts: list[tuple[PagePart[View], DrawThrottle, Callable[[], bool]]] = []
         self._owners: dict[type[Command], PagePart[View]] = {}
         for part in parts:
             self.add(part)
 
-    def add(self, part: PagePart[View]) -> None:
-        """Add a part, which is drawn after the others."""
-        self._parts.append((part, DrawThrottle(part.every, self._clock)))
+    def add(self, part: PagePart[View], is_shown: Callable[[], bool] = lambda: True) -> None:
+        """Add a part, which is drawn after the others.
+
+        Args:
+            is_shown: Whether a page may show the part. It is not drawn otherwise, since every browser would receive it.
+        """
+        self._parts.append((part, DrawThrottle(part.every, self._clock), is_shown))
         for kind in part.does:
             assert kind not in self._owners, f"two parts do {kind.__name__}"
             self._owners[kind] = part
@@ -113,9 +117,10 @@ class Parts(Generic[View]):
         return owner.do(command, visitor)
 
     def draw(self, view: View) -> None:
-        due = [is_due.is_due(part.key(view), part.urgent(view)) for part, is_due in self._parts]
-        together = any(now and part.of_the_moment for now, (part, _) in zip(due, self._parts, strict=True))
-        for now, (part, is_due) in zip(due, self._parts, strict=True):
+        shown = [(part, is_due) for part, is_due, is_shown in self._parts if is_shown()]
+        due = [is_due.is_due(part.key(view), part.urgent(view)) for part, is_due in shown]
+        together = any(now and part.of_the_moment for now, (part, _) in zip(due, shown, strict=True))
+        for now, (part, is_due) in zip(due, shown, strict=True):
             if now or (together and part.of_the_moment):
                 is_due.drawn(part.key(view), part.urgent(view))
                 part.draw(view)
