@@ -114,3 +114,24 @@ def test_frequent_pictures_have_the_panels_width_and_the_last_full_size(panels: 
     clock.passes(0.3)
     panel.draw(replace(moving, pictures_serial=3))
     assert image.image.shape == (600, 1000, 3)
+
+
+def test_no_picture_is_sent_while_no_page_shows_the_tab(panels: Panels, clock: Clock) -> None:
+    """Nor is one requested for the Studio; ticked pictures are still requested for the frustums in the view."""
+    is_shown = False
+    panel = CamerasPanel(panels.server, is_shown=lambda: is_shown, clock=clock)
+    view = seen(1, (camera("base"),))
+    assert view is not None
+    view = replace(view, placed=("sensor", "base"))
+    panel.draw(view)
+    assert panels.part(BASE).images() == [] and panel.wanted(view) == (
+        CameraRequest("base", "sensor", ("rgb",)),
+    )
+    panels.visitors.do = panel.do
+    panels.do(ShowPictures(kind="sensor", name="base", modality="rgb", on=False))
+    assert panel.wanted(view) == ()
+    is_shown = True
+    assert panel.wanted(view) == (CameraRequest("base", "sensor", ("rgb",)),)
+    panels.do(ShowPictures(kind="sensor", name="base", modality="rgb", on=True))
+    panel.draw(view)
+    assert len(panels.part(BASE).images()) == 1

@@ -95,8 +95,7 @@ def count(shown: Iterable[Card]) -> int:
 
 
 def without_finding(checks: ChecksView, shown: list[Card]) -> list[RuleResult]:
-    """Results of the rules without a finding. A rule that the checks found kept is left out if playing found
-    a breach of it."""
+    """Results of the rules without a finding. A rule is left out if playing found a breach of it, even if the checks found none."""
     broken = {card.rule.id for card in shown if not card.old}
     return [result for result in checks.results if result.rule not in broken]
 

@@ -273,7 +273,7 @@ def advanced(state: ReviewState, now: float) -> ReviewState:
     if position <= view.last:
         return state if position == view.position else _with(state, position=position)
     if view.loop:
-        # The last state is shown as long as any other.
+        # The last state is shown for the same time as every other state.
         return _with(state, position=view.first, playback=Playback(view.first, now))
     return _with(state, position=view.last, playback=None)
 

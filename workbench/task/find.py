@@ -191,7 +191,8 @@ def _top_level(tree: ast.Module) -> Iterator[ast.stmt]:
 
 
 def _name(node: ast.expr) -> str:
-    """``BaseEnv`` of ``BaseEnv``, ``sapien_env.BaseEnv``, ``BaseEnv(...)`` and ``BaseEnv[...]``; empty for another form."""
+    """The last name of an expression: ``BaseEnv`` for each of ``BaseEnv``, ``sapien_env.BaseEnv``, ``BaseEnv(...)`` and
+    ``BaseEnv[...]``. Empty for any other form."""
     if isinstance(node, ast.Call):
         node = node.func
     if isinstance(node, ast.Subscript):

@@ -39,8 +39,8 @@ _permanent_folder = False
 def is_own_file(path: str, folder: Path) -> bool:
     """True for the author's files in or below `folder`.
 
-    A project's root may also contain a virtual environment and, if installed from its repository, the workbench: those are
-    not the author's.
+    A project's root may also contain a virtual environment, and the workbench itself if it was installed from a
+    clone. Their files are not the author's.
     """
     root = str(folder) + os.sep
     if not path.startswith(root) or path.startswith(LIBRARY_ROOTS):

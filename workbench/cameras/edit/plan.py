@@ -94,7 +94,7 @@ def _why_not(changes: Changes, call: CameraCall, name: str) -> str | None:
     """Reason why an argument cannot be edited in the form in which it is written; None if it can."""
     part = call.trace.parts.get(name)
     if part is None:
-        return "the camera's call has no pose" if name == "pose" else None
+        return "the call that makes the camera sets no pose" if name == "pose" else None
     if name == "pose":
         return why_not_a_pose(changes, part)
     readable = {
@@ -125,7 +125,7 @@ def _write_fields(changes: Changes, call: CameraCall, fields: list[str], after: 
         elif part is not None:
             changes.number(part, getattr(after, name), 0 if name in ("width", "height") else 4)
         elif name in ("width", "height"):
-            raise RefusedEdit(f"the camera's call has no {name} ({call.where})")
+            raise RefusedEdit(f"the call that makes the camera does not set {name} ({call.where})")
         else:
             added.append(f"{name}={number_text(getattr(after, name), 4)}")
     if "fov" in fields or "intrinsic" in fields:

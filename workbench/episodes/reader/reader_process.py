@@ -263,7 +263,7 @@ class Reader:
         if isinstance(error, TimeoutError):
             return ReaderEnded(f"takes longer to read than {seconds:.0f} s")
         if isinstance(error, Unreadable):
-            return ReaderEnded(f"gave an invalid answer: {error}")
+            return ReaderEnded(f"made the process that reads recordings send an invalid answer: {error}")
         with_what = "" if status is None else f" (it {describe_exit(status)})"
         return ReaderEnded(f"ended the process that reads recordings{with_what}")
 

@@ -362,7 +362,7 @@ class _Process:
         self._thread.join()
 
     def _run(self) -> None:
-        why = "it failed within the workbench"
+        why = "the workbench itself failed while it read from the process in the background"
         try:
             why = self._serve()
         except OSError as error:

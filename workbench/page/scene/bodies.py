@@ -139,7 +139,8 @@ class SceneView:
             self._leaving, self._rows = [], None
 
     def hide(self) -> None:
-        """Show no bodies until the next `build`; they stay in the browser, and equal ones are not sent again."""
+        """Hide all bodies until the next `build`. They stay in the browser, so `build` does not send again those that
+        look the same."""
         if self._rows is not None:
             self._remove_leaving()
             self._rows = None
