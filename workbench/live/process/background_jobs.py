@@ -102,7 +102,7 @@ class Jobs:
         except Exception as error:
             # A fault of the workbench. The page must see that the job is over.
             report_failure(f"The job '{job.progress.what}' failed", error)
-            why = f"it failed within the workbench ({type(error).__name__}: {shorten(str(error))})"
+            why = f"the workbench itself failed ({type(error).__name__}: {shorten(str(error))})"
             failure = JobFailed(why)
         if job.stopped:
             return
