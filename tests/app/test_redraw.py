@@ -253,16 +253,19 @@ def test_a_page_after_many_changes_shows_the_same_as_a_new_one(live: Live) -> No
         new.server.stop()
 
 
-def test_a_tab_that_no_page_shows_is_not_redrawn_until_a_page_opens_it(live_page: Live) -> None:
-    """Else every browser would receive curves and pictures that it does not show."""
+def test_a_tab_that_no_page_shows_is_redrawn_rarely_and_at_once_when_a_page_opens_it(live_page: Live) -> None:
+    """Else every browser would receive curves and pictures that it does not show; and the tab must not open empty."""
     reward = live_page.part("Reward")
 
-    def show(count: int) -> str:
-        live_page.show(replace(running(count), step_serial=count))
+    def show(count: int, seconds: float = 0.3) -> str:
+        live_page.show(replace(running(count), step_serial=count), seconds=seconds)
         return reward.html("wb-numbers")
 
-    before = show(2)
     live_page.do(TellOpenTab(tab="Run"))
+    before = show(2)
+    assert before, "it is filled before a page opens it"
     assert show(3) == before
+    assert (later := show(3, seconds=5)) != before
+    assert show(4) == later
     live_page.do(TellOpenTab(tab="Reward"))
-    assert show(3) != before
+    assert show(4) != later

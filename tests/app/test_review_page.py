@@ -208,6 +208,8 @@ def test_a_press_retries_an_unreadable_recording(shown: Reviewed, folder: Path) 
     assert "was not opened" in shown.part("Review").html() and shown.shows(TRY_AGAIN)
     for path, content in files.items():
         path.write_bytes(content)
+    # A scan between two of the writes sees another recording.
+    until(lambda: shown.library.refresh() or shown.library.row(row.id), "the row of the whole files")
     shown.press(TRY_AGAIN)
     until(
         lambda: len(shown.review.view().opened) == 1,

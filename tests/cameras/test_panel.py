@@ -116,22 +116,39 @@ def test_frequent_pictures_have_the_panels_width_and_the_last_full_size(panels: 
     assert image.image.shape == (600, 1000, 3)
 
 
-def test_no_picture_is_sent_while_no_page_shows_the_tab(panels: Panels, clock: Clock) -> None:
-    """Nor is one requested for the Studio; ticked pictures are still requested for the frustums in the view."""
+def test_few_pictures_are_sent_while_no_page_shows_the_tab(panels: Panels, clock: Clock) -> None:
+    """None is requested for the Studio; ticked pictures are still requested, for the frustums in the view."""
     is_shown = False
     panel = CamerasPanel(panels.server, is_shown=lambda: is_shown, clock=clock)
-    view = seen(1, (camera("base"),))
-    assert view is not None
-    view = replace(view, placed=("sensor", "base"))
-    panel.draw(view)
-    assert panels.part(BASE).images() == [] and panel.wanted(view) == (
-        CameraRequest("base", "sensor", ("rgb",)),
-    )
     panels.visitors.do = panel.do
-    panels.do(ShowPictures(kind="sensor", name="base", modality="rgb", on=False))
-    assert panel.wanted(view) == ()
+
+    def draw(serial: int) -> ShownCameras:
+        view = seen(1, (camera("base"),))
+        assert view is not None
+        pictures = dict.fromkeys(
+            view.pictures, Picture("base", "sensor", 0, POSE, np.full((6, 8, 3), serial, np.uint8))
+        )
+        view = replace(view, placed=("sensor", "base"), pictures_serial=serial, pictures=pictures)
+        panel.draw(view)
+        return view
+
+    def shown() -> int:
+        (image,) = panels.part(BASE).images()
+        return int(np.asarray(image.image).mean())
+
+    view = draw(10)
+    assert shown() == 10 and panel.wanted(view) == (CameraRequest("base", "sensor", ("rgb",)),)
+    clock.passes(0.5)
+    draw(20)
+    assert shown() == 10
+    clock.passes(5)
+    draw(30)
+    assert shown() == 30
     is_shown = True
-    assert panel.wanted(view) == (CameraRequest("base", "sensor", ("rgb",)),)
-    panels.do(ShowPictures(kind="sensor", name="base", modality="rgb", on=True))
-    panel.draw(view)
-    assert len(panels.part(BASE).images()) == 1
+    clock.passes(0.5)
+    draw(40)
+    assert shown() == 40
+    panels.do(ShowPictures(kind="sensor", name="base", modality="rgb", on=False))
+    assert panel.wanted(view) == (CameraRequest("base", "sensor", ("rgb",)),), "the Studio's"
+    is_shown = False
+    assert panel.wanted(view) == ()

@@ -122,7 +122,7 @@ class CamerasPanel:
     Args:
         no_camera: The note for a task without cameras.
         studio_shows: Returns the modality that the Studio shows of the camera that is being placed.
-        is_shown: Returns whether a page may show the pictures of the panel and of the Studio; otherwise none is sent.
+        is_shown: Returns whether a page may show the panel and the Studio; otherwise few pictures are sent.
     """
 
     does = (ShowPictures,)
@@ -167,7 +167,7 @@ class CamerasPanel:
         for camera in self._cameras.values():
             for image in camera.images.values():
                 image.settle()
-        if not self._is_shown() or not self._due.is_due((seen.pictures_serial, seen.env)):
+        if not self._due.is_due((seen.pictures_serial, seen.env), hidden=not self._is_shown()):
             return
         for key, camera in self._cameras.items():
             picture = seen.pictures.get(key)

@@ -18,6 +18,10 @@ BEFORE_FOLD_VALUE = " \N{MIDDLE DOT} "
 """Separates a folder's name from its value; the scripts (``panels.js``) find folders by the name."""
 
 
+HIDDEN_SECONDS = 2.0
+"""Interval at which what no page shows is drawn: it must not open empty, or long out of date."""
+
+
 class PagePart(Generic[View]):
     """One part of a page, drawn from an immutable view.
 
@@ -72,11 +76,16 @@ class DrawThrottle:
         """Store this as drawn."""
         self._drawn = key, urgent, self._clock()
 
-    def is_due(self, key: object, urgent: object = None) -> bool:
-        """Whether to draw now; if so, store this as drawn."""
+    def is_due(self, key: object, urgent: object = None, hidden: bool = False) -> bool:
+        """Whether to draw now; if so, store this as drawn.
+
+        Args:
+            hidden: Whether no page shows it: then nothing is urgent, and it is drawn every `HIDDEN_SECONDS`.
+        """
         if self._drawn is not None:
             drawn, was_urgent, at = self._drawn
-            if urgent == was_urgent and (key == drawn or self._clock() - at < self._every):
+            is_early = self._clock() - at < (HIDDEN_SECONDS if hidden else self._every)
+            if (hidden or urgent == was_urgent) and (key == drawn or is_early):
                 return False
         self.drawn(key, urgent)
         return True
@@ -96,7 +105,7 @@ class Parts(Generic[View]):
         """Add a part, which is drawn after the others.
 
         Args:
-            is_shown: Whether a page may show the part. It is not drawn otherwise, since every browser would receive it.
+            is_shown: Whether a page may show the part. It is drawn rarely otherwise, since every browser receives it.
         """
         self._parts.append((part, DrawThrottle(part.every, self._clock), is_shown))
         for kind in part.does:
@@ -117,10 +126,11 @@ class Parts(Generic[View]):
         return owner.do(command, visitor)
 
     def draw(self, view: View) -> None:
-        shown = [(part, is_due) for part, is_due, is_shown in self._parts if is_shown()]
-        due = [is_due.is_due(part.key(view), part.urgent(view)) for part, is_due in shown]
-        together = any(now and part.of_the_moment for now, (part, _) in zip(due, shown, strict=True))
-        for now, (part, is_due) in zip(due, shown, strict=True):
-            if now or (together and part.of_the_moment):
+        parts = [(part, is_due, not is_shown()) for part, is_due, is_shown in self._parts]
+        due = [is_due.is_due(part.key(view), part.urgent(view), hidden) for part, is_due, hidden in parts]
+        in_step = [part.of_the_moment and not hidden for part, _, hidden in parts]
+        together = any(now and both for now, both in zip(due, in_step, strict=True))
+        for now, both, (part, is_due, _) in zip(due, in_step, parts, strict=True):
+            if now or (together and both):
                 is_due.drawn(part.key(view), part.urgent(view))
                 part.draw(view)
