@@ -128,7 +128,8 @@ def check(
 
 
 def report_of(what: CheckOptions, known: Mapping[int, ItemOutcome]) -> CheckReport:
-    """Report of a check from the results of these items. Runs nothing. Raises ValueError as `degrees_of_request`."""
+    """Report of a check from the results of these items. Runs nothing. Raises ValueError as
+    `degrees_of_request` does."""
     found = _Results(what)
     for number in sorted(known):
         found.take(number, known[number])

@@ -126,7 +126,7 @@ class CheckPlan:
     chunk: int
     """Number of item numbers in a chunk; some numbers have no item."""
     part: int
-    """Number of seeds of a part: at least one for each env, which rules that compare whole batches need."""
+    """Number of seeds of a part: at least one for each env, since some rules compare whole batches."""
     parts: int
 
     @property

@@ -61,7 +61,7 @@ class _Worker:
         """
         Args:
             runs: recorded runs to replay, from `find_actions`.
-            here: folder in which a policy is found.
+            here: the folder that was current at the start, in which a policy is found.
         """
         self._what, self._loaded, self._runs, self._here, self._queue = what, loaded, runs, here, queue
         self._degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
@@ -134,7 +134,8 @@ class _Worker:
 
 
 def _require_assets(loaded: LoadedTask, what: CheckOptions) -> None:
-    """Raise TaskError if a download is missing: no line of the task is at fault."""
+    """Raise TaskError if a download is missing. This ends the whole check: no line of the task is at
+    fault."""
     given = given_arguments(loaded.cls, what.options.env_kwargs, loaded.default_kwargs)
     with blamed("build", loaded):
         require_assets(loaded.cls.__name__, loaded.asset_ids, robots_of(loaded.cls, given))
@@ -163,7 +164,7 @@ class _Given:
         """
         Args:
             runs: recorded runs to replay, from `find_actions`; empty for a policy.
-            here: folder in which a policy is found.
+            here: the folder that was current at the start, in which a policy is found.
             episodes: indices of the episodes, counted over the whole check.
 
         Raises:

@@ -111,8 +111,8 @@ def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) 
 
 
 def _comments(view: SessionView) -> list[Comment]:
-    """Silencing comments without effect. Which comments silence no finding is known once all rules are
-    checked."""
+    """Silencing comments without effect. Comments that silence no finding are among them only once all rules
+    are checked."""
     task, checks = view.task, view.of(ChecksView)
     if task is None:
         return []

@@ -44,7 +44,7 @@ class CheckGroup(Question[CheckedGroup]):
     degrees: Mapping[str, Degree]
     """Degree of each rule."""
     known: tuple[str, ...] = ()
-    """Rules of the group that were checked before a job of higher priority came."""
+    """Rules that already have a result, since a job of higher priority may have interrupted the group."""
 
 
 @dataclass(frozen=True)

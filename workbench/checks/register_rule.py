@@ -45,8 +45,8 @@ def rule(id: str, degree: Degree, hook: str, *, see: See | None = None, solve: b
 
 
 def outlier_check(id: str, *, see: See) -> Declare:
-    """Declare the decorated function as the check of a rule of `OUTLIER_RULES`. The rule's page is there, not
-    in the docstring.
+    """Declare the decorated function as the check of a rule of `OUTLIER_RULES`, which also has the rule's
+    page.
 
     Args:
         see: as in `rule`.

@@ -41,8 +41,8 @@ class Silenced:
 
 @dataclass(frozen=True)
 class Seen:
-    """What a check saw of one thing, such as a body, in some episodes. `evidence.over_seeds` joins the rows
-    of several parts of the seeds."""
+    """A row of what a check saw: of one thing, such as a body, in some episodes. `evidence.over_seeds` joins
+    the rows that come from several parts of the seeds."""
 
     names: tuple[str, ...] = ()
     """Names of the thing, such as a body; empty for the episodes as a whole."""

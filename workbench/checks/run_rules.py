@@ -244,7 +244,8 @@ def over_seeds(results: Sequence[RuleResult], degree: Degree) -> RuleResult:
 
 
 def _with_code(rule: str, row: Seen) -> Seen:
-    """The row with code and silencing comment of its line: the process that judges it may have another version of the file."""
+    """The row with code and silencing comment of its line: the process that judges the row may have another
+    version of the file."""
     if row.place is None:
         return row
     file, line, _ = row.place

@@ -35,8 +35,8 @@ def comments_without_effect(
         sources: texts of the author's files by path.
         results: results of all checked rules, once the check is done. Only a rule that is kept, broken or
             silenced can show that a comment silences no finding.
-        class_name: the class that was checked. A comment in another task is not reported for silencing no
-            finding, since that task was not checked.
+        class_name: the class that was checked. In other tasks, comments that silence no finding are not
+            reported, since these tasks were not checked.
         others: class names of other tasks in the file.
     """
     found: list[Comment] = []

@@ -40,7 +40,7 @@ class ChecksView:
     """Results of the rules so far."""
 
     state: ChecksState = "none"
-    """``loading``: the version is loaded in the background process; ``off``: every rule is off."""
+    """``loading``: the version is being loaded in the background process; ``off``: every rule is off."""
     serial: int = 0
     """Grows with every change."""
     results: tuple[RuleResult, ...] = ()
@@ -180,7 +180,7 @@ def apply(checks: Checks, event: object, before: Run, run: Run) -> Change:
             return checks, effects
         case VersionLoaded() if _task_id(before) != _task_id(run):
             return _changed(checks, before=(), results=()), []
-        # The check begins here, and not at `VersionLoaded`, at which rescoring begins: of two jobs of the
+        # The check begins here, later than rescoring, which begins at `VersionLoaded`: of two jobs of the
         # same priority, the one that begins later runs first.
         case LoadDone() if (load := run.running_load()) is not None:
             return _check_loaded(checks, load)

@@ -32,13 +32,14 @@ class PlannedEpisode:
     fail: NDArray[np.bool_]
     """(T,) after each step; all False if the task has no fail."""
     best: NDArray[np.float32]
-    """(T,) return of the best rollout, before each step."""
+    """(T,) return of the best rollout in the plan of each step."""
     hold: NDArray[np.float32]
     """(T,) return of the rollout that holds still; NaN if one of its rewards was NaN."""
     worst: NDArray[np.float32]
     """(T,) return of the worst rollout among those with a finite return."""
     terms: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """(T,) for each term of ``info["reward_terms"]``: range of the rollouts' sums of the term."""
+    """(T,) by name of each term of ``info["reward_terms"]``: the largest minus the smallest of the rollouts'
+    sums of the term."""
     evaluate: Mapping[str, float] = field(default_factory=dict)
     """Entries of ``evaluate`` at the last step that have one number per env."""
     plan_seconds: float = 0.0
@@ -52,12 +53,12 @@ class PlannedEpisode:
 
     @property
     def solved_at(self) -> int:
-        """The step of the first success, from 1 on; 0 if there is no success."""
+        """The step of the first success, counted from 1; 0 if there is no success."""
         return int(self.success.argmax()) + 1 if self.success.any() else 0
 
     @property
     def failed_at(self) -> int:
-        """The step of the first fail, from 1 on; 0 if there is no fail."""
+        """The step of the first fail, counted from 1; 0 if there is no fail."""
         return int(self.fail.argmax()) + 1 if self.fail.any() else 0
 
 

@@ -93,7 +93,7 @@ class Planner:
 
     @property
     def rollout_env(self) -> BaseEnv:
-        """The env whose K envs are the rollouts."""
+        """The batch of K envs in which the rollouts run."""
         return self._rollouts.env
 
     def actions(self, env_idx: Sequence[int] | int | None = None) -> Any:

@@ -1,4 +1,4 @@
-"""Plans for any env of a task, with rollouts on a separate batch of envs of the same task."""
+"""Plans the actions of any env of a task, with rollouts on a separate batch of envs of the same task."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ _ABSOLUTE_NOISE_FACTOR = 0.2
 """Factor on the noise for absolute joint positions: no plan crosses the whole range of a joint."""
 _PLANNED_MODE = "pd_ee_delta_pose"
 _NOT_FOR_ROLLOUTS = ("num_envs", "obs_mode", "render_mode", "render_backend", "sim_backend")
-"""Arguments of the live env that its rollouts replace: rollouts need no pictures and no observations."""
+"""Keyword arguments of the live env that are not passed on to the envs of its rollouts: rollouts need no
+pictures and no observations."""
 
 
 class NotAlike(ValueError):
@@ -78,11 +79,11 @@ class Plan:
 
 
 def control_mode_to_plan(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, str]:
-    """Keyword argument of the control mode in which plans are found fastest; empty if `env` uses it already,
-    if `given` names a mode, or if the robot lacks it.
+    """Keyword argument of the control mode in which plans are found fastest; empty if `env` uses this mode
+    already, if the robot lacks it, or if `given` names a mode.
 
-    In a task about bodies, each of the six dimensions of a hand motion has a direct effect; a single joint
-    has none.
+    In a task about bodies, each of the six dimensions of a hand motion has a direct effect; the motion of a
+    single joint has none.
     """
     modes = getattr(env.agent, "supported_control_modes", ())
     if (
@@ -141,7 +142,7 @@ def make_rollout_env(
 
 
 class RolloutPlanner:
-    """Plans for the envs of a task, one after the other, on a batch of K envs of the same task.
+    """Plans the actions of a task's envs, one env after the other, on a batch of K envs of the same task.
 
     The author's reward is used unchanged: the return of a rollout is the sum of its rewards over the horizon, up to a fail. A
     rollout restores a snapshot and takes control steps.
@@ -207,7 +208,7 @@ class RolloutPlanner:
             )
 
     def plan(self, snapshot: Snapshot, env: int, traced: int | None = None) -> Plan:
-        """Plan from the state that this env has in the snapshot, starting from its last plan.
+        """Plan from the state that this env has in the snapshot, starting from the env's last plan.
 
         Preserves the state of the process's random generators.
 

@@ -7,22 +7,24 @@ import torch
 from workbench.planning.options import PlanOptions
 
 _NOISE_FACTORS = 0.05, 0.5
-"""Minimum and maximum factor on the noise, for a third of the candidates: large steps do not improve a nearly right
-plan."""
+"""Minimum and maximum of the random factor on the noise of a third of the candidates: large steps do not
+improve a plan that is nearly right."""
 _MOVE_PROBABILITY = 0.5
-"""Probability that a dimension is changed from the plan, in a third of the candidates."""
+"""Probability that a dimension gets noise, in the third of the candidates that move the same way at every
+knot."""
 _FLIP_PROBABILITY = 0.3
 """Probability that a knot of a switching dimension is redrawn, in half of the candidates. The other half
-keeps the plan's knots: a candidate that drops an object does not find how to carry it."""
+keeps the plan's knots in this dimension: a candidate that drops an object does not find how to carry it."""
 _TOP_FRACTION = 0.25
-"""Fraction of best candidates whose spread of returns scales MPPI's temperature: if many candidates drop an object, the
-spread of all is so wide that all good ones get the same weight."""
+"""MPPI's temperature is scaled by the spread of the returns of this fraction of the candidates, the best
+ones. If many candidates drop an object, the spread of all returns is so wide that all good candidates would
+get the same weight."""
 _KEPT_CANDIDATES = 2
 """Number of best candidates of a round that are tried again in the next round."""
 _MOTION_PENALTY = 1.0
-"""MPPI's penalty on motion, in spreads of the best candidates: the return of full motion in every dimension
-must exceed the return of holding still by this much. Without it, useless rotations add up, and a hand that
-arrives tilted grasps badly."""
+"""MPPI's penalty on full motion in every dimension, in standard deviations of the best candidates' returns:
+such a motion must earn this much more than holding still. Without the penalty, useless rotations add up, and
+a hand that arrives tilted grasps badly."""
 _MIN_SPREAD = 0.2
 """CEM's minimum spread, as a fraction of the noise: a spread of zero finds nothing new."""
 
@@ -31,8 +33,8 @@ class Sampler:
     """Plan of one env: knots of actions from -1 to 1, and candidates around the plan.
 
     A knot is an action at a time of the horizon: the first knot is now, the last at the end. Between knots a dimension is
-    interpolated linearly; a switching one (a gripper) keeps the value of the previous knot, since a half-closed gripper holds
-    nothing.
+    interpolated linearly; a switching dimension (a gripper) keeps the value of the previous knot, since a
+    half-closed gripper holds nothing.
     """
 
     def __init__(
@@ -41,7 +43,7 @@ class Sampler:
         """
         Args:
             steps: H, control steps of the horizon.
-            switches: (A,) bool, dimensions that switch.
+            switches: (A,) whether each dimension switches.
             scale: (A,) factor on the noise of each dimension.
             seed: seed of the random candidates.
         """
@@ -68,12 +70,14 @@ class Sampler:
         return int(torch.randint(2**31, (1,), generator=self._generator))
 
     def candidates(self, hold: torch.Tensor) -> torch.Tensor:
-        """(K, P, A) knots within -1 to 1: the plan itself, holding still, the best of the last round, others around the plan,
-        and a sixth around holding still, since small steps do not escape from a bad plan.
+        """(K, P, A) knots within -1 to 1: the plan itself, holding still, the best candidates of the last
+        round, and new candidates. A sixth of the new ones are drawn around holding still, since small steps
+        do not escape from a bad plan; the others around the plan.
 
         Args:
-            hold: (A,) the action that changes nothing; the initial plan of an episode. Switching dimensions keep their last
-                value: a gripper that is commanded to the width of the object that it holds drops it.
+            hold: (A,) the action that changes nothing; the initial plan of an episode. Switching dimensions
+                keep their last value instead: a gripper that is commanded to the width of a held object drops
+                the object.
         """
         if self._taken is not None:
             hold = torch.where(self._switches, self._taken, hold)
@@ -85,7 +89,8 @@ class Sampler:
         flips = torch.rand(shape, generator=self._generator) < _FLIP_PROBABILITY
         flips &= torch.rand((shape[0], 1, 1), generator=self._generator) < 0.5
         some = torch.rand((shape[0], 1, shape[2]), generator=self._generator) < _MOVE_PROBABILITY
-        # A third of the candidates repeat one action throughout, in some dimensions, to find the effect of long motions.
+        # A third of the candidates move the same way at every knot, in some of the dimensions, to find the
+        # effect of long motions.
         drawn[0::3], flips[0::3] = drawn[0::3, :1].clone(), flips[0::3, :1].clone()
         side = torch.sign(drawn)
         drawn[0::3] *= some[0::3]
@@ -151,7 +156,8 @@ class Sampler:
 
 
 def _weights(at: torch.Tensor, times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """(T, P) weights of the knots at times (T,): for linear interpolation, and for holding the previous knot."""
+    """Two (T, P) arrays, the weights of the knots at the times `at`: for linear interpolation, and for
+    holding the previous knot."""
     after = torch.searchsorted(times, at, right=True).clamp(1, len(times) - 1)
     part = ((at - times[after - 1]) / (times[after] - times[after - 1])).clamp(0, 1)
     return _rows(after, part, len(times)), _rows(after, (part >= 1).float(), len(times))

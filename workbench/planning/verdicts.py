@@ -20,10 +20,10 @@ _MIN_FALL_FRACTION = 0.25
 MIN_EPISODES = 3
 """Minimum number of episodes among which a majority counts as evidence."""
 MIN_SEEDS = 8
-"""Minimum number of seeds for which a report without verdicts is evidence: a reward that pays without success shows only
-if some seeds are solved and others are not."""
+"""Minimum number of seeds for which a report without verdicts is evidence of a good reward: a reward that
+pays without success shows only if some seeds are solved and others are not."""
 _LAST_STEPS = 10
-"""Control steps at the end of an episode that are compared, at most half of the episode."""
+"""Number of steps at the end of an episode that the verdicts look at; at most half of the episode's steps."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class RewardVerdict:
     """Id of the rule in the table of rules."""
     message: str
     seeds: tuple[int, ...]
-    """Seeds of the episodes that show it."""
+    """Seeds of the episodes that break the rule."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,8 @@ def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> s
 
 
 def exploited(episodes: PlannedEpisodes) -> RewardVerdict | None:
-    """Episodes without success whose final reward is at least that of successful ones at success."""
+    """Unsolved episodes that earn, in their last steps, at least as much per step as solved episodes earn at
+    success."""
     found = [one for one in episodes.unsolved if _earns_like_success(episodes, one)]
     if not found:
         return None
@@ -147,8 +148,8 @@ def flat(episodes: PlannedEpisodes) -> RewardVerdict | None:
 
 
 def stuck(episodes: PlannedEpisodes) -> RewardVerdict | None:
-    """Unsolved episodes at whose end no rollout earned more than the better of two: holding still, and
-    repeating the previous reward."""
+    """Unsolved episodes at whose end no rollout earned more per step than the better of two: the rollout that
+    holds still, and the step before."""
     found = [
         one
         for one in episodes.unsolved
@@ -237,7 +238,7 @@ VERDICTS: dict[str, Callable[[PlannedEpisodes], RewardVerdict | None]] = {
 
 
 def _end(episode: PlannedEpisode, row: NDArray[Any] | None = None) -> NDArray[Any]:
-    """The last steps of an episode's rewards, or of another row (T,)."""
+    """The values of `row` (T,) at the last steps of the episode; without a row, the rewards."""
     row = episode.reward if row is None else row
     return row[-max(1, min(_LAST_STEPS, episode.steps // 2)) :]
 
@@ -261,8 +262,9 @@ def _spread_a_step(episode: PlannedEpisode) -> NDArray[Any]:
 
 
 def _gain_a_step(episode: PlannedEpisode) -> NDArray[Any]:
-    """(T,) gain per step of the best rollout over the better of holding still and repeating the previous reward: an object may
-    slip while holding still."""
+    """(T,) reward per step of the best rollout, minus the better of two: the reward per step of holding
+    still, and the reward of the step before. Holding still may earn less than the step before, since an
+    object may slip."""
     before = np.concatenate([[-np.inf], episode.reward[:-1]])
     return episode.best / episode.horizon - np.maximum(episode.hold / episode.horizon, before)
 
@@ -280,7 +282,7 @@ def _is_stuck(episodes: PlannedEpisodes, episode: PlannedEpisode) -> bool:
 
 
 def _since(row: NDArray[Any], most: float) -> int:
-    """The step, counted from 1, after which a row stays at or below `most`."""
+    """The first step, counted from 1, from which on a row stays at or below `most`."""
     above = np.flatnonzero(row > most)
     return int(above[-1]) + 2 if len(above) else 1
 

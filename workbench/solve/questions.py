@@ -31,7 +31,7 @@ class PlannedEnv:
     paths: NDArray[np.float32]
     """(P, H + 1, 3) paths of the traced body in some of the rollouts, best first; metres in the env's frame."""
     drawn: tuple[int, ...]
-    """(P,) indices of the rollouts in `paths`."""
+    """(P,) index in `returns` of each rollout in `paths`."""
     traced: str
     """Name of the traced body; empty if the task has no body to trace."""
     seconds: float

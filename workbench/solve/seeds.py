@@ -157,7 +157,7 @@ def _changed(view: SeedsView, **values: Any) -> SeedsView:
 
 @dataclass(frozen=True)
 class _Setup:
-    """Some fields of `solve.job.SolveOptions`. The server cannot import its module."""
+    """Some fields of `solve.job.SolveOptions`, whose module the server cannot import."""
 
     task: str
     out: Path

@@ -54,7 +54,7 @@ class SolveSeedsPanel(PagePart[SessionView]):
         self._session, self._on_look, self._link = session, on_look, link
         self._open: set[str] = set()
         """Ids of unfolded rules."""
-        # If there are rows already, they are shown: the user comes back from a recording.
+        # Unfolded if there are results already: the user comes back from a recording.
         before = session.view().of(SeedsView)
         self._folder = server.gui.add_folder(TITLE, expand_by_default=before.state != "none")
         with self._folder:

@@ -134,7 +134,7 @@ class Solving:
 
 @dataclass(frozen=True)
 class RolloutsStart:
-    """The planning process has not loaded the version with the rollouts' envs yet."""
+    """The planning process must first load the version and build the rollouts' envs."""
 
 
 @dataclass(frozen=True)
@@ -286,8 +286,8 @@ def _changed(solving: Solving, **values: Any) -> Solving:
 class PlanJobs:
     """Performs the effects: one plan at a time. Used on the loop, except `close`.
 
-    A separate process has the same version of the task with the envs of the rollouts. It is started with the first plan
-    and ends some time after the last.
+    A separate process has loaded the same version of the task, and runs the rollouts in envs of its own. It
+    is started with the first plan and ends some time after the last.
     """
 
     def __init__(self, happen: Callable[[SolverEvent], object]) -> None:

@@ -44,7 +44,7 @@ MAX_PATHS = 24
 
 
 class FollowedPlan:
-    """Planned actions in the worker that plays. While it waits for a plan, the worker continues its loop."""
+    """Planned actions in the worker that plays. While a plan is awaited, the worker continues its loop."""
 
     def __init__(self, send: Callable[[PlanWanted | PlanDropped], None]) -> None:
         """
@@ -54,7 +54,7 @@ class FollowedPlan:
         self._send = send
         self._asked: int | None = None
         self._told = False
-        """Whether the server has a request for a plan that was not dropped."""
+        """Whether a request for a plan was sent to the server and has not been dropped since."""
         self._at = -1
         """`Stepped.number` of the moment for which the first of `_actions` is."""
         self._actions: deque[NDArray[np.float32]] = deque()
@@ -138,8 +138,8 @@ def _wanted(opened: OpenedTask, moment: int, envs: tuple[int, ...]) -> PlanWante
 class WorkerPlans:
     """Makes plans with its own rollout envs, which are built at the first request.
 
-    A plan continues the env's last plan if the snapshot is of the same episode, at the step where that plan
-    ended; else a new plan begins.
+    A plan continues the env's last plan if the snapshot is of the same episode, at the step at which the next
+    plan was due; else a new plan begins.
     """
 
     def __init__(self, waits: Callable[[], bool]) -> None:
@@ -152,7 +152,8 @@ class WorkerPlans:
         self._planner: RolloutPlanner | None = None
         self._options = PlanOptions()
         self._next: dict[int, tuple[int, int]] = {}
-        """Seed of the episode, and its control steps at the next plan, by env that has a plan."""
+        """By env that has a plan: seed of its episode, and control step of the episode at which the next plan
+        is due."""
 
     def answer(
         self,
@@ -232,7 +233,7 @@ class WorkerPlans:
 def _for_page(env: int, plan: Plan, steps: int, traced: str) -> PlannedEnv:
     returns = plan.returns
     order = np.argsort(np.where(np.isfinite(returns), -returns, np.inf), kind="stable")
-    # Evenly from the best to the worst, or the page would show only paths similar to the best.
+    # Spread evenly from the best to the worst: otherwise the page would show only paths similar to the best.
     drawn = np.unique(np.linspace(0, len(order) - 1, MAX_PATHS).astype(int))
     paths = np.zeros((0, 0, 3), np.float32) if plan.paths is None else plan.paths[order[drawn]]
     return PlannedEnv(
@@ -251,7 +252,8 @@ def _for_page(env: int, plan: Plan, steps: int, traced: str) -> PlannedEnv:
 
 
 def _body_to_trace(rolled: TaskEnv, name: str) -> int | None:
-    """Index of the body of this name, else of the robot's tool, else of its last link; None if there is none of these."""
+    """Index of the body of this name, else of the robot's tool, else of the scene's last link; None if there
+    is none of these."""
     env = rolled.env
     names = scene_index(env).names
     if name in names:

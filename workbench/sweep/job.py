@@ -30,8 +30,8 @@ from workbench.task.reference import file_and_class, find_module, named_file, sp
 from workbench.task.settings_in_text import Argument, Constant, SettingError, TaskText
 
 _MIN_CHUNKS = 64
-"""Chunks of a long sweep grow until there are about this many of them, since each chunk opens the task once
-in its worker."""
+"""A long sweep gets larger chunks, so that there are only about this many of them: each chunk opens the task
+once in its worker."""
 _STEPS_AFTER_SUCCESS = 5
 """Number of control steps that a planned episode continues after its success, as in `solve.job`."""
 _MAX_NAME_CHARACTERS = 80
@@ -79,7 +79,7 @@ class SweepOptions:
 
     @property
     def chunk(self) -> int:
-        """Number of episodes that a worker runs together. It does not depend on how the job runs."""
+        """Number of episodes that a worker runs together. It is the same for any number of workers."""
         envs = self.options.num_envs
         points = math.prod(len(one.values) for one in self.settings)
         enough = -(-self.seeds * points // (_MIN_CHUNKS * envs)) * envs
@@ -226,7 +226,7 @@ def sweep(
 ) -> SweepReport:
     """Record every point of a sweep. The rows of a point that fails hold the failure.
 
-    Other arguments are as in `record`.
+    The arguments after `what` are as in `record`.
 
     Raises:
         SettingError: as `recordings_of` does.

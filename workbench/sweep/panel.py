@@ -41,7 +41,8 @@ MAX_CLICKABLE_LINES = 64
 MAX_SHOWN_EPISODES = 5
 """Number of best and of worst episodes of a point that are shown."""
 WIDTH, TOP, BOTTOM, SIDE = 500, 34, 196, 34
-"""Sizes in pixels of the plot and of its axes."""
+"""In pixels: width of the plot, y of the upper and lower ends of its axes, and margin beside the outer
+axes."""
 _TERMS = "reward_terms/"
 _RATE = "success"
 
@@ -53,10 +54,10 @@ class Axis:
     name: str
     x: float
     heights: tuple[float | None, ...]
-    """Height of each point in pixels; None for a point without a value."""
+    """For each point of the sweep, y on this axis in pixels; None for a point without a value."""
     ticks: tuple[tuple[str, float, str], ...]
-    """Label and height in pixels of each tick, and the JSON of the setting's value; empty JSON on other
-    axes."""
+    """Label of each tick, its y in pixels, and the setting's value in JSON; an empty text on axes of
+    results."""
 
 
 def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Axis]:
@@ -164,11 +165,11 @@ class Shown:
     """Index of the chosen point. If None, the point of the open episode is shown; without an open episode,
     the best point."""
     only: frozenset[tuple[str, str]] = frozenset()
-    """Shown values by setting; a setting that is missing here shows all values."""
+    """Pairs (setting, value): the values that are shown. A setting without a pair shows all values."""
     pages: Paged = field(default_factory=lambda: Paged(PAGE_ROWS))
 
     def keeps(self, one: PointSummary) -> bool:
-        """Whether the point has the values of `only`."""
+        """Whether the point is shown; see `only`."""
         return all((name, one.values.get(name)) in self.only for name in {name for name, _ in self.only})
 
 
@@ -344,8 +345,8 @@ def _note_html(read: LoadedSweep) -> str:
 def _shown_point(
     read: LoadedSweep, shown: Shown, view: ReviewView, library: Sequence[LibraryRow]
 ) -> PointSummary | None:
-    """The point whose episodes are listed: the chosen one, else that of the open episode, else the best one.
-    If that one is filtered out, the best remaining one."""
+    """The point whose episodes are listed: the chosen point, else the point of the open episode, else the
+    best point. If this point is filtered out, the best of the shown points."""
     by_index: dict[int | None, PointSummary] = {one.index: one for one in read.summaries}
     opened = {one.id for one in view.opened}
     paths = (str(path) for row in library if row.id in opened for path in row.paths)

@@ -15,7 +15,8 @@ _RAYS = 162
 """Number of directions in which walls are looked for."""
 _MAX_TRIANGLES = 50_000
 _MIN_WALL_SHARE, _MIN_OPEN_SHARE = 0.6, 0.03
-"""In a hollow mesh, minimum shares of the rays from inside that meet a wall, and that meet nothing."""
+"""Of the rays from inside a hollow mesh: minimum share that meets a wall, and minimum share that meets
+nothing."""
 
 
 def triangles_in(file: str, more_than: int) -> int | None:

@@ -12,8 +12,8 @@ from workbench.checks.results import Seen
 
 @dataclass(frozen=True)
 class OverSeeds:
-    """A `Check` in two parts. A part of the seeds must not decide the result: a reward that is constant over
-    32 seeds may vary in the next seeds."""
+    """A `Check` in two steps, `see` and `judge`. No part of the seeds may decide the result alone: a reward
+    that is constant over 32 seeds may vary in the next seeds."""
 
     see: Callable[[Checkup], Iterator[Seen]]
     """Looks at the seeds of a checkup, and gives what it saw as rows."""
@@ -66,6 +66,6 @@ def tried(seen: Iterable[Seen], *names: str) -> int:
 
 
 def first_kind(seen: Iterable[Seen]) -> Seen | None:
-    """The row of the first kind of episodes that has breaches, if the rows are named by kinds of episodes;
-    None if no kind has a breach."""
+    """Of rows that are named by kinds of episodes: the row of the first kind with a breach; None if no kind
+    has a breach."""
     return next((row for row in together(seen) if row.count), None)

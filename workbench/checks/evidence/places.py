@@ -175,8 +175,8 @@ class Places:
         Args:
             name: as in `SceneIndex.names`.
             hooks: functions that are searched for a line that sets the pose of the attribute that holds the
-                body. If there is no such line, the result is the first line of any function that names the
-                body; if there is none of these either, the ``def`` line of a hook.
+                body. If there is no such line, the result is the first line, in any function, that names the
+                body; without such a line, the ``def`` line of a hook.
         """
         owner = name.split("/", 1)[0]
         attributes = set(self._attributes_of(owner))

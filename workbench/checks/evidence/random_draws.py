@@ -32,8 +32,8 @@ _MANISKILL = "mani_skill.envs.utils.randomization."
 
 
 def global_draw(node: ast.AST, module: Module) -> str | None:
-    """The call as text, such as ``np.random.rand()``, if the node draws from NumPy's or Python's global generator, or from a
-    new one without a seed; no reset seeds these."""
+    """The call as text, such as ``np.random.rand()``, if the node draws from NumPy's or Python's global
+    generator, or from a new generator without a seed. No reset seeds these generators."""
     if not isinstance(node, ast.Call):
         return None
     written, full = _names(node, module)

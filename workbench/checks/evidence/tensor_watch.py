@@ -41,8 +41,8 @@ _PASSED_THROUGH = ("mani_skill.utils.common", "mani_skill.utils.structs.pose")
 """Modules whose copies count for the line that calls them: ``pose.sp``, ``common.to_numpy(x)``."""
 _STATE = "_workbench_device"
 _OWN = "own"
-"""State of a tensor on the env's device. The state of a tensor that would stay on the host is the `Place` that made it. A
-tensor of unknown origin (``torch.Tensor([1])``) has no state."""
+"""State of a tensor on the env's device. The state of a tensor that would stay on the host is the `Place` of
+the line that made it. A tensor of unknown origin (``torch.Tensor([1])``) has no state."""
 _HOST = torch.device("cpu", 0)
 """What ``tensor.device`` gives for a host tensor, so that a tensor that is made on the device of a host
 tensor counts as a host tensor too. Unlike the env's device, it has an index."""
@@ -263,7 +263,8 @@ def _tensors(values: Iterable[Any]) -> Iterator[torch.Tensor]:
 
 
 def _device_of(args: Any, kwargs: Any) -> str | None:
-    """``host`` or ``own``; None if no device is given."""
+    """The device that the arguments of an operation ask for: ``host`` or ``own``; None if they name no
+    device."""
     for value in (*args[1:], *kwargs.values()):
         if isinstance(value, torch.Tensor):
             return "host" if _is_host(value) else "own"

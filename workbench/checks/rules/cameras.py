@@ -33,7 +33,7 @@ from workbench.pictures.visibility import (
 from workbench.task.blame import blamed
 
 RESETS = 4
-"""Resets of `Checkup.pictured` whose pictures are measured."""
+"""Number of resets of `Checkup.pictured` after which pictures are measured."""
 MAX_OBJECTS = 30
 """Maximum number of objects that are looked for: each takes an extra picture."""
 MISSED_SHARE = 0.25
@@ -330,7 +330,7 @@ def hook_configs(checkup: Checkup) -> dict[CameraKey, Any]:
 
 
 def sensor_reports(checkup: Checkup) -> dict[CameraKey, CameraReport]:
-    """Evidence for `Checkup.look`: what each sensor camera sees after each of the `RESETS`."""
+    """Evidence for `Checkup.look`: what each sensor camera sees after each of `RESETS` resets."""
     task = checkup.pictured
     sensors: list[CameraKey] = [key for key in cameras_of(task.env) if key[0] == "sensor"]
     if not sensors:
@@ -354,7 +354,7 @@ def _measured(env: Any, e: int, key: CameraKey, objects: list[SceneObject]) -> C
 
 
 def _objects(env: Any) -> list[SceneObject]:
-    """The robots, the scenery and the first other objects."""
+    """The robots, the scenery and the first `MAX_OBJECTS` of the other objects."""
     scenery = [thing for thing in list_objects(env) if thing.robot or thing.scenery]
     return [*scenery, *_drawn(env)[:MAX_OBJECTS]]
 

@@ -187,7 +187,7 @@ def _is_count(node: ast.expr) -> bool:
 
 
 def _is_loop(checkup: Checkup, place: Place) -> bool:
-    """Whether the line has a loop, and not ``x, y = tensor``."""
+    """Whether a loop or comprehension iterates at this line, in contrast to ``x, y = tensor``."""
     module: Module | None = next((each for each in checkup.places.modules if each.file == place[0]), None)
     return module is not None and any(
         isinstance(node, _LOOPS) and node.iter.lineno <= place[1] <= (node.iter.end_lineno or 0)

@@ -158,7 +158,8 @@ def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _misspelt(entries: Collection[str]) -> Iterator[tuple[str, str]]:
-    """Pairs (entry, name that ManiSkill reads): the entry has nearly that name, and no entry has it."""
+    """Pairs (entry, name that ManiSkill reads): the entry has nearly that name, and no entry has exactly that
+    name."""
     for name in entries:
         for known in READ_BY_MANISKILL:
             close = difflib.SequenceMatcher(None, name.lower(), known).ratio() >= 0.8
@@ -204,8 +205,8 @@ def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def see_success_and_fail(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each kind of rollouts, up to the first breach: the number of states with both success and
-    fail, and whether any state has success and any has fail."""
+    """A row for each kind of rollouts, up to the first kind with a breach: the number of states with both
+    success and fail, whether any state has success, and whether any state has fail."""
     for episodes in checkup.rollouts:
         success, fail = _flag(episodes, "success"), _flag(episodes, "fail")
         both = success & fail
@@ -325,8 +326,8 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_entries_finite(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each kind of rollouts, and a row for each entry of ``evaluate()`` that is not finite, with
-    the first kind in which it is not."""
+    """A row for each kind of rollouts, and a row for each entry of ``evaluate()`` that is not finite, about
+    the first kind in which it is not finite."""
     reported: set[str] = set()
     for episodes in checkup.rollouts:
         numbers = float(sum(rows.dtype.kind == "f" for rows in episodes.evaluate.values()))

@@ -162,7 +162,7 @@ def _named_files(checkup: Checkup) -> Iterator[NamedFile]:
 
 
 def _branches(function: ast.FunctionDef) -> set[ast.AST]:
-    """The nodes that run under a condition."""
+    """The nodes within an ``if``, a conditional expression or a ``try``."""
     return {
         part
         for node in ast.walk(function)
@@ -190,8 +190,8 @@ def _paths_in(node: ast.AST, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
 
 
 def _loaded_by(call: ast.Call, values: _Values) -> Iterator[tuple[ast.AST, Path]]:
-    """The files that a call reads: its first argument, and ``filename=``, ``path=`` or ``file=``; each only
-    if it is a name, a constant or a relative path."""
+    """The files that a call reads, from its first argument and from ``filename=``, ``path=`` or ``file=``. An
+    absolute path counts only if the argument is a name or a constant: `_paths_in` finds the others."""
     name = getattr(call.func, "attr", getattr(call.func, "id", ""))
     if name not in _LOADS and not name.endswith("_from_file"):
         return

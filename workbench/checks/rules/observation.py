@@ -22,8 +22,8 @@ HUGE_NUMBER = 1000.0
 
 
 def see_observation_finite(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each leaf in random rollouts; if all are finite, one for the first leaf that is not finite in
-    odd states."""
+    """A row for each leaf in random rollouts; if all leaves are finite there, also a row for the first leaf
+    that is not finite in odd states."""
     finite = True
     for name, rows in _leaves(checkup).items():
         bad = np.logical_or.reduce(~np.isfinite(rows), axis=2)
@@ -130,7 +130,7 @@ def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_observation_huge(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each leaf in random rollouts, with the states in which it is huge."""
+    """A row for each leaf in random rollouts, with the number of states in which it is huge."""
     for name, rows in _leaves(checkup).items():
         size = np.abs(np.nan_to_num(rows, posinf=0, neginf=0))
         huge = size.max(axis=2) > HUGE_NUMBER

@@ -27,7 +27,8 @@ from workbench.task.problem import TaskError
 OVERLAP_METRES = 0.002
 """Depth in metres that two bodies may overlap: contacts of bodies at rest are about that deep."""
 MOVED_METRES, TURNED_RADIANS = 0.02, 0.35
-"""Metres and radians that a body may move in a second: a body that is put down 1 cm above the table may settle."""
+"""Metres that a body may move and radians that it may turn in a second: a body that is put down 1 cm above
+the table may settle."""
 MOVING_SPEED = 0.01
 """Velocity after a reset, in m/s or rad/s, above which the task wants the body to move."""
 SAG_LIMITS = {"prismatic": 0.02, "revolute": 0.1}
@@ -265,7 +266,7 @@ def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _whole_batches_at(function: ast.FunctionDef, lines: Collection[int | None]) -> Iterator[ast.AST]:
-    """Calls that make a tensor of self.num_envs rows, if these lines use more of it than the rows of
+    """Calls that make a tensor of self.num_envs rows, if these lines use more of the tensor than the rows of
     ``env_idx``."""
     made: dict[str, ast.AST] = {}
     """The call that made the tensor of a local variable or attribute of self, by its name."""
@@ -297,8 +298,8 @@ def _name_of(node: ast.AST) -> str:
 
 
 def _uses(node: ast.AST, made: Mapping[str, ast.AST]) -> Iterator[ast.AST]:
-    """Calls that make a whole batch (`_whole_batches`) that this part of the source uses: it contains the
-    call, or it names its result. Uses that take only some rows do not count."""
+    """Calls that make a whole batch (`_whole_batches`), if this part of the source contains the call or names
+    its result. Uses that take only some rows of the batch do not count."""
     batches = {id(batch): batch for batch in _whole_batches(node)}
     waiting: list[ast.AST] = [node]
     while waiting:
@@ -461,7 +462,8 @@ def _quaternions(checkup: Checkup) -> Iterator[tuple[str, NDArray[np.float32], P
 
 
 def see_robot_holds(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each driven joint, while the controllers hold their pose for a second."""
+    """A row for each driven joint: how far it moves while the controllers hold the pose of the reset for a
+    second."""
     env = checkup.task.env
     if not checkup.task.parts:
         raise NotApplicable("the task has no robot")
@@ -538,7 +540,7 @@ def robot_holds(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each dynamic body, with its distance from the robot's base."""
+    """A row for each dynamic body, with its largest distance from the robot's base over all resets."""
     task = checkup.task
     robots = agents(task.env)
     if not robots:
@@ -547,7 +549,7 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
         raise NotKnown("the task has several robots, and which of them must touch which body is not known")
     if not _is_fixed(robots[0].robot):
         raise NotApplicable("the robot moves around")
-    tool = getattr(robots[0], "tcp", None)  # an error in a property of the author's is reported
+    tool = getattr(robots[0], "tcp", None)  # an error in the author's property is reported
     if not isinstance(tool, Link):
         raise NotKnown("the robot has no tcp, of which the reach is measured")
     base, reach = _reach(checkup, robots[0].robot, tool)
@@ -632,7 +634,7 @@ def _reach(checkup: Checkup, articulation: Any, tool: Any) -> tuple[NDArray[np.f
 
 
 def where_placed(checkup: Checkup, body: str) -> Place | None:
-    """The author's line that sets the body's pose in a reset; else the one that makes or places the body."""
+    """The author's line that sets the body's pose in a reset; else the line that `Places.body` finds."""
     owner = body.split("/", 1)[0]
     lines = [each.place for each in checkup.placed if each.name == owner and each.place is not None]
     return lines[-1] if lines else checkup.places.body(body, "_initialize_episode")

@@ -27,7 +27,7 @@ PARTIAL_RESETS = 6
 REPLAYED_STEPS = 10
 """Number of steps that are made twice."""
 SAME_TOLERANCE = 1e-4
-"""Maximum difference of two numbers that count as equal: poses come back rounded."""
+"""Maximum difference of two numbers that count as equal: a pose that is set and read again is rounded."""
 RESTORED_TOLERANCE = 1e-3
 """Maximum difference of two numbers that count as equal after a state dict is restored: restoring computes
 link poses from joints. Relative for numbers above 1."""
@@ -109,7 +109,7 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     checkup.require_task()
     task, seeds = checkup.task, next(checkup.batches())
     first = _seen(task, checkup.reset(task, seeds))
-    # Reset other seeds in between: a generator of the task's own might be at the same place again.
+    # Reset other seeds in between: otherwise a generator of the task's own might be in the same state again.
     checkup.reset(task, [seed + 5000 for seed in seeds])
     rng = np.random.default_rng(2)
     for _ in range(3):
@@ -327,7 +327,7 @@ def _rescored(task: TaskEnv) -> Numbers:
 
 
 def _observed(task: TaskEnv) -> Numbers:
-    """The leaves of the observation; a flat one is split by its names."""
+    """The leaves of the observation; a flat observation is split by its names."""
     found: Numbers = {}
     for name, value in read_obs(task).items():
         names = flat_names(task, task.obs) if name == "obs" else None
@@ -347,7 +347,7 @@ def _episode(checkup: Checkup, task: TaskEnv, seeds: list[int]) -> list[Numbers]
 
 
 def _differing(one: Numbers, other: Numbers, tolerance: float) -> dict[str, float]:
-    """Largest difference by name of the numbers that differ; infinite if their shapes differ."""
+    """By name, the arrays that differ, each with its largest difference; infinite if the shapes differ."""
     found: dict[str, float] = {}
     for name in one.keys() & other.keys():
         a, b = one[name], other[name]

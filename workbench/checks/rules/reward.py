@@ -187,7 +187,7 @@ def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def paid_at_success(seen: OddStates, mode: str) -> float | None:
-    """The reward at success if it is the same number in all states; else None."""
+    """The reward with ``info["success"]`` set to true, if it is the same number in all states; else None."""
     told = np.concatenate([*seen.told.get(mode, ()), np.zeros(0)])
     if not len(told) or not np.isfinite(told).all() or np.ptp(told) > ROUNDING:
         return None
@@ -257,7 +257,7 @@ def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] |
 def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
     """For each kind of rollouts and each batch of odd states: a row with the number of compared episodes and
     the range of the rewards, and a row for each episode whose reward is higher elsewhere than at success. One
-    more row for the reward at success, if it is the same number in all states."""
+    more row about `paid_at_success`, unless that is None."""
     _require_dense(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     every = _scored(checkup)
@@ -433,7 +433,7 @@ class _Scored:
     of: str
     """The kind of episodes, or which odd states."""
     short: NDArray[np.bool_] | None = None
-    """(T,) whether an odd state is short of a success; None for episodes, which reach success by steps."""
+    """(T,) whether each odd state was made between the reset and a success (`SHORT`); None for rollouts."""
 
     def tried(self, column: int) -> bool:
         """Whether an episode has a success, and states near it without success."""

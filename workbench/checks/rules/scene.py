@@ -117,8 +117,8 @@ def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _is_unposed(checkup: Checkup, each: Built) -> bool:
-    """Whether a body should have an initial pose and has none. A body that stays at the origin needs none, and a kinematic body
-    does harm only if it is built inside another body."""
+    """Whether a body should have an initial pose and has none. A body that stays at the origin needs no pose,
+    and a kinematic body does harm only if it is built inside another body."""
     if each.quaternion is not None or each.kind == "static":
         return False
     if each.kind == "kinematic" and each.name not in _inside_others(checkup):
@@ -595,8 +595,8 @@ def _name_on(env: Any, thing: Any) -> str:
 
 
 def _hiding_line(checkup: Checkup, thing: Any) -> Place | None:
-    """The line that puts a body into ``_hidden_objects``: the first that names the body; if none does, the
-    first of all."""
+    """The line that puts a body into ``_hidden_objects``: the first line with this name that also names the
+    body, else the first line with this name."""
     name = _name_on(checkup.task.env, thing)
     lines = [
         (name != "" and name in ast.unparse(statement), module.place(statement))
@@ -651,8 +651,8 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def see_env_spacing(checkup: Checkup) -> Iterator[Seen]:
-    """A row for each body that goes further than half of the spacing between envs, in resets and random
-    episodes."""
+    """A row for each body that is ever further from the middle of its env, in x or y, than half of the
+    spacing between envs. Looks at resets and random episodes."""
     index, half = scene_index(checkup.task.env), checkup.task.env.sim_config.spacing / 2
     moving = [i for i, kind in enumerate(index.kinds) if kind in ("dynamic", "link") and not index.hidden[i]]
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])[:, :, moving]
@@ -738,8 +738,8 @@ def _merges(checkup: Checkup) -> list:
 
 
 def _own(checkup: Checkup) -> Iterator[Built]:
-    """Bodies that the author's files build, without robots; a body that is built once for each env is given
-    once."""
+    """Bodies that the author's files build, except robots. A body that is built once for each env is given
+    only once."""
     lines = set()
     for each in _builds(checkup):
         if each.place is not None and not each.of_robot and (each.place, each.name) not in lines:
@@ -752,7 +752,7 @@ def _places_of(checkup: Checkup) -> dict[str, Place | None]:
 
 
 def _mesh_files(checkup: Checkup, kind: str) -> dict[str, Built]:
-    """The files of the task's bodies that are used as this kind of shape, each with the first body that uses it."""
+    """The files that bodies of the task use as this kind of shape, each with the first body that uses it."""
     found: dict[str, Built] = {}
     for each in _own(checkup):
         for shape in each.collision + each.visual:

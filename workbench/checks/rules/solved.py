@@ -1,4 +1,4 @@
-"""Checks of the reward on episodes that are solved by planning: what the rollouts of each step earned."""
+"""Checks of the reward on planned episodes, by what the rollouts of each step earned."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ def _verdict(checkup: Checkup, rule_id: str, hook: str) -> Iterator[Found | Note
 
 
 def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
-    """Evidence for `Checkup.look`: episodes of the first seeds, each to its fail, its time limit, or
+    """Evidence for `Checkup.look`: episodes of the first seeds. Each ends at its fail, at its time limit, or
     `STEPS_AFTER_SUCCESS` steps after its success.
 
     Raises:

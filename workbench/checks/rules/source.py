@@ -546,7 +546,7 @@ def _names_of(checkup: Checkup, cls: type) -> set[str]:
 
 
 def _guarded(body: list[ast.stmt]) -> Iterator[ast.AST]:
-    """The nodes behind a condition about the backend, in these statements and below."""
+    """The nodes of these statements that a condition about the backend or a ``try`` guards."""
     behind = False
     for statement in body:
         if behind:
