@@ -37,9 +37,8 @@ from workbench.task.reference import find_module, named_file, split_reference
 class ActionChooser:
     """Chooses the action of every control step for the page's batch.
 
-    Random actions and the seeds of new episodes come from one generator for the whole batch, so that a reset
-    with the session's seed makes all later actions and seeds repeat. The random actions of one env therefore
-    depend on the number of envs.
+    One generator for the whole batch draws the random actions and the seeds of new episodes. After a reset
+    with the session's seed, all of them repeat. The random actions of one env depend on the number of envs.
     """
 
     def __init__(self, folder: CurrentFolder) -> None:
@@ -77,7 +76,8 @@ class ActionChooser:
         """Set the source of the actions.
 
         Args:
-            policy: the `reference` of `load_policy`. If it is None or empty, only `next_action` raises.
+            policy: the `reference` of `load_policy`. If it is None or empty, `use` does not raise, but
+                `next_action` does.
             task_folder: as in `load_policy`.
 
         Raises:
@@ -187,7 +187,8 @@ class RecordActionChooser:
     def __init__(self, chooser: ActionChooser | None, planned: PlannedActions | None = None) -> None:
         """
         Args:
-            chooser: chooses actions that are neither random, planned nor from a file; None for those three.
+            chooser: chooses the actions, unless they are random, planned or from a file; None in these three
+                cases.
             planned: plans the actions; None if they are not planned.
         """
         self._chooser, self._planned = chooser, planned
@@ -195,7 +196,7 @@ class RecordActionChooser:
         self._given: dict[int, RecordedRun] = {}
 
     def begin(self, env: int, seed: int, given: RecordedRun | None) -> str:
-        """Begin an episode in this env; returns the name of its source of actions for the recording.
+        """Begin an episode in this env. Returns the name of the source of its actions, for the recording.
 
         Args:
             given: run of a file; its actions are replayed. None if the actions do not come from a file.
@@ -418,10 +419,10 @@ def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
 
     ``.npy``: one array (T, A) for all episodes, or an array (E, T, A) with one (T, A) per episode. ``.npz``:
     an array (T, A) per episode. ``.h5``: trajectories of ManiSkill, or a recording of the workbench; their
-    runs also have a seed and env states. The states correct a replay in which the actions lead to other
-    states than the recorded ones, as on another machine, in another version, or in a GPU batch that was
-    seeded as a whole. As in ManiSkill's ``replay_trajectory``, an episode of a file does not stop at success
-    or at the time limit.
+    runs also have a seed and env states. The states correct a replay whose own states deviate from the
+    recorded ones, for example on another machine, in another version, or in a GPU batch that was seeded as a
+    whole. As in ManiSkill's ``replay_trajectory``, an episode of a file does not stop at success or at the
+    time limit.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -30,21 +30,22 @@ from workbench.task.watch import SourceWatcher
 
 Policy = Callable[[Any], Any]
 """Takes the task's batched observation in the task's ``obs_mode``. Returns an array or tensor: (N, A), or one
-action (A,) for all envs. For several robots it returns a dict."""
+action (A,) for all envs. For several robots it returns a dict with one of these per robot."""
 
 _warned: set[Path] = set()
 """Files named like a library, for which a warning was printed."""
 
 
 class NoPolicy(ValueError):
-    """The reference names no policy; the message gives the reason. Not raised by the author's code."""
+    """The reference names no policy; the message gives the reason. The author's code never raises it."""
 
 
 def find_policy(reference: str, task_folder: Path | None = None) -> tuple[str | Path, str]:
     """The module name or file path, and the function name, in `reference`. Imports nothing.
 
     Args:
-        task_folder: the task's folder. A relative file is looked up in the current folder first, then here.
+        task_folder: the task's folder. A relative file is looked up in the current folder first, then in
+            `task_folder`.
 
     Raises:
         NoPolicy: the reference is not of the form ``module:function`` or ``file.py:function``, or the file
@@ -128,8 +129,8 @@ def policy_problem(
 
     Args:
         task_folder: as in `load_policy`.
-        policy: the function, if it was imported. If the traceback has no line of the author's, such as for a
-            wrong return value, the problem is at the function's ``def``.
+        policy: the function, if it was imported. If the traceback has no line of the author's (after a wrong
+            return value, for example), the problem is at the function's ``def``.
     """
     if isinstance(error, NoPolicy):
         return Problem("policy", str(error), None, None, None, "")
@@ -193,8 +194,8 @@ def list_policies(here: Path, task_folder: Path | None) -> tuple[str, ...]:
     folders = [here.resolve()] if task_folder is None else [here.resolve(), task_folder.resolve()]
     for folder in folders if folders[0] != folders[-1] else folders[:1]:
         for file in _python_files(folder):
-            # Same lookup as in `find_policy`: a file of the first folder hides a file of the same name in the
-            # second.
+            # As in `find_policy`, a file of the first folder hides a file of the same name in the second, so
+            # the second one is listed by its full path.
             name = str(file) if file.name in taken else file.name
             taken.add(file.name)
             found += [(not likely, f"{name}:{function}") for function, likely in _functions_that_fit(file)]

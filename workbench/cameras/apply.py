@@ -220,7 +220,8 @@ def _take_suggestion(studio: Studio, number: int, run: Run, now: Now) -> Change:
 
 
 def _draw_preview(studio: Studio, run: Run) -> Change:
-    """Draw a preview if one is wanted and its step or question has changed since the last preview."""
+    """Draw a preview if one is wanted, unless the last preview was drawn at the same step and by the same
+    question."""
     key, step = studio.selected, shown_step(run)
     settings = None if key is None else studio.placements.now(key)
     if studio.preview_scale == 1.0 or key is None or settings is None or refusal(run, key):

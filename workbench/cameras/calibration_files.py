@@ -33,11 +33,11 @@ Floats = NDArray[np.float64]
 FORMAT = "workbench-cameras"
 MAX_CHARACTERS = 100_000
 MAX_YAML_CHARACTERS = 20_000
-"""Limit for YAML: a calibration has about 2,000, and Python's YAML parser takes 20 ms for 1,000
-characters."""
+"""Maximum number of characters of a YAML text. A calibration has about 2,000. Python's YAML parser takes 20
+ms for 1,000."""
 # ManiSkill's `intrinsic_cv` counts pixels from the outer edge of the first pixel (the middle of a picture is
-# W / 2), but OpenCV's calibration counts from the first pixel's centre. Files name every convention, since an
-# ``extrinsic`` without a named convention may be any of four matrices.
+# W / 2), but OpenCV's calibration counts from the first pixel's centre. Exported files name every convention,
+# since an ``extrinsic`` without a named convention may be any of four matrices.
 PIXELS = "pixels from the outer edge of the top left pixel; OpenCV's own calibration gives half a pixel less"
 CONVENTIONS = {
     "length": "metres",

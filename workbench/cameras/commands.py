@@ -388,7 +388,7 @@ class ShowSearchBox(Command, frozen=True):
 
 
 MAX_SEARCH_RESETS = 256
-"""Maximum number of resets that a placement is searched over."""
+"""Maximum number of fresh resets that a search for placements covers."""
 
 
 class ChooseSearchResets(Command, frozen=True):

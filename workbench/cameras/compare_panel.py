@@ -36,8 +36,8 @@ PICTURE_PIXELS = 256
 
 
 class CameraCompare(PagePart[SessionView]):
-    """The Compare folder: the current placement next to the file's, the file's before its last change, or the
-    one that was kept as A."""
+    """The Compare folder: the current placement next to a second one. The second is the placement in the
+    file, the one before the file's last change, or the one that was kept as A."""
 
     does = (ChooseCompared, KeepPlacement, ComparePlacements, ReturnToKept)
 
@@ -46,7 +46,7 @@ class CameraCompare(PagePart[SessionView]):
         self._kept: dict[CameraKey, CameraSettings] = {}
         self._in_file: dict[CameraKey, CameraSettings] = {}
         self._before: dict[CameraKey, CameraSettings] = {}
-        """Placement that each camera had in the file before the file's placement last changed."""
+        """Previous placement in the file of each camera whose placement changed there."""
         self._asked: tuple[CameraKey, CameraSettings, CameraSettings, str] | None = None
         self._other: Other = "file"
         with server.gui.add_folder("Compare", expand_by_default=False) as self.folder:

@@ -167,8 +167,8 @@ NEW = CameraSettings(
     far=100.0,
     shader_pack="minimal",
 )
-"""Settings of a new camera if the task has no camera of its kind, as in ManiSkill's own tasks. The pose is
-replaced."""
+"""Settings of a new camera if the task has no camera of its kind without a mount. They are as in ManiSkill's
+own tasks, but the pose is replaced."""
 NEW_NAMES = {"sensor": "side_camera", "human": "render_camera"}
 PREVIEW_PIXELS = 256
 """Longer side of the new camera's picture."""
@@ -285,10 +285,12 @@ class WriteToFile(PagePart[SessionView]):
         stale = is_stale(studio)
         can_place = chosen is not None and not chosen.refused
         of_members = edit_state.what != "edit"
-        # Hidden while "Save" is shown: a second press must not write a diff that the user has not read.
+        # "Show the change" is hidden while "Save" is shown: a second press on it must not write a diff that
+        # the user has not read.
         can_plan = can_place and (edit_state.stage != "planned" or stale or of_members)
         wants_plan = can_plan and chosen is not None and chosen.moved and edit_state.stage != "written"
-        # Disabled, not hidden: a button that appears with the first movement would push the others away.
+        # Before the first movement the button is disabled, not hidden: if it appeared with the movement, it
+        # would push the other buttons away.
         plan = tool("Show the change", PlanCameraChange(), off=not wants_plan, tone="main")
         self._plan.visible, self._plan.content = can_plan, tools_html([plan])
         for change, here in ((self._change, not of_members), (self._member_change, of_members)):
@@ -339,7 +341,8 @@ DISTANCE_FACTOR = 1.25
 MIN_DISTANCE_METRES = 0.6
 """Minimum distance: a hand that reaches for one small object must be in the picture too."""
 KEEP_VIEW_FACTOR = 1.5
-"""The page's viewpoint is kept if its distance is at most this factor times the wanted distance."""
+"""The page's viewpoint is kept if its distance from the objects is at most this factor times the wanted
+distance."""
 MIN_TARGET_METRES = 0.1
 MAX_NAMES = 3
 

@@ -70,7 +70,7 @@ UNITS_HINT = "Units of the pasted calibration. Shown and downloaded poses, and o
 class CameraExport(PagePart[SessionView]):
     """The folder "Matrices and files", in the present container.
 
-    A matrix does not state its direction and the convention of the camera's axes: both are chosen here, for
+    A matrix states neither its direction nor the convention of the camera's axes: both are chosen here, for
     shown and for pasted matrices.
     """
 

@@ -20,8 +20,8 @@ CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 )
 MAX_IMAGE_PIXELS = 128
-"""Target for the longer side of a frustum's picture. A larger picture is shrunk by a whole factor, so that it
-stays below twice this."""
+"""Target for the longer side of a frustum's picture. A larger picture is shrunk by a whole factor, so its
+longer side stays below twice this number."""
 SMALL_METRES, LARGE_METRES = 0.07, 0.14
 """Depth of a frustum: small for one env, large for a view of the whole grid."""
 COLOURS: dict[CameraKind, tuple[int, int, int]] = {"sensor": (245, 159, 0), "human": (132, 94, 247)}
@@ -153,7 +153,7 @@ def _distance_to(handle: viser.CameraFrustumHandle, origin: NDArray, direction: 
     x = y * handle.aspect
     depth = np.mean(handle.scale) / np.cbrt(x * y / 3)
     sides = np.array([[0, 0, 1], [1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y]])
-    # A point is inside where `sides @ point <= room`.
+    # The point `start + v` is inside if `sides @ v <= room`.
     room = np.array([depth, 0, 0, 0, 0]) - sides @ start
     speed = sides @ along
     if (room[speed == 0] < 0).any():

@@ -49,7 +49,7 @@ class JobResult:
 
     Each folder has a `JobResult` under its own button. Only the one whose button was pressed last shows the
     running job. A single bar for all folders would push the pressed button away if it were at the top, and
-    would not be visible at the end.
+    would be out of sight if it were at the end.
     """
 
     _asked_last: ClassVar[JobResult | None] = None

@@ -349,7 +349,7 @@ def _with_size(settings: CameraSettings, sized: CameraSettings) -> CameraSetting
 
 
 def _angles(settings: CameraSettings) -> list[float]:
-    # 180 and -180 degrees are equal; the field would flicker between the two.
+    # 180 and -180 degrees are the same angle; without this, the field would flicker between the two.
     return [180.0 if round(a, DEGREES) == -180 else a for a in rpy_of(settings.quaternion)]
 
 

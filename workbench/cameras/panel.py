@@ -48,8 +48,8 @@ KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "human view"}
 class CameraImage:
     """A picture of a camera in a container, created with the first picture.
 
-    Pictures in quick succession are sent at the size at which the panel shows them; the last one is then sent in full size,
-    for opening it large.
+    Pictures in quick succession are sent at the size at which the panel shows them; the last one is then sent
+    in full size, so that it can be opened large.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class CamerasPanel:
     Args:
         no_camera: The note for a task without cameras.
         studio_shows: Returns the modality that the Studio shows of the camera that is being placed.
-        is_shown: Returns whether a page may show the panel and the Studio; otherwise few pictures are sent.
+        is_shown: Returns whether any page may show the panel and the Studio; if not, few pictures are sent.
     """
 
     does = (ShowPictures,)

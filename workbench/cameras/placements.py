@@ -14,7 +14,8 @@ from workbench.pictures.camera_conventions import axes_of
 
 _MAX_UNDO_STEPS = 500
 MIN_TARGET_METRES, MAX_TARGET_METRES, DEFAULT_TARGET_METRES = 0.1, 3.0, 1.0
-"""Limits and default of the distance from the eye to the target, for a camera without a target."""
+"""Limits and default of the distance from the eye to the target, for a camera whose settings have no
+target."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,9 @@ class Placements:
     """Placements of cameras, with undo and redo. Methods that change something return a new value.
 
     An undo step has a camera's full settings before and after the step, so it can be undone even if the file
-    has changed since. A gesture is one step, such as a drag through a hundred positions. When a new version
-    is loaded, placements that are not in the file stay, except for cameras whose settings changed in the
-    file: the author's change wins, and Undo restores the placement.
+    has changed since. A whole gesture, such as a drag through a hundred positions, is one step. When a new
+    version is loaded, placements that are not in the file stay, except for cameras whose settings changed in
+    the file: the author's change wins, and Undo restores the placement.
     """
 
     in_file: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
@@ -132,7 +133,7 @@ class Placements:
         self, key: CameraKey, written: CameraSettings, in_file: CameraSettings
     ) -> Placements | None:
         """Handle a revert of a written placement: use the file's settings, and let Undo restore the
-        placement. Returns None if the camera was placed elsewhere since it was written.
+        placement. Returns None if the camera was placed elsewhere after that placement was written.
 
         Args:
             written: the settings that were removed from the file.

@@ -51,7 +51,8 @@ class Snap:
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame in which a camera's pose is given (its mount's, else the env's), as placed in the 3D view."""
+    """The frame in which a camera's pose is given (its mount's, else the env's), and the place of this frame
+    in the 3D view."""
 
     mount: NDArray[np.float32] | None
     """(7,) pose of the link that carries the camera, in the env's frame; None for a camera without a mount."""
@@ -81,7 +82,8 @@ class Frame:
         return moved if distance is None else replace(moved, distance=max(distance, 1e-3))
 
     def turned_to(self, settings: CameraSettings, target: ArrayLike) -> CameraSettings:
-        """`settings` rotated to look at a target (3,) in the frame of the camera's position.
+        """`settings` rotated to look at a target (3,) that is given in the same frame as the camera's
+        position.
 
         Raises:
             ValueError: the target is at the camera's position.
@@ -90,7 +92,8 @@ class Frame:
         return self.from_view(settings, looking_at(pose, pose[:3], there), math.dist(there, pose[:3]))
 
     def point_to_view(self, point: ArrayLike) -> Floats:
-        """(3,) position in the view of a point (3,) in the frame of the camera's position."""
+        """(3,) position in the view of a point (3,) that is given in the same frame as the camera's
+        position."""
         there = np.asarray(point, np.float64)
         if self.mount is not None:
             there = compose(self.mount, make_pose(there, (1, 0, 0, 0)))[:3]

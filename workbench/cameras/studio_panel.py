@@ -304,7 +304,8 @@ class StudioPanel(PagePart[SessionView]):
         )
 
     def _handles_of(self, scale: float) -> str:
-        """HTML of the buttons for the gizmos (pose or eye and target, axes, snap) and the preview's size."""
+        """HTML of the buttons for the gizmos (what they move, their axes, their snap steps) and for the
+        preview's size."""
         rows = [
             _choice(
                 "Handles",

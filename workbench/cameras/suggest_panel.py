@@ -37,13 +37,14 @@ from workbench.pictures.camera_report import OfferedPlacement
 from workbench.task.description import TaskDescription
 
 BOX_METRES, MOUNTED_BOX_METRES = 0.3, 0.1
-"""Distance from the eye to each side of the initial box; less for a mounted camera, which must stay near its
-body."""
+"""Distance from the eye to each side of the initial box; less for a mounted camera, which must stay near the
+body that carries it."""
 MAX_LINKS = 12
 """If an object has at most this many links, the links are offered too; otherwise only the object is
 offered."""
 FIRST_ROBOT_LINKS = 4
-"""Number of a robot's links that are offered at first, those of its hand; the others are offered on demand."""
+"""Number of links of the robots that are offered at first, beginning with the hands. The others are offered
+on demand."""
 PICTURE_PIXELS = 160
 MIN_PERFECT_SCORE = 0.995
 """Scores of at least this are shown as 1.00."""
@@ -89,9 +90,9 @@ class CameraSuggest(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
         self._session = session
         self._wanted: dict[CameraKey, frozenset[str]] = {}
-        """Names of the objects that each camera must see, for cameras for which the user chose them."""
+        """Names of the objects that a camera must see, for each camera for which the user chose objects."""
         self._boxes: dict[CameraKey, Box] = {}
-        """Search box of each camera, for cameras for which the user edited it."""
+        """Search box of each camera whose box the user edited."""
         self._all_links, self._draws_box, self._resets = False, False, 8
         self._drawn_names: object = None
         gui = server.gui

@@ -81,8 +81,8 @@ class _Begun:
     """Number of the moment that the pictures show."""
     at: float
     ready_at: float
-    """Time at which the pictures should be ready. Like `at`, the time of their start, in seconds of
-    `time.monotonic`."""
+    """Time at which the pictures should be ready. `at` is the time at which they were begun; both are in
+    seconds of `time.monotonic`."""
 
 
 class WorkerCameras:
@@ -92,11 +92,11 @@ class WorkerCameras:
     scene, `settle` finishes the current picture and places the waiting cameras.
 
     A picture takes 25 to 90 ms on a software renderer; drawn synchronously between two steps it would halve the step rate.
-    So a picture is started, steps continue, and the picture is fetched when it should be ready, estimated
-    from the last pictures (see `begin_pictures`). Sensors and human cameras see different objects and so
-    cannot be drawn at once: the sensors come first, and the pictures of each kind are sent as soon as they
-    are ready. At most 15 rounds a second, each with a proportional pause, leave CPU time for a browser on the
-    same machine. A camera that is being dragged is drawn next, alone and without a pause.
+    So a picture is started, steps continue, and the picture is fetched when it should be ready, a time that
+    is estimated from the last pictures (see `begin_pictures`). Sensors and human cameras see different
+    objects and so cannot be drawn at once: the sensors come first, and the pictures of each kind are sent as
+    soon as they are ready. At most 15 rounds a second, each with a proportional pause, leave CPU time for a
+    browser on the same machine. A camera that is being dragged is drawn next, alone and without a pause.
     """
 
     def __init__(self, task: GuardedTask, on_first: Callable[[bool], None]) -> None:
@@ -424,7 +424,8 @@ def _observe_again(opened: OpenedTask) -> None:
 
 
 REPORT_PIXELS = 128
-"""Maximum shorter side of a measured picture: what vanishes at this size is hardly visible anyway."""
+"""Maximum length of the shorter side of a measured picture: what vanishes at this size is hardly visible
+anyway."""
 MAX_SCALE = 4.0
 _PROGRESS_PERIOD_SECONDS = 0.2
 

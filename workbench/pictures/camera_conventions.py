@@ -50,9 +50,9 @@ class LookAt:
     """Any point on the optical axis in front of the eye."""
     roll: float = 0.0
     """Radians about the line of sight; positive turns the camera clockwise as seen from behind it. At roll 0
-    the camera is upright. At roll 0, the top of the picture of a camera that looks straight down is towards
-    +x, and of a camera that looks straight up, towards -x. An upright camera that looks along +x gets these
-    orientations when it is tilted down or up."""
+    the camera is upright. If it looks straight down, roll 0 means that the top of the picture is towards +x;
+    if straight up, towards -x. An upright camera that looks along +x gets these orientations when it is
+    tilted down or up."""
 
 
 # --- rotations ---------------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ class ObjectSummary:
     """One object over all envs that have it; shares are 0..1, NaN where undefined."""
 
     present: int
-    """Envs that have the object."""
+    """Number of envs that have the object."""
     seen: float
     """Share of these envs in which at least one pixel of the object is in the picture."""
     median_pixels: float
@@ -49,7 +49,7 @@ class ObjectSummary:
     """Share of the object that the robot covers, averaged over the envs in which the object would be seen
     without the robot."""
     wholly_hidden: float
-    """Share of these envs in which the object is visible only without the robot."""
+    """Share of the envs with the object in which it is visible only without the robot."""
     covered: float
     """Share of the object that things other than the robot cover, averaged over the envs in which the object
     would be in the picture if nothing covered it."""
@@ -162,7 +162,7 @@ class CameraReport:
     """Width and height of the measured pictures. If these are smaller than the camera's own, objects smaller
     than one measured pixel are missed."""
     envs: tuple[int, ...]
-    """(E,) an env may occur several times: at several moments, or with several seeds."""
+    """(E,) indices of the envs. An env may occur several times: at several moments, or with several seeds."""
     objects: tuple[ObjectSeen, ...]
     depth: DepthReport
     pictures: int
@@ -250,9 +250,9 @@ class OfferedPlacement:
     """One of the best placements of a search."""
 
     settings: CameraSettings
-    """In the frame of the camera's mount, or in the env's frame if the camera has no mount."""
+    """Their pose is in the frame of the camera's mount, or in the env's frame if the camera has no mount."""
     target: tuple[float, float, float]
-    """A point on its line of sight, for a look-at."""
+    """A point on the placement's line of sight: the target of a `LookAt`."""
     score: float
     """0..1, higher is better; see `camera_search.score_of`."""
     words: str
@@ -266,7 +266,8 @@ _Part = TypeVar("_Part", ObjectSeen, DepthReport)
 
 
 def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
-    """One report over all envs of several reports of one camera: steps of an episode, or several seeds.
+    """Join reports of one camera (over steps of an episode, or over several seeds) into one report over all
+    their envs.
 
     Raises:
         ValueError: there is no report, or the reports differ in camera, picture size or scene.
@@ -303,7 +304,7 @@ def _end_to_end(parts: Sequence[_Part]) -> _Part:
 
 
 def size_text(pixels: float, size: tuple[int, int]) -> str:
-    """The share of a picture of this width and height, to two digits: ``0.13 %``."""
+    """Share of a picture of this `size` (width, height) that `pixels` cover, to two digits: ``0.13 %``."""
     share = 100 * pixels / (size[0] * size[1])
     if 0 < share < 0.01:
         return "< 0.01 %"

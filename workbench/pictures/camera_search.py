@@ -48,15 +48,14 @@ FREE_METRES = 0.1
 ROBOT_DISTANCE_METRES = 0.2
 """Least distance of an eye from the origin of every robot link, in the searched envs."""
 MOUNT_DISTANCE_METRES = 0.05
-"""Least distance of an eye on a mount from the origin of every robot link; a mounted camera is meant to be
-near a link."""
+"""Replaces `ROBOT_DISTANCE_METRES` for a mounted camera, which is meant to be near a link."""
 SUFFICIENT_SCORE = 0.995
-"""Score at which no further round is sampled."""
+"""No further round is sampled once `SearchSpace.best` placements have at least this score."""
 ROUNDS = 2
 """Number of rounds of samples around the best candidates."""
 MAX_EYE_ATTEMPTS = 50
-"""Maximum attempts to sample an eye clear of the robot. After these attempts any eye is used, so that a box
-within the robot can be searched too."""
+"""Maximum number of attempts to sample an eye clear of the robot. After these attempts any eye is used, so
+that a box within the robot can be searched too."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
 
@@ -80,7 +79,8 @@ def suggest_cameras(
         cancelled: called before each measured view; True ends the search.
 
     Raises:
-        ValueError: no env is named; an object is missing, never drawn for such a camera, or the robot itself.
+        ValueError: no env is named; or an object is missing, is never drawn for such a camera, or is the
+            robot itself.
         IndexError: there is no such env.
         RuntimeError: the renderer failed.
     """
@@ -133,7 +133,7 @@ class _Search:
         self.progress, self.cancelled = progress, cancelled
         every = list_objects(env)
         self.wanted = [_wanted(every, name, space.kind, self.index) for name in space.objects]
-        # A requested link of the robot does not count as the robot that may hide objects.
+        # A requested link of the robot is an object to see, not a part of the robot that may hide objects.
         asked = {body for thing in self.wanted for body in thing.bodies}
         robots = [replace(t, bodies=tuple(b for b in t.bodies if b not in asked)) for t in every if t.robot]
         self.objects = [*robots, *self.wanted]
@@ -236,7 +236,7 @@ class _Search:
         return not len(self.links) or np.linalg.norm(self.links - eye, axis=1).min() >= least
 
     def _apart_from(self, eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-        # An eye on its target has no direction; the box may contain the objects.
+        # The box may contain the objects, so an eye may be at its target, where it would have no direction.
         return target if np.linalg.norm(target - eye) > 1e-3 else target - [0.0, 0.0, 0.01]
 
     def _where_the_objects_are(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

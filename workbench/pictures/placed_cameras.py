@@ -38,10 +38,10 @@ class PlacedCameras:
     """The cameras of one env whose pose, lens, size or shader differ from the task's.
 
     Pose and lens are set on SAPIEN's camera components. Size and shader are fixed when a component is made,
-    so a new component replaces the old one on the same entity if they change. Bodies and physics are
-    untouched. ManiSkill's objects around the components are updated (config, cached matrices, camera group):
-    observations and ``get_params`` are those of an env that was built with such a config. Resets and
-    snapshots keep a placement, but a reset that rebuilds the scene does not: call `put_back` after such a
+    so if one of these changes, a new component replaces the old one on the same entity. Bodies and physics
+    are untouched. ManiSkill's objects around the components are updated (config, cached matrices, camera
+    group): observations and ``get_params`` are those of an env that was built with the changed config. Resets
+    and snapshots keep a placement, but a reset that rebuilds the scene does not: call `put_back` after such a
     reset.
     """
 
@@ -91,7 +91,7 @@ class PlacedCameras:
         return changed
 
     def put_back(self, env: Any) -> None:
-        """Place the placed cameras again if the scene was rebuilt, such as by a reset."""
+        """Place the cameras again if the scene was rebuilt, for example by a reset."""
         for key, placed in list(self._placed.items()):
             camera = maniskill_private.cameras(env).get(key)
             if camera is None:
@@ -228,7 +228,8 @@ def _numbers(value: Any) -> np.ndarray:
 
 
 def _one(value: Any, *shape: int) -> Any:
-    """The number, or matrix of this shape, that all envs share; None if they differ."""
+    """The number, or matrix of this shape, that all envs share; None if the envs differ, or if there is no
+    value."""
     numbers = np.zeros(0) if value is None else _numbers(value)
     if not numbers.size or numbers.shape[numbers.ndim - len(shape) :] != shape:
         return None

@@ -286,8 +286,9 @@ def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]
 
     ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by visibility, in GPU
     simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back for
-    pictures of human cameras. If something else has moved an object back meanwhile, sensors see it, as the policy does.
-    Visibility and poses are restored afterwards, so a picture does not change the simulation.
+    pictures of human cameras. If other code has moved an object back meanwhile, sensors see it here too, as
+    the policy does. Visibility and poses are restored afterwards, so a picture does not change the
+    simulation.
     """
     slot_of = scene_index(env).slot_of
     true = (
@@ -352,7 +353,8 @@ def _read(
 
 
 def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component: Any) -> NDArray[np.float32]:
-    """(H, W) metres, 0 for background, from the texture `data` and ManiSkill's own reading of it.
+    """(H, W) metres, 0 for background, from the texture `data`, and from `transformed`, ManiSkill's own
+    reading of the texture.
 
     ManiSkill's standard is int16 millimetres. Where the texture holds float positions in metres, as
     in the default and ray tracing shaders, they are used directly. The minimal shader's texture is

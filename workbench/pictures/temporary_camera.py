@@ -65,8 +65,8 @@ def temporary_camera(
 
     The camera is in a second, empty ``sapien.Scene`` that shares the sub-scene's render system. An entity in
     the sub-scene would change the order of entities, on which tables, snapshots and PhysX's packed state
-    rely, and use up a segmentation id. (Measured with sapien 3.0.3: entities, packed poses, ids and pictures
-    of the other cameras are equal before and after.)
+    rely. It would also use up a segmentation id. (Measured with sapien 3.0.3: entities, packed poses, ids and
+    pictures of the other cameras are equal before and after.)
 
     Args:
         kind: sensors do not see what the task hides from them.

@@ -51,7 +51,7 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class Placement:
-    """Settings, kind and mount of a camera, which the env need not have."""
+    """Settings, kind and mount of a camera that need not exist in the env."""
 
     settings: CameraSettings
     kind: CameraKind = "sensor"
@@ -259,8 +259,9 @@ def measure(
     Bounding boxes and frustums ignore occlusion, so pictures are rendered. The segmentation gives each
     pixel's object; a second picture without the robot shows what the robot covers; a picture of each object
     alone shows what the border cuts and what other things cover. The robot's meshes are nearly all of a
-    picture's cost (30 ms with a Panda on a software driver, 2 ms without), so the further pictures are almost
-    free. An object that the task hides from sensors counts as never drawn for a sensor.
+    picture's cost (30 ms with a Panda on a software driver, 2 ms without), so the other pictures, which are
+    without the robot, are almost free. An object that the task hides from sensors counts as never drawn for a
+    sensor.
 
     Args:
         settings: settings of the camera; pixel counts are scaled to its size, since `view` may be smaller.
@@ -334,7 +335,7 @@ def _depths(
     return DepthReport(
         counts=histogram.astype(np.int64)[None],
         background=_one(1 - something.mean()),
-        # If neither robot nor objects are in view, everything is beyond.
+        # If neither robot nor objects are in view, everything counts as beyond them.
         beyond=_one((far > np.nan_to_num(limit, nan=-1.0)).sum() / depth.size),
         nearest=_one(far.min() if len(far) else np.nan),
         farthest_object=_one(limit),

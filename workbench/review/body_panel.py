@@ -38,7 +38,8 @@ class ReviewBodyPanel(PagePart[ReviewView]):
 
 
 def body_html(body: str, view: ReviewView) -> str:
-    """Name, kind and pose of a body; empty if none is selected, or the selected recording lacks it."""
+    """Name, kind and pose of `body`, as HTML; empty if `body` is empty, or if the selected recording lacks
+    the body."""
     chosen = view.chosen
     geometry = None if chosen is None else chosen.episode.geometry
     if chosen is None or geometry is None or chosen.episode.poses is None or body not in geometry.body_names:

@@ -38,8 +38,8 @@ class ReviewComparePanel(PagePart[ReviewView]):
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
         self._wish, self._metres = 1, DEFAULT_TOLERANCE_METRES
-        """(index of the recording that the user chose last, tolerance in metres): the index is kept while
-        fewer recordings are open."""
+        """(index of the recording that the user chose last, tolerance in metres). The index is kept even
+        while too few recordings are open for it."""
         self._other = choice(server, "A against", CompareWith, "index", {"B": 1}, 1)
         self._swap = server.gui.add_html("")
         self._tolerance = choice(

@@ -62,7 +62,7 @@ class ReviewNumbers(PagePart[ReviewView]):
 
 
 class ReviewCurves(PagePart[ReviewView]):
-    """Charts of the reward and of a chosen entry, each with one line per aligned recording.
+    """Charts of the reward and of a chosen entry, each with one line per recording (see `shown_together`).
 
     The action and the reward terms have many lines, so they are drawn only for the selected recording.
     """
@@ -80,14 +80,15 @@ class ReviewCurves(PagePart[ReviewView]):
         self._offered: dict[str, tuple[str, str]] = {}
         """(entry, line) of each choice; the line is empty if the entry has a single line."""
         self._wish = ""
-        """Last chosen entry; kept while the open recordings lack it."""
+        """Last chosen entry; kept even while the open recordings lack it."""
 
     def key(self, view: ReviewView) -> object:
         which = view.opened_serial, len(view.opened), view.selected
         return *which, view.position, view.anchors, self._wish
 
     def draw(self, view: ReviewView) -> None:
-        # By id: a recording that gets its scene later is still the same recording.
+        # Curves are kept by id: a recording that gets its scene later becomes a new object with the same id
+        # and curves.
         self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
         shown = shown_together(view)
         also = self._offer(view, shown)
@@ -167,11 +168,12 @@ class ReviewCurves(PagePart[ReviewView]):
         chosen: ChartLine | None = None,
         at: int | None = None,
     ) -> None:
-        """Draw the lines, reduced to their peaks if there are many positions.
+        """Draw the lines. If there are many positions, draw only the lowest and the highest value of each
+        span of positions.
 
         Args:
-            chosen: The line whose peaks are drawn at their exact positions; the peaks of other lines may be
-                off by less than a span of positions.
+            chosen: The line whose peaks are drawn at their exact positions; the peaks of the other lines are
+                off by less than one span.
             at: The present position.
         """
         # Put the chosen line first: `points` takes its x values from the first line's extremes, so only that
@@ -187,7 +189,7 @@ class ReviewCurves(PagePart[ReviewView]):
 
 
 def _mode_of(episode: Episode) -> str:
-    """The reward mode for `number_rows`, which tells only whether there is a reward: ``none`` or empty."""
+    """The reward mode for `number_rows`: ``none`` if the episode has no reward, else empty."""
     return "" if episode.info.has_reward else "none"
 
 

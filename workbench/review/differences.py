@@ -44,7 +44,7 @@ class FirstDifference:
 class Difference:
     """The differences between two recordings.
 
-    With the same seed, episodes of two versions of a task are the same simulation up to some step; after it
+    With the same seed, two versions of a task simulate the same episode up to some step; from that step on
     everything differs slightly. So the comparison finds the first step that differs, for each quantity
     separately, and the first body that differs.
     """
@@ -54,8 +54,8 @@ class Difference:
     body: str
     """The body that differs first; empty if none differs."""
     apart: NDArray[np.float64]
-    """(K,) at each compared state, from `begin` on: the largest distance of any body between the two
-    recordings, as `distances` returns it."""
+    """(K,) for each compared state, from `begin` on: the largest of the bodies' `distances` between the two
+    recordings."""
     begin: int
     """Position of the first compared state."""
     compared: int
@@ -69,7 +69,8 @@ class Difference:
     same_source: bool | None
     """Whether both recordings contain the same source; None if one of them contains none."""
     source: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
-    """File, and its changed lines as (``add``, ``del``, ``at`` or ``same``, text)."""
+    """For each file that differs: its name, and its changed lines with context as (kind, text). The kind is
+    ``add``, ``del``, ``at`` or ``same``."""
 
 
 def difference(
@@ -176,8 +177,8 @@ def _bodies_difference(
 
 
 def distances(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-    """(...,) distance in metres between poses (..., 7), plus `ARM_METRES` times the angle in radians; 0 if
-    both recordings lack the body, inf if one does."""
+    """(...,) distance in metres between poses (..., 7), plus `ARM_METRES` times the angle between them in
+    radians; 0 if both recordings lack the body, inf if only one of them has it."""
     metres, radians = pose_distances(a, b)
     return metres + ARM_METRES * radians
 

@@ -61,10 +61,11 @@ class _Stopped(Exception):
 
 
 class Review:
-    """Opened recordings with one position. All methods are thread-safe; all but `wait` return at once.
+    """Open recordings that share one position. All methods are thread-safe; all but `wait` return at once.
 
     Recordings are in memory (pictures encoded), so seeking only changes a number. While playing, the position is computed
-    from the clock on request; there is no timer. A later opening, or `close`, cancels an earlier one.
+    from the clock on request; there is no timer. A new opening, or `close`, cancels an opening that is still
+    in progress.
     """
 
     def __init__(

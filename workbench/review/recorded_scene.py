@@ -1,4 +1,4 @@
-"""Makes the 3-D scene of recordings that contain none (ManiSkill's own), from the env that they name."""
+"""Makes 3-D scenes for recordings that contain none (those of ManiSkill), from the env that each names."""
 
 from __future__ import annotations
 

@@ -39,10 +39,10 @@ GHOST_ALPHA = 0.45
 """Alpha of a ghost. With a lower alpha it vanishes over a white table, with a higher one it hides the bodies
 behind it."""
 MAX_NAMED = 16
-"""Maximum number of recordings side by side at which each has a label. A browser lays out labels in every
-frame: sixty labels halve its frame rate (measured)."""
+"""With more recordings than this side by side, only the selected one has a label. A browser lays out labels
+in every frame: sixty labels halve its frame rate (measured)."""
 MIN_GHOST_METRES = 5e-4
-"""Minimum distance between a ghost and its body for the ghost to be drawn."""
+"""A ghost's body is drawn only if it is at least this far from the same body in the first recording."""
 _SAME_PLACE_METRES = 1e-5
 
 
@@ -52,7 +52,7 @@ class ReviewScene:
 
     Each recording is an env of one scene, and equal shapes are shared. When the recordings are overlaid, all
     but the first are ghosts: tinted and half transparent, and drawn only where they differ from the first. A
-    ghost omits the bodies that rest for the whole time at the same place as in the first recording.
+    ghost omits the bodies that rest for the whole time, at the same place as in the first recording.
     """
 
     geometry: SceneGeometry
@@ -64,8 +64,8 @@ class ReviewScene:
     """Indices of each recording's bodies among all bodies."""
 
     def poses(self, states: Sequence[int]) -> NDArray[np.float32]:
-        """(N, B, 7) poses of each recording at its state in `states`; NaN for bodies that a recording
-        lacks."""
+        """(N, B, 7) poses of each recording at its state in `states`; NaN for bodies that a recording lacks,
+        and for bodies of a ghost that are where the first recording's are."""
         found = _side_by_side(self._poses, self._bodies, len(self.geometry.body_names), states)
         if self.ghosts:
             for ghost in found[1:]:
@@ -293,7 +293,8 @@ class ReviewIn3D:
         self._frustums.draw(cameras, pictures, scene.layout.offsets[view.selected], SMALL_METRES)
 
     def _draw_names(self, view: ReviewView, scene: ReviewScene | None) -> None:
-        """Label the recordings that are not selected, if they are few; the selected one's label is on its frame."""
+        """Label the recordings that are not selected, if at most `MAX_NAMED` are open. The selected one's
+        label is on its frame."""
         few = scene is not None and len(view.opened) <= MAX_NAMED
         for index, label in enumerate(self._names):
             if scene is None or not few or index >= len(view.opened) or index == view.selected:

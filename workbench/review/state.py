@@ -56,7 +56,7 @@ class OpeningState:
     show_at: float = 0.0
     """Clock time in seconds at which the recordings read so far are shown."""
     pause: float = FIRST_SHOWN_SECONDS
-    """Seconds from the previous value of `show_at` to `show_at`."""
+    """Seconds to `show_at` from the start of the opening, or from the last time recordings were shown."""
     shown: bool = False
     """Whether recordings of this opening are already shown."""
     closed: frozenset[str] = frozenset()
@@ -456,8 +456,8 @@ def _open(
     now: float,
     library_stays: bool,
 ) -> Change:
-    # The library lists the newest first, but a comparison starts from the oldest. The oldest is also read first: the
-    # recording that is shown first stays selected when others arrive.
+    # The library lists the newest first, but a comparison starts from the oldest. The oldest is also read
+    # first, so that it is shown first and stays selected when the others arrive.
     rows = tuple(sorted(rows, key=lambda row: (row.date is None, row.date or _NEVER)))
     opening = OpeningState(
         state.opening.number + 1, rows, at, show_at=now + FIRST_SHOWN_SECONDS, pause=FIRST_SHOWN_SECONDS
@@ -479,7 +479,7 @@ def _loading(opening: OpeningState) -> str:
 
 
 def _row_done(state: ReviewState, now: float) -> ReviewState:
-    """Show the recordings read so far if the user has waited long enough for the others."""
+    """Count one more row as done. If `OpeningState.show_at` has passed, show the recordings read so far."""
     opening = replace(state.opening, done=state.opening.done + 1)
     state = replace(state, opening=opening)
     if opening.done < len(opening.rows) and opening.read and now >= opening.show_at:
@@ -525,7 +525,8 @@ def _set_opened(
 
 
 def _align(state: ReviewState, how: str, kept: int | None, now: float) -> ReviewState:
-    """Align the recordings and stay at state `kept` of the selected one; None goes to the first position."""
+    """Align the recordings. Stay at state `kept` of the selected one, or go to the first position if `kept`
+    is None."""
     opened, name = state.view.opened, how.removeprefix("first ")
     anchors = tuple(0 if how == START else (one.first(name) or 0) for one in opened)
     first = -max(anchors, default=0)

@@ -50,7 +50,8 @@ class Opened:
     episode: Episode
     events: tuple[EpisodeEvent, ...]
     scene: str = ""
-    """Message about a missing 3-D scene: it is being made, or why it cannot be made."""
+    """Message about the 3-D scene: that it is being made, why it cannot be made, or what of it was not
+    restored."""
     making: bool = False
     """Whether the scene is being made in the background."""
 
@@ -248,7 +249,7 @@ def _flag(values: NDArray | None) -> NDArray[np.bool_] | None:
         return flat
     if flat.dtype.kind != "f":
         return None
-    # An entry that only some states have is stored as 0.0 and 1.0, with NaN for the others.
+    # A bool entry that only some states have is stored as 0.0 and 1.0, with NaN at the other states.
     known = flat[np.isfinite(flat)]
     return np.nan_to_num(flat) != 0 if len(known) and np.isin(known, (0.0, 1.0)).all() else None
 

@@ -41,9 +41,9 @@ def plan_add(
     express the pose.
 
     Raises:
-        RefusedEdit: the hook returns anything else (a name, a concatenation, a call of the parent's hook) or has several
-            returns. As in all plans of this module except a removal, the exception has the reason and the
-            text to copy.
+        RefusedEdit: the hook returns anything else (a name that is not assigned a list or dict, a
+            concatenation, a call of the parent's hook), or has several returns. As in all plans of this
+            module except a removal, the exception has the reason and the text to copy.
     """
     check_camera(settings)
     kind, uid = key

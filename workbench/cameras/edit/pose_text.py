@@ -27,8 +27,8 @@ _MANISKILL_POSE = ("mani_skill.utils.structs.Pose", "mani_skill.utils.structs.po
 _STILL_AT_TARGET = 3e-5
 _MIN_DISTANCE_METRES = 0.1
 _DECIMALS = (4, 5, 6)
-"""Numbers of decimals to try for lengths in metres: 4 (0.1 mm), then more, since 0.1 mm would rotate a camera
-whose target is very close."""
+"""Numbers of decimals to try for lengths in metres: 4 (0.1 mm), then more, since rounding to 0.1 mm rotates a
+camera whose target is very close."""
 
 
 def why_not_a_pose(changes: Changes, pose: TracedValue) -> str | None:
