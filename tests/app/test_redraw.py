@@ -258,7 +258,7 @@ def test_a_tab_that_no_page_shows_is_redrawn_rarely_and_at_once_when_a_page_open
     reward = live_page.part("Reward")
 
     def show(count: int, seconds: float = 0.3) -> str:
-        live_page.show(replace(running(count), step_serial=count), seconds=seconds)
+        live_page.show(replace(running(count), step_serial=count, playing=True), seconds=seconds)
         return reward.html("wb-numbers")
 
     live_page.do(TellOpenTab(tab="Run"))

@@ -201,8 +201,8 @@ class Page:
         opening = () if self._opening is None else (self._opening,)
         self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
         for part in self._reward:
-            self._parts.add(part, lambda: self._open_tabs.may_show(REWARD))
-        self._parts.add(self._studio, lambda: self._open_tabs.may_show(CAMERAS))
+            self._parts.add(part, lambda view: self._is_shown(REWARD, view))
+        self._parts.add(self._studio, lambda view: self._is_shown(CAMERAS, view))
 
         self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
         self._frames, self._frustums = BodyFrames(server), CameraFrustums(server)
@@ -213,6 +213,11 @@ class Page:
         add_help_topics(server, visitors)
         # viser awaits coroutines, although its types do not say so.
         server.scene.on_click()(self._on_scene_click)  # type: ignore[arg-type]
+
+    def _is_shown(self, tab: str, view: SessionView) -> bool:
+        """Whether a page may show this tab. While paused, every tab is drawn: there is little to send, and a tab that is
+        opened must not show an earlier moment."""
+        return not view.playing or self._open_tabs.may_show(tab)
 
     def _is_own(self, file: str) -> bool:
         return isinstance(self._session.reference, str) and self._session.knows_file(file)

@@ -96,12 +96,12 @@ class Parts(Generic[View]):
 
     def __init__(self, parts: Iterable[PagePart[View]], clock: Clock = time.monotonic) -> None:
         self._clock = clock
-        self._parts: list[tuple[PagePart[View], DrawThrottle, Callable[[], bool]]] = []
+        self._parts: list[tuple[PagePart[View], DrawThrottle, Callable[[View], bool]]] = []
         self._owners: dict[type[Command], PagePart[View]] = {}
         for part in parts:
             self.add(part)
 
-    def add(self, part: PagePart[View], is_shown: Callable[[], bool] = lambda: True) -> None:
+    def add(self, part: PagePart[View], is_shown: Callable[[View], bool] = lambda view: True) -> None:
         """Add a part, which is drawn after the others.
 
         Args:
@@ -126,7 +126,7 @@ class Parts(Generic[View]):
         return owner.do(command, visitor)
 
     def draw(self, view: View) -> None:
-        parts = [(part, is_due, not is_shown()) for part, is_due, is_shown in self._parts]
+        parts = [(part, is_due, not is_shown(view)) for part, is_due, is_shown in self._parts]
         due = [is_due.is_due(part.key(view), part.urgent(view), hidden) for part, is_due, hidden in parts]
         in_step = [part.of_the_moment and not hidden for part, _, hidden in parts]
         together = any(now and both for now, both in zip(due, in_step, strict=True))
