@@ -33,7 +33,7 @@ class Refused(ValueError):
 
 
 def name_of(kind: type[Command]) -> str:
-    """``reset_selected`` of `ResetSelected`."""
+    """The name of a command, made from its class name: ``reset_selected`` for `ResetSelected`."""
     return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
 
 

@@ -40,7 +40,8 @@ class RefusedEdit(Exception):
     def __init__(self, reason: str, snippet: str = "") -> None:
         super().__init__(reason)
         self.reason, self.snippet = reason, snippet
-        """The end of a sentence for the author, and text that they can copy into the file themselves."""
+        """`reason` is the end of a sentence for the author; `snippet` is text that they can copy into the
+        file."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class SourceFile:
         )
 
     def _offset(self, line: int, column: int) -> int:
-        """Offset of a column in bytes of UTF-8, as Python's nodes count it."""
+        """Offset in the text of a column that is counted in bytes of UTF-8, as in Python's nodes."""
         start = self._starts[line - 1]
         if self.text.isascii():
             return start + column

@@ -203,7 +203,7 @@ class ValueReader:
         return self._evaluate(file, node, node, bool)
 
     def _with_editable_number(self, file: SourceFile, node: ast.expr, whole: TracedValue) -> TracedValue:
-        """`whole`. If a number within it can be edited instead, that number is its part ``of``.
+        """`whole`; if a number within it can be edited instead, with this number as its part ``of``.
 
         Examples: the 60 of ``60 * np.pi / 180``; the 0.2 of ``HEIGHT + 0.2``, so that the value still follows
         HEIGHT.
@@ -460,7 +460,7 @@ def _subclasses(cls: type) -> Iterator[type]:
 
 
 def _place_text(binding: Binding) -> str:
-    """``push.py:12 in PushEnv.__init__``."""
+    """The place of a binding, as text: ``push.py:12 in PushEnv.__init__``."""
     file = binding.file
     return f"{file.name}:{file.line(binding.node)} in {file.qualname(binding.node)}"
 
@@ -534,7 +534,7 @@ class KnownFunction:
     name: str = ""
     """Name for `TracedValue.function`; empty if `parameters` is empty."""
     parameters: tuple[str, ...] = ()
-    """Parameters in order, of a function whose arguments may be edited."""
+    """The function's parameters, in order, if its arguments may be edited; else empty."""
     converts: bool = False
     """Whether the function only converts the type of its first argument; then the argument is edited, not the
     call."""

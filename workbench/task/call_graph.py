@@ -154,8 +154,8 @@ def _defines(statement: ast.stmt, at_top: bool) -> str | None:
 
 
 def _one_import_each(body: list[ast.stmt]) -> Iterator[ast.stmt]:
-    """``from x import a, b`` as two statements, so that a name can be added without changing the symbols of a
-    and b."""
+    """The statements of `body`, with one import statement for each imported name: ``from x import a, b``
+    becomes two statements. So a name can be added to it without changing the symbols of a and b."""
     for statement in body:
         if isinstance(statement, ast.ImportFrom) and statement.module == "__future__":
             # Skip it: annotations are ignored, and the other features are the default now.
@@ -192,7 +192,8 @@ def bound_names(statement: ast.AST) -> set[str]:
 
 
 def _runs_as_script_only(statement: ast.stmt) -> bool:
-    """``if __name__ == "__main__":``, which does not run here."""
+    """Whether a statement is an ``if __name__ == "__main__":`` without ``else``. It does nothing in an
+    import."""
     if not isinstance(statement, ast.If) or statement.orelse:
         return False
     return ast.unparse(statement.test) in ("__name__ == '__main__'", "'__main__' == __name__")
@@ -340,7 +341,7 @@ class TwoVersions:
         }
 
     def siblings(self, family: set[Key]) -> set[Key]:
-        """The task classes of the files that are not in `family`; they have no live env."""
+        """The task classes of all files, without those in `family`. They have no live env."""
         found: set[Key] = set()
         tasks, before = {"BaseEnv", *(name for _, name in family)}, -1
         while before != len(found):

@@ -94,8 +94,8 @@ def choose_task(
 
 
 def _alternatives(cls: type, candidates: list[type], registered: Collection[type]) -> tuple[str, ...]:
-    """Classes to try if `cls` fails: the registered ones if `cls` is registered, else the others. Base
-    classes of `cls` are left out: a base may open and show nothing."""
+    """Classes to try if `cls` fails: the registered classes if `cls` is registered, else the
+    unregistered ones. Base classes of `cls` are left out: a base may open and show nothing."""
     return tuple(
         other.__name__
         for other in reversed(candidates)

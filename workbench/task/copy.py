@@ -68,11 +68,11 @@ def copy_task(source: Path, folder: Path) -> TaskCopy:
 def copied_text(
     source: Path, text: str, number: int = 1, names: NewNames | None = None
 ) -> tuple[str, tuple[tuple[str, str], ...]]:
-    """The text of the copy, and pairs of the original's and the copy's id.
+    """The text of the copy, and a pair for each registered id: the original's id and the copy's id.
 
-    Only what depends on the file's place and ids changes. Relative imports become absolute. ``__file__``
-    becomes that of the installed module, beside which the assets are. Registered ids get another name.
-    Without `names`, the rest is identical.
+    Only the ids, and code that depends on the file's place, change. Relative imports become absolute.
+    ``__file__`` becomes that of the installed module, beside which the assets are. Registered ids get another
+    name. Without `names`, the rest is identical.
 
     Args:
         source: the file of `text`; its packages are found by their ``__init__.py``.
@@ -175,7 +175,8 @@ def registrations_in(tree: ast.Module) -> Iterator[tuple[ast.ClassDef, ast.Call,
 
 
 def _new_id(env_id: str, number: int) -> str:
-    """``PushCube-v1`` becomes ``MyPushCube-v1``, then ``MyPushCube2-v1``."""
+    """The id of a copy: ``MyPushCube-v1`` for the first copy of ``PushCube-v1``, ``MyPushCube2-v1`` for the
+    second."""
     space, slash, name = env_id.rpartition("/")
     version = _VERSION.search(name)
     bare = name if version is None else name[: version.start()]

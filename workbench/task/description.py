@@ -124,7 +124,7 @@ class TaskDescription:
     pictures: PictureDegree = "exact"
     """Quality of the pictures that its envs render for observations and recordings."""
     chosen: str = ""
-    """Name of the class, or of a robot that is shown in a scene."""
+    """Name of the open class: the task's, or that of a robot shown in a scene."""
     others: tuple[str, ...] = ()
     """The other tasks of the file."""
     in_place_of: str | None = None
@@ -132,7 +132,7 @@ class TaskDescription:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments with which ``gym.make`` makes such an env, as far as JSON can represent them."""
     objects: tuple[ObjectToSee, ...] = ()
-    """Objects of which a camera report can tell what a camera sees."""
+    """Objects for which a camera report can state how well a camera sees them."""
     joints: tuple[str, ...] = ()
     """Names of `StepResult.qpos`."""
     notices: tuple[str, ...] = ()
@@ -170,7 +170,7 @@ class Restored:
     recording: str = ""
     """Description of the episode and the state that an `EnterRecording` restored; `origin` is then `NO_MOMENT`."""
     how: str = ""
-    """How the state was reached, as a sentence; empty if it was restored."""
+    """How the state was reached, as a sentence; empty if it was restored without a replay."""
     number: int = 0
     """Number of the `EnterRecording` that this result answers; 0 for a `Restore`."""
     replayed: tuple[int, ...] = ()

@@ -16,7 +16,7 @@ from workbench.machine.parse_python import parse_python
 from workbench.task.library_names import LIBRARY_FOLDERS
 
 MAX_DEPTH = 6
-"""Maximum depth of searched folders below the first."""
+"""Maximum depth of searched folders below the given folder."""
 MAX_FILES_READ = 5_000
 """Maximum number of Python files that are opened."""
 MAX_FOUND = 200
@@ -107,7 +107,7 @@ def find_task_files(folder: Path, read: Callable[[Path], TaskFile | None] | None
 
 
 _BEGUN = re.compile(rb"^[ \t]*(class[ \t][^(\n]*\([^)\n]*\bBaseEnv\b|@[\w.]*\bregister_env\b)", re.MULTILINE)
-"""Pattern of a text that does not parse but is most likely an unfinished task."""
+"""Pattern for a text that does not parse: with a match, it is most likely an unfinished task."""
 
 
 def read_task_file(path: Path) -> TaskFile | None:
@@ -180,7 +180,7 @@ def _tasks_of(tree: ast.Module) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _top_level(tree: ast.Module) -> Iterator[ast.stmt]:
-    """The statements of a module, and those within its ``if`` and ``try``."""
+    """The statements of a module, and those within its ``if``, ``try`` and ``with`` statements."""
     waiting: list[ast.stmt] = list(reversed(tree.body))
     while waiting:
         node = waiting.pop()

@@ -101,8 +101,8 @@ def make(
         max_episode_steps = limit = None
     else:
         limit = found.max_episode_steps
-        # ``register_env`` adds the same wrapper. It removes gymnasium's own limit, which gives one bool for
-        # all envs.
+        # ``register_env`` adds the same wrapper. The wrapper removes gymnasium's own limit, which gives one
+        # bool for all envs.
         entry = "mani_skill.utils.registration:TimeLimitWrapper"
         limits = (WrapperSpec("MSTimeLimit", entry_point=entry, kwargs={"max_episode_steps": limit}),)
     if pictures == "fast":

@@ -58,7 +58,8 @@ def memoizing_statement(function: ast.AST, imported: Collection[str]) -> str | N
 
 
 def root_name(value: ast.AST) -> str | None:
-    """``torch`` of ``torch.linalg.norm``; None if it does not begin with a name."""
+    """The first name of an expression with dots or indices, as ``torch`` in ``torch.linalg.norm``; None if
+    the expression does not begin with a name."""
     while isinstance(value, (ast.Attribute, ast.Subscript)):
         value = value.value
     return value.id if isinstance(value, ast.Name) else None

@@ -213,7 +213,8 @@ def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
 
 
 def import_module(name: str) -> ModuleType:
-    """Import a module that a person named, as Python does; `find_module` lists the searched places. Raises TaskError."""
+    """Import a module that a person named, as Python does, but also from the current folder (see
+    `find_module`). Raises TaskError."""
     if name in sys.modules:
         return sys.modules[name]
     found = find_module(name)
@@ -236,7 +237,7 @@ def import_modules(names: Sequence[str]) -> None:
 
 
 def class_of_module(name: str, class_name: str) -> type[BaseEnv]:
-    """A task class of a module that is imported as Python does. Raises TaskError."""
+    """A task class of a module, which `import_module` imports. Raises TaskError."""
     module = import_module(name)
     cls = getattr(module, class_name, None)
     if not isinstance(cls, type) or not registry.is_task(cls):
@@ -246,7 +247,7 @@ def class_of_module(name: str, class_name: str) -> type[BaseEnv]:
 
 
 def _load_named(name: str, class_name: str, given: dict[str, str]) -> LoadedTask:
-    """Load ``package.module:ClassName`` as its file, with the package's modules.
+    """Load the file of ``package.module:ClassName``, with the package's modules.
 
     A library's module is imported normally: it is not edited, and other code uses its classes.
     """
@@ -526,7 +527,7 @@ def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
 
 
 def _named_module_problem(exc: BaseException, module: NamedModule) -> Problem:
-    """The problem of a module that a person named and that is imported as Python does."""
+    """The problem of `exc`, which the import of `module` by `import_module` raised."""
     problem = problem_from_exception(exc, "import", [module.file])
     message = f"{module.name} cannot be imported: {problem.message}"
     return dataclasses.replace(problem, message=message, file=problem.file or str(module.file))

@@ -38,7 +38,8 @@ class ModuleName:
 def module_name(file: Path) -> ModuleName:
     """The module name of `file`: unique, and the same at every load.
 
-    A file in a package (its folder has an ``__init__.py``) has its dotted name, which relative imports need.
+    For a file in a package (its folder has an ``__init__.py``) it is the dotted name, which relative imports
+    need.
     """
     if (file.parent / "__init__.py").is_file():
         parts, folder = [] if file.stem == "__init__" else [file.stem], file.parent
@@ -131,9 +132,9 @@ class AuthorFinder(MetaPathFinder):
         """The spec for a name that has no given text: an installed module, else a folder of given texts without
         ``__init__.py``.
 
-        Raises ModuleNotFoundError for the folder's other files. If this returned None, Python would continue
-        with `PathFinder`, which finds them if an earlier task, or the code itself, has put the folder on
-        ``sys.path``.
+        Raises ModuleNotFoundError for a file of the task's folder that has no given text. After None, Python
+        would continue with `PathFinder`, which finds this file if an earlier task, or the code itself, has
+        put the folder on ``sys.path``.
         """
         root = str(self.file.parent)
         places = [place for place in (sys.path if path is None else path) if not _is_in(place, root)]
@@ -160,7 +161,7 @@ class AuthorFinder(MetaPathFinder):
 
     @property
     def _is_newest(self) -> bool:
-        """Whether this is the task that was loaded last; imports are then for this task."""
+        """Whether this finder's task was loaded last: an import is then one of this task."""
         return next((f for f in sys.meta_path if isinstance(f, AuthorFinder)), None) is self
 
     def text(self, path: str) -> str:
@@ -199,8 +200,8 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
     """Executes one text. Reads and writes no bytecode files."""
 
     executed = 0
-    """Number of modules that the loaders of this process have begun to execute, without modules that have no
-    statement."""
+    """Number of modules that the loaders of this process have begun to execute; modules without a statement
+    do not count."""
 
     def __init__(self, finder: AuthorFinder, name: str, path: str) -> None:
         super().__init__(name, path)
@@ -237,8 +238,8 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
 
 
 def executed_modules() -> int:
-    """Number of authors' modules that this process has begun to execute in all loads, without modules that
-    have no statement."""
+    """Number of authors' modules that this process has begun to execute in all loads; modules without a
+    statement do not count."""
     return _AuthorLoader.executed
 
 

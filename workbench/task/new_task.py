@@ -159,7 +159,8 @@ def _taken(file: Path) -> str:
 
 
 def camel_case(name: str) -> str:
-    """``stack_two`` becomes ``StackTwo``; a name that begins with a digit gets a prefix."""
+    """A name in camel case: ``stack_two`` becomes ``StackTwo``. The prefix ``Task`` is added if the result
+    would not begin with a letter."""
     joined = "".join(word[0].upper() + word[1:] for word in _WORD.findall(name))
     return joined if joined[:1].isalpha() else f"Task{joined}"
 

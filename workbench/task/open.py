@@ -115,13 +115,13 @@ def with_advice(
 
 
 _MAX_SEEDS_TRIED = 8
-"""Maximum number of seeds with which one env is tried: an error of 16 envs may come from the state of one of
-them."""
+"""Maximum number of seeds with which one env is tried: an error with 16 envs may come from the state of a
+single env."""
 
 
 def _may_be_of_the_batch(error: TaskError) -> bool:
-    """Whether the error may be absent with one env: it is a broken rule, or may be about a shape (from torch,
-    numpy or a check). False for refusals of the core, which have their own advice."""
+    """Whether the task may work with one env: the error is a broken rule, or it may be about a shape (from
+    torch, numpy or a check). False for refusals of the core, which have their own advice."""
     cause = error.__cause__
     if isinstance(cause, BrokenRule):
         return True
@@ -199,8 +199,8 @@ def import_task(
 
 
 def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
-    """Build, rehearse and reset an imported task. A task that uses features that exist only for one env gets one env and a
-    notice.
+    """Build, rehearse and reset an imported task. A task that uses a feature that works only with one env
+    gets one env and a notice.
 
     On TaskError the caller undoes the import (`undo_load`).
     """
@@ -272,7 +272,7 @@ def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
     version is replaced.
 
     Raises:
-        TaskError: one of them fails.
+        TaskError: a reset or the step fails, or returns a wrong value.
     """
     with blamed("reset", loaded, task):
         task.reset(seed)
@@ -359,7 +359,7 @@ def warm_up(options: TaskOptions, keep_going: Callable[[], bool]) -> None:
     A TaskError of the build is ignored: the author's own load would fail too (no renderer, no GPU), and its
     report is better.
     """
-    # Of the author's arguments, only this one decides whether rendering is possible.
+    # Of the author's arguments, only ``render_backend`` decides whether rendering is possible.
     renderer = {name: value for name, value in options.env_kwargs.items() if name == "render_backend"}
     try:
         opened = open_task(_SMALL_TASK, replace(options, num_envs=1, env_kwargs=renderer, imports=()))

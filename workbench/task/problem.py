@@ -157,15 +157,15 @@ def problem_from_exception(
     Its line is the first of these that exists:
 
     * the line that one of the core's notes names, unless the author's innermost line raised the exception;
-    * the innermost frame of `exc`, or else of its causes, that is in `own_files` or in another file that is
-      not installed;
+    * the innermost frame, of `exc` or else of its causes, in an author's file: one of `own_files`, or any
+      other file that is not installed;
     * with `cls` (the task's class), the ``def`` of an override that cannot take the failed call's arguments;
     * with `cls`, the ``def`` of the author's hook of the stage, except for the stages ``build`` and ``step``;
     * `otherwise` (file and line).
 
-    A hook of `HOOK_STAGES` on the traceback replaces `stage`, unless `stage` is ``import``, ``syntax``,
-    ``policy`` or ``worker``. The message begins with the core's notes about earlier errors, and with the
-    first exception of the chain.
+    If a hook of `HOOK_STAGES` is on the traceback, its stage replaces `stage`, unless `stage` is ``import``,
+    ``syntax``, ``policy`` or ``worker``. The message begins with the core's notes about earlier errors, and
+    with the first cause of `exc`.
     """
     own = {str(path) for path in own_files}
     chain = [*chain_of(exc)]
@@ -290,7 +290,7 @@ def check_step_returns(
         reward: (N,) real numbers, or bools, which the rule `reward-rows` reports; None if no reward was computed.
 
     With one env shape () is allowed too. Tensors may be on any device. The problem's stage is ``returns``; its place is in
-    `source_files`, or None if the hook is inherited. NaN has the right shape: `envs.outliers` reports it.
+    `source_files`, or None if the hook is inherited. NaN is no problem here: `envs.outliers` reports it.
     """
     from workbench.envs.evaluate_entries import (  # imports torch, which the server must not
         no_reward,
@@ -425,8 +425,8 @@ def _is_raised_at(exc: BaseException, place: _Line | None) -> bool:
 
 
 def _hands_on(frame: FrameType, below: list[FrameType]) -> bool:
-    """Whether `frame` is a constructor that calls the base class's constructor, which called the object's
-    method that failed.
+    """Whether `frame` is a constructor that calls the base class's constructor, and the error is in another
+    method of the object, which the base class's constructor called.
 
     ``BaseEnv.__init__`` builds the scene and resets, so the line that calls it does not show where the build
     or reset fails.

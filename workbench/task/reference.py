@@ -22,7 +22,7 @@ _REFERENCE = re.compile(rf"(?P<module>{_NAME.pattern}):(?P<cls>[^\W\d]\w*)")
 
 @dataclass(frozen=True)
 class RecordedTask:
-    """A task that a recording names, as opposed to a ``str``, which a person gave.
+    """A task that a recording names. A task that a person names is a ``str``.
 
     A separate type, so that a path or module name from a recording is never opened as if a person had given
     it. Only a registered id is opened, or the exact texts that a person approved.
@@ -34,8 +34,8 @@ class RecordedTask:
     """The task's own file, absolute, if the recording has one."""
     class_name: str | None = None
     approved: Mapping[str, str] | None = None
-    """Text by path of `file` and of its modules, approved by a person: only these are executed. None: `file` is not
-    opened."""
+    """Texts of `file` and of its modules, by path, as a person approved them: only these texts are executed.
+    None: `file` is not opened."""
 
     def __str__(self) -> str:
         if self.file is None:
@@ -143,15 +143,14 @@ def missing_file(file: Path) -> TaskError:
 
 
 def reference_to_class(reference: TaskName, file: Path, class_name: str) -> TaskName:
-    """The reference of another class of the same file or package; `file` is the file of the class that
-    `reference` opened."""
+    """The reference to another class of the file that `reference` opened; `file` is that file."""
     if isinstance(reference, RecordedTask):
         return replace(reference, class_name=class_name)
     named = split_reference(reference)
     module = None if named is None else find_module(named[0])
     if module is None or module.search_folder is None or not file.is_relative_to(module.search_folder):
         return f"{named_file(reference)}:{class_name}"
-    # The named module may only import the class from another module.
+    # Name the module of `file`: the module in `reference` may merely import the class.
     parts = file.relative_to(module.search_folder).with_suffix("").parts
     return f"{'.'.join(parts[:-1] if parts[-1] == '__init__' else parts)}:{class_name}"
 
@@ -170,7 +169,7 @@ class NamedModule:
     it)."""
     own_folder: Path | None
     """Top package of the module, or the folder of a module without a package: everything in it is the author's. None for a
-    library's module, which is imported normally and not watched."""
+    library's module (imported normally and not watched), and if `search_folder` is None."""
 
 
 def split_reference(reference: str) -> tuple[str, str] | None:

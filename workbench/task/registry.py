@@ -123,14 +123,13 @@ def is_robot(value: object) -> bool:
 
 @contextmanager
 def registering(is_own: Callable[[str], bool], registrations: Registrations) -> Iterator[None]:
-    """Context manager that records in `registrations` what the files for which `is_own(path)` is true
-    register.
+    """Context manager: registrations by files for which `is_own(path)` is true are added to `registrations`.
 
     ManiSkill's `@register_env` keeps the old class of a known id ("already registered. Skip"), so a file that
     is executed on every save would keep its first version, and a file with a built-in id would be ignored. So
-    the two decorators are replaced by decorators that clear the name first. The tables are not reset
-    afterwards, whether the body raises or not: see `Registrations.undo`. Registrations of libraries that the
-    file imports are left alone, because the libraries stay imported.
+    `register_env` and `register_agent` are replaced by decorators that first remove the entries under the
+    name. The entries stay after the block, even if it raises: `Registrations.undo` removes them.
+    Registrations of libraries that the file imports are left alone, because the libraries stay imported.
 
     Depends on undocumented names of mani_skill 3.0.1; tests/task/test_registry.py fails if one moves.
     """

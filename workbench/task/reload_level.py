@@ -21,8 +21,8 @@ from workbench.task.problem import hooks_of
 
 Level = Literal["same", "patched", "cameras", "rebuilt"]
 """same: only comments, docstrings or layout changed. patched: only code that runs at steps and resets
-changed; the new class is put on the live env. cameras: camera configs changed, perhaps with such code; the
-scene stays. rebuilt: anything else changed."""
+changed; the new class is put on the live env. cameras: camera configs changed, and perhaps code that runs
+at steps and resets; the scene stays. rebuilt: anything else changed."""
 
 RESET_HOOKS = frozenset(hooks_of("reset"))
 STEP_HOOKS = frozenset(hooks_of("step"))
@@ -99,7 +99,7 @@ def find_change(
     author's classes. If code may reach further than the names in it (``exec``), nothing is replaced. In doubt
     the level is rebuilt: a wrong "rebuilt" costs a second, a wrong "patched" shows numbers of mixed code.
 
-    Pure: nothing is imported or executed, and no content of the texts raises.
+    Pure: nothing is imported or executed. Does not raise, whatever the texts contain.
     """
     if dict(old) == dict(new):
         return Change("same", "nothing changed")
@@ -218,8 +218,8 @@ class _Comparison:
     # --- code that cannot be analysed ----------------------------------------------------------------
 
     def _refuse_another_order(self, family: set[Key]) -> None:
-        """Refuse a changed order of members: the order numbers an enum's members and a dataclass's
-        arguments."""
+        """Refuse a changed order of a class's members: the values of an enum and the order of a dataclass's
+        arguments depend on it."""
         for key, versions in self._versions.by_key.items():
             if versions[0].kind != "class" or key in family or key in self._versions.changed:
                 continue
@@ -348,8 +348,11 @@ def _joined(names: list[str]) -> str:
 
 
 def removed_effects(old: Mapping[str, str], new: Mapping[str, str]) -> str:
-    """A statement with an effect outside its module (a call, an assignment to another module's attribute) that the old version
-    ran at its import and that the new version lacks: ``push.py:7 (torch.set_num_threads(8))``. Empty if there is none.
+    """Place and code of a statement that the old version ran at its import and that the new version lacks,
+    such as ``push.py:7 (torch.set_num_threads(8))``; empty if there is none.
+
+    Only statements with an effect outside their module count: a call, or an assignment to another module's
+    attribute.
     """
     changed = [path for path in old if old[path] != new.get(path)]
     ran = [(path, *effect) for path in changed for effect in _effects(path, old[path])]

@@ -44,7 +44,7 @@ class TaskText:
     def __init__(self, file: Path, text: str, class_name: str | None = None) -> None:
         """
         Args:
-            class_name: name of the task's class; None for the class that the file opens with.
+            class_name: name of the task's class; None for the class that opens if only the file is named.
 
         Raises:
             SettingError: the text is not Python.

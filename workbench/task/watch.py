@@ -35,19 +35,19 @@ Content = str | bytes | None
 """A file's text; its bytes if they are not text; None if it is missing or unreadable (device, pipe, too
 large)."""
 Statuses = dict[Path, tuple[int, ...]]
-"""By file: the fields of ``stat`` that change with its content, modification time first; empty for no
-file."""
+"""By file: the fields of ``stat`` that change with the file's content, modification time first; empty if
+there is no such file."""
 
 
 class SourceWatcher:
     """Thread that calls `on_change` with the followed files that have new content.
 
-    One save is many events of the file system: truncate and write; a temporary file renamed over it; delete and create; a
-    formatter that repeats all of it 20 ms later. So the paths are polled 25 times a second by ``stat``, which takes
-    microseconds. If there are hundreds of files, those saved last are polled every time, and the others in
-    turn. After a rename, creation or deletion in one of their folders (most editors save in this way), all
-    files are polled. Once ``stat`` is stable the texts are compared: a ``touch``, a ``git checkout`` of the
-    same content or a line-end conversion is no change.
+    One save is several events of the file system: an editor truncates and writes the file, or renames a
+    temporary file over it, or deletes and creates it; a formatter may do the same 20 ms later. So the paths
+    are polled 25 times a second by ``stat``, which takes microseconds. If there are hundreds of files, those
+    saved last are polled every time, and the others in turn. After a rename, creation or deletion in one of
+    their folders (most editors save in this way), all files are polled. Once ``stat`` is stable the texts are
+    compared: a ``touch``, a ``git checkout`` of the same content or a line-end conversion is no change.
 
     `on_change` may call `follow` and `stop`. An exception of `on_change` is reported, and watching continues.
     """

@@ -1,5 +1,4 @@
-"""Applies and reverts edits of the author's files, if a file still has the text for which its edit was
-planned."""
+"""Applies and reverts edits of the author's files. An edit is refused if a file lacks the expected text."""
 
 from __future__ import annotations
 
@@ -41,9 +40,10 @@ class FileChange:
 class SourceEdit(FileChange):
     """A planned change of one of the author's files, and of `others` if constants of other modules change too.
 
-    The author may save the same files in an editor meanwhile. So a file must still have `old_text`, is replaced by a
-    rename, and keeps its line ends, encoding, byte order mark, permissions and symbolic links. All files are checked before
-    the first is written; if writing a file fails, the files written before it are reverted.
+    The author may save the same files in an editor meanwhile. So an edit is refused unless each file still
+    has its `old_text`. A file is replaced by a rename, and keeps its line ends, encoding, byte order mark,
+    permissions and symbolic links. All files are checked before the first is written; if writing a file
+    fails, the files written before it are reverted.
     """
 
     notes: tuple[str, ...]
@@ -124,8 +124,8 @@ def _reverted(change: FileChange, since: str) -> bool:
 
 
 def _replace_text(path: str, expected: str, new_text: str | None, since: str) -> None:
-    """Replace the text `expected` of a file by `new_text`. If that is None, only check that this is
-    possible."""
+    """Replace the text `expected` of a file by `new_text`. If `new_text` is None, only check that the
+    file has this text and can be written."""
     if (reason := why_not_writable(path)) is not None:
         raise RefusedEdit(reason)
     real = Path(path).resolve()

@@ -74,7 +74,7 @@ class Why(Enum):
     """A page of another site made the request."""
     NO_TOKEN = "no token"
     OTHER_TOKEN = "other token"
-    """A wrong token, or one that was replaced by a new one."""
+    """A wrong token, or an old token that a new one has replaced."""
 
 
 @dataclass(frozen=True)
@@ -175,8 +175,8 @@ def _without_token(path: str) -> str:
 def decide(rules: AccessRules, asked: RequestParts) -> Decision:
     """Decide on one request or handshake. Never raises, for any client input.
 
-    Checks, in this order. *Host*: is the name ours? A rebound name cannot fake this. *Origin*: does the requesting page
-    come from exactly this address? *Sec-Fetch-Site*: does a request without an Origin (as of an image or
+    Checks, in this order. *Host*: is the name ours? A rebound name never is. *Origin*: does the requesting
+    page come from exactly this address? *Sec-Fetch-Site*: does a request without an Origin (as of an image or
     script tag) come from a foreign page? *Token*: 256 random bits, first in the printed address, afterwards
     in a cookie that scripts cannot read and that pages of other sites do not send.
 

@@ -47,9 +47,9 @@ class ConnectionLimits:
 
     A connection costs a task and buffers before its client has presented the token, so until then its
     duration and the size of its head are limited, and so is the number of such connections. If there are too
-    many, the oldest is closed, not the newest: a browser sends its request with the first packet, and idle
-    sockets of an attacker must not lock the browser out. (Chromium holds some idle sockets itself, and opens
-    new ones when they are closed.)
+    many, the oldest one of the peer that has the most is closed, not the newest: a browser sends its request
+    with the first packet, and idle sockets of an attacker must not lock the browser out. (Chromium holds some
+    idle sockets itself, and opens new ones when they are closed.)
     """
 
     def __init__(self, told: RateLimitedLog) -> None:
@@ -130,7 +130,8 @@ class Connection(ServerConnection):
 
 
 def of_peer(peer: str) -> str:
-    """`` (from 10.0.0.7)``, or nothing for a Unix socket, whose peers have no address."""
+    """The client's address for a message, `` (from 10.0.0.7)``; empty for a Unix socket, whose peers have no
+    address."""
     return f" (from {peer})" if peer else ""
 
 
@@ -197,8 +198,8 @@ MAX_LINE_CHARACTERS = 300
 
 
 class RateLimitedLog:
-    """Logs each kind of event at once, then again after `pause` seconds, after twice that time, and so on.
-    Thread-safe.
+    """Logs the first event of each kind at once. The next line of that kind is logged only after `pause`
+    seconds, and the pause doubles with each line. Thread-safe.
 
     Args:
         say: Prints one line.

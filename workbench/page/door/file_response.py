@@ -57,7 +57,7 @@ async def send_file(
     accepts_gzip: bool,
     not_found: Callable[[], Response],
 ) -> Response:
-    """Send the file over the connection block by block, each when the previous one is nearly sent.
+    """Send the file over the connection in blocks; a block is written when the previous one is nearly sent.
 
     A recording may have gigabytes, and `websockets` accepts a response only as one bytes object: a file that is open in
     three tabs would be in memory three times. So head and blocks are written to the connection here.

@@ -102,7 +102,7 @@ class GatedServer:
     """Warning for the terminal about a binding wider than loopback or an unknown viser version; None if there
     is neither."""
     notice: str | None
-    """Notice for the terminal that the page is not on its default port; None if it is."""
+    """Notice for the terminal if the page is on another port than requested; else None."""
     _listening: Listening = field(repr=False)
     _access_check: _AccessCheck = field(repr=False)
     _gated: viser_private.GatedViser = field(repr=False)
@@ -142,8 +142,9 @@ class GatedServer:
         return self.addresses()[0]
 
     def addresses(self, path: str = "/") -> tuple[str, ...]:
-        """The addresses, with the token, of ``path`` (from the root: ``/rerun/...``): first for a browser on this machine,
-        then for other machines (none on loopback; which of them works depends on the network)."""
+        """The addresses of ``path`` (from the root: ``/rerun/...``), with the token. The first is for a
+        browser on this machine. The rest are for other machines; which of them works depends on the network.
+        A server on loopback has only the first."""
         token = self._access_check.rules.token
         shown = f"?token={token}" if token else ""
         hosts = dict.fromkeys((self._listening.host, *self._listening.hosts_elsewhere()))

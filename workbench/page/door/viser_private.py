@@ -63,9 +63,9 @@ the second in its console.
 REFUSED_FROM_CLIENTS = (
     "ShareUrlRequest",  # opens a tunnel that makes the page public, for any client
     "ShareUrlDisconnect",
-    "FileTransferStartUpload",  # no size limit, file name used as sent; we accept no uploads
+    "FileTransferStartUpload",  # viser limits no size and trusts the file name; we accept no uploads
     "FileTransferPart",
-    "SceneNodeClickMessage",  # our nodes handle no clicks or drags, our buttons no holding
+    "SceneNodeClickMessage",  # our nodes handle no clicks or drags, and our buttons cannot be held
     "SceneNodeDragMessage",
     "GuiButtonHoldMessage",
 )
@@ -137,7 +137,7 @@ def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
 
 
 def wait_until_taken(server: viser.ViserServer, timeout: float) -> None:
-    """Wait until all messages so far are in a batch that is being sent to each page, at most `timeout` seconds.
+    """Wait up to `timeout` seconds until all messages so far are in a batch that is being sent to each page.
 
     A page handles a batch as a whole: messages written after this call do not delay earlier ones.
     """
@@ -363,9 +363,9 @@ def make_viser(
     viser serves page and websocket from one ``websockets`` server that it starts in ``viser/infra/_infra.py``, without a
     way to check a request first, choose the socket, refuse a message or suppress output. So while the server is made, the
     name ``websockets`` in that module is a stand-in whose ``serve`` is ours. It passes viser's arguments on,
-    but changes among others the socket, ``process_request``, compression, and the handler, which checks every
-    message first, sends as fast as the page acknowledges and closes stalled clients. `missing_names` is
-    checked before, and `gated_server` tests the result with a forbidden request.
+    but changes among others the socket, ``process_request``, compression and the handler. Our handler checks
+    every message first, sends as fast as the page acknowledges, and closes stalled clients. `missing_names`
+    is checked before, and `gated_server` tests the result with a forbidden request.
 
     Args:
         listening: bound and listening; the server owns it from here on.
@@ -414,8 +414,8 @@ def make_viser(
         real = infra.websockets
         infra.websockets = look_alike  # type: ignore[assignment]
         try:
-            # If a viser does not call our `serve`, it listens on loopback only, on any port, until it is
-            # stopped below.
+            # A version of viser that does not call our `serve` listens on loopback only, on any port, until
+            # it is stopped below.
             server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
         finally:
             infra.websockets = real

@@ -44,7 +44,7 @@ class EnvLayout:
     high: NDArray[np.float32]
     """(3,) highest corner of one env's contents without the floor, in the env's frame."""
     floor_height: float
-    """Height (z) of the floor, or of the lowest point of the env."""
+    """Height (z) of the floor; without a floor, of the env's lowest point."""
     has_floor: bool
 
     def box_of_all(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -59,7 +59,8 @@ def box_corners(low: ArrayLike, high: ArrayLike) -> NDArray:
 
 
 def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDArray[np.floating] | None:
-    """The normal (3,), in the env's frame, of a flat, very wide, static body (floor or backdrop); else None."""
+    """The normal (3,), in the env's frame, of a flat, very wide body that is static or kinematic (floor or
+    backdrop); None for any other body."""
     if any(geometry.body_kinds[b] not in ("static", "kinematic") for b in np.unique(visual.bodies)):
         return None
     extent = np.ptp(visual.mesh.vertices, axis=0)
@@ -240,7 +241,8 @@ class SelectionMark:
         self._drawn: tuple[int, int, str] | None = None
 
     def draw(self, layout: EnvLayout, env: int, shown: bool, name: str | None = None) -> None:
-        """Mark this env, unless it is alone in the view (not `shown`); `name` replaces its number."""
+        """Mark this env and label it with `name`, by default its number. Without `shown` (the env is alone in
+        the view), remove the mark."""
         name = f"env {env}" if name is None else name
         if not shown:
             self.clear()

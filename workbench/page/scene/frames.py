@@ -46,7 +46,7 @@ class BodyFrames:
         origin = np.array([[0, 0, 0, 1, 0, 0, 0]], np.float32)
         shown = np.concatenate([origin, shown])
         if len(shown) != self._count:
-            self.clear()  # viser's arrays are set one by one, and must have one length
+            self.clear()  # viser's two arrays are set one after the other, and must have equal lengths
         self._count = len(shown)
         self._axes.draw(shown[:, 3:], shown[:, :3] + np.asarray(offset, np.float32))
 

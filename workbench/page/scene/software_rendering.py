@@ -21,7 +21,8 @@ from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Visitor
 
 TOLERANCE_PIXELS = 0.75
-"""Distance within which 99 % of a surface must stay. With 1.5 a white part shows through the black one around it."""
+"""Maximum distance, in pixels, of 99 % of a simplified surface from the exact one. With 1.5 a white part
+shows through the black part around it."""
 MIN_TRIANGLES = 25_000
 """Number of triangles in the view below which shapes are not simplified: then pixels, not triangles, take the time."""
 TOLERANCE_FACTOR = 1.6

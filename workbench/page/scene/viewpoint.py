@@ -24,7 +24,8 @@ FOV_RADIANS = 0.75
 DEFAULT_ASPECT = 1.385
 """Aspect ratio (width over height) of the view in a 1280 x 720 window, used until a page has sent its own."""
 FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
-"""Direction from the scene to the eye: ManiSkill's robots face +x, so they are seen from there, slightly from the side."""
+"""Direction from the scene to the eye: ManiSkill's robots face +x, so the eye is in front of them, slightly
+to the side."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +198,8 @@ class Framing:
         viewpoint = frame(aspect_of(client))
         client.camera.position = viewpoint.position
         client.camera.look_at = viewpoint.look_at
-        # Last: a caller that waits for this may close the page, and viser warns about writes to a closed page.
+        # Last: a caller that waits for this entry may close the page, and viser warns about writes to a
+        # closed page.
         self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
 
 
@@ -232,8 +234,9 @@ def light(server: viser.ViserServer) -> None:
 class View3D:
     """The 3-D view of a server, shared by its pages: bodies, lights and viewpoint.
 
-    The bodies stay in the browser while one page replaces another, so that equal ones are not sent again and the view is
-    empty only until a task has loaded. Labels, frustums, marks and handles are removed with their page.
+    The bodies stay in the browser while one page replaces another. So bodies that look the same on both pages
+    are not sent again, and the view is empty only until a task has loaded. Labels, frustums, marks and
+    handles are removed with their page.
     """
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
@@ -265,7 +268,8 @@ DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
 
 @dataclass
 class ViewChoice:
-    """What the user chose to see. It outlives a page, which is rebuilt with each change between review and live page."""
+    """What the user chose to see. The choice is kept when the review replaces the live page, or the
+    reverse."""
 
     all_envs: set[str] = field(default_factory=set)
     """The tasks of which all envs are shown. Of any other task, only the selected env is shown."""

@@ -29,7 +29,7 @@ class EditorLink:
     copied: str
     """Text to copy: ``/home/me/push.py:88``."""
     new_tab: bool = False
-    """Whether the address is a web page, which in the same tab would replace this one."""
+    """Whether the address is a web page: opened in the same tab, it would replace the workbench's page."""
 
 
 LinkTo = Callable[[str | None, int | None], EditorLink]

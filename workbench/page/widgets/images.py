@@ -179,7 +179,7 @@ def in_colours(
 
 
 def narrowed(pixels: NDArray[np.uint8], width: int, smooth: bool) -> NDArray[np.uint8]:
-    """A picture scaled to at most `width` pixels.
+    """A picture, scaled down if it is wider than `width` pixels.
 
     Args:
         smooth: Average colours; if False, use only colours of the picture.

@@ -84,5 +84,5 @@ def add(
 
 
 def add_hints(server: viser.ViserServer) -> viser.GuiHtmlHandle:
-    """Add four hints to the present container, until the user closes them for good."""
+    """Add four hints to the present container, unless the user has closed them for good."""
     return server.gui.add_html("" if kept_choices().hints_closed else render("hints", close=CloseHints()))

@@ -144,7 +144,8 @@ def _polylines(
 
 
 def polylines(points: Sequence[str | None]) -> list[str]:
-    """``points`` of SVG polylines through these points, with a gap at each None."""
+    """Values for the attribute ``points`` of SVG polylines through these points; each None is a gap between
+    two polylines."""
     runs = [[point for point in run if point] for there, run in groupby(points, key=bool) if there]
     # SVG does not draw a polyline of one point; one of length zero with round ends is a dot.
     return [" ".join(run if len(run) > 1 else run * 2) for run in runs]
@@ -160,7 +161,8 @@ def ticks(low: float, high: float, most: int = MAX_TICKS) -> list[float]:
 
 
 def part_round(count: int, place: int | None) -> slice:
-    """At most `MAX_POINTS` of `count` points: around an index, or the newest."""
+    """The slice of at most `MAX_POINTS` of `count` points: around the index `place`, or, if it is None, the
+    newest."""
     end = count if place is None else min(max(place + MAX_POINTS // 2, MAX_POINTS), count)
     return slice(max(0, end - MAX_POINTS), end)
 

@@ -19,7 +19,8 @@ BEFORE_FOLD_VALUE = " \N{MIDDLE DOT} "
 
 
 HIDDEN_SECONDS = 2.0
-"""Interval at which what no page shows is drawn: it must not open empty, or long out of date."""
+"""Minimum interval of drawings, in seconds, of a part that no page shows. The part is still drawn, so that it
+does not open empty or long out of date."""
 
 
 class PagePart(Generic[View]):
@@ -80,7 +81,8 @@ class DrawThrottle:
         """Whether to draw now; if so, store this as drawn.
 
         Args:
-            hidden: Whether no page shows it: then nothing is urgent, and it is drawn every `HIDDEN_SECONDS`.
+            hidden: Whether no page shows it: then nothing is urgent, and the minimum interval is
+                `HIDDEN_SECONDS`.
         """
         if self._drawn is not None:
             drawn, was_urgent, at = self._drawn
@@ -105,7 +107,8 @@ class Parts(Generic[View]):
         """Add a part, which is drawn after the others.
 
         Args:
-            is_shown: Whether a page may show the part. It is drawn rarely otherwise, since every browser receives it.
+            is_shown: Returns whether a page may show the part. A part that no page shows is drawn rarely,
+                since each drawing is sent to every browser.
         """
         self._parts.append((part, DrawThrottle(part.every, self._clock), is_shown))
         for kind in part.does:

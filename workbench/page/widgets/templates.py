@@ -77,7 +77,7 @@ def sentence(why: str) -> str:
 
 
 def counted(count: int, what: str) -> str:
-    """``1 step``, ``7 steps``."""
+    """A number and its noun: ``1 step``, ``7 steps``."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 

@@ -54,8 +54,8 @@ class Visitor:
     _sent: viser.GuiHtmlHandle | None = None
 
     def send(self, html: str) -> None:
-        """Add an HTML element to this page, whose script acts on it (``arrivals`` in ``input.js``). It
-        replaces the element of the previous call."""
+        """Add an HTML element to this page. The page's script acts on the element (``arrivals`` in
+        ``input.js``). The element replaces that of the previous call."""
         if self._sent is not None:
             self._sent.remove()
         self._sent = self.client.gui.add_html(html)
@@ -113,8 +113,8 @@ class Visitors:
         return asked
 
     async def ask(self, command: Command, visitor: Visitor) -> str:
-        """Carry out a command after all earlier commands of any page. Returns the reason of a refusal, or an empty text; the
-        page shows it."""
+        """Carry out a command after all earlier commands of any page. If it is refused or fails, tell the
+        page and return the reason; else return an empty text."""
         try:
             await asyncio.wrap_future(submit(self._carry_out(command, visitor)))
         except Refused as reason:
