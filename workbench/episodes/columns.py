@@ -29,7 +29,8 @@ class Layout:
 
     A control step of one env is thirty to fifty small arrays, and writing each with its name and type would cost more
     than the step. Names and types stay the same from step to step, so a row is only the bytes of its arrays, and a
-    layout, stored once, describes them. It is a numpy structured type: one call converts a thousand rows to columns.
+    layout, stored once, describes them. A layout is a numpy structured type, so one call converts a thousand
+    rows to columns.
 
     A packer makes one object per key: compare layouts by identity.
     """
@@ -98,9 +99,10 @@ def assemble(runs: Sequence[NDArray]) -> dict[str, NDArray]:
     """Join `runs`, each a structured array (n,), to columns (sum of n, ...), in the order in which their
     names first appear.
 
-    Entries of ``evaluate()`` come, go and change their type while the author edits; each change is a new
-    layout. A column that every row has, always in the same shape, keeps its type. Any other column is
-    floating point, NaN where a row lacks it; rows of differing shape are flattened and padded with NaN.
+    While the author edits, entries of ``evaluate()`` appear, disappear and change their type; each change
+    begins a new layout. A column that every row has, always in the same shape, keeps its type. Any other
+    column is floating point, NaN where a row lacks it; rows of differing shape are flattened and padded with
+    NaN.
     """
     names = dict.fromkeys(name for run in runs for name in run.dtype.names or ())
     return {
@@ -146,8 +148,8 @@ MAX_TEXT_LINES = MAX_TEXT_BYTES
 CUT_MESSAGE = "not recorded from here on: it changes too often"
 
 TextLine = tuple[int, bytes]
-"""First state of a text, and its value in the journal. A plain pair, because a reader of rows must not import the journal's
-module: Arrow would start a thread in the process that forks."""
+"""(first state with this text, the text as the journal holds it). A plain pair instead of a `JournalEntry`:
+the journal's module imports Arrow, which would start a thread in the process that forks readers."""
 
 
 class TextEntry(Struct, frozen=True, array_like=True):

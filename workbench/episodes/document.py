@@ -51,7 +51,8 @@ MAX_BYTES = 64 << 20
 _BLOCK_BYTES = 1 << 20
 _ESCAPED_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 MAX_PATH_PARTS = 40
-"""Maximum number of parts of a recorded path. The path is untrusted, and a longer one is not searched for."""
+"""Maximum number of parts of a recorded path. The path is untrusted, and a longer path is not searched
+for."""
 
 T = TypeVar("T")
 Vector = tuple[float, float, float]
@@ -127,12 +128,13 @@ MAX_SEGMENTS = 1_000_000
 class Description(Struct, frozen=True, kw_only=True):
     """Metadata of a recording, in the ``.json`` and in the ``.rrd``; fields with a default may be missing.
 
-    A library lists thousands of episodes from this alone. It also holds what the ``.rrd`` and ``.h5`` lack: types of
-    the entries of ``evaluate()``, names and kinds of bodies, camera parameters.
+    A library lists thousands of episodes from their descriptions alone. A description also holds what the
+    ``.rrd`` and ``.h5`` lack: types of the entries of ``evaluate()``, names and kinds of bodies, camera
+    parameters.
     """
 
     format: int = FORMAT
-    # Up to `source_hash` as in `EpisodeInfo`.
+    # Fields up to `source_hash`: as in `EpisodeInfo`.
     id: Name
     task: Name
     env_index: SmallInt
@@ -179,7 +181,7 @@ class Description(Struct, frozen=True, kw_only=True):
     obs: Columns
     # Only in the .json:
     files: dict[str, Checksum] | UnsetType = UNSET
-    """Checksum of the other two files by suffix."""
+    """Checksums of the other two files, by suffix."""
     source_path: PathText | None | UnsetType = UNSET
     """Path of the task's file relative to the recording's folder."""
     thumbnail: str | None | UnsetType = UNSET
@@ -347,8 +349,8 @@ def json_text(value: object, indent: int | None = None) -> str:
 
 
 def seen_otherwise(info: EpisodeInfo) -> dict[str, Any]:
-    """Fields for the metadata of an export that say how pictures or observations differ from those of the
-    episode's source; empty if they do not."""
+    """Fields for the metadata of an export: the cameras that were not where the recorded source places them,
+    and the version that made the observations if it is later than that source. Empty if neither applies."""
     fields = {"moved_cameras": as_json(info.moved_cameras), "observed_by": info.observed_by}
     return {name: value for name, value in fields.items() if value}
 
@@ -397,10 +399,10 @@ def _typed(data: object, kind: type[T], place: str) -> T:
 def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     """The task's file at `source_path` relative to the recording's `folder`; None if it is not found.
 
-    In a copied recording the path is wrong, but the copy is usually opened from the task's folder. So each
-    end of the path (of ``a/b/c.py`` also ``b/c.py`` and ``c.py``) is also tried below the current folder,
-    below the recording's folder, and below the folders above the recording's. A file that is found in this
-    way must contain the task's name.
+    In a copied recording the path is wrong, but the copy is usually opened from the task's folder. So the
+    path and its ends (for ``a/b/c.py``: ``b/c.py`` and ``c.py``) are tried below the current folder, below
+    the recording's folder, and below the folders above the recording's. A file that is found in this way must
+    contain the task's name.
     """
     if not source_path:
         return None
@@ -429,8 +431,9 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
 # the page cache, which takes a hundredth of the time of writing them (measured). The `.json` itself ends with
 # a hash of everything before it.
 #
-# Checksums detect damage, not forgery. After you changed an `.rrd` or `.h5` (`rerun rrd optimize`), remove
-# its entry from `workbench.files` in the `.json`; after you changed the `.json`, set its hash to null.
+# Checksums detect damage, not forgery. After you changed an `.rrd` or `.h5` (with `rerun rrd optimize`, for
+# example), remove its entry from `workbench.files` in the `.json`; after you changed the `.json`, set its
+# hash to null.
 
 _OWN = "workbench_checksum"
 
@@ -442,7 +445,8 @@ def with_checksum(text: bytes) -> bytes:
 
 
 def _require_unchanged(content: bytes, document: Document) -> None:
-    """Raise WrongDocument if it was changed since it got its checksum."""
+    """Raise WrongDocument if `content`, the text of `document`, was changed after its checksum was
+    written."""
     if _OWN not in document.data:
         # A recording with a damaged checksum key must not pass for an old recording, which has no checksum.
         if document.is_ours and document.data["workbench"].get("format", 1) != 1:
@@ -480,7 +484,7 @@ def check(path: Path, checksums: Mapping[str, Checksum]) -> None:
 
 
 def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str | None:
-    """Problem with a file of `size` bytes; None if this is the recorded size, or none was recorded."""
+    """Problem with a file of `size` bytes; None if this is the recorded size, or no size was recorded."""
     if suffix not in checksums or checksums[suffix].size == size:
         return None
     return f"it has {size} bytes, and had {checksums[suffix].size} when it was written"

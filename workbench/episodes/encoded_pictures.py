@@ -100,8 +100,8 @@ def decode(modality: Modality, blob: bytes) -> NDArray:
 
 @contextlib.contextmanager
 def open_picture(blob: bytes) -> Iterator[Image.Image]:
-    """Open a JPEG, PNG or WebP of at most `MAX_PIXELS`. Raises OSError if it is invalid, even if this shows
-    only while the block decodes it."""
+    """Open a JPEG, PNG or WebP of at most `MAX_PIXELS`. Raises OSError if it is invalid, even
+    if only decoding it, in the block, shows this."""
     try:
         with Image.open(io.BytesIO(blob), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > MAX_PIXELS:

@@ -37,7 +37,8 @@ ActedBy = Annotated[tuple[tuple[SmallInt, PathText], ...], Entries]
 
 
 def is_shallow(value: object) -> bool:
-    """Whether lists and dicts in `value` are nested at most `MAX_DEPTH` deep: Python's ``repr`` fails at a few hundred."""
+    """Whether lists and dicts in `value` are nested at most `MAX_DEPTH` deep: Python's ``repr`` fails at a
+    few hundred levels."""
     level = [value]
     for _ in range(MAX_DEPTH):
         inside = (
@@ -176,9 +177,9 @@ class BrokenFile:
 class Episode:
     """T actions and T + 1 states of one env. State 0 is the reset; action t leads to state t + 1.
 
-    Stored as whole columns, since every format and every reader uses them; rerun writes columns forty times faster than
-    with one call per step (measured). Only pictures are not plain arrays: an hour of pictures from four
-    cameras does not fit into memory.
+    Stored as whole columns, since every format and every reader uses them; rerun writes a column forty times
+    faster in one call than in one call per step (measured). Only pictures are not plain arrays: an hour of
+    pictures from four cameras does not fit into memory.
     """
 
     info: EpisodeInfo
@@ -218,7 +219,8 @@ class Episode:
         return len(self.reward)
 
     def flag(self, name: str) -> NDArray[np.bool_] | None:
-        """(T + 1,) an entry of ``evaluate()`` with one value per state, False where it is NaN; None if there is none."""
+        """(T + 1,) an entry of ``evaluate()`` with one value per state, False where it is NaN; None if there
+        is no such entry."""
         values = self.evaluate.get(name)
         if values is None or values.ndim != 1:
             return None

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
-"""Relative tolerance (fraction of the largest recorded number) and absolute tolerance of equal numbers."""
+"""Numbers count as equal up to the larger of these differences: a fraction of the largest recorded number,
+and an absolute difference."""
 
 
 def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:
@@ -33,8 +34,8 @@ def numbers_differ(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> ND
 def too_far(
     old: NDArray, apart: NDArray, least: float = SAME_NUMBER, axis: int | None = None
 ) -> NDArray[np.bool_]:
-    """True where `apart` is larger than `least` and than `SAME_SHARE` of the largest magnitude in `old` (if
-    `axis` is 1: in the same row of `old`)."""
+    """True where `apart` exceeds both `least` and `SAME_SHARE` times the largest finite magnitude in `old`
+    (if `axis` is 1: in the same row of `old`)."""
     if not apart.any():
         return apart > 0
     scale = np.abs(old).max(axis=axis, initial=0.0, where=np.isfinite(old), keepdims=True)

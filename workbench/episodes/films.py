@@ -39,7 +39,7 @@ class Encoding:
     """Settings of an mp4; the defaults are for films that people watch."""
 
     crf: int = 18
-    """H.264's quality, lower is better; 18 is visually almost lossless."""
+    """H.264's constant rate factor: a lower one gives better quality; 18 is visually almost lossless."""
     key_every: int | None = None
     """Interval of key frames, in frames; None for the encoder's default. A long interval makes seeking slow."""
     exact_size: bool = False
@@ -216,8 +216,8 @@ class FilmPart:
 def film_frames(film: Path, begin: float, count: int) -> Iterator[NDArray[np.uint8]]:
     """At most `count` frames (H, W, 3) from `begin` seconds on.
 
-    An untrusted ``.mp4`` may be a playlist that names other files and addresses, or claim pictures of any
-    size. So ffmpeg gets a fixed format, may open files but no addresses, and has limits on pixels, frames and
+    An untrusted ``.mp4`` may be a playlist that names other files and URLs, or claim pictures of any
+    size. So ffmpeg gets a fixed format, may open files but no URLs, and has limits on pixels, frames and
     time. It outputs PPM, which contains the size of each frame.
 
     Raises:
@@ -309,7 +309,7 @@ def camera_of(episode: Episode, name: str) -> CameraTrack:
 
 
 def picture_index(camera: CameraTrack, state: int) -> int:
-    """Index of the newest picture at `state`, or of the first if there is none yet."""
+    """Index of the newest picture up to `state`; of the first picture if all pictures are later."""
     return max(int(np.searchsorted(camera.frame, state, side="right")) - 1, 0)
 
 
@@ -384,8 +384,8 @@ def contact_sheet(episode: Episode, columns: int = COLUMNS) -> Image.Image:
 
 
 def chosen_states(episode: Episode, columns: int) -> list[int]:
-    """At most `columns` evenly spaced states. The state of the first success replaces the nearest of them,
-    except the first and the last; so does the state of the first fail."""
+    """At most `columns` evenly spaced states. The first state with success, and then the first with fail,
+    each replace the nearest state that is neither the first nor the last."""
     states = sorted(set(np.linspace(0, episode.length, columns).round().astype(int).tolist()))
     for name in ("success", "fail"):
         moment = _first(episode, name)
@@ -423,7 +423,7 @@ FROM_THE_FRONT = np.array([1.0, 0.55, 0.75])
 
 @dataclass(frozen=True)
 class FilmEye:
-    """A fixed camera; metres in the env's frame."""
+    """A fixed camera; positions are in metres in the env's frame."""
 
     position: tuple[float, float, float]
     look_at: tuple[float, float, float]

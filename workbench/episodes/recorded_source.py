@@ -225,8 +225,8 @@ def recorded_source(info: EpisodeInfo) -> Iterator[str]:
 def write_source(info: EpisodeInfo) -> tuple[Path, str]:
     """Write the recorded source to a new folder, which the caller removes; returns the folder and the reference to open.
 
-    Other files of the task's folder, such as meshes, are not in a recording, but their names are; those that still exist
-    are linked into the new folder in their current state.
+    Other files of the task's folder, such as meshes, are not in a recording, but their names are; the files
+    that still exist are linked into the new folder, in their current state.
 
     Raises:
         CannotEnterRecording: as `recorded_source` does.
@@ -264,7 +264,8 @@ def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
 
 
 def _class_of(text: str, env_id: str) -> str | None:
-    """The class that is registered under this id, or has this name; None if there is none."""
+    """Name of the class that is registered under the id `env_id`, else of the class with that name; None if
+    there is neither."""
     try:
         tree = parse_python(text)
     except (SyntaxError, ValueError, RecursionError, MemoryError):

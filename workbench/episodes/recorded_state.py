@@ -24,7 +24,8 @@ _POSE = 7
 
 
 def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
-    """Parts of a recorded state that do not fit this env, and parts of the env that the state lacks: reason by name.
+    """Names of the parts of a recorded state that do not fit this env, and of the parts of the env that the
+    state lacks, each with the reason.
 
     Args:
         env: an unwrapped ManiSkill env, batched.
@@ -56,7 +57,8 @@ def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
     missed = {i: state_mismatches(env, i, state) for i, state in states.items()}
     px = batched_system(env.scene)
     maniskill_private.fetch(env)
-    # Writes only what differs: a root pose that is set again reads back with a different rounding.
+    # Collect the values in the tensors, because applying the tensors writes only what differs: a root pose
+    # that is set again reads back with a different rounding.
     with nullcontext() if px is None else px.holding_back():
         for name, struct in scene_index(env).states.items():
             fitting = [
@@ -134,7 +136,7 @@ def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tu
 
 
 def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
-    """Whether all entries that both states have are equal to the last bit, including velocities."""
+    """Whether all entries that both states have are exactly equal, including velocities."""
     both = [name for name in was if name in now and now[name].shape == was[name].shape]
     return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
 

@@ -29,7 +29,8 @@ from workbench.task.load import LoadedTask
 from workbench.task.open import OpenedTask
 
 PARTED_METRES, PARTED_RADIANS = 1e-4, 1e-3
-"""Maximum distance of a state from the recorded one; beyond it the state is corrected."""
+"""Largest distances from the recorded state that a replay accepts, the second one for rotations of bodies and
+joints; beyond these the replay restores the recorded state."""
 
 Way = Literal["re-simulated", "corrected", "put there"]
 
@@ -47,8 +48,8 @@ class ReplayResult:
     corrected: int = 0
     """Number of steps after which the recorded state was restored."""
     start_differs: bool = False
-    """Whether the reset with the recorded seed gave a different first state than the recorded one, which was
-    then restored."""
+    """Whether the reset with the recorded seed gave another first state than the recorded one, so that the
+    recorded one was restored."""
     missed: dict[str, str] = field(default_factory=dict)
     """Name and reason of each part of the state that could not be restored."""
 
@@ -58,7 +59,7 @@ class Beginning:
     """Result of putting an env into the first state of a run."""
 
     differs: bool
-    """Whether the reset gave a different state than the recorded one, which was then restored."""
+    """Whether the reset gave another state than the recorded one, so that the recorded one was restored."""
     missed: dict[str, str]
     """Name and reason of each part of the state that could not be restored."""
 
@@ -66,8 +67,8 @@ class Beginning:
 def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
     """Put these envs into the first state of their runs: reset with the seed, then restore the state if it differs.
 
-    The state after the reset may differ because envs that were reset together share torch's generator, so
-    their random numbers depend on more than the seed.
+    The state may differ if the recorded env was reset together with other envs: they shared torch's
+    generator, so its random numbers depended on more than the seed.
 
     Raises:
         TaskError: a reset raised.
@@ -127,10 +128,10 @@ def replay_to(
 
     A state that is only restored (`episodes.recorded_state`) has all bodies in place, but lacks what no
     recording holds: contacts, drive targets, the task's own counters. A replay from the recorded seed with
-    the recorded actions reproduces these to the last bit if the code is the same; with different code it
-    reaches a different state. So the run is replayed, and the bodies are compared with the recording after
-    each step. If a body is too far from its recorded pose, the recorded state is restored; the result counts
-    the steps after which this happened.
+    the recorded actions reproduces all of this exactly if the code is the same; different code leads to a
+    different state. So the run is replayed, and the bodies are compared with the recording after each step.
+    If a body is too far from its recorded pose, the recorded state is restored; the result counts the steps
+    after which this happened.
 
     The other envs do not move (`step_only`), and the task's attributes for them are restored afterwards.
 

@@ -154,7 +154,7 @@ def clean_facts(facts: Facts) -> Facts:
 
 
 def clean_text(value: object, longest: int = 200) -> str:
-    """One line of printable characters, cut to `longest`; empty for other types."""
+    """A string as one line of printable characters, cut to `longest`; empty if `value` is not a string."""
     if not isinstance(value, str):
         return ""
     if len(value) <= longest and value.isprintable():

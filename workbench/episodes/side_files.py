@@ -28,11 +28,11 @@ def side_files(task: str | None, source: Mapping[str, str]) -> dict[str, str]:
     """Hash of each side file, by path relative to the task's folder.
 
     A recording holds the task's text but not its meshes, which may be larger than all recordings together. The files that
-    a task reads cannot be observed, since native libraries open many. So the result has each file below the
-    task's folder that strings of the text name, directly or by a folder above it, and each file that these
-    files name in turn (as a URDF names its meshes). A file is missed if the code composes its path and no
-    string names its folder. If a string names a folder, its files are included even if the task never reads
-    them. So a change of a side file is only reported: it never prevents anything.
+    a task reads cannot be observed, since native libraries open many of them. So the result has each file
+    below the task's folder for which a string in the text names the file or a folder above it, and each file
+    that these files name in turn (as a URDF names its meshes). A file is missed if the code composes its path
+    and no string names its folder. If a string names a folder, its files are included even if the task never
+    reads them. So a change of a side file is only reported: it never prevents anything.
 
     Args:
         task: the task's file. For a file of an installed package the result is empty: the package's version

@@ -15,10 +15,10 @@ from workbench.machine.files import open_regular_file, replace_file
 
 RESULTS = "results.parquet"
 SET, MEAN = "set.", "mean."
-"""Prefixes of the columns of set values, and of means over an episode."""
+"""Prefixes of the columns of values that points set, and of means over an episode."""
 MAX_POINTS = 1000
 MAX_NAMES = 100
-"""Maximum number of set names, and of entries with a mean."""
+"""Maximum number of names that a point sets, and of entries with a mean."""
 MAX_ROWS = 1_000_000
 MAX_BYTES = 256 << 20
 MAX_TEXT_CHARACTERS = 2000
@@ -26,7 +26,7 @@ MAX_TEXT_CHARACTERS = 2000
 _ABOUT = b"workbench.sweep"
 _FORMAT = 1
 _Z = 1.959964
-"""Standard deviations around the mean that contain 95 % of a normal distribution."""
+"""95 % of a normal distribution lies within this many standard deviations of the mean."""
 
 T = TypeVar("T")
 
@@ -68,7 +68,7 @@ class SweepResults:
     seeds: int
     """Number of seeds requested for each point."""
     points: tuple[Mapping[str, str], ...]
-    """Set values of each point by name, in JSON."""
+    """Values that each point sets, by name, in JSON."""
     episodes: tuple[SweepEpisode, ...]
     """Episodes ordered by point and seed."""
 
@@ -92,7 +92,7 @@ class PointSummary:
 
     index: int
     values: Mapping[str, str]
-    """Set values by name, in JSON."""
+    """Values that the point sets, by name, in JSON."""
     episodes: int
     solved: int | None
     """Episodes with success in any state; None for a task without ``success``."""
@@ -117,7 +117,7 @@ class PointSummary:
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a rate with `successes` in `count`."""
+    """Wilson's 95 % confidence interval of a success rate, for `successes` out of `count`."""
     rate, part = successes / count, _Z * _Z / count
     middle = (rate + part / 2) / (1 + part)
     half = _Z / (1 + part) * math.sqrt(rate * (1 - rate) / count + part / (4 * count))
@@ -157,7 +157,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def value_text(json_text: str) -> str:
-    """A set value for display: a string without its quotes, any other value as JSON."""
+    """A value that a point sets, for display: a string without its quotes, any other value as JSON."""
     try:
         value = json.loads(json_text)
     except ValueError:

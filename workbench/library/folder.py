@@ -55,8 +55,8 @@ class LibraryView:
     rows: tuple[LibraryRow, ...] = ()
     """Rows, sorted by name."""
     reading: tuple[int, int] | None = None
-    """Numbers of files (read, to read) while files are read; (0, 0) before they are counted, None when all
-    are read."""
+    """(files read so far, files to read in all) while changed files are read; (0, 0) before they are counted;
+    None when all are read."""
     problem: str | None = None
     """Why the folder cannot be listed, as a sentence; None if it can."""
     trash: Trash = Trash()

@@ -74,7 +74,7 @@ class LibraryIndex:
     def store(
         self, read: Collection[tuple[RecordingFiles, Sequence[LibraryEntry]]], gone: Collection[str] = ()
     ) -> None:
-        """Store read files and delete the keys in `gone`."""
+        """Store the rows of the files in `read`, and delete those of the keys in `gone`."""
 
         def write(database: sqlite3.Connection) -> None:
             for found, entries in read:

@@ -81,8 +81,8 @@ class Listing:
     """All rows of the library."""
     wanted: LibraryList
     list: LibraryList
-    """`wanted` without rows that are not listed, and without a task filter for which there is no
-    recording."""
+    """`wanted`, after deselecting rows that are not listed, removing the cursor from such a row, and dropping
+    a filter for a task without recordings."""
     rows: tuple[LibraryRow, ...]
     """The listed rows, in order."""
 

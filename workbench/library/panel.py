@@ -137,7 +137,8 @@ class LibraryPanel(PagePart[object]):
         self._pictured: tuple[LibraryRow, ...] = ()
         """Rows whose thumbnails are being read or were read last."""
         self._thumbnails: Mapping[str, bytes | None] = {}
-        """JPEGs by row id; None for a recording without one. A missing row has not been read yet."""
+        """JPEGs by row id; None for a recording without one. A row that is missing here has not been read
+        yet."""
         library.on_change.add(self._library_changed)
         self._library_changed()
 

@@ -451,7 +451,7 @@ class EpisodeFinisher:
         except BaseException as error:
             if isinstance(error, (KeyboardInterrupt, SystemExit)):
                 raise
-            # A panic of rerun's Rust code is not an Exception. The journal stays, and the next start tries again.
+            # A panic of rerun's Rust code is not an Exception. The journal stays, for `recover`.
             if not isinstance(error, (RecordingError, OSError, ValueError)):
                 report_failure(f"An episode of env {episode.env} could not be written", error)
             return f"An episode of env {episode.env} could not be written: {error}", 0

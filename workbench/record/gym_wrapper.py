@@ -73,10 +73,10 @@ class Recorder(gym.Wrapper):
         env.close()  # waits for the files
 
     Writes the same files as the page and ``workbench record``, one set per episode: .rrd, .h5 and .json. An
-    episode of an env lasts from one reset to the next, so partial resets, auto-resets and wrappers that
-    continue after success work. The Recorder records the env's own state, observation and reward, so it must
-    wrap the env of `make` directly, inside all wrappers that change actions. If at least four envs are
-    recorded, a subprocess makes the files (on a machine with more than one core).
+    episode of an env lasts from one reset to the next, so you can use partial resets, auto-resets and
+    wrappers that continue after success. The Recorder records the env's own state, observation and reward, so
+    it must wrap the env of `make` directly, inside all wrappers that change actions. If at least four envs
+    are recorded, a subprocess makes the files (on a machine with more than one core).
 
     A full disk must not end a training loop: if the files cannot be written, one warning is given, the
     recording ends, and `problem` has the reason.

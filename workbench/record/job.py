@@ -50,9 +50,9 @@ class RecordProgress:
     """Maximum number of control steps of an episode."""
     done: float = 0.0
     """Number of episodes kept so far. If all episodes are kept, not only the successes, each running episode
-    adds the fraction that is done."""
+    adds the fraction of it that is done."""
     failures: tuple[Failure, ...] = ()
-    """Episodes so far without a result, by number."""
+    """The failures so far, each with the numbers of its episodes, which have no result."""
     was_there: bool = False
     """Whether the episode that has ended comes from an earlier run of the job."""
 
@@ -74,7 +74,8 @@ class Recorded:
     start_corrected: int = 0
     """Number of episodes with `Written.start_corrected`."""
     failures: tuple[Failure, ...] = ()
-    """Episodes, by number, in which the author's code failed or whose workers died."""
+    """The failures, each with the numbers of the episodes in which the author's code failed or whose workers
+    died."""
     missing: int = 0
     """Number of requested episodes that were not finished."""
 

@@ -152,8 +152,9 @@ class Written:
 
 
 def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[RecordedRun]]:
-    """The options, with the number of episodes and the control mode from the file of actions, and the file's
-    runs: one run for each episode, one for all episodes, or none without a file.
+    """(options, runs). The options are completed with the number of episodes and the control mode from the
+    file of actions. The runs are those of the file: one for each episode, or one for all; none if there is no
+    file.
 
     Raises:
         FileNotFoundError, ValueError: as `find_actions` does; or the requested numbers are invalid.
@@ -261,7 +262,8 @@ def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> Opened
         for finding in findings_of_shaders(opened.description.cameras):
             queue.send_update(RecordUpdate(finding=finding))
     if isinstance(opened.env.env, BatchedCpuMixin):
-        # Otherwise the last bits of an episode would depend on the earlier episodes of the same process.
+        # Otherwise the last bits of an episode's numbers would depend on earlier episodes of the same
+        # process.
         opened.env.env.begins_anew = True
     return opened
 

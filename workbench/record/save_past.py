@@ -206,8 +206,8 @@ class PastSaver:
 
 
 def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:
-    """The running version, which makes the pictures, with the file and source of the version that played the
-    episode."""
+    """The description of the running version, which makes the pictures, but with the file and source of the
+    version that played the episode."""
     played = episode.played_by
     if played is None:
         return task

@@ -234,7 +234,8 @@ def request_of(run: Run, env_idx: tuple[int, ...] | None, before: bool = False) 
 
 
 def find_episode(history: History, env: int, serial: int | None, before: bool = False) -> PastEpisode | str:
-    """The episode of this env that contains a moment, up to its end; or the reason why none can be recorded.
+    """This env's episode that contains the moment `serial`, up to the episode's end; or the reason why it
+    cannot be recorded.
 
     Args:
         serial: serial of the moment; None for the running episode or, if it has no step yet, the previous one.

@@ -25,7 +25,7 @@ EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 WORKBENCH_FILE = "meta/workbench.json"
-"""Not part of the format: the recordings that the episodes were made from."""
+"""A file that is not part of the format: it names the recordings that the episodes were made from."""
 
 CHUNK_SIZE = 1000
 """Maximum number of files per folder."""
@@ -138,15 +138,16 @@ class Choice:
     cameras: tuple[str, ...] | None = None
     """Names of cameras; None takes all with colour pictures."""
     every: int = 1
-    """Keep every n-th step, with its action."""
+    """Keep every n-th step, with its action and the sum of the rewards until the next kept step."""
 
 
 @dataclass(frozen=True)
 class Frames:
     """Frames of an episode.
 
-    LeRobot has a row per decision: the observation of state t, action t, and the result under ``next.``. So row t of our
-    T actions and T + 1 states is state t with action t and the reward of that step; the last state is left out.
+    LeRobot has a row per decision: the observation of state t, action t, and the result under ``next.``. So,
+    if every step is kept, row t of our T actions and T + 1 states is state t with action t and the reward of
+    that step; the last state is left out.
     """
 
     columns: dict[str, NDArray]
@@ -154,7 +155,7 @@ class Frames:
     episode: Episode
     cameras: tuple[str, ...]
     states: NDArray[np.int64]
-    """(T,) state index of each frame."""
+    """(number of frames,) state index of each frame."""
 
     def pictures(self, camera: str) -> Iterator[NDArray[np.uint8]]:
         """One (H, W, 3) per frame."""

@@ -88,7 +88,7 @@ def _of_episodes(
 
 
 def _flat(column: pa.ChunkedArray) -> NDArray[np.float64]:
-    """One number per frame; some datasets store them as lists of one."""
+    """One number per frame; some datasets store each as a list with one item."""
     array: Any = column.combine_chunks()
     while pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type):
         array = array.flatten()
@@ -264,7 +264,8 @@ def _format_path(pattern: str, values: dict[str, Any]) -> str:
 
 
 def _workbench_entries(folder: Path) -> list[dict[str, Any]]:
-    """The recordings of the episodes, if the workbench wrote the dataset."""
+    """Metadata of each episode's recording, by episode index; empty if the workbench did not write the
+    dataset."""
     try:
         found = read_json(Path(folder) / form.WORKBENCH_FILE)["episodes"]
     except (OSError, ValueError, KeyError, TypeError):

@@ -20,7 +20,7 @@ from workbench.episodes.row import UnreadableRecording
 from workbench.machine.text import short_line
 
 WORKBENCH_ID = "workbench_id"
-"""Key of an episode in the ``.json``: the id of its recording."""
+"""Key in an episode's entry of the ``.json``; its value is the id of the recording."""
 _FLAT = "state"
 """The observation mode in which ManiSkill returns one vector."""
 

@@ -73,7 +73,7 @@ def open_h5(path: Path) -> Iterator[H5Group]:
 
 
 class _Budget:
-    """Remaining limits of an open file."""
+    """How much may still be read from an open file."""
 
     def __init__(self, file_size: int) -> None:
         self.file_size = file_size

@@ -21,7 +21,7 @@ TRAJECTORY = "traj_0"
 _MIN_COMPRESSED_BYTES = 8 << 10
 _CHUNK_BYTES = 256 << 10
 _ZLIB_LEVEL = 1
-"""Compression level of zlib. On numbers of a simulation level 4 saves 1 % more and takes a third longer."""
+"""Compression level of zlib. On numbers of a simulation, level 4 saves 1 % more and takes a third longer."""
 _MAKES_UTF8 = h5py.h5p.create(h5py.h5p.LINK_CREATE)
 _MAKES_UTF8.set_char_encoding(h5py.h5t.CSET_UTF8)
 _ORDERED = h5py.h5p.create(h5py.h5p.GROUP_CREATE)

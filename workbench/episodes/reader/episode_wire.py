@@ -115,8 +115,8 @@ def unpack_episode(
 ) -> Episode:
     """Unpack and validate an episode: the file may be broken, and the reader compromised.
 
-    The code that uses an episode relies on columns with a row per state, on faces of existing vertices, and
-    on as many names of actions as action dimensions.
+    The code that uses an episode relies on columns with a row per state, on faces whose vertices exist, and
+    on a name for each action dimension.
 
     Args:
         process: number of the process that read the episode.

@@ -143,8 +143,8 @@ def _broken_file(file: Path, error: Exception, lost: str) -> BrokenFile:
 
 
 def _read_description(file: Path | None) -> tuple[Description | None, Exception | None]:
-    """The description in the .json (None if the workbench did not write it), and the error of reading it
-    (None if it was read)."""
+    """(description in the .json, error). The description is None if the file is missing, unreadable or from
+    another program; the error is None unless reading the file failed."""
     if file is None:
         return None, None
     try:

@@ -1,4 +1,4 @@
-"""Makes library rows from the files of one name."""
+"""Makes library rows from the files that share one name."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ MAX_EPISODES = 20_000
 """Maximum number of episodes of one file that are listed."""
 
 _MAX_PICTURE_PIXELS = 4096
-"""Maximum longer side of a picture that a thumbnail is made from."""
+"""Thumbnails are made only from pictures whose longer side has at most this many pixels."""
 
 
 def read_found(folder: Path, found: RecordingFiles, only_names: bool = False) -> list[LibraryEntry]:
@@ -116,8 +116,8 @@ def _workbench_entry(found: RecordingFiles, document: Document) -> LibraryEntry:
     except WrongDocument as error:
         written, problem = {}, problem or clean_text(f"{name}.json {error}.", 500)
     for suffix, size in found.sizes.items():
-        # Compares sizes only: a list of thousands must not read contents. Opening a recording compares
-        # checksums.
+        # Compares sizes only, to list thousands of recordings without reading them. Opening a recording
+        # compares checksums.
         if problem is None and (why := wrong_size(written, suffix, size)) is not None:
             problem = f"{name}{suffix} was cut short or changed: {why}."
     described = document.data["workbench"]

@@ -28,7 +28,7 @@ POLL_SECONDS = 0.2
 
 
 FOR_READING = {
-    # A fork copies only one thread.
+    # Start no further threads: a fork copies only one thread.
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     # Load no filter plugins of HDF5.
@@ -228,7 +228,8 @@ class Reader:
                 self._kill()
 
     def close_episode(self, process: int, opened: int) -> None:
-        """Close an episode with the next request. Does not block, because a finalizer may call it on any thread."""
+        """Close an episode when the next request is sent. Does not block, because a finalizer may call this
+        on any thread."""
         self._closed.append((process, opened))
 
     def close(self) -> None:

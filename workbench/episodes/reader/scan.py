@@ -17,8 +17,8 @@ recording."""
 DATASET_KEY = ["meta", "info"]
 """End of the key of a LeRobot dataset."""
 SETTLE_SECONDS = 3.0
-"""Time after a change of a folder in which a further change may leave its modification time the same (the
-times advance in ticks), and in which a new recording may still get its other files."""
+"""For this long after a change of a folder, a further change may leave the folder's modification time the
+same (the times advance in ticks), and a new recording may still get its other files."""
 MAX_ENTRIES = 500_000
 """Maximum number of names that are listed: the folder may be a home folder."""
 

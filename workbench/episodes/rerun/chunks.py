@@ -18,7 +18,8 @@ SIM_TIME = "sim_time"
 LOOK = "look"
 """Component of a visual, JSON: its name, its colour (RGBA), metallic and roughness."""
 _MAX_CACHED_STEPS = 2000
-"""Maximum number of steps whose times are cached: hours would take a hundred megabytes for the life of the process."""
+"""Maximum number of steps whose times are cached: the times of hours of recording would take a hundred
+megabytes for the life of the process."""
 SERIES_COLORS = (
     (86, 180, 233),
     (230, 159, 0),
@@ -163,7 +164,8 @@ class TimedChunks:
             begin += len(rows)
 
     def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> Chunk:
-        """A chunk of `values` (len(steps), ...), one batch per step with at least one number; only `changed_rows`."""
+        """A chunk of `values` (len(steps), ...): one batch per step, of at least one number; only
+        `changed_rows`."""
         flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
         (rows,) = changed_rows(flat[None])
         if rows is not None:

@@ -34,8 +34,8 @@ LOGS = "/logs"
 EVENTS = "/logs/events"
 ENTRY_TEXTS = "/logs/evaluate"
 OBSERVATION = "/observation/state"
-"""All observations except pictures as one batch, as in LeRobot: one entity for each would cost 5 kB per file and 40 B per
-step."""
+"""All observations except pictures as one batch, as in LeRobot. A separate entity for an observation would
+cost 5 kB per file and 40 B per step."""
 
 _MAX_PIXELS, _MAX_PICTURES = 1 << 20, 1024
 """Maximum pixels and pictures of one chunk, whose pictures are in memory together."""

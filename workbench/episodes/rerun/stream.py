@@ -70,8 +70,8 @@ def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: I
 
 @contextmanager
 def _rerun_enabled() -> Iterator[None]:
-    """Override the user's ``RERUN=off``, which is meant for logging in the user's code: with this setting
-    rerun silently writes nothing."""
+    """Override the user's ``RERUN=off``, which is meant for logging in the user's code, but would make rerun
+    silently write nothing here too."""
     entries = os.environ.get("RERUN")
     if entries is None:
         yield

@@ -122,7 +122,7 @@ class EpisodeWriter:
         Args:
             pictures: pictures of this env alone; later pictures of a camera must have the modalities of its
                 first picture. The pictures are encoded in the background: do not modify them afterwards.
-            others: entries of ``evaluate()`` that are not rows, each as returned by `OtherEntry.of_env`.
+            others: `StepResult.others`, each entry as returned by `OtherEntry.of_env`.
 
         Raises:
             ValueError: the row does not fit the episode, which is unchanged.
@@ -300,8 +300,9 @@ def _arrays_of(picture: Picture) -> dict[Modality, NDArray]:
 MAX_PENDING_BYTES = 8 << 20
 """Maximum size of pictures that wait for a thread: a few hundredths of a second of work, which a killed process loses."""
 _BATCH_BYTES = 1 << 20
-"""Size from which pictures are submitted together. Waking a thread at every step for one small picture costs the step as
-much as encoding it, and with cold caches it takes three times as long (measured)."""
+"""Pictures are submitted to the threads together, once they have this size. Waking a thread at every step for
+one small picture costs the step as much time as encoding the picture, and with cold caches the encoding takes
+three times as long (measured)."""
 
 _Pictures = Sequence[tuple[str, int, Modality, NDArray]]
 

@@ -47,7 +47,8 @@ class _Made:
 
 @dataclass(frozen=True)
 class _NotMade:
-    """Export failed in the subprocess. The caller tries again in its own process, to get the real error."""
+    """The files could not be made in the subprocess. The caller tries again in its own process, to get the
+    real error."""
 
 
 class FilesProcess:

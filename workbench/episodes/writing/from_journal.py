@@ -126,7 +126,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
     """
     layouts: list[np.dtype] = []
     runs: list[tuple[int, list[bytes]]] = []
-    """Layout, and consecutive rows in it."""
+    """(number of a layout, consecutive rows of that layout)."""
     seen = [_CameraEntries() for _ in header.cameras]
     acted = list(header.info.acted_by)
     placed: list[MovedCamera] = []

@@ -34,7 +34,7 @@ SYNC_SECONDS = 0.4
 _BATCH_BYTES = 2 << 20
 """Queued bytes from which `append` writes by itself, so that memory stays bounded if the disk is slower than the episode."""
 _MAX_CACHED_BATCHES = 4
-"""Maximum number of cached batches while reading: each batch is read again for every camera."""
+"""Maximum number of batches that a reader caches, because it reads each batch again for every camera."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 _BEGIN = _SCHEMA.serialize().size
 """Offset of the first batch."""
@@ -90,7 +90,7 @@ class Journal:
             with self._writing:
                 self._put(_SCHEMA.serialize())
         except OSError:
-            with contextlib.suppress(OSError):  # report the first error
+            with contextlib.suppress(OSError):  # the first error is raised
                 self.remove()
             raise
         _journal_threads.watch(self)
@@ -208,7 +208,8 @@ class Journal:
 
 
 def _resolve(items: Sequence[JournalItem]) -> tuple[list[JournalEntry], int, OSError | None]:
-    """(entries, number of items that gave them, error). With an error, only the complete states before it."""
+    """(entries, number of items that gave them, error). With an error, the entries are
+    those of the complete states before it."""
     entries: list[JournalEntry] = []
     whole, done = 0, 0
     for number, item in enumerate(items, 1):

@@ -98,7 +98,7 @@ def candidates(stem: str) -> Iterator[str]:
 
 def _remove(paths: Sequence[Path]) -> None:
     for path in reversed(paths):
-        with contextlib.suppress(OSError):  # report the first error
+        with contextlib.suppress(OSError):  # the first error is raised
             path.unlink(missing_ok=True)
 
 

@@ -32,7 +32,7 @@ def require_place(address: str) -> None:
         system.pipe_file(f"{path}/.workbench", b"")
         system.rm_file(f"{path}/.workbench")
     except Exception as error:
-        # Catches every error: each storage has its own types.
+        # Catches every error: each storage has its own types of errors.
         raise RecordingError(f"Cannot record to {address}: {type(error).__name__}: {error}") from error
 
 
