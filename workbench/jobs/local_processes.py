@@ -60,7 +60,7 @@ class _Process:
     place: int
     """Index of the process's share of the cores."""
     heard: bool = True
-    """Whether its messages are read; False after it has ended."""
+    """Whether more messages of the process are awaited; False after its last message or its end."""
 
 
 class _ProcessPool:
@@ -97,7 +97,8 @@ class _ProcessPool:
                     self._leave(process)
                     failure = failure or error
                     self._scheduler.lower(0)
-            # A process that failed may have given back its chunk after all others had ended.
+            # If a process fails after all others have ended, no process is left for the chunk that it gave
+            # back.
             if not self._busy() and self._scheduler.count_left(1):
                 self._start(0)
         if failure is not None:

@@ -1,9 +1,9 @@
 """Runs a job's work on a Ray cluster: a running one, or one that is started on this machine.
 
 A worker is a Ray actor that runs the same function as a local process. It sends its messages, packed by
-`wire`, to another actor, the broker, which the dealing process polls. So a worker never blocks, and the
-dealing process never loads a pickle that the author's code may have made. When Ray reports that an actor has
-ended, its chunk is dealt again.
+`wire`, to another actor, the broker. The process that deals the chunks polls the broker. So a worker never
+blocks, and the dealing process never loads a pickle that the author's code may have made. When Ray reports
+that a worker has ended, the worker's chunk is dealt again.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class _ActorPool:
         )(RayWorker)
         self._busy: dict[int, _Started] = {}
         self._ending: list[_Started] = []
-        """Workers that have sent their last message and removed their folders."""
+        """Workers that have sent their last message. Each is killed as soon as it has removed its folder."""
         self._started = 0
 
     def serve(self) -> None:
@@ -193,8 +193,8 @@ class _ActorPool:
             self._ending.remove(actor)
 
     def _guarded(self, number: int, failure: Any, act: Any) -> Any:
-        """Call `act` for a worker. Returns `failure`, or if that is None the error of `act`. After an error
-        that ends the job, the other workers finish their items."""
+        """Call `act` for a worker. If `act` raises an error that ends the job, kill this worker and stop the
+        others. Returns `failure` if it is not None; otherwise the error of `act`, or None."""
         try:
             act()
         except (TaskError, PoolError) as error:
@@ -335,8 +335,8 @@ class RayWorker:
         """Do the work.
 
         Args:
-            work: the pickled function and its setup. To unpickle them, modules are imported, which takes
-                seconds: so `quick_imports` is active then.
+            work: the pickled function and its setup. Unpickling them imports modules, which takes seconds;
+                `quick_imports` shortens this time.
 
         Raises:
             OtherVersions: this machine has other versions of the packages than the submitting side.

@@ -16,7 +16,7 @@ from typing import Any
 
 AUTO, LOCAL = "auto", "local"
 BREAKPOINT = "PYTHONBREAKPOINT"
-"""Environment variable that Ray sets for its workers and for processes that connect."""
+"""Environment variable that Ray sets for its workers and for processes that connect to a cluster."""
 _CONNECT_SECONDS = 5.0
 _PROBE_SECONDS = 2.0
 _HEAD_DOWN_SECONDS = 20.0
@@ -46,7 +46,7 @@ class ClusterHealth:
         self._raylet: socket.socket | None = None
         self._head = ""
         self._probed_at = self._answered_at = time.monotonic()
-        if _global_node is None:  # a ray:// address: Ray's own errors report its end
+        if _global_node is None:  # a ray:// address: Ray's own errors report the cluster's end
             return
         self._head = _global_node.gcs_address
         self._raylet = socket.socket(socket.AF_UNIX)

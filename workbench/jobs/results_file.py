@@ -163,7 +163,7 @@ class JobFile:
 
 @dataclass(frozen=True)
 class Kept:
-    """Executor that skips the items in a job file, and writes new results to it."""
+    """Executor that skips the items whose results are in a job file, and writes new results to the file."""
 
     executor: Executor
     file: JobFile | None = None
@@ -241,7 +241,7 @@ def read_parts(files: Sequence[Path]) -> JobParts:
     values: dict[int, bytes] = {}
     folders: dict[int, str] = {}
     owners: dict[int, Path] = {}
-    """The file that each item comes from."""
+    """For each item: the job file with its result."""
     request = b""
     for path in files:
         if not path.is_file():

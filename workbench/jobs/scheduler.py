@@ -36,8 +36,8 @@ class PoolError(RuntimeError):
 class Chunk:
     """Items that one worker runs together.
 
-    The number of workers does not change the division into chunks, and so does not change the results: those
-    of a policy differ in the last bits with the batch size and with the row in the batch.
+    The division into chunks does not depend on the number of workers. So neither do the results, although the
+    outputs of a policy differ in the last bits with the batch size and with the row in the batch.
     """
 
     numbers: tuple[int, ...]
@@ -181,7 +181,7 @@ class Scheduler(Generic[Result, Update]):
         """Failures of each group since its last result: (kind, first item of the chunk)."""
         self._limit = NO_LIMIT
         self.is_going_on = False
-        """Whether results of an earlier run are being taken."""
+        """True while `go_on` passes results of an earlier run to `on_result`."""
         self.results = 0
         self.failures: list[Failure] = []
 
@@ -381,8 +381,8 @@ class Scheduler(Generic[Result, Update]):
             self._on_failure(failure)
 
     def _alike(self, key: object, held: _Held) -> bool:
-        """Record a failure of this kind; returns whether enough chunks of the group have failed in this way
-        since its last result to give up the group."""
+        """Record a failure of this kind. Returns whether to give up the group: enough of its chunks have
+        failed in this way since its last result."""
         first = held.chunk.numbers[0]
         group = first // self._group
         before = self._failed_alike.setdefault(group, [])
@@ -393,7 +393,7 @@ class Scheduler(Generic[Result, Update]):
 
 @dataclass(frozen=True)
 class Work(Generic[Setup, Result, Update]):
-    """Work of each worker of a job."""
+    """What each worker of a job does, and the files that it needs."""
 
     run: Callable[[Setup, ItemQueue], None]
     """A function that can be imported by name. It returns when its queue has no next chunk and none is running.
@@ -411,8 +411,8 @@ class Work(Generic[Setup, Result, Update]):
     """Folders of the author that workers on other machines need, with everything below."""
     files: Sequence[Path] = ()
     """Other files that workers on other machines need. Paths in `setup` outside `folders` and `files` must
-    exist on all machines. A path in a copied folder that must not be relocated (the results folder) is stored
-    as bytes."""
+    exist on all machines. A path that must not be relocated although it is in a copied folder, such as the
+    results folder, is stored as bytes."""
 
 
 class Executor(Protocol):

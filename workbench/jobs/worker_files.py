@@ -38,11 +38,11 @@ class WorkerFiles:
     stay valid."""
 
     def unpack(self, folder: Path) -> dict[str, str]:
-        """Write all files below `folder`, which is empty. The copy of the submitting side's current folder
-        becomes the current folder of this process.
+        """Write all files into `folder`, which must be empty, and its subfolders. The copy of the submitting
+        side's current folder becomes the current folder of this process.
 
         Returns:
-            for each root: its path on the submitting side, and its path here.
+            maps each root's path on the submitting side to its path here.
 
         Raises:
             OSError: a file cannot be written.

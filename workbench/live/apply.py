@@ -142,8 +142,8 @@ DOES: frozenset[type[Command]] = frozenset(
 )
 """Commands that `apply` handles."""
 PICTURES_DELAY_SECONDS = 0.35
-"""Debounce: the pictures of a past moment are drawn only after the moment was shown for this long, so not for
-every moment that the user drags over."""
+"""Debounce: the pictures of a past moment are drawn only after the moment was shown for this long. So a drag
+of the slider does not draw the pictures of every moment on the way."""
 
 
 def apply(run: Run, event: object, now: Now) -> Change:
@@ -361,7 +361,8 @@ def _show_live(run: Run) -> Run:
 
 
 def _show(run: Run, past: Past | None) -> Run:
-    """The run with `past` and new pictures; the same run if `past` shows the same moment as before."""
+    """The run with `past`, its pictures marked as new. The run unchanged if `past` is None or shows the same
+    moment as before."""
     if past is None or run.past is None or past.shown is run.past.shown:
         return run
     return new_pictures(replace(run, past=past))

@@ -26,7 +26,7 @@ class Then:
 
 @dataclass(frozen=True)
 class Later:
-    """Effect: handle this event after `seconds`. `apply` ignores an event that no longer applies by then."""
+    """Effect: handle this event after `seconds`. `apply` ignores the event if it is outdated by then."""
 
     seconds: float
     event: Any

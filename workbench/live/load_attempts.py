@@ -9,11 +9,11 @@ from typing import Literal, NamedTuple
 from workbench.task.description import TaskDescription
 
 Attempt = Literal["file", "moment", "version", "nothing"]
-"""What to load: the file on disk, the last good version at its newest moment, the same from its start, or
-nothing."""
+"""What to load. ``file``: the file on disk. ``moment``: the last good version, at its newest moment.
+``version``: the last good version, from its start."""
 Newest = Callable[[], bytes | None]
-"""Returns the newest state of the batch, a pickled `envs.snapshots.snapshot.Snapshot`, or None. Called only when needed,
-since assembling one takes longer than a step."""
+"""Returns the newest state of the batch, a pickled `envs.snapshots.snapshot.Snapshot`, or None. Called only
+when needed, because assembling the snapshot takes longer than a step."""
 _GOOD_VERSIONS = 2
 _PROVEN_SECONDS = 30.0
 """A version that ran for longer than this before its process crashed counts as one that works."""
@@ -120,8 +120,8 @@ class Recovery:
         return replace(self, good=(*self.good[:-1], replace(self.good[-1], idle_crashes=0)))
 
     def failed(self, kept: bool, newest: Newest) -> tuple[Recovery, bool]:
-        """Record that a load failed in a worker that continues. Returns True if the worker has no version now and
-        `next_load` has another attempt."""
+        """Record that a load failed in a worker that continues. Also returns whether to call `next_load`: the
+        worker has no version now, and an attempt is left."""
         after = replace(self, loading=self.file_waits)
         if kept or not self.loading or self.file_waits:
             return after, False

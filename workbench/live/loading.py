@@ -280,7 +280,8 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
 
 
 def _texts(run: Run) -> Mapping[str, str]:
-    """Source by path of the version that is being loaded (empty if unknown), else of the running version."""
+    """While a version is being loaded: its source by path, empty if unknown. Otherwise: the source of the
+    running version."""
     recovery = run.recovery
     if not recovery.loading:
         return {} if run.task is None else run.task.source

@@ -288,7 +288,8 @@ Request = (
 
 
 def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
-    """Waiting requests after an interrupt, without control steps; a `SingleStep` becomes the pause that it starts with."""
+    """The waiting requests that remain after an interrupt. A `Play` that starts playing is dropped; a
+    `SingleStep` becomes the pause that it starts with."""
     for request in requests:
         if isinstance(request, SingleStep):
             yield Play(False)

@@ -48,7 +48,8 @@ class TimelineView:
     not_carried: tuple[str, ...] = ()
     """Parts of the state that the last jump could not restore, each with the reason."""
     arrived: str = ""
-    """How the last jump reached its state: by a replay or from a recording; empty if it was restored."""
+    """How the last jump reached its state: by a replay or from a recording; empty if the state was
+    restored."""
     entered: int = 0
     """Number of the last finished `EnterRecording`; 0 for none."""
     wants_pictures: bool = False
@@ -144,7 +145,8 @@ class Past:
         return self.history.last if self.pinned is None else self.pinned
 
     def seek(self, serial: int | None) -> Past:
-        """Pin the moment of this serial, or the nearest kept one; the newest serial, or None, goes live."""
+        """Pin the moment of this serial, or the nearest kept moment. Go live if `serial` is None or the
+        newest."""
         if serial is None or serial >= self.history.last:
             return replace(self, pinned=None)
         return replace(self, pinned=max(serial, self.history.first))
@@ -188,7 +190,8 @@ class Past:
         return self.seek(max(self.history.serial_of_tick(tick), first))
 
     def seek_event(self, env: int, direction: int) -> Past:
-        """Go to the next (1) or previous (-1) event of this env; after the last event comes live."""
+        """Go to the next (1) or previous (-1) event of this env. Without a next event, go live; without a
+        previous event, go to the oldest moment."""
         here = self.at
         if direction > 0:
             after = self.history.events(env, here + 1, self.history.last)
@@ -311,7 +314,7 @@ class Past:
         """Numbers of this env's whole shown episode, and of the episodes before it; see `History.episodes`.
 
         Args:
-            last: serial of the live moment; the history may have newer moments by now.
+            last: serial of the newest moment in the caller's view; the history may have newer ones by now.
         """
         end = last if self.pinned is None else min(self.history.segment_at(env, self.at)[1], last)
         return self.history.episodes(env, end, columns, before)

@@ -64,7 +64,7 @@ class Run:
     reference: TaskName
     """The requested task: a file, ``file.py:ClassName``, a registered env id, or a task named by a recording."""
     options: TaskOptions
-    """Build options in effect; the seed is `seed`."""
+    """Build options in effect, apart from their seed: the seed in use is `Run.seed`."""
     history_bytes: int
     """Memory limit of the history."""
     own_file: Path | None
@@ -93,8 +93,8 @@ class Run:
     `playing`."""
     wants_play: bool = False
     policy_failed: bool = False
-    """Whether a failure of the policy stopped playing, and playing has not resumed since. `problem` may be None already: a
-    save that leads to a load clears it."""
+    """Whether a failure of the policy stopped playing, and playing has not resumed since. `problem` may be
+    None nevertheless, because a successful load clears it."""
     named_policy: str | None = None
     """The policy that was named last, to use when the source of actions is a policy again."""
 
@@ -240,7 +240,7 @@ class Run:
 
     @property
     def stands_at(self) -> object:
-        """Key of the shown past moment for which pictures are needed; None while live."""
+        """Key of the shown past moment and of the pictures that the page needs of it; None while live."""
         if self.past is None or self.past.pinned is None:
             return None
         return self.past.pinned, self.env, self.settings.cameras, self.settings.pictures

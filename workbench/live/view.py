@@ -76,7 +76,7 @@ class SessionView:
     told: NDArray[np.float32] | None = None
     """(N, A) next action of the sliders; for a past moment, the action that led there. None if unknown."""
     options: TaskOptions = TaskOptions()
-    """How the envs are made; the seed is `seed`."""
+    """How the envs are made, apart from the seed in these options: the seed in use is `SessionView.seed`."""
     options_refused: TaskOptions | None = None
     """Options that were applied last and with which the task failed."""
     seed: int = 0
@@ -109,7 +109,8 @@ class SessionView:
     """The view of each feature, by its class."""
 
     def of(self, kind: type[Part]) -> Part:
-        """The view of a feature, such as ``of(StudioView)``; one with default values if the session has none."""
+        """The view of a feature, such as ``of(StudioView)``. If the session has no such view: a view with
+        default values."""
         return self.features[kind] if kind in self.features else kind()
 
     @property

@@ -201,7 +201,8 @@ def _needed(setup: RescoreSetup) -> tuple[list[Path], list[Path]]:
 
 
 def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
-    """The setup for other machines, and the recordings that are sent to them: all, or none if they are too large."""
+    """The setup for other machines, and the files of the recordings to send there: all files, or none if they
+    are too large together."""
     files = {
         file
         for of in setup.items.values()

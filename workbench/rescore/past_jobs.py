@@ -27,8 +27,8 @@ _SUMMARY_SECONDS = 0.5
 class PastRescorer:
     """Rescores the history in the background process, a few moments at a time.
 
-    To stop a job, it sends no more requests. If the process does not answer, for example
-    because the new code hangs, the process is killed.
+    A stopped job sends no more requests. If the process does not answer, for example because the new code
+    hangs, the process is killed.
     """
 
     def __init__(self, process: Background, happen: Callable[[RescoringTold], object]) -> None:

@@ -143,8 +143,8 @@ def _place(verdict: Verdict[PastRun]) -> tuple[int, int]:
 
 
 def chart_data(curve: RescoredCurve, shown: int | None) -> tuple[NDArray, NDArray, NDArray, float | None]:
-    """x (control steps), the recorded curve, the new curve, and x of the shown moment, or None if it is not
-    on the chart.
+    """x (control steps), the recorded curve, the new curve, and x of the shown moment (None if that moment is
+    not on the chart).
 
     A long curve is cut to the part around the shown moment, or to its newest part.
     """

@@ -112,8 +112,8 @@ class RescoredPast:
         return int((self._is_step & self._rescored).sum())
 
     def runs(self) -> list[range]:
-        """Rows to replay, as runs that each begin with a jump of all envs. The shown run comes first, then
-        the others from the newest to the oldest, because a history may contain minutes of simulation.
+        """Rows to replay, as runs that each begin with a jump of all envs. A history may contain minutes of
+        simulation, so the shown run comes first, then the others from the newest to the oldest.
         """
         begins = [int(row) for row in np.flatnonzero(self._jumped.all(axis=1))]
         ends = [*begins[1:], len(self._serial)]

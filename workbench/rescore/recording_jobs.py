@@ -303,8 +303,8 @@ class Rescorer:
 
 
 def _write_text(info: EpisodeInfo, stack: ExitStack, job: Job) -> str:
-    """Enter `recorded_source` on `stack`; returns the reference to open. It is entered in this process, so
-    that the text is removed even if the background process is killed. Raises CannotEnterRecording."""
+    """Enter `recorded_source` on `stack`; returns the reference to open. This process writes and removes the
+    text: so it is removed even if the background process is killed. Raises CannotEnterRecording."""
     reference = stack.enter_context(recorded_source(info))
     if job.stopped:
         stack.close()

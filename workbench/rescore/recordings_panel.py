@@ -42,7 +42,7 @@ class Code:
 
     label: str = field(compare=False)
     told: str = field(compare=False)
-    """Text for the page that names the files."""
+    """Text for the page. It names the files."""
     file: Path | None = None
     """File to use for the tasks in it, instead of the files named by the recordings."""
     recorded: bool = False
@@ -242,7 +242,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         at = verdict.first_difference
         opened = [one.id for one in self._review.view().opened]
         return {
-            # Index of its colour, if it is one of several open recordings.
+            # Index of the recording's colour, if the recording is one of several open ones.
             "badge": opened.index(verdict.of.id) if len(opened) > 1 and verdict.of.id in opened else None,
             "name": f"seed {verdict.seed}" if verdict.seed >= 0 else _end_of(verdict.of.name),
             "hint": f"{verdict.of.name}. Click to open it"

@@ -28,7 +28,7 @@ def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMome
             return RescoredMoments(tuple(steps), missed, error.problem)
         steps.append(step)
         if len(moment.env_idx) == opened.env.num_envs:
-            # Only for jumps of all envs: a jump of some envs does not restore state of the whole batch, not
-            # even while playing.
+            # Not for a jump of some envs: such a jump never restores state of the whole batch, and did not
+            # when the history was recorded either.
             missed |= report.not_carried
     return RescoredMoments(tuple(steps), missed)

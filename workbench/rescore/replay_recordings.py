@@ -66,7 +66,7 @@ class _Rescoring:
     evaluate: dict[str, list[float]] = field(default_factory=dict)
     """(T + 1,) new values of each entry of evaluate."""
     drift: list[tuple[float, float]] = field(default_factory=list)
-    """(T + 1,) metres and radians from the recorded state, if there is one."""
+    """(T + 1,) metres and radians from the recorded state; zero where no state is recorded."""
 
     @property
     def at(self) -> int:
@@ -103,7 +103,7 @@ def rescore(
     progress a few times a second.
 
     Each env begins an episode (`replay.begin_run`), applies its actions, and then continues with the next
-    episode, independent of the other envs. Envs without an episode do not move.
+    episode, without waiting for the other envs. Envs without an episode do not move.
 
     Args:
         use_env_states: after every step, restore the recorded state, so that nothing drifts.
@@ -170,8 +170,8 @@ def opened_code(
 
 
 def answer(request: Rescore, on_progress: Callable[[int, int, Rescored], None]) -> Rescored:
-    """Carry out `request` in a worker. All results go to `on_progress`; the answer contains only an exception
-    of the code."""
+    """Carry out `request` in a worker. All results go to `on_progress`; the returned answer contains none,
+    only the exception if the task's code raised."""
     try:
         code = RescoredBy(request.task, request.options, request.or_else)
         with CurrentFolder().again(), opened_code(code) as opened:

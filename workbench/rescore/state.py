@@ -40,7 +40,7 @@ class RescoreView:
     unit: str = "steps"
     """Unit of `done` and `total`: ``steps`` (control steps of the batch) or ``episodes``."""
     steps: int = 0
-    """Number of control steps so far."""
+    """Number of control steps that were rescored so far."""
     seconds: float = 0.0
     """Duration of these steps in seconds, without loading."""
     task: str = ""
@@ -105,7 +105,7 @@ class RescoringTold:
 
 @dataclass(frozen=True)
 class BeginRescoring:
-    """Begin this job with the history; cancel the previous one."""
+    """Begin this job, which rescores the history; cancel the previous job."""
 
     job: int
     view: RescoreView
@@ -173,7 +173,7 @@ def rescore_after_load(past: PastAfterLoad, view: RescoreView) -> Literal["resco
     if past == "patched":
         return "rescore"
     if past == "same":
-        # Saved again without a relevant change: resume the job that the save stopped.
+        # Saved again without a relevant change: restart the job that the save stopped.
         return "rescore" if view.stopped_by is StoppedBy.SAVE else "keep"
     return "forget"
 

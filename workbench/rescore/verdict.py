@@ -38,8 +38,8 @@ class Scores:
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Generic[Of]):
-    """Comparison of one run: T control steps and T + 1 states. It covers the steps that have recorded and new
-    scores, even those after a step at which the current code would have ended the episode.
+    """Comparison of one run: T control steps and T + 1 states. It covers all steps that have both recorded
+    and new scores, even those after a step at which the current code would have ended the episode.
 
     Rescoring replays the run, so the verdict also has the distance of the replayed states from the recorded
     ones.

@@ -160,10 +160,10 @@ class Clearances:
 
     A recording is untrusted unless its seal proves that it was made here. Its task is opened without a
     question if it is an id of an installed package, a file that the user named (on the command line, or open
-    live), or the file that this installation had open when it recorded. For anything else the texts are read,
-    not run, and the user is asked; the answer is stored by the hash of the texts. Exactly the approved texts
-    run, even if the file changes later. Later saves run only if the file is followed (continuing live), which
-    is a separate question.
+    live), or the file that this installation had open when it made the recording. For anything else the texts
+    are read, not run, and the user is asked; the answer is stored by the hash of the texts. Exactly the
+    approved texts run, even if the file changes later. Later saves run only if the user was asked about them
+    too (`TrustQuestion.followed`) and said yes.
 
     Args:
         named: Returns the files that the user named: on the command line, or by having them open live.
@@ -378,7 +378,7 @@ def _is_unchanged(content: TaskContent) -> bool:
 
 
 def paths_in_arguments(info: EpisodeInfo) -> list[str]:
-    """Texts in the recorded arguments of an env that look like a path; a task may open such a path."""
+    """Those texts in an env's recorded arguments that look like a path; a task may open such a path."""
     found: list[str] = []
     waiting: list[Any] = [info.env_kwargs, info.reset_options, info.control_mode]
     while waiting:

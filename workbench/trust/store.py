@@ -55,7 +55,7 @@ class TrustStore:
             return any(e.hash == content.hash for e in self._all())
 
     def follows(self, content: TaskContent) -> bool:
-        """Whether later saves of this file, starting with this text, may run too."""
+        """Whether this text may run, and also all later saves of its file."""
         key = content.hash, content.main, True
         with self._lock:
             return any((e.hash, e.file, e.followed) == key for e in self._all())
@@ -90,12 +90,12 @@ class TrustStore:
                 )
 
     def _all(self) -> Iterator[_Entry]:
-        """Entries of this run, then those on disk, which are read only if those of this run do not match."""
+        """Entries of this run, then those on disk. The disk is not read if the caller stops before them."""
         yield from self._this_run
         yield from self._read()
 
     def _read(self, repair: bool = False) -> list[_Entry]:
-        """The stored entries. With `repair`, which is for use before writing, an unreadable store raises
+        """The stored entries. Set `repair` if the store will be written next: then an unreadable store raises
         OSError, and a broken store is renamed."""
         try:
             content = read_private(STORE_FILE)

@@ -198,8 +198,8 @@ class Spans:
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(K,) steps and (L, K) numbers to draw.
 
-        The steps are those of the first line's extremes, so only the points of this line are exact; points of
-        the other lines are off by less than a span. NaN where a line has a gap.
+        The steps are those of the first line's extremes. So only this line's points are exact; the points of
+        the other lines are shifted by less than a span. Numbers are NaN where a line has a gap.
         """
         lines, count = self.low.shape
         starts = self.first + self.width * np.arange(count)

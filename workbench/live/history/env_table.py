@@ -35,7 +35,7 @@ EnvEvent = Literal["failed", "flagged"]
 
 @dataclass(frozen=True)
 class LastEpisode:
-    """For each env: the last episode before the present one that ended or had outliers.
+    """For each env: of the episodes before the present one, the last that ended or had outliers.
 
     Envs are reset as soon as an episode ends, so "failed" would never be visible in the row of the present episode.
     """
@@ -74,8 +74,9 @@ class EnvRows:
     followed: NDArray[np.bool_]
     """(N,) whether `total` is known: the task has a reward, and the episode was followed from its start."""
     first: Mapping[Hashable, NDArray[np.int32]]
-    """(N,) first step at which an entry was true; 0 is the reset, -1 is never. Keys are the names of
-    bool entries of ``evaluate``, and `OutlierKind`, also those of rules that are off."""
+    """For each entry: (N,) the first step of the episode at which it was true; 0 is the reset, -1 is never.
+    Keys are the names of bool entries of ``evaluate``, and `OutlierKind` values, even if their rule is
+    off."""
     outliers: Outliers
     last: LastEpisode
     ended: NDArray[np.int64]
@@ -246,8 +247,8 @@ class EnvTable:
         return True
 
     def _begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
-        """Start new episodes in these envs (N,); `EnvRows.last` keeps the previous ones that ended or had
-        outliers."""
+        """Start new episodes in these envs (N,); `EnvRows.last` keeps their previous episodes, if these ended
+        or had outliers."""
         now, from_start = self._now, step.elapsed_steps == 0
         worth_keeping = envs & ((now.end >= 0) | np.isin(np.arange(len(envs)), list(now.outliers)))
         until = np.where(now.end < 0, now.steps, now.end)
@@ -321,6 +322,6 @@ def _note_first(
 
 
 def _merged(envs: NDArray[np.bool_], new: Outliers, old: Outliers) -> Outliers:
-    """The new outliers in these envs (N,), the old ones in the others."""
+    """Outliers by env: the new ones of these envs (N,), and the old ones of all other envs."""
     kept = {env: seen for env, seen in old.items() if not envs[env]}
     return {**kept, **{env: seen for env, seen in new.items() if seen and envs[env]}}

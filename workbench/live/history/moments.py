@@ -134,8 +134,8 @@ class Moment:
 
 
 EnvMoment = tuple[Moment, int]
-"""A moment of an episode, and the env's number in it. The number differs where the env continued from another env's
-moment."""
+"""A moment of an env's episode, and the index of the episode's row in that moment. Where the episode was
+continued from another env's moment, this is the index of that other env."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,9 +210,9 @@ class History:
     def add(self, stepped: Stepped) -> Moment:
         """Add a moment.
 
-        Without an action (a reset or a jump back) the worker sends reward zero and no reward terms. The stored values are
-        NaN in envs that were reset. Envs that went back get the values of the origin, and all other envs keep
-        the values of the previous moment.
+        Without an action (a reset or a jump back) the worker sends reward zero and no reward terms. Other
+        values are stored instead: NaN for envs that were reset, those of the origin for envs that went back,
+        and those of the previous moment for all other envs.
         """
         restored, jumps = stepped.restored, bool(stepped.reset_mask.any())
         origin = None if restored is None else self.at(restored.origin)
@@ -560,8 +560,8 @@ class History:
 
         kept = np.flatnonzero(~jumped | stepped.resumed)
         if self._moments:
-            # Also if every env was reset: otherwise entries would disappear for a moment, and the rows below
-            # move.
+            # Call this even if every env was reset: otherwise this moment would lack the terms, and the
+            # page's rows below them would move.
             take(self._moments[-1].step, kept, kept)
         if restored is not None and origin is not None:
             take(origin.step, list(restored.env_idx), list(restored.source))

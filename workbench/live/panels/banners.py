@@ -34,11 +34,11 @@ REBUILD_HINT = (
     "attribute. The current state is restored."
 )
 _MAY_BE_OLD = ("reset", "step", "evaluate", "reward", "observation", "returns")
-"""Stages that use objects made while the scene was built: a patch keeps those objects. Other objects, which
-the new code expects, may be missing."""
+"""Stages that use objects made while the scene was built. A patch keeps the old objects, so objects that the
+new code expects may be missing."""
 SHOWN_AFTER_SECONDS = 4.0
-"""Time after which the banner of long-running code is shown. The status line shows it earlier; a banner is for code
-that the user may want to end."""
+"""Time after which the banner of long-running code is shown. The status line reports such code earlier; a
+banner is for code that the user may want to end."""
 
 DOING = {
     "syntax": "is not Python yet",

@@ -64,7 +64,7 @@ def wanted_width(columns: Sequence[EnvColumn]) -> float:
 
 
 def levels(columns: Sequence[EnvColumn]) -> list[LeftOut]:
-    """The levels: first the words are left out, then half of the padding, then the columns by rank."""
+    """The levels: first the words are left out, then part of the padding, then the columns by rank."""
     with_words = MARGIN_PIXELS + sum(column.least(words=True) + PADDING_PIXELS for column in columns)
     without = MARGIN_PIXELS + sum(column.least(words=False) + PADDING_PIXELS for column in columns)
     room = without - (PADDING_PIXELS - NARROW_PADDING_PIXELS) * len(columns)

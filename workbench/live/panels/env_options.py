@@ -161,7 +161,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
             self._session.happen(OptionsApplied(wanted))
 
     def _as_the_task_does(self) -> None:
-        """Drop the user's keyword arguments."""
+        """Drop the user's keyword arguments, except `RUN_KEYWORDS`."""
         options = self._session.view().options
         kept = _of_the_machine(options.env_kwargs)
         self._session.happen(OptionsApplied(replace(options, env_kwargs=kept)))

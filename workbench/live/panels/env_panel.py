@@ -56,7 +56,7 @@ WORDS = {
 TABLE = "envs"
 """Name of the panel in the page's report that the panel was unfolded."""
 MAX_DEFAULT_ENTRIES = 6
-"""Number of bool entries with a column by default; with more, a row is wider than the view."""
+"""Maximum number of bool entries with a column by default; with more, a row is wider than the view."""
 CURVE_POINTS = 40
 """Number of points of a row's small curve."""
 STEP_CHARACTERS = 3
@@ -162,8 +162,8 @@ def moment_of(rows: EnvRows, env: int) -> int | None:
 def make_rows(
     rows: EnvRows, envs: NDArray[np.int64], chosen: Mapping[str, bool] | None = None
 ) -> list[dict[str, Any]]:
-    """The cells of these envs. A curve is ``points`` of SVG polylines; flags of the present episode come
-    before those of the previous one."""
+    """The cells of these envs. A curve is a list of ``points`` of SVG polylines. Among the flags, those of
+    the present episode come before those of the previous one."""
     names = entry_names(rows, chosen)
     curves = _curves(rows.rewards, envs)
     made = []

@@ -222,8 +222,8 @@ class InspectPanel(PagePart[SessionView]):
                 self.choose_sections()
 
     def forces(self, view: SessionView) -> Inspection | None:
-        """The reading whose contacts the 3-D view shows; None to show none, as for a past moment: contacts
-        are read live only."""
+        """The reading whose contacts the 3-D view shows. None to show no contacts, for example at a past
+        moment: contacts are read only from the live env."""
         here = self._now is not None and self._now.env == view.selected_env
         known = view.timeline.shown is None and not self._no_step_yet(view)
         shown = self._tabs.shows(self._forces_on, TAB) and here and known

@@ -299,7 +299,8 @@ class NumberRow:
 def number_rows(
     step: StepResult, selected_env: int, max_episode_steps: int | None, reward_mode: str = ""
 ) -> list[NumberRow]:
-    """Elapsed steps, reward if there is one, success and fail first, then every other entry by its name."""
+    """Rows of the elapsed steps, the reward if there is one, success and fail; then one row for every other
+    entry, sorted by name."""
     env = selected_env
     of = f" / {max_episode_steps}" if max_episode_steps else ""
     rows = [NumberRow("elapsed steps", f"{_item(step.elapsed_steps, env)}{of}", _batch(step.elapsed_steps))]

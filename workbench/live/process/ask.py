@@ -100,7 +100,8 @@ class Preempted(Exception):
 
 
 Priority = Literal["person", "low", "lowest"]
-"""Priority of a job: ``person`` if the user waits for it, ``low`` if its results are wanted soon."""
+"""Priority of a job: ``person`` if the user waits for it, ``low`` if its results are wanted soon, else
+``lowest``."""
 _ORDER: dict[Priority, int] = {"person": 2, "low": 1, "lowest": 0}
 _Rank = tuple[int, int]
 """Rank of a job: its priority and its number; the highest rank runs first."""

@@ -92,8 +92,8 @@ class PrintedLog:
         self._view = NOTHING_PRINTED
 
     def feed(self, stream: str, piece: bytes) -> bool:
-        """Add the next bytes of a stream, which may end within a line; empty bytes mean that the stream has
-        ended. Returns True during a flood."""
+        """Add the next bytes of a stream; they may end within a line. An empty `piece` means that the stream
+        has ended. Returns True during a flood."""
         ended = not piece
         with self._lock:
             if ended:

@@ -210,8 +210,8 @@ Doing = Literal[
 ]
 _DOINGS: tuple[Doing, ...] = get_args(Doing)
 _LAYOUT = struct.Struct("=QdBQ")
-"""Layout: number of the piece of work, its start in seconds, index into `_DOINGS`, and the number again: the two differ
-while the worker writes."""
+"""Layout: number of the piece of work, its start in seconds, index into `_DOINGS`, and the number again. The
+two numbers differ while the worker writes."""
 _PID, _PID_AT = struct.Struct("=I"), 64
 """Layout and offset of the worker's process id; 0 until the worker has started."""
 _HELD_AT = 128

@@ -260,8 +260,9 @@ class Supervisor:
 
     def send(self, request: Request) -> None:
         """Send a request to the current worker. While one worker hands over to the next, commands of the user
-        are queued for the next worker; so is a load that came too late for its `first_requests`. Other
-        requests that are sent between two workers are lost: `first_requests` must include their effect."""
+        are queued for the next worker; so is a load that came too late for that worker's `first_requests`.
+        Other requests that are sent between two workers are lost: `first_requests` must include their
+        effect."""
         with self._condition:
             worker = self._worker
             if isinstance(request, Load) and not self._begun:

@@ -242,7 +242,8 @@ class WorkerProcess:
         # A worker that is not forked yet has no output, and the fork server holds its pipes while it imports.
         timeout = 1.0 if self._process.pid else 0.0
         for reader in self._readers:
-            # A process that left the group may hold the pipe: its reader thread is left behind.
+            # A process that left the group may hold the pipe: then the thread that reads the pipe is left
+            # behind.
             reader.join(timeout=timeout)
         self._line.end.close()
         os.close(self._stacks)

@@ -115,7 +115,7 @@ class ForkedKeeper:
 
 
 class WorkerForks:
-    """The fork server of this process; the first worker starts it. Thread-safe."""
+    """The fork server of this process, started together with the first worker. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -38,10 +38,10 @@ def go_back(
     A restored state lacks the internal state of PhysX, above all contacts, so a run continues differently if bodies press
     on each other (`envs.snapshots.snapshot`; ``tests/benchmarks/restore_distance.py`` measures the
     difference). But an episode begins without internal state (`envs.snapshots.snapshot.begin_anew`), and so
-    does a run from a restored moment. From such an exact point the same actions lead to the same moment,
-    contacts included. The replayed state is compared with the moment byte by byte; if they differ (edited
-    code, a task that draws numbers for the whole batch), the state is restored. State outside PhysX comes
-    from the moment's snapshot in both cases.
+    does a run from a restored moment. These are exact points: the same actions lead from them to the same
+    moment, contacts included. The replayed state is compared with the moment byte by byte; if they differ
+    (edited code, a task that draws numbers for the whole batch), the state is restored. State outside PhysX
+    comes from the moment's snapshot in both cases.
 
     Args:
         on_step: called with the number of steps replayed so far, and with the number of all steps to replay.

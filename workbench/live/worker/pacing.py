@@ -98,7 +98,8 @@ class Shares:
             self._spent.popleft()
 
     def of(self, what: str, now: float) -> float:
-        """Share (0 to 1) of the window, or of the time since `clear` while that is shorter."""
+        """The share (0 to 1) of the window that work of kind `what` took; of the time since `clear`, if that
+        is shorter than the window."""
         begin = max(now - self.window, self._since)
         spent = sum(
             min(seconds, at - begin) for at, name, seconds in self._spent if name == what and at > begin

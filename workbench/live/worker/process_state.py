@@ -20,7 +20,7 @@ _MODULES = (
     *("torch", "torch.nn.functional", "numpy", "numpy.random", "random", "time", "math", "os", "builtins"),
     *("mani_skill.envs.sapien_env", "mani_skill.utils.common", "mani_skill.utils.sapien_utils", "sapien"),
 )
-"""Modules whose functions are compared: a task may have replaced one."""
+"""Modules whose functions are compared: a task may have replaced one of these functions."""
 _FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType)
 
 _TRACED = "sys.settrace()"

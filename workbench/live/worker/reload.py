@@ -146,8 +146,8 @@ def _bring_in(
 def why_new_process(
     request: Load, running: Running, failed: bool, at_start: ProcessState, when_loaded: ProcessState
 ) -> NewProcessNeeded | None:
-    """What the running version left in this process that no reload undoes. None if there is nothing, if the
-    new version will leave the same, or if the new version is not Python.
+    """What the running version left in this process that no reload undoes. None if it left nothing, if the
+    new version will leave the same things behind, or if the new version is not Python.
 
     Args:
         failed: whether the running version raised while it ran.
@@ -300,8 +300,8 @@ def _exchange(
 
 
 def _find_place(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[str, int] | None:
-    """The place of a finding in the new version; None if its function has changed, or the finding has no
-    file."""
+    """The place of a finding in the new version; the same place if its file is not part of the task. None if
+    the function at the place has changed, or the finding has no file."""
     if row.file is None or row.line is None or row.file not in before.source:
         return None if row.file is None else (row.file, row.line or 1)
     text = after.source.get(row.file)

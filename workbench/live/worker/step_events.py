@@ -59,8 +59,8 @@ class StepEvents:
         return frozenset(self._recording | self._from_reset)
 
     def pictures_due(self, step: StepResult, reset_mask: NDArray[np.bool_]) -> bool:
-        """Whether `event` renders pictures for this step: no other picture may be in progress then. Begins to
-        record envs that waited for this reset."""
+        """Whether `event` renders pictures for this step; no other picture may be in progress then. Also
+        starts the recording of envs that waited for this reset."""
         begun = {env for env in self._from_reset if reset_mask[env] and step.elapsed_steps[env] == 0}
         self._recording |= begun
         self._from_reset -= begun
