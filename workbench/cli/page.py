@@ -37,7 +37,8 @@ from workbench.task.reference import TaskName, named_file
 _CLOSING_SECONDS = 1.4
 """Closing is given up after this time without a written episode, because a disk may hang."""
 _Requests = queue.SimpleQueue[Callable[[], object] | int]
-"""Queue of functions that the command calls next; an int ends the command with this exit code."""
+"""Queue of functions that the command calls in turn. An int in the queue ends the command with this exit
+code."""
 
 
 @loop_in_main
@@ -52,7 +53,7 @@ def open_in_terminal(
     editor: str = "",
     pictures: ShownPictures = "auto",
 ) -> int:
-    """Serve the page of a task; returns (the exit code) only if the server cannot start.
+    """Serve the page of a task. Returns only if the server cannot start: the exit code.
 
     Args:
         trust: run code that recordings name without asking.
@@ -97,7 +98,7 @@ def start_in_terminal(
     trust: bool = False,
     editor: str = "",
 ) -> int:
-    """Serve the page to choose a task from; returns (the exit code) only if the server cannot start.
+    """Serve the page to choose a task from. Returns only if the server cannot start: the exit code.
 
     Args:
         options: options of the tasks that are opened from the page.
@@ -124,7 +125,7 @@ def review_in_terminal(
     trust: bool = False,
     editor: str = "",
 ) -> int:
-    """Serve the page of a folder of recordings; returns (the exit code) only if the server cannot start.
+    """Serve the page of a folder of recordings. Returns only if the server cannot start: the exit code.
 
     Args:
         worker, base: options of tasks that are opened from the page.
@@ -177,8 +178,8 @@ class _HowToOpen:
         def on_event_and_note(event: Event) -> None:
             on_event(event)
             if isinstance(event, Loaded):
-                # Prepare the reading of recordings only now: earlier, this would delay the task, for which
-                # the user waits.
+                # Start the processes that read recordings only now: earlier, they would delay the load of the
+                # task, for which the user waits.
                 start_reading()
                 made = replace(event.options or options, seed=0)
                 if noted[-1:] != [made]:
@@ -209,7 +210,8 @@ class _HowToOpen:
 
 
 def _for_others(options: TaskOptions) -> TaskOptions:
-    """The options of one task as options of other tasks: without the keyword arguments of its class."""
+    """The options of one task, for use with other tasks. Of the keyword arguments, only `RUN_KEYWORDS` are
+    kept: the others belong to the class of that task."""
     kwargs = {name: value for name, value in options.env_kwargs.items() if name in RUN_KEYWORDS}
     return replace(options, env_kwargs=kwargs)
 

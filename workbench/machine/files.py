@@ -134,7 +134,8 @@ def new_file(path: Path) -> Iterator[Path]:
 def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:  # `new_file` would report that the file itself exists
+    except FileExistsError as error:
+        # Another type, since `new_file` takes a FileExistsError to mean that its own file exists.
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(path)) from error
 
 

@@ -212,8 +212,8 @@ def ensure_render_device(install: bool) -> RenderProbe:
     that renders then needs `RenderProbe.env` (``python -m workbench.machine.software_vulkan --export`` prints it for a shell).
 
     Returns:
-        The last probe. If ``ok``, start the process that renders with ``probe.env`` added; else ``error`` ends with what
-        to do next.
+        The last probe. If it is ``ok``, add its ``env`` to the environment of the process that renders. If
+        not, its ``error`` ends with what to do next.
     """
     probe = probe_render_device()
     if probe.missing_libraries and install and can_install_packages():
@@ -348,7 +348,8 @@ def _command_to_type() -> str:
 
 
 def main() -> None:
-    """Provide a render device if there is none; ``--export`` prints only shell lines for its variables."""
+    """Provide a render device if there is none. Prints the device, and the shell lines that set its
+    variables; with ``--export`` only these lines."""
     export = "--export" in sys.argv[1:]
     probe = known_render_device(install=True) if export else ensure_render_device(install=True)
     if probe.ok:

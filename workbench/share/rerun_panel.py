@@ -47,13 +47,15 @@ _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
 class RerunPages:
     """The addresses under which rerun shows recordings. One object per `GatedServer`.
 
-    rerun's web viewer is a program of 43 MB that fetches any address it is given and reports its use to its makers. Here it
-    comes from the wheel that wrote the recordings (so file and viewer have the same version), compressed, under the page's
-    own address: the same cookie and one forwarded port suffice, and a content security policy blocks other servers.
+    rerun's web viewer is a program of 43 MB that fetches any address it is given and reports its use to its
+    makers. The workbench serves the viewer itself: compressed, and from the wheel that wrote the recordings
+    (so file and viewer have the same version). The viewer is below the page's own address, so the same cookie
+    and one forwarded port suffice, and a content security policy blocks other servers.
 
-    The viewer's address contains the recordings as full addresses, with host and port. Only the browser knows the host
-    (behind ``ssh -L`` it differs), so the opened page is a small one of ours that builds the addresses and redirects to
-    rerun. The address cannot contain the step: rerun accepts a step only for recordings of its own servers.
+    The viewer's address contains the recordings as full addresses, with host and port. Only the browser knows
+    the host (behind ``ssh -L`` it differs). So the browser first opens a small page of ours, which builds the
+    addresses and redirects to rerun. The address cannot contain the step: rerun accepts a step only for
+    recordings of its own servers.
     So a script of ours in rerun's page sends the step (``viewer_control``, rerun 0.41: one hand-written
     protobuf message) when the recording has been read. A version of rerun without that message opens at the
     first step.

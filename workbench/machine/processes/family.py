@@ -107,7 +107,7 @@ def _read(path: str) -> bytes:
         return file.read()
 
 
-# --- a keeper above the worker adopts what detaches itself, and ends it all ---------------------------
+# --- a keeper above the worker adopts processes that detach themselves, and ends them all -------------
 
 
 _PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_CHILD_SUBREAPER = 1, 4, 36
@@ -194,7 +194,8 @@ def end_family(keeper: Keeper) -> None:
     try:
         keeper.wait(timeout=2 * _END_TIMEOUT_SECONDS)
     except subprocess.TimeoutExpired:
-        # The keeper is stopped. Killing it ends the worker, but not detached processes.
+        # The keeper does not react: it may be suspended. Killing it ends the worker, but not detached
+        # processes.
         keeper.kill()
         keeper.wait()
 

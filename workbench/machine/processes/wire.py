@@ -26,8 +26,8 @@ _READ_BYTES, _COPIED_BYTES = 1 << 18, 1 << 14
 """Size of one read, larger than a socket's buffer; and size below which a message is copied to be sent in one call."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
-"""msgpack extensions: the next of the arrays behind the message; and an array that the message already
-contains, by its number."""
+"""msgpack extensions: `_ARRAY` stands for the next of the arrays behind the message; `_AGAIN` contains the
+number of an array that the message has had before."""
 _ARRAY_KINDS = "biufcSU"
 """Kinds of arrays that may be sent; arrays of objects may not."""
 _MAX_DESCRIPTION_BYTES = 500
@@ -173,7 +173,8 @@ class MessageSocket:
 def pack(value: object) -> bytes:
     r"""Encode dataclasses, arrays and plain data.
 
-    A text with lone surrogates arrives escaped (``\udcff``), which can be read but opens no file; a `Path` arrives unchanged.
+    A text with lone surrogates arrives escaped (``\udcff``): a person can read it, but as a path it opens no
+    file. A `Path` arrives unchanged.
 
     Raises:
         TypeError: `value` contains something else.
