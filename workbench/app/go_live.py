@@ -102,7 +102,7 @@ class GoLive:
 
     Args:
         shared: The pages, and the open session, if any.
-        make_session: Opens a task with these options.
+        make_session: Opens a session of a task with the given options.
         clearances: Decide which code named by recordings may run.
         base: Options that all opened tasks share.
     """

@@ -35,7 +35,7 @@ from workbench.task.description import ShownPictures, TaskOptions
 from workbench.task.reference import TaskName, named_file
 
 _CLOSING_SECONDS = 1.4
-"""Closing is given up after this time without a written episode, because a disk may hang."""
+"""Closing is given up if no episode has been written for this time, because a disk may hang."""
 _Requests = queue.SimpleQueue[Callable[[], object] | int]
 """Queue of functions that the command calls in turn. An int in the queue ends the command with this exit
 code."""
@@ -56,7 +56,7 @@ def open_in_terminal(
     """Serve the page of a task. Returns only if the server cannot start: the exit code.
 
     Args:
-        trust: run code that recordings name without asking.
+        trust: whether code that recordings name runs without a question.
         editor: URL template that opens a line in the author's editor.
         pictures: how the page renders camera pictures.
     """
@@ -102,7 +102,7 @@ def start_in_terminal(
 
     Args:
         options: options of the tasks that are opened from the page.
-        trust: run code without asking, as in `open_in_terminal`.
+        trust: whether code runs without a question, as in `open_in_terminal`.
         editor: as in `open_in_terminal`.
     """
     gated_server = _start_server(at, "Workbench")
@@ -129,7 +129,7 @@ def review_in_terminal(
 
     Args:
         worker, base: options of tasks that are opened from the page.
-        trust: run code that recordings name without asking.
+        trust: whether code that recordings name runs without a question.
         editor: URL template that opens a line in the author's editor.
     """
     gated_server = _start_server(at, "Recordings")

@@ -1,4 +1,5 @@
-"""Runs ``workbench record``: a progress bar, or a line for each episode, then a list of them. Ctrl-C keeps finished episodes."""
+"""Runs ``workbench record``: prints a progress bar (or, outside a terminal, lines of progress), then the
+episodes. Ctrl-C keeps finished episodes."""
 
 from __future__ import annotations
 

@@ -32,8 +32,8 @@ from workbench.machine.software_vulkan import ensure_render_device
 
 DEFAULT_PORT = 8080
 MIN_MEMORY_GIB = 6.0
-"""Minimum available memory: one worker with 16 envs and cameras on a software driver, its warm spare, the server and a
-browser."""
+"""Minimum available memory, for one worker with 16 envs and cameras on a software driver, its warm spare, the
+server and a browser."""
 CHILD_TIMEOUT_SECONDS = 120
 
 GPU_SCRIPT = """

@@ -38,7 +38,7 @@ class RenderProbe:
     driver: str | None = None
     """Driver and version: ``llvmpipe, Mesa 25.0.7-2``."""
     error: str | None = None
-    """The reason in a sentence; None if `ok`."""
+    """Why SAPIEN cannot render; None if `ok`."""
     env: Mapping[str, str] = field(default_factory=dict)
     """Environment variables with which a process finds this device; empty for a system driver."""
     device: str | None = None

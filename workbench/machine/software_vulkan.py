@@ -185,7 +185,8 @@ class MesaPlan:
 
 
 def mesa_version(debian_version: str) -> tuple[int, int]:
-    """``25.0.7-2~bpo12+1`` -> (25, 0), without the epoch; (0, 0) if it does not start with numbers."""
+    """Major and minor version, without the epoch: (25, 0) for ``25.0.7-2~bpo12+1``; (0, 0) for an unknown
+    form."""
     match = re.match(r"(?:\d+:)?(\d+)\.(\d+)", debian_version)
     return (int(match[1]), int(match[2])) if match else (0, 0)
 

@@ -128,8 +128,8 @@ class RerunView:
     Args:
         server: The page.
         pages: Addresses of rerun.
-        make_way: Called before the panel opens, to make room for it, with a function that folds and unfolds it; returns the
-            width in pixels between the other panels.
+        make_way: Called before the panel opens, to make room for it. Its argument is a function that folds
+            and unfolds the panel. Returns the width in pixels between the other panels.
     """
 
     does = (OpenInRerun, CloseRerun)
@@ -198,7 +198,7 @@ class RerunView:
         """Set the panel's width once a page has placed it.
 
         viser gives 300 pixels to a panel that is docked next to another panel, and ignores the width given at
-        docking. A request for the panel's content shows that it exists.
+        docking. A page's request for the panel's content shows that the panel exists on that page.
         """
         if self._panel is not None:
             self._panel.set_width(self._width)

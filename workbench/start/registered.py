@@ -92,8 +92,8 @@ class RegisteredView:
 class RegisteredTasks:
     """ManiSkill's tasks and their thumbnails, cached by ManiSkill's version below the user's cache folder.
 
-    Importing ManiSkill takes seconds, and every picture needs an env, so both happen in a process of the lowest priority,
-    which gets only idle CPU time. It ends when everything is done.
+    Importing ManiSkill takes seconds, and every picture needs an env. So both happen in a process of the
+    lowest priority, which gets only idle CPU time. The process ends when everything is done.
 
     Args:
         may_work: called on the loop before every picture; if it returns False, drawing waits and the process is ended to

@@ -24,7 +24,8 @@ def python_command(*arguments: str) -> list[str]:
 
 
 def script_command(script: str, *arguments: str) -> list[str]:
-    """Command line of a child that runs a file with only the standard library, which starts in some milliseconds."""
+    """Command line of a child that runs a file with only the standard library. Such a child starts in some
+    milliseconds."""
     return [sys.executable, "-I", "-S", script, *arguments]
 
 

@@ -23,7 +23,8 @@ MAX_MESSAGE_BYTES = 1 << 30
 """Maximum size of one message. The largest messages of a working task, its meshes and the pictures of all envs, have some
 100 MB."""
 _READ_BYTES, _COPIED_BYTES = 1 << 18, 1 << 14
-"""Size of one read, larger than a socket's buffer; and size below which a message is copied to be sent in one call."""
+"""`_READ_BYTES`: size of one read, larger than a socket's buffer. `_COPIED_BYTES`: smaller messages are
+copied behind their length, so that one call sends both."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
 """msgpack extensions: `_ARRAY` stands for the next of the arrays behind the message; `_AGAIN` contains the
