@@ -95,13 +95,14 @@ class _Transition:
 class GoLive:
     """Continues recordings in a live env.
 
-    If the recording's task is already open, its selected env (or all envs) gets the recorded state. If not,
-    `GoLive` opens another session. It later closes that session, and removes the folder of recorded code. The
-    review page stays until the live page has something to show. Call all methods on the loop, except `close`.
+    If the recording's task is already open, its selected env (or all its envs) gets the recorded state. If
+    not, `GoLive` opens a session for that task. When this session is no longer needed, `GoLive` closes it,
+    and removes the folder with the recorded code, if there is one. The review page stays until the live page
+    has something to show. Call all methods on the loop, except `close`.
 
     Args:
         shared: The pages, and the open session, if any.
-        make_session: Opens a task with these options.
+        make_session: Opens a session of a task with the given options.
         clearances: Decide which code named by recordings may run.
         base: Options that all opened tasks share.
     """
@@ -160,8 +161,9 @@ class GoLive:
                 self._transition = None
 
     def _open_already(self, info: EpisodeInfo) -> Session | None:
-        """The open session that runs this task with its current code, not with recorded code; None if there
-        is none."""
+        """A session that already runs this task with its current code, not with recorded code: that of the
+        live page, else the one that the user opened. None if neither does. The session of the live page is
+        also returned if it has not loaded its task yet."""
         session = self._shared.session
         if session is not None and (self._own is None or self._own[1] is None):
             task = session.view().task
@@ -258,7 +260,9 @@ class GoLive:
         """End the session opened here. The pages must have been stopped. Must not be called on the loop."""
         do(self.let_go)
         self._opening.close(_OPEN_TIMEOUT_SECONDS)
-        do(lambda: None)  # a session may just have opened: the loop starts to end it before this
+        # A session may just have opened. Its transition, which runs on the loop, begins to end it: wait for
+        # that.
+        do(lambda: None)
         self._ending.close()
 
     def _let_go(self) -> None:
@@ -280,8 +284,8 @@ class GoLivePart(PagePart[ReviewView]):
         self._go_live = go_live
         go_live.review_is_back()
         self._about: object = None
-        """(recording id, whether its recorded code is chosen) for the note that is shown below the choice of
-        code."""
+        """(recording id, whether its recorded code is chosen), as they were when the note below the choice of
+        code was last drawn."""
         gui = server.gui
         self._folder = gui.add_folder("Continue live", expand_by_default=False, visible=False)
         with self._folder:

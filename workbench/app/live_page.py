@@ -533,5 +533,5 @@ def _shown_of(view: SessionView) -> tuple[object, object]:
         view.activity,
         view.pictures_serial,
     )
-    # Each view counts as new content. While no steps are made, each must also be drawn at once.
+    # Each snapshot counts as new content. While no steps are made, it must also be drawn at once.
     return object(), (waited_for if steps_go_on else object())

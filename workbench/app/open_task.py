@@ -39,7 +39,7 @@ class Choices:
 
 
 _SHOW_TIMEOUT_SECONDS = 10.0
-"""Maximum time that the old session stays open until the page of the new one is shown."""
+"""Maximum time for which the old session stays open while the page of the new session is built."""
 
 
 class OpenTask:
@@ -52,7 +52,7 @@ class OpenTask:
 
     Args:
         shared: The pages and the open session.
-        go_live: Ends a session that it opened.
+        go_live: Ends the session that it opened for a recording, if there is one.
         open_session: Opens a task.
         catalogue: The tasks that may be chosen.
         clearances: Decide whether a file may run.
@@ -95,8 +95,8 @@ class OpenTask:
     async def create(self, name: str, template: TemplateName) -> None:
         """Write a new task into the folder of the list, and open it; see `Chooser.create`."""
         made = await self._aside.run(lambda: write_new_task(name, template, self.catalogue.folder))
-        # Not by its number in the list: a search that began before the file was written may end now and lack
-        # the file.
+        # The row is passed on, not its number: a search that began before the file was written may end now,
+        # and its list lacks the file.
         self._want(self.catalogue.add_file(made.file, made.env_id))
 
     def doing(self) -> str:
@@ -174,7 +174,7 @@ class OpenTask:
         if old is not None:
             old.do(PauseRun())
             self._kept[self._open_reference] = old.kept_work()
-            # Not recorded code: its reference is the path of a file, which may contain other code by now.
+            # Not a `RecordedTask`: the user allowed only its texts, and its file may contain others by now.
             if isinstance(old.reference, str):
                 self._ran.add(self._open_reference)
         kept = self._kept.get(entry.lasting)

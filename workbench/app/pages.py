@@ -24,8 +24,8 @@ from workbench.page.widgets.visitors import Done, Visitor
 log = logging.getLogger(__name__)
 
 FRAME_SECONDS = 1 / 30
-"""Period of a frame. More updates slow a browser down (measured: at 350 updates a second it draws 13 to 30
-frames a second)."""
+"""Time from one frame to the next. More frequent updates slow a browser down (measured: at 350 updates
+a second it draws 13 to 30 frames a second)."""
 PANELS_TIMEOUT_SECONDS = 0.01
 """Longest time in each frame that the 3-D view waits for the panels to be sent."""
 RETRY_SECONDS = 1.0
@@ -80,9 +80,10 @@ class _PageRequest:
 class Pages:
     """Shows one of several pages on the same server, and redraws it whenever there is something new to show.
 
-    viser has one page per server, so a page is removed whole and the next one is built in its place; every
-    open browser follows. The session and the review continue, the bodies in the 3-D view stay (`View3D`), and
-    nothing is sent before the new page was drawn once, so that no empty control is ever visible.
+    viser has one page per server. So the whole page is removed and the next one is built in its place, and
+    every open browser shows the next one. Meanwhile the session and the review continue, and the bodies in
+    the 3-D view stay (`View3D`). Nothing is sent before the new page has been drawn once, so that no empty
+    control is ever visible.
 
     If a page cannot be drawn, every open browser shows a notice, and drawing is retried: without the notice,
     a frozen page would look alive.

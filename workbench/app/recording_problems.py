@@ -47,7 +47,7 @@ class RecordingProblems:
 
     def _tell(self, now: RecordingStatus) -> None:
         before, self._before = self._before, now
-        # By identity: the same problem may occur again between two polls.
+        # Compare identities, not texts: the same problem may have occurred again since the last poll.
         if now.problem is not None and now.problem is not before.problem:
             self._on_notice(now.problem)
             tell_all(self._server, "Not recorded", now.problem, "red")

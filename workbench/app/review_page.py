@@ -181,7 +181,7 @@ class ReviewPage:
         add_help_topics(server, shared.visitors)
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
-        """Returns the Review tab, which gets more content later, and the parts of all tabs."""
+        """Add the tabs. Returns the Review tab, and the parts of all tabs."""
         server, review, shared = self._server, self._review, self._shared
         library, go_live = shared.recordings.library, self._tools.go_live
         tabs = server.gui.add_tab_group()
@@ -327,7 +327,8 @@ class ReviewPage:
         self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures, self._body.body)
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
-        """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""
+        """Minimize the library when a recording is opened on a small screen. On any screen, expand the
+        library when all recordings are closed."""
         ids = tuple(one.id for one in view.opened)
         if view.library_stays and (ids or view.loading):
             self._had_opened = ids
@@ -409,7 +410,7 @@ class ReviewPage:
         self._cameras_note.content = render("note", text=self._reader.problem) if self._reader.problem else ""
         shown = episode and ShownCameras(
             self._reader.cameras(episode),
-            # Each recording brings its own cameras.
+            # A different number for each recording, since each has its own cameras.
             view.opened_serial * 1000 + view.selected,
             self._pictures,
             self._pictures_serial,
@@ -467,9 +468,9 @@ SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 
 
 class ReviewTimeline(TimeBar[ReviewView]):
-    """The timeline of the live page, but counting forwards: a recording has a start and an end.
+    """A timeline like that of the live page, but it counts steps forwards from the start of the recordings.
 
-    Each of several recordings has its own line on the strip, shifted by its alignment.
+    If several recordings are open, each has its own line on the strip, shifted by its alignment.
     """
 
     does = (

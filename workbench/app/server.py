@@ -40,11 +40,11 @@ class App:
         base: Options that all tasks named by recordings share.
         session: The live env, if there is one.
         tasks: Task files that may define the envs of foreign recordings.
-        trust: Run code named by recordings without asking.
+        trust: Whether code that recordings name runs without a question.
         on_notice: Called, on any thread, with a message for the terminal.
         editor: URL template that opens a line in the author's editor, from `parse_editor`.
-        choices: The recent tasks for the list of tasks, and how a chosen task is opened. With None there are
-            no recent tasks, and `make_session` opens the task.
+        choices: The recent tasks for the list of tasks, and how a chosen task is opened. With None, the list
+            has no recent tasks, and `make_session` opens the chosen task.
     """
 
     def __init__(

@@ -115,9 +115,10 @@ class Session:
             kept: work of the previous session of this task; its options replace `options`.
             check: whether the rules are checked after each load, until a `CheckAfterSave` changes this.
             make_worker: makes the supervisor; tests without a worker process replace it.
-            on_event: called with every event of the worker, and with its death as `TaskFailed`, on the supervisor's thread.
-            on_line: called with each line that the worker prints, on another thread; in a flood, lines are
-                dropped.
+            on_event: called, on the supervisor's thread, with the events of the worker, and with a
+                `TaskFailed` if the worker dies.
+            on_line: called, on a thread that reads the output, with each line that the worker prints. If the
+                worker prints too many lines, some are dropped.
             on_notice: called, on any thread, with a message for the terminal.
         """
         self.reference = task
@@ -161,7 +162,7 @@ class Session:
         self._policies = PolicySearch(self._happen)
         self._asker = QuestionClient(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
-        # Create the recorder last: it reports recovered episodes at once.
+        # Created after the parts above, since it reports recovered episodes at once.
         self._recorder = LiveRecorder(recordings, self._happen, on_notice)
         self._past_saver = PastSaver(recordings, self._recorder.finisher, self._background, self._happen)
         self._past_rescorer = PastRescorer(self._background, self._happen)
@@ -391,7 +392,8 @@ class Session:
         return requests
 
     def _take(self, event: Event) -> None:
-        """Handle an event of the worker. Called on the supervisor's thread, which continues after the event was handled."""
+        """Handle an event of the worker. Called on the supervisor's thread; returns when the event is
+        handled."""
         # Files are read here: a disk that hangs must not block the loop.
         if isinstance(event, TaskFailed):
             # Watch the files before the user sees the problem and saves a fix.

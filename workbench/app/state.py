@@ -63,8 +63,8 @@ DOES: frozenset[type[Command]] = (
 
 @dataclass(frozen=True)
 class State:
-    """State of a session. An event leaves the parts that it does not change as they are: the next state
-    contains the same objects."""
+    """State of a session. For the parts that an event does not change, the next state contains the same
+    objects."""
 
     run: Run
     recording: of_recording.LiveRecording
@@ -101,8 +101,8 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
     new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
-    # Of two jobs with the same priority, the one that starts later runs first: rescoring starts before
-    # checks. Effects of the run come after the jobs: when a load is done, the recording must continue before
-    # a recorded run is entered.
+    # Of two jobs with the same priority, the one that is started later runs first: rescoring is started
+    # before the checks, so that the checks run first. Effects of the run come after the jobs: when a load is
+    # done, the recording must continue before a recorded run is entered.
     for_jobs = [*for_recording, *for_rescoring, *for_checks, *for_profile, *for_seeds, *for_solver]
     return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio]

@@ -72,7 +72,7 @@ class StatusLine(MomentPart):
 
 
 def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
-    """The values of the template.
+    """The values for the template of the status line.
 
     Args:
         fresh: whether a new version has just been loaded.
@@ -81,10 +81,10 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
     # While the renderer works, the session's activity is more specific than "busy".
     busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
     moving = view.playing and view.state == "running" and task is not None and busy is None
-    # Planning dominates the time: rates of single steps would mean nothing.
+    # Planning takes most of the time, so a rate of steps would mean nothing.
     planning = moving and view.settings.action_source == "solve"
     starting = planning and view.of(SolveView).state == "starting"
-    known = view.steps_per_second > 0  # from the second step on
+    known = view.steps_per_second > 0  # the rate is known from the second step on
     slow = (
         known and view.real_time_factor < 0.85 * view.settings.speed and view.settings.speed != float("inf")
     )

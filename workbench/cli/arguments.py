@@ -30,7 +30,7 @@ Rules = Annotated[
         choices=DEGREES,
     ),
 ]
-"""Degree of all rules; None, each rule's own degree, cannot be written on the command line."""
+"""Degree of all rules. None leaves each rule its own degree; it cannot be given on the command line."""
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""

@@ -62,7 +62,7 @@ printed first, and the rules on the lines below."""
 
 @dataclass(frozen=True)
 class CheckOutput:
-    """Output of a check in addition to its text."""
+    """What a check writes besides its text, or prints in place of it."""
 
     json: bool = False
     """Print JSON instead of text."""
@@ -166,7 +166,8 @@ def write_reports(said: Reported, output: CheckOutput) -> None:
 
 
 def exit_code(said: Reported) -> int:
-    """Exit code of a check: 2 if nothing was checked, 1 if a finding has a degree that fails."""
+    """Exit code of a check: 2 if nothing was checked, 1 if a finding has a degree at which the check
+    fails."""
     if said.error is not None:
         return Exit.REFUSED
     return Exit.FAILED if said.report.fails(said.fail_on) else Exit.DONE

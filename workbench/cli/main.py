@@ -207,7 +207,7 @@ def review(
             return refuse(f"there is no file {file}")
     from workbench.episodes.reader.reading import start_reading
 
-    # Prepare the processes that read recordings while the page is imported.
+    # The processes that read recordings get ready while the modules of the page are imported.
     start_reading()
     from workbench.cli.page import review_in_terminal
     from workbench.live.process.memory_limit import parse_memory

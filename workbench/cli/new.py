@@ -17,8 +17,8 @@ def new_in_terminal(name: str, origin: str) -> int:
 
     Args:
         name: name of the task; empty to ask for it.
-        origin: a template or an id. If empty, the first template is used if a name is given, and else the
-            user is asked.
+        origin: a template or an id. If it is empty and a name is given, the first template is used. If both
+            are empty, the user is asked for both.
     """
     folder = Path.cwd()
     if not name:

@@ -169,8 +169,7 @@ def print_problem(problem: Problem) -> None:
 
 
 def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> None:
-    """Print the failures of a job that continued after them: each kind of failure once, with the items that
-    it affects.
+    """Print the failures that did not end a job: each kind of failure once, with the items that it affects.
 
     Args:
         names: returns the name of an item.
@@ -233,7 +232,8 @@ def _what_runs(failed: TaskFailed) -> str:
 
 
 def print_line(line: PrintedLine) -> None:
-    """Print a line of the author's code, marked to distinguish it from the workbench's own."""
+    """Print a line that the author's code has printed, with a mark that distinguishes it from the workbench's
+    own lines."""
     from workbench.live.process.captured_output import for_terminal
 
     coloured = line.runs and out.color_system is not None and not out.no_color

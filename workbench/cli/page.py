@@ -35,9 +35,10 @@ from workbench.task.description import ShownPictures, TaskOptions
 from workbench.task.reference import TaskName, named_file
 
 _CLOSING_SECONDS = 1.4
-"""Closing is given up after this time without a written episode, because a disk may hang."""
+"""Closing is given up if no episode has been written for this time, because a disk may hang."""
 _Requests = queue.SimpleQueue[Callable[[], object] | int]
-"""Queue of functions that the command calls next; an int ends the command with this exit code."""
+"""Queue of functions that the command calls in turn. An int in the queue ends the command with this exit
+code."""
 
 
 @loop_in_main
@@ -52,10 +53,10 @@ def open_in_terminal(
     editor: str = "",
     pictures: ShownPictures = "auto",
 ) -> int:
-    """Serve the page of a task; returns (the exit code) only if the server cannot start.
+    """Serve the page of a task. Returns only if the server cannot start: the exit code.
 
     Args:
-        trust: run code that recordings name without asking.
+        trust: whether code that recordings name runs without a question.
         editor: URL template that opens a line in the author's editor.
         pictures: how the page renders camera pictures.
     """
@@ -97,11 +98,11 @@ def start_in_terminal(
     trust: bool = False,
     editor: str = "",
 ) -> int:
-    """Serve the page to choose a task from; returns (the exit code) only if the server cannot start.
+    """Serve the page to choose a task from. Returns only if the server cannot start: the exit code.
 
     Args:
         options: options of the tasks that are opened from the page.
-        trust: run code without asking, as in `open_in_terminal`.
+        trust: whether code runs without a question, as in `open_in_terminal`.
         editor: as in `open_in_terminal`.
     """
     gated_server = _start_server(at, "Workbench")
@@ -124,11 +125,11 @@ def review_in_terminal(
     trust: bool = False,
     editor: str = "",
 ) -> int:
-    """Serve the page of a folder of recordings; returns (the exit code) only if the server cannot start.
+    """Serve the page of a folder of recordings. Returns only if the server cannot start: the exit code.
 
     Args:
         worker, base: options of tasks that are opened from the page.
-        trust: run code that recordings name without asking.
+        trust: whether code that recordings name runs without a question.
         editor: URL template that opens a line in the author's editor.
     """
     gated_server = _start_server(at, "Recordings")
@@ -177,8 +178,8 @@ class _HowToOpen:
         def on_event_and_note(event: Event) -> None:
             on_event(event)
             if isinstance(event, Loaded):
-                # Prepare the reading of recordings only now: earlier, this would delay the task, for which
-                # the user waits.
+                # Start the processes that read recordings only now: earlier, they would delay the load of the
+                # task, for which the user waits.
                 start_reading()
                 made = replace(event.options or options, seed=0)
                 if noted[-1:] != [made]:
@@ -209,7 +210,8 @@ class _HowToOpen:
 
 
 def _for_others(options: TaskOptions) -> TaskOptions:
-    """The options of one task as options of other tasks: without the keyword arguments of its class."""
+    """The options of one task, for use with other tasks. Of the keyword arguments, only `RUN_KEYWORDS` are
+    kept: the others belong to the class of that task."""
     kwargs = {name: value for name, value in options.env_kwargs.items() if name in RUN_KEYWORDS}
     return replace(options, env_kwargs=kwargs)
 

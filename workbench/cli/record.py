@@ -1,4 +1,5 @@
-"""Runs ``workbench record``: a progress bar, or a line for each episode, then a list of them. Ctrl-C keeps finished episodes."""
+"""Runs ``workbench record``: prints a progress bar (or, outside a terminal, lines of progress), then the
+episodes. Ctrl-C keeps finished episodes."""
 
 from __future__ import annotations
 
@@ -150,8 +151,8 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
         requested, _ = with_given_actions(what)
         if recovered := recover_confined(what.out):
             err.print(f"recovered {_episodes(len(recovered))} that an earlier recording left unfinished")
-        # Print this warning before the task is opened: if an import fails because of such a file, its error
-        # does not say so.
+        # Warn before the task is opened. A module next to the task's file cannot be imported if a library has
+        # the same name, and the error of the import does not say so.
         hidden = hidden_modules_text(what.task)
         for notice in hidden:
             warn(notice)

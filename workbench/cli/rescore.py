@@ -73,7 +73,7 @@ class RescoreOptions:
 
 @dataclass(frozen=True)
 class RescoreOutput:
-    """Output in addition to the table as text."""
+    """What the command writes besides the table as text, or prints in place of it."""
 
     csv: bool = False
     """Print CSV instead of text."""
@@ -114,14 +114,15 @@ def rescore_all(
         on_progress: called with the number of rescored episodes, the number of all episodes, and the number
             of control steps so far.
         clearances: decides which code that recordings name may run; None never asks.
-        on_notice: called before the task is opened, for each file in the task's folder that no import finds.
+        on_notice: called before the tasks are opened, with a sentence for each module next to a task's file
+            that cannot be imported because a library has the same name.
         run: where the work runs; the verdicts do not depend on it.
 
     Raises:
         NotTrusted: a recording names code that is not trusted, and asking is impossible or every answer was no.
         FileNotFoundError, UnreadableRecording: there is nothing to rescore.
-        TaskError: every task fails to open or raises. If only some tasks do, their verdicts contain the
-            error.
+        TaskError: each of the tasks either cannot be opened or raises. If only some of them do so, their
+            verdicts contain the errors.
         CannotEnterRecording: like TaskError, for recorded source code that cannot be opened.
         PoolError: as `rescore_recordings` does.
         OSError, ValueError: as `run_by` does.

@@ -148,7 +148,7 @@ class StatusWriter:
         return both
 
     def end(self, state: JobState) -> None:
-        """Write the final status; a job that failed before its first episode has none."""
+        """Write the final status, unless the job failed before it made any progress."""
         if self._file is not None and (self._last is not None or state != "failed"):
             self._write(state)
 

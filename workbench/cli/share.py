@@ -122,7 +122,7 @@ def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]],
 def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
     """Show recordings in rerun's viewer until the window is closed or Ctrl-C; returns the exit code.
 
-    Uses a page instead of a window with `web`, or if there is no display.
+    The viewer is shown in a page instead of a window if `web` is True or there is no display.
     """
     from workbench.episodes.rerun.viewer import has_screen, open_window, resolve_recordings
 

@@ -62,7 +62,7 @@ _COLUMNS = ("seed", "solved_at", "steps", "return", "seconds", "in_the_way", "ru
 
 @dataclass(frozen=True)
 class SolveOutput:
-    """Output in addition to the text."""
+    """What the command writes besides its text, or prints in place of it."""
 
     json: bool = False
     """Print JSON instead of text."""

@@ -115,8 +115,8 @@ ONE_LINE_NAMES = {"signed-by": "Signed-By", "trusted": "Trusted", "arch": "Archi
 class AptSource:
     """One binary ("deb") source, in either format of sources.list(5).
 
-    Either one line per source, ``deb [options] uri suite component...``, or deb822 paragraphs with ``Types:``, ``URIs:``,
-    ``Suites:``, ``Components:``.
+    One format has a line for each source, ``deb [options] uri suite component...``. The other, deb822, has
+    paragraphs with ``Types:``, ``URIs:``, ``Suites:``, ``Components:``.
     """
 
     uris: tuple[str, ...]
@@ -178,9 +178,9 @@ def backports_source(sources: list[AptSource], codename: str) -> str | None:
     """A deb822 source for ``CODENAME-backports`` on the mirror of ``CODENAME`` itself; None if no source has
     ``CODENAME``'s ``main``.
 
-    That mirror may be the only one that the machine reaches. Its trust options (``Signed-By``, ``Trusted``)
-    are copied, since apt would refuse the source without them. Adding backports upgrades nothing: their
-    Release file has ``NotAutomatic``.
+    The same mirror is used, since the machine may reach no other. Its trust options (``Signed-By``,
+    ``Trusted``) are copied, since apt would refuse the source without them. Adding backports upgrades
+    nothing: their Release file has ``NotAutomatic``.
     """
     for source in sources:
         if codename in source.suites and "main" in source.components:

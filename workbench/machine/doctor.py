@@ -32,8 +32,8 @@ from workbench.machine.software_vulkan import ensure_render_device
 
 DEFAULT_PORT = 8080
 MIN_MEMORY_GIB = 6.0
-"""Minimum available memory: one worker with 16 envs and cameras on a software driver, its warm spare, the server and a
-browser."""
+"""Minimum available memory, for one worker with 16 envs and cameras on a software driver, its warm spare, the
+server and a browser."""
 CHILD_TIMEOUT_SECONDS = 120
 
 GPU_SCRIPT = """
@@ -73,7 +73,7 @@ def diagnose() -> list[DoctorFinding]:
     """Run all checks. Never raises: a check that fails becomes a finding with its error.
 
     A broken driver crashes or hangs its process, so SAPIEN's renderer and torch's CUDA are probed in child processes with a
-    timeout. PhysX's GPU library is looked for on disk, since SAPIEN would fetch it from the network.
+    timeout. PhysX's GPU library is only searched for on the disk, since SAPIEN would download it.
     """
     questions: list[tuple[str, Callable[[], list[DoctorFinding]]]] = [
         ("Python", _python),
@@ -312,7 +312,7 @@ def _page_address() -> list[DoctorFinding]:
         f"http://127.0.0.1:{DEFAULT_PORT}/ and a token that `workbench open` prints; from elsewhere: {tunnel}"
     )
     with socket.socket() as trial:
-        # A server does the same: a port with lingering connections counts as free.
+        # As a server does: with this option, a port with lingering connections counts as free.
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind(("127.0.0.1", DEFAULT_PORT))

@@ -72,8 +72,8 @@ def create_file(path: Path, content: bytes, mode: int = 0o666) -> bool:
 
 
 def real_path(path: Path) -> Path:
-    """The absolute path with links resolved; `path` itself where links form a cycle, for which ``Path.resolve`` raises
-    RuntimeError before Python 3.13."""
+    """The absolute path with links resolved. If links form a cycle, the path stays as it is; ``Path.resolve``
+    would raise RuntimeError before Python 3.13."""
     return Path(os.path.realpath(path))
 
 
@@ -126,7 +126,8 @@ def new_file(path: Path) -> Iterator[Path]:
             raise
         raise OSError(error.errno, f"Cannot write {path}: {os.strerror(error.errno)}.") from error
     finally:
-        # Either `path` exists by now, or an error is being raised, which a failed removal must not hide.
+        # If `path` exists by now, a failed removal does no harm. If not, it must not hide the error of the
+        # block.
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 
@@ -134,7 +135,8 @@ def new_file(path: Path) -> Iterator[Path]:
 def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:  # `new_file` would report that the file itself exists
+    except FileExistsError as error:
+        # Another type, since `new_file` takes a FileExistsError to mean that its own file exists.
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(path)) from error
 
 

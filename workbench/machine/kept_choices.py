@@ -23,7 +23,7 @@ class KeptChoices(msgspec.Struct, frozen=True):
     check_after_save: bool = True
     """Whether rules are checked after each load."""
     policies: dict[str, list[str]] = {}
-    """Policies that were used, newest first, by the folder in which the command was started."""
+    """By the folder in which the command was started: the policies that were used, newest first."""
 
 
 def kept_choices() -> KeptChoices:

@@ -24,7 +24,8 @@ SYSTEM_LIBRARIES = {
     "libGL.so.1": "libgl1",
     "libgthread-2.0.so.0": "libglib2.0-0",
 }
-"""Libraries that the wheels of sapien and opencv-python load but do not contain -> Debian's package."""
+"""Libraries that the wheels of sapien and opencv-python load but do not contain, each with its Debian
+package."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class RenderProbe:
     driver: str | None = None
     """Driver and version: ``llvmpipe, Mesa 25.0.7-2``."""
     error: str | None = None
-    """The reason in a sentence; None if `ok`."""
+    """Why SAPIEN cannot render; None if `ok`."""
     env: Mapping[str, str] = field(default_factory=dict)
     """Environment variables with which a process finds this device; empty for a system driver."""
     device: str | None = None
@@ -173,13 +174,15 @@ class _Driver:
 
 
 def _vulkan_drivers() -> dict[str, _Driver]:
-    """Driver of every device that Vulkan lists, by device name; SAPIEN has the device's name only.
+    """Driver of every device that Vulkan lists, by device name. SAPIEN tells only the name of its device.
 
-    From ``VkPhysicalDeviceDriverProperties`` (core since 1.2). Uses the C layout of Vulkan 1.2 on 64 bits:
+    Read from ``VkPhysicalDeviceDriverProperties`` (core since 1.2), with the C layout of Vulkan 1.2 on 64
+    bits:
     VkApplicationInfo is 48 bytes with apiVersion at 44; VkInstanceCreateInfo is 64 bytes with the application info's
     address at 24;
     VkPhysicalDeviceDriverProperties has driverName (256 characters) at 20 and driverInfo at 276;
-    VkPhysicalDeviceProperties2 has pNext at 8 and the properties at 16, their deviceType at 16 and deviceName at 20.
+    VkPhysicalDeviceProperties2 has pNext at 8 and the properties at 16; within the properties, deviceType is
+    at 16 and deviceName at 20.
     """
     try:
         vulkan = ctypes.CDLL(os.environ.get("SAPIEN_VULKAN_LIBRARY_PATH", "libvulkan.so.1"))

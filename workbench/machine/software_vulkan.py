@@ -185,7 +185,8 @@ class MesaPlan:
 
 
 def mesa_version(debian_version: str) -> tuple[int, int]:
-    """``25.0.7-2~bpo12+1`` -> (25, 0), without the epoch; (0, 0) if it does not start with numbers."""
+    """Major and minor version, without the epoch: (25, 0) for ``25.0.7-2~bpo12+1``; (0, 0) for an unknown
+    form."""
     match = re.match(r"(?:\d+:)?(\d+)\.(\d+)", debian_version)
     return (int(match[1]), int(match[2])) if match else (0, 0)
 
@@ -212,8 +213,8 @@ def ensure_render_device(install: bool) -> RenderProbe:
     that renders then needs `RenderProbe.env` (``python -m workbench.machine.software_vulkan --export`` prints it for a shell).
 
     Returns:
-        The last probe. If ``ok``, start the process that renders with ``probe.env`` added; else ``error`` ends with what
-        to do next.
+        The last probe. If it is ``ok``, add its ``env`` to the environment of the process that renders. If
+        not, its ``error`` ends with what to do next.
     """
     probe = probe_render_device()
     if probe.missing_libraries and install and can_install_packages():
@@ -348,7 +349,8 @@ def _command_to_type() -> str:
 
 
 def main() -> None:
-    """Provide a render device if there is none; ``--export`` prints only shell lines for its variables."""
+    """Provide a render device if there is none. Prints the device, and the shell lines that set its
+    variables; with ``--export`` only these lines."""
     export = "--export" in sys.argv[1:]
     probe = known_render_device(install=True) if export else ensure_render_device(install=True)
     if probe.ok:

@@ -26,7 +26,8 @@ def number_text(value: float, form: str = ".4g") -> str:
 
 
 def rate_text(value: float) -> str:
-    """A rate of zero or more, with two digits if it is small: ``5 125``, ``240``, ``9.6``, ``0.93``, ``0.045``."""
+    """A rate of zero or more as text, with two significant digits below 10: ``5 125``, ``240``, ``9.6``,
+    ``0.93``, ``0.045``."""
     return f"{value:,.0f}".replace(",", " ") if value >= 9.95 else f"{value:.2g}"
 
 
@@ -119,7 +120,7 @@ def colour_codes(numbers: str) -> Iterator[tuple[int, ...]]:
     for part in parts:
         if ":" in part:
             values = [int(value) if value else 0 for value in part.split(":")]
-            # 38:2:SPACE:r:g:b, and the common 38:2:r:g:b.
+            # There are two forms, 38:2:COLOUR_SPACE:r:g:b and the common 38:2:r:g:b: drop the colour space.
             if values[0] in (38, 48) and len(values) > 5 and values[1] == 2:
                 del values[2]
             yield tuple(values)
@@ -155,7 +156,8 @@ class SafeStream:
 def guard_terminal() -> None:
     """Let this process print only text and colours to its terminal.
 
-    Never undone, since a traceback that ends the process is printed last. Does not cover native code and other programs.
+    This is never undone, since a traceback that ends the process is printed last. Output of native code and
+    of other programs is not filtered.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)

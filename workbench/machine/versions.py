@@ -39,7 +39,7 @@ class PrivateName:
     name: str
     """Attribute of the owner; for a class, also a field that is annotated or that its methods assign."""
     disables: str = ""
-    """What does not work without the name; empty if the workbench works without it."""
+    """The feature that does not work without the name; empty if no task can be opened without it."""
 
     @property
     def dotted(self) -> str:
@@ -189,7 +189,7 @@ def moved_text(moved: Iterable[PrivateName]) -> str:
 
 
 def rerun_notice() -> str:
-    """Notice that an untested version of rerun cannot record; empty if it can."""
+    """Notice that the installed version of rerun is untested and cannot record; else empty."""
     if not untested(["rerun-sdk"]):
         return ""  # rerun is not imported to open a task: it takes 0.3 s
     try:

@@ -59,7 +59,8 @@ class MakeRequest:
     what: What
     sources: tuple[Source, ...]
     folder: Path
-    """Folder for the files; for a dataset the folder of the dataset, for ManiSkill's demonstrations their ``.h5`` file."""
+    """Folder for the files. For a LeRobot dataset, the folder of the dataset; for ManiSkill's demonstrations,
+    the path of their ``.h5`` file."""
     camera: str = EVERY_CAMERA
     """Camera of a film."""
     eye: FilmEye | None = None

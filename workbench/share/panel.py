@@ -75,7 +75,7 @@ class Chosen:
     cameras: tuple[str, ...] = ()
     """Names of the cameras; known only for open recordings."""
     selected: bool = False
-    """Whether they are the recordings selected in the library."""
+    """Whether `sources` are the recordings selected in the library."""
     in_view: bool = False
     """Whether there is one recording to share, and only this one is open. A film of the 3-D view then uses
     the page's viewpoint."""
@@ -285,7 +285,7 @@ _TIME = re.compile(r"_\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d")
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Names without the time at their end, unless two names would become equal."""
+    """The names without their date and time; the whole names if two of them would become equal."""
     short = [_TIME.sub("", name) for name in names]
     return short if len(set(short)) == len(short) else list(names)
 

@@ -47,13 +47,15 @@ _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
 class RerunPages:
     """The addresses under which rerun shows recordings. One object per `GatedServer`.
 
-    rerun's web viewer is a program of 43 MB that fetches any address it is given and reports its use to its makers. Here it
-    comes from the wheel that wrote the recordings (so file and viewer have the same version), compressed, under the page's
-    own address: the same cookie and one forwarded port suffice, and a content security policy blocks other servers.
+    rerun's web viewer is a program of 43 MB that fetches any address it is given and reports its use to its
+    makers. The workbench serves the viewer itself: compressed, and from the wheel that wrote the recordings
+    (so file and viewer have the same version). The viewer is below the page's own address, so the same cookie
+    and one forwarded port suffice, and a content security policy blocks other servers.
 
-    The viewer's address contains the recordings as full addresses, with host and port. Only the browser knows the host
-    (behind ``ssh -L`` it differs), so the opened page is a small one of ours that builds the addresses and redirects to
-    rerun. The address cannot contain the step: rerun accepts a step only for recordings of its own servers.
+    The viewer's address contains the recordings as full addresses, with host and port. Only the browser knows
+    the host (behind ``ssh -L`` it differs). So the browser first opens a small page of ours, which builds the
+    addresses and redirects to rerun. The address cannot contain the step: rerun accepts a step only for
+    recordings of its own servers.
     So a script of ours in rerun's page sends the step (``viewer_control``, rerun 0.41: one hand-written
     protobuf message) when the recording has been read. A version of rerun without that message opens at the
     first step.
@@ -126,8 +128,8 @@ class RerunView:
     Args:
         server: The page.
         pages: Addresses of rerun.
-        make_way: Called before the panel opens, to make room for it, with a function that folds and unfolds it; returns the
-            width in pixels between the other panels.
+        make_way: Called before the panel opens, to make room for it. Its argument is a function that folds
+            and unfolds the panel. Returns the width in pixels between the other panels.
     """
 
     does = (OpenInRerun, CloseRerun)
@@ -196,7 +198,7 @@ class RerunView:
         """Set the panel's width once a page has placed it.
 
         viser gives 300 pixels to a panel that is docked next to another panel, and ignores the width given at
-        docking. A request for the panel's content shows that it exists.
+        docking. A page's request for the panel's content shows that the panel exists on that page.
         """
         if self._panel is not None:
             self._panel.set_width(self._width)

@@ -35,10 +35,10 @@ def write_scene_html(
 ) -> None:
     """Write the animated scene to a new file at `path`.
 
-    viser's page can play messages of its server from a recording in the page itself: the scene is built and
-    moved state by state on a server without viewers, with pauses in between, and recorded. The player repeats
+    viser's page can contain a recording of its server's messages, and play it. For this recording, the scene
+    is built and moved state by state on a server without viewers, with pauses in between. The player repeats
     without a pause, so the recording holds the last state for `PAUSE_SECONDS`. The player's clock would
-    include this pause, so it is hidden, and our caption shows the episode's time and step.
+    include that time: the clock is hidden, and our caption shows the episode's time and step.
 
     Args:
         path: file, which must not exist.

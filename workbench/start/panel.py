@@ -238,7 +238,8 @@ def tasks_html(
 
     Args:
         doing: text about the work in progress, or empty.
-        is_open: returns whether a row is the open task, which is marked. For Enter, see `best_row`.
+        is_open: returns whether a row is the open task. That row is marked, and Enter opens it only if there
+            is no better row (see `best_row`).
         field: name of the search field.
     """
     found, searched = shown_rows(view, search), bool(search.words.split())

@@ -49,7 +49,7 @@ class _Document(msgspec.Struct):
 class RecentTasks:
     """The tasks that this user opened last, newest first. Thread-safe; other processes may write too.
 
-    If the file is missing, broken, or writable by other users, there are no tasks. Invalid entries are dropped. If the file
+    A file that is broken or writable by other users is ignored, and invalid entries are dropped. If the file
     cannot be written, entries last until the program ends.
 
     Args:

@@ -92,8 +92,8 @@ class RegisteredView:
 class RegisteredTasks:
     """ManiSkill's tasks and their thumbnails, cached by ManiSkill's version below the user's cache folder.
 
-    Importing ManiSkill takes seconds, and every picture needs an env, so both happen in a process of the lowest priority,
-    which gets only idle CPU time. It ends when everything is done.
+    Importing ManiSkill takes seconds, and every picture needs an env. So both happen in a process of the
+    lowest priority, which gets only idle CPU time. The process ends when everything is done.
 
     Args:
         may_work: called on the loop before every picture; if it returns False, drawing waits and the process is ended to
@@ -270,7 +270,8 @@ def _write(file: Path, content: bytes) -> None:
 
 
 def _write_jpeg(file: Path, pixels: np.ndarray) -> None:
-    """Scale a picture to cover the size of the cached pictures, cut off what is outside its centre, and write it. Raises ValueError if `pixels` is not a picture."""
+    """Scale a picture until it covers the size of cached pictures, crop it to that size around its centre,
+    and write it. Raises ValueError if `pixels` is not a picture."""
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or not 0 < pixels.size < 1 << 26:
         raise ValueError("the task's picture is not an RGB image")
     height, width = pixels.shape[:2]

@@ -134,7 +134,7 @@ class _ForkServer:
         if pid:
             _tell(end, Forked(pid))
             with suppress(OSError):
-                os.setpgid(pid, pid)  # also here: the group may be signalled before the child has created it
+                os.setpgid(pid, pid)  # the child does this too, but the group may be signalled earlier
             self._workers[pid] = end
         else:
             end.close()

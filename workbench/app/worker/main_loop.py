@@ -301,7 +301,7 @@ class Worker:
                 ),
             )
         self._task.when_loaded = read_process_state()
-        # An interrupt here would leave the page with another task than the worker runs.
+        # After an interrupt here, the page would show a task that the worker does not run.
         with self._interrupts.shielded():
             self._replace_task(opened, report, request, send)
             self._send_rules()
@@ -423,8 +423,8 @@ class Worker:
             self._chooser.use(s.action_source, s.policy, folder)
         except TaskError as error:
             self._task.drop_steps_if_interrupted(error)
-            # Before a task is loaded, this failure would look like a failed load. In that case, the first
-            # step reports it.
+            # Before a task is loaded, the page would take this failure for a failed load. The first step then
+            # reports it.
             if self._task.opened is not None:
                 self._task.fail(error.problem)
             return False
@@ -474,7 +474,7 @@ class Worker:
         return self._followed.ready(opened, self._steps.number, envs)
 
     def _step_due(self, now: float) -> bool:
-        # Ask for the plan even if no step is due yet: so the next plan is computed while the last one is
+        # Ask for the next plan even if no step is due yet: it is then computed while the present one is
         # played.
         ready = not self._is_planned or self._plan_ready()
         return self._pacer.due(now) and ready
@@ -529,11 +529,11 @@ class Worker:
     def _reset_with_seeds(
         self, task: TaskEnv, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> StepResult:
-        """Reset these envs. Envs that are recorded are reset one by one, so that a seed gives the same
-        initial state whatever the other envs are.
+        """Reset these envs. Envs that are recorded are reset one by one, so that their initial states depend
+        only on their own seeds.
 
-        Envs that are reset together share torch's generator: their random numbers depend on all of them, and
-        on the first seed.
+        Envs that are reset together share torch's generator: the random numbers of each env depend on which
+        envs are reset with it, and on the seed of the first.
         """
         every = range(task.num_envs) if env_idx is None else env_idx
         alone = [env for env in every if env in self._steps.recorded] if len(every) > 1 else []

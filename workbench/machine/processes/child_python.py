@@ -24,7 +24,8 @@ def python_command(*arguments: str) -> list[str]:
 
 
 def script_command(script: str, *arguments: str) -> list[str]:
-    """Command line of a child that runs a file with only the standard library, which starts in some milliseconds."""
+    """Command line of a child that runs a file with only the standard library. Such a child starts in some
+    milliseconds."""
     return [sys.executable, "-I", "-S", script, *arguments]
 
 
@@ -44,7 +45,7 @@ def start_with_socket(
     """Start ``python -m MODULE SOCKET`` without output; returns the process and the other end of the socket, which keeps
     message boundaries.
 
-    Ctrl-C reaches only this process, which still needs the child. Raises OSError.
+    Ctrl-C in the terminal does not reach the child, because this process still needs it. Raises OSError.
 
     Args:
         new_session: start the child in its own session, not only in its own process group.
@@ -88,9 +89,9 @@ def quick_imports() -> Iterator[None]:
     """Context for imports without garbage collection. Later collections skip the objects that the imports
     made.
 
-    Importing torch, ManiSkill and rerun takes a quarter less time: of a million objects made by imports, ten thousand are
-    garbage. If later collections did not skip these objects, the collections that BaseEnv starts at every
-    build and close would take 0.25 s each, most of the time of a reload of 16 envs.
+    Importing torch, ManiSkill and rerun then takes a quarter less time: of the million objects that these
+    imports make, only ten thousand are garbage. BaseEnv starts a collection at every build and close. If a
+    collection did not skip these objects, it would take 0.25 s, most of the time of a reload of 16 envs.
     """
     before, enabled = len(sys.modules), gc.isenabled()
     gc.disable()

@@ -42,7 +42,8 @@ def landlock_version() -> int:
 
 
 def confine(reads: Iterable[Path], most_memory: int, writes: Iterable[Path] = ()) -> None:
-    """Restrict this process and its children: they can read only programs, libraries and files below `reads`.
+    """Restrict this process and its children: they can read only programs, libraries, and what is below
+    `reads`.
 
     They can write only below `writes`, open no TCP connection, signal no outside process, and gain no rights
     from programs that they start. A kernel without Landlock enforces only that they gain no rights, and the

@@ -1,4 +1,5 @@
-"""Lets a debugger attach to a worker, and answers ``breakpoint()`` and ``pdb.set_trace()`` without a terminal."""
+"""Lets a debugger attach to a worker, and sets what ``breakpoint()`` and ``pdb.set_trace()`` do without a
+terminal."""
 
 from __future__ import annotations
 

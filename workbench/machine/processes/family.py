@@ -107,7 +107,7 @@ def _read(path: str) -> bytes:
         return file.read()
 
 
-# --- a keeper above the worker adopts what detaches itself, and ends it all ---------------------------
+# --- a keeper above the worker adopts processes that detach themselves, and ends them all -------------
 
 
 _PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_CHILD_SUBREAPER = 1, 4, 36
@@ -125,11 +125,12 @@ def main() -> None:
 def begin_family(server: int) -> None:
     """Fork: the child returns and becomes the worker; this process never returns, and becomes the child's keeper.
 
-    A task may start processes that leave the worker's group (``setsid``) or its process tree (double fork), which cannot be
-    found once the worker is gone. The keeper is their *subreaper*: a process below it that loses its parent becomes its
-    child. When the worker ends, or the server asks (SIGTERM) or is gone, the keeper kills its children until it has none,
-    and exits with the worker's status. It kills nothing else, since a child's process id is not reused before its parent has
-    waited for it. A cgroup would need rights that a container or an ssh login does not have.
+    A task may start processes that leave the worker's group (``setsid``) or its process tree (double fork).
+    They cannot be found once the worker is gone. The keeper is their *subreaper*: a process below the keeper
+    that loses its parent becomes a child of the keeper. When the worker has ended, the server is gone, or the
+    server asks for it (SIGTERM), the keeper kills its children until it has none, and exits with the worker's
+    status. It kills nothing else, since a child's process id is not reused before its parent has waited for
+    it. A cgroup would need rights that a container or an ssh login does not have.
 
     Call it before any import (the keeper then takes 6 MB) and before any thread is started.
 
@@ -194,7 +195,8 @@ def end_family(keeper: Keeper) -> None:
     try:
         keeper.wait(timeout=2 * _END_TIMEOUT_SECONDS)
     except subprocess.TimeoutExpired:
-        # The keeper is stopped. Killing it ends the worker, but not detached processes.
+        # The keeper does not react: it may be suspended. Killing it ends the worker, but not detached
+        # processes.
         keeper.kill()
         keeper.wait()
 
@@ -211,7 +213,8 @@ def describe_exit(code: int | None) -> str:
 
 
 def _keep(worker: int) -> NoReturn:
-    # The server notices the worker's end when shared descriptors close, so the keeper must hold none.
+    # The server notices the worker's end when the worker's descriptors close, so the keeper must hold no
+    # copies.
     for fd in sorted(map(int, os.listdir("/proc/self/fd"))):
         if fd > 2:
             try:

@@ -8,9 +8,11 @@ from collections.abc import Sequence
 
 
 def without_current_folder(path: Sequence[str], python_path: str) -> list[str]:
-    """`path` without the current folder, unless it was named or this package is imported from it.
+    """`path` without the current folder. The folder stays if ``PYTHONPATH`` names it, or if this package, the
+    standard library or installed packages are in it.
 
-    ``python -m`` and an empty entry of ``PYTHONPATH`` add that folder: a ``numpy.py`` in a downloaded folder would run.
+    ``python -m`` and an empty entry of ``PYTHONPATH`` add the current folder: in a downloaded folder, its
+    ``numpy.py`` would run.
 
     Args:
         python_path: the variable ``PYTHONPATH``; folders named there stay, even ``.``.

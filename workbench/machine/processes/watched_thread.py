@@ -75,8 +75,9 @@ def stop_listening(listener: Callable[[str], None]) -> None:
 def on_free_cores(wanted: Callable[[], bool]) -> Iterator[None]:
     """Context in which the threads of this process, and threads that they start, run only on cores that are idle.
 
-    A nice value is not enough: on two busy cores, play at unlimited speed was slower next to a process at nice 10. The
-    processes that use the cores must be in the same session (see `begin_family`).
+    A nice value is not enough: on two busy cores, play at unlimited speed was slower next to a process at
+    nice 10. The other processes that use the cores must be in the session of this process (see
+    `begin_family`).
 
     Args:
         wanted: polled; after it returns True, the threads run normally, since a caller waits for this process.

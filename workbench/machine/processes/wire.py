@@ -23,11 +23,12 @@ MAX_MESSAGE_BYTES = 1 << 30
 """Maximum size of one message. The largest messages of a working task, its meshes and the pictures of all envs, have some
 100 MB."""
 _READ_BYTES, _COPIED_BYTES = 1 << 18, 1 << 14
-"""Size of one read, larger than a socket's buffer; and size below which a message is copied to be sent in one call."""
+"""`_READ_BYTES`: size of one read, larger than a socket's buffer. `_COPIED_BYTES`: smaller messages are
+copied behind their length, so that one call sends both."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
-"""msgpack extensions: the next of the arrays behind the message; and an array that the message already
-contains, by its number."""
+"""msgpack extensions: `_ARRAY` stands for the next of the arrays behind the message; `_AGAIN` contains the
+number of an array that the message has had before."""
 _ARRAY_KINDS = "biufcSU"
 """Kinds of arrays that may be sent; arrays of objects may not."""
 _MAX_DESCRIPTION_BYTES = 500
@@ -173,7 +174,8 @@ class MessageSocket:
 def pack(value: object) -> bytes:
     r"""Encode dataclasses, arrays and plain data.
 
-    A text with lone surrogates arrives escaped (``\udcff``), which can be read but opens no file; a `Path` arrives unchanged.
+    A text with lone surrogates arrives escaped (``\udcff``): a person can read it, but as a path it opens no
+    file. A `Path` arrives unchanged.
 
     Raises:
         TypeError: `value` contains something else.
