@@ -37,7 +37,7 @@ class ActionPart:
     low: NDArray[np.float32]
     high: NDArray[np.float32]
     shape: tuple[int, ...]
-    """Shape of the controller's action for one env. The flat action contains it flattened."""
+    """Shape of the controller's action for one env; the flat action contains that action flattened."""
 
 
 @once_a_scene
@@ -85,7 +85,7 @@ def width(parts: tuple[ActionPart, ...]) -> int:
 def action_of(
     parts: tuple[ActionPart, ...], num_envs: int, rows: Mapping[int, NDArray]
 ) -> NDArray[np.float32]:
-    """(N, A) action from `rows`: (A,) numbers by env index; zeros for all other envs."""
+    """(N, A) action from `rows`, which has (A,) numbers by env index; zeros for envs without a row."""
     action = np.zeros((num_envs, width(parts)), np.float32)
     for env, row in rows.items():
         action[env] = row
@@ -95,7 +95,7 @@ def action_of(
 def random_action(
     parts: tuple[ActionPart, ...], num_envs: int, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """(N, A) uniform within the bounds; dimensions without bounds are drawn from -1 to 1."""
+    """(N, A) uniform random numbers: within the bounds, or from -1 to 1 where a bound is infinite."""
     low, high = bounds(parts)
     bounded = np.isfinite(low) & np.isfinite(high)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
@@ -110,15 +110,16 @@ def hold_action(parts: tuple[ActionPart, ...], num_envs: int) -> NDArray[np.floa
 
     * Delta and velocity controllers: zero.
     * Absolute joint position: the present qpos, through the inverse of ManiSkill's ``clip_and_scale_action``.
-    * Absolute end-effector pose: zero, since its inverse would need the controller's frame; hold such a robot with
-      ``step(None)``.
+    * Absolute end-effector pose: zero, which does not hold, since a pose that holds would need the
+      controller's frame. Hold such a robot with ``step(None)``.
     """
     columns = [_hold(part, num_envs) for part in parts]
     return np.concatenate(columns, axis=1) if columns else np.zeros((num_envs, 0), np.float32)
 
 
 def to_env_action(env: BaseEnv, parts: tuple[ActionPart, ...], flat: NDArray[np.float32]) -> Any:
-    """The argument of ``env.step``: a tensor (N, A), a dict of them for several robots, None without a robot."""
+    """The argument of ``env.step``: a tensor (N, A), or a dict of tensors by robot if there are several; None
+    without a robot."""
     if not parts:
         return None
     action = torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32)).to(env.device)
@@ -126,14 +127,14 @@ def to_env_action(env: BaseEnv, parts: tuple[ActionPart, ...], flat: NDArray[np.
 
 
 def by_robot(parts: tuple[ActionPart, ...], action: torch.Tensor) -> Any:
-    """The argument of ``env.step`` for a flat action (N, A): a tensor, a dict of them for several robots,
-    None without a robot."""
+    """The argument of ``env.step`` for a flat action (N, A): a tensor, or a dict of tensors by robot if there
+    are several; None without a robot."""
     if not parts:
         return None
     split = torch.split(action, [len(p.names) for p in parts], dim=1)
     of_robots: dict[str | None, list[torch.Tensor]] = {}
     for part, columns in zip(parts, split, strict=True):
-        # Several controllers of one robot share a flat action.
+        # The controllers of one robot share that robot's flat action.
         of_robots.setdefault(part.robot, []).append(columns.reshape(len(columns), *part.shape))
     made = {robot: each[0] if len(each) == 1 else torch.cat(each, 1) for robot, each in of_robots.items()}
     return made[None] if None in made else made
@@ -152,8 +153,8 @@ def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> 
         flat = np.concatenate(each, axis=1)
     else:
         flat = _rows(action, count, sum(of_robots.values()), "", of_robots, env.control_mode)
-    # Fast test: a finite sum means that all numbers are finite. Otherwise test each, since a sum may
-    # overflow.
+    # Fast test: a finite sum means that all numbers are finite. Otherwise test each number, since the sum of
+    # finite numbers may overflow.
     if not math.isfinite(np.add.reduce(flat, axis=None)) and not (finite := np.isfinite(flat)).all():
         row, column = np.argwhere(~finite)[0].tolist()
         name = [name for part in parts for name in part.names][column]

@@ -50,10 +50,11 @@ def require_assets(task: str, asset_ids: Sequence[str], robot_uids: Any = None) 
 
 
 def robots_of(task: type, kwargs: Mapping[str, Any]) -> Any:
-    """``robot_uids`` as the task class will see them: from `kwargs`, else its constructor's default.
-
-    None if the constructor has no such parameter or no default: it may then pass any robot to its parent's
+    """``robot_uids`` as the task class will see them: from `kwargs`, else the default of the class's
     constructor.
+
+    None if the constructor has no such parameter, or gives it no default: the constructor may then pass any
+    robot to that of its parent.
     """
     if "robot_uids" in kwargs:
         return kwargs["robot_uids"]
@@ -82,8 +83,9 @@ def refuse_downloads(task: str) -> Iterator[None]:
 
     Some tasks declare no assets and fail on a missing file while they build. If ManiSkill notices that, it
     asks "download now? (y|n)" on standard input, calls ``exit()`` after a no, and treats
-    MS_SKIP_ASSET_DOWNLOAD_PROMPT as a yes. Here nothing is asked or downloaded. An exception about a missing
-    file that a download would provide becomes the cause of a MissingAssets; other exceptions pass.
+    MS_SKIP_ASSET_DOWNLOAD_PROMPT as a yes. Here nothing is asked or downloaded. An exception becomes the
+    cause of a MissingAssets if a download would provide the missing file, or if the file of a robot is
+    missing; other exceptions pass.
     """
 
     @wraps(download_asset.prompt_yes_no)
@@ -128,7 +130,7 @@ def _missing(task: str, names: Iterable[str], instead: str = "") -> MissingAsset
 
 
 def _sources_to_fetch(name: str) -> list[str]:
-    """The missing single downloads behind a name (an asset or a group of them)."""
+    """The downloads that are missing: of all assets in the group `name`, or of the asset `name`."""
     group = name in assets.DATA_GROUPS
     sources = assets.expand_data_group_into_individual_data_source_ids(name) if group else [name]
     return [source for source in sources if not assets.is_data_source_downloaded(source)]
@@ -167,7 +169,7 @@ def _no_robot_file(task: str, robot: type, path: Path | None) -> MissingAssets:
 
 
 def _how_to_name(path: Path | None) -> str:
-    """Advice for a missing robot file. A relative path starts at the working directory."""
+    """Advice for a missing robot file."""
     if path is None or path.is_absolute():
         return "Put the file there, or set the path of the file that you have."
     return (
@@ -177,7 +179,7 @@ def _how_to_name(path: Path | None) -> str:
 
 
 def _named_by(error: Exception) -> list[str]:
-    """The downloads that contain the file whose absence raised the exception."""
+    """The downloads that contain the missing file which caused the exception."""
     text = str(error)
     advised = re.search(r"mani_skill\.utils\.download_asset\s+([\w/\-]+)", text)
     if advised is not None and advised[1] in {*assets.DATA_GROUPS, *assets.DATA_SOURCES}:
@@ -196,7 +198,8 @@ def _named_by(error: Exception) -> list[str]:
 def _robot_loaded(trace: TracebackType | None) -> tuple[type, Path] | None:
     """The class of the robot that was being loaded, and its file.
 
-    For an agent class that was never registered, ManiSkill's look-up raises a bare KeyError with the robot's uid.
+    Both are read from the frames: for an agent class that was never registered, the exception is a bare
+    KeyError with the robot's uid, from ManiSkill's look-up.
     """
     for frame, _ in walk_tb(trace):
         if frame.f_code.co_filename == base_agent.__file__ and "asset_path" in frame.f_locals:

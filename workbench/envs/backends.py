@@ -61,7 +61,7 @@ def why_no_gpu_simulation() -> str | None:
 def find_renderer() -> Renderer | None:
     """The device and backend that SAPIEN renders with; None if it finds no device.
 
-    Cached: a process can have only one render device, and to ask for it by another name raises.
+    The answer is cached: a process can have only one render device, and asking for it by another name raises.
 
     Raises:
         BackendUnavailable: a material that was made earlier holds the device under another name.
@@ -83,8 +83,8 @@ def find_renderer() -> Renderer | None:
 def _render_system(device: str) -> sapien.render.RenderSystem:
     """A render system on device ``cpu``, ``cuda`` or ``cuda:1``; RuntimeError if there is no such device.
 
-    SAPIEN refuses a device name as long as a material exists that was made without a render system, for
-    example by a failed build: hence the garbage collection.
+    SAPIEN refuses a device name while a material exists that was made without a render system. A failed build
+    may leave such a material behind: hence the garbage collection.
     """
     try:
         return sapien.render.RenderSystem(sapien.Device(device))
@@ -117,8 +117,8 @@ def _device_summary() -> str | None:
 
 
 def choose_backend(wanted: Backend, render: bool) -> ChosenBackend:
-    """Choose simulation and renderer. ``auto`` is the batched CPU: GPU simulation has passed its tests
-    (``make test-gpu``) on no machine so far.
+    """Choose simulation and renderer. ``auto`` is the batched CPU: so far, GPU simulation has not passed its
+    tests (``make test-gpu``) on any machine.
 
     Raises:
         BackendUnavailable: with the reason, and what to use instead.
@@ -148,7 +148,8 @@ def unused_gpu_text(wanted: Backend) -> str | None:
 def _brdf_table() -> sapien.render.RenderTexture:
     """SAPIEN's BRDF table, as read by ``tests/envs/test_brdf_table.py``: (512, 512, 2), scale and bias.
 
-    The file holds (2, 512, 512) float16 as differences of their bits along a row, which takes a quarter of the bytes.
+    The file holds (2, 512, 512) numbers in float16, as differences between the bits of neighbours in a row:
+    these compress to 154 kB, the numbers themselves to 416 kB.
     """
     steps = np.load(Path(__file__).parent / "brdf_table.npz")["steps"]
     table = np.moveaxis(np.cumsum(steps, axis=2, dtype=np.uint16).view(np.float16), 0, 2)
@@ -163,7 +164,7 @@ def give_brdf_table(camera: sapien.render.RenderCameraComponent) -> None:
     Otherwise SAPIEN computes the table for the first picture of the process, from 268 million samples: 5 to 19 s on a
     software driver. With this table the first picture takes 0.1 s, and is the same to the bit. The table is that of the
     split-sum approximation (Karis, Real Shading in Unreal Engine 4, 2013). On a GPU SAPIEN computes the
-    table at once, so this function does nothing.
+    table quickly, so this function then does nothing.
     """
     scene = camera.entity.scene
     if not scene.render_system.device.is_cuda():

@@ -27,12 +27,12 @@ MAX_PLACES = 64
 OWN_CODE = ("workbench.envs.", "workbench.pictures.")
 """Prefixes of the core's own modules."""
 _GENERAL_CODE = ("workbench.", "mani_skill.utils.", "mani_skill.envs.s")
-"""Prefixes of modules that are never at fault, ``mani_skill.envs.sapien_env`` and ``.scene`` among them: they
-only write what a task passes."""
+"""Prefixes of modules that are never at fault, since they only write what a task passes. The last prefix
+covers ``mani_skill.envs.sapien_env`` and ``mani_skill.envs.scene``."""
 _FRAMES_KEPT = 12
 _BASE_ENV, _OUTERMOST = "mani_skill.envs.sapien_env", ("step", "reset")
-"""Module and names of the outermost functions whose frames are kept: the traceback has the frames above them
-anyway."""
+"""Module and names of the outermost functions whose frames are kept; the frames of their callers are in the
+traceback anyway."""
 
 Frame = tuple[FrameType, int, int]
 """A frame, with the instruction and the line at which it was when it was noted."""
@@ -60,7 +60,8 @@ class WrongReturn(BrokenRule):
 
 
 class NeedsOneEnv(CoreRefusal, RuntimeError):
-    """The task uses something that exists for a single env only; the tools then open it with one env."""
+    """The task uses something that exists for a single env only; the tools then open the task with one
+    env."""
 
     def __init__(self, reason: str, instead: str, place: Place | None) -> None:
         """
@@ -149,9 +150,9 @@ class BrokenRules:
 
         Args:
             frames: frames at fault, which become the innermost of the traceback. An empty sequence means the
-                frames of the present call. None means that there are no frames: no line is at fault, or only
-                its `place` is known.
-            subject: breaches with the same subject share a row; None: breaches at the same line share a row.
+                frames of the present call. None means that there are no frames: no line is at fault, or the
+                line is known only as `place`.
+            subject: breaches with the same subject share a row; without a subject, breaches at the same line.
         """
         degree = self._degrees[rule]
         if degree == "off":
@@ -166,7 +167,7 @@ class BrokenRules:
         self._note(rule, message, place, subject, exact=frames is not None)
 
     def begin(self) -> None:
-        """Set the step count to zero: the trial steps of the task are over."""
+        """Set the step count and the first step of each row to zero, after the trial steps of the task."""
         self.step = 0
         self._rows = {
             key: replace(row, finding=replace(row.finding, first_step=0)) for key, row in self._rows.items()
@@ -213,8 +214,7 @@ class BrokenRules:
     def during(self, occasion: Occasion, confirms: bool = True) -> Iterator[None]:
         """Context in which breaches belong to `occasion`.
 
-        At its end, those rows of the occasion are dropped whose rules were not broken again since the file
-        was edited.
+        At its end, it drops the rows of the occasion that no breach has confirmed since the file was edited.
 
         Args:
             confirms: whether every rule of this occasion can be broken in the context; if not, no row is
@@ -325,7 +325,8 @@ def find_assignment(task: type, path: str) -> Place | None:
     """The line of the task's source that assigns ``self.<path>``, preferably in ``_initialize_episode``.
 
     Args:
-        path: ``target``, ``memory.best``, ``targets['left']``, ``goal.raw_pose``.
+        path: what follows ``self.``, such as ``target``, ``memory.best``, ``targets['left']``,
+        ``goal.raw_pose``.
     """
     names = _NAME.findall(re.sub(r"\[.*?\]", "", path))
     wanted = names[-2] if names[-1:] == ["raw_pose"] and len(names) > 1 else (names or [""])[-1]

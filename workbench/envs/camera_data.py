@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 CameraKind = Literal["sensor", "human"]
 PictureDegree = Literal["exact", "fast"]
-"""``exact``: SAPIEN's own, to the bit. ``fast``: heavy meshes are simplified, see `envs.rendering.fast_shapes`."""
+"""``exact``: SAPIEN's own picture, to the bit. ``fast``: heavy meshes are simplified, see
+`envs.rendering.fast_shapes`."""
 CameraKey = tuple[CameraKind, str]
 """Kind and name: a sensor and a camera for people may have the same name."""
 
@@ -160,7 +161,7 @@ def why_no_camera(settings: CameraSettings) -> str | None:
     return None
 
 
-# --- What cameras there are, and what one of them saw: plain data that crosses the pipe -------
+# --- What cameras there are, and what they saw: plain data that processes exchange --------------------
 
 
 @dataclass(frozen=True)
@@ -214,14 +215,15 @@ class Picture:
     """(H, W, 3)"""
     depth: NDArray[np.float32] | None = None
     """(H, W) metres along the optical axis, without a limit; 0 where the ray met nothing. If `step_pictures`
-    took the picture from ManiSkill's observation, these are whole millimetres: int16, up to 32767."""
+    took the picture from ManiSkill's observation: int16 millimetres instead, up to 32767."""
     segmentation: NDArray[np.int32] | None = None
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""
     position: NDArray[np.float32] | None = None
     """(H, W, 3) metres, in the camera's OpenGL frame (x right, y up, z backward); 0 where the ray met
-    nothing. ManiSkill observes whole millimetres. The minimal shader's numbers end at 32.767 m."""
+    nothing. (ManiSkill's observations have whole millimetres.) The minimal shader's numbers end at 32.767
+    m."""
     normal: NDArray[np.float32] | None = None
-    """(H, W, 3) of unit length, in the same frame; 0 where the ray met nothing."""
+    """(H, W, 3) of unit length, in the frame of `position`; 0 where the ray met nothing."""
     albedo: NDArray[np.uint8] | None = None
     """(H, W, 3) colour without light."""
     degree: PictureDegree | None = "exact"

@@ -196,7 +196,8 @@ class BatchedCpuScene(ManiSkillScene):
         Args:
             camera: the camera with this key in this env.
             textures: textures that a fast picture needs; None: `camera` itself draws all of its textures.
-            degree: None for the scene's own. A fast picture needs `prepare_fast` before ``update_render``.
+            degree: None for the scene's own degree. Before a fast picture, call `prepare_fast`, then
+                ``update_render``.
         """
         if self.degree_of(camera, degree) == "exact":
             camera.take_picture()
@@ -210,10 +211,11 @@ class BatchedCpuScene(ManiSkillScene):
     def degree_of(
         self, camera: sapien.render.RenderCameraComponent, asked: PictureDegree | None = None
     ) -> PictureDegree:
-        """The degree at which a picture is drawn if `asked` (None: the scene's own) is requested.
+        """The degree at which a picture is drawn if `asked` is requested; None requests the scene's own
+        degree.
 
-        Always exact if the camera's quaternion is not of unit length (``look_at`` straight down): SAPIEN
-        turns and zooms such a picture, so it is unknown which bodies are out of view.
+        Always exact if the camera's quaternion is not of unit length (as after ``look_at`` straight down):
+        SAPIEN turns and zooms such a picture, so it is unknown which bodies are out of view.
         """
         if (asked or self.pictures) == "exact" or abs(
             float(np.linalg.norm(camera.local_pose.q)) - 1
@@ -261,8 +263,8 @@ class BatchedCpuScene(ManiSkillScene):
         return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
 
     def _sapien_add_camera(self, *args: Any, **kwargs: Any) -> Any:
-        # In GPU simulation a camera on a link gets a GPU pose index, which a CPU body lacks. Here it moves
-        # with its entity.
+        # In GPU simulation a camera on a link gets a GPU pose index, which a CPU body lacks. Here the camera
+        # moves with its entity.
         self.gpu_sim_enabled = False
         try:
             camera = super()._sapien_add_camera(*args, **kwargs)
@@ -304,8 +306,7 @@ class BatchedCpuScene(ManiSkillScene):
 
     @property
     def _gpu_sim_initialized(self) -> bool:
-        """Read by ManiSkill. False where ManiSkill allows something only before a GPU simulation runs; see
-        `allowed_on_the_cpu`."""
+        """Read by ManiSkill, which allows some calls only while it is False; see `allowed_on_the_cpu`."""
         return not allowed_on_the_cpu(sys._getframe(1), self._system.laid_out)
 
     @_gpu_sim_initialized.setter
@@ -377,7 +378,7 @@ class BatchedCpuMixin:
     begins_anew = False
     """Whether each reset is an exact point, from which an episode can be repeated to the last bit."""
     _to_begin: list[int] | None = None
-    """During a reset with `begins_anew`: initialised envs, which will become exact points. Else None."""
+    """During a reset with `begins_anew`: the envs that it has initialised, for `begin_anew`. Else None."""
     _sim_freq: int
     _sim_steps_per_control: int
     _set_scene_config: Any
@@ -455,7 +456,7 @@ class BatchedCpuMixin:
 
     @_sim_device.setter
     def _sim_device(self, value: sapien.Device) -> None:
-        """Ignore the device that BaseEnv parsed from the backend: the CPU, as requested in __init__."""
+        """Ignore the device that BaseEnv parsed from the backend."""
 
     def step(self, action: Any) -> Any:
         resetting = self.scene.px.resetting
@@ -463,7 +464,7 @@ class BatchedCpuMixin:
         with self._in_turn("step"), AuthorCall():
             result = super().step(action)  # type: ignore[misc]
         if resetting is not None:
-            # Called by a hook of a partial reset: only the envs that are being reset count the step.
+            # A hook of a partial reset made this step: only the envs that are being reset count it.
             self._elapsed_steps[~resetting] = before[~resetting]
         return result
 
@@ -761,8 +762,8 @@ def refuse_unbuilt_agent(agent: Any) -> None:
 def _culprit(cls: type, base: type, silent: bool) -> tuple[type, Place | None]:
     """The class at fault, and the place of its constructor.
 
-    It is the first class before `base` that has a constructor; with `silent`, preferably one whose
-    constructor calls no other.
+    It is the first class that has a constructor, in the order of inheritance from `cls` to `base`; with
+    `silent`, preferably the first whose constructor calls no other constructor.
     """
     every = cls.__mro__[: cls.__mro__.index(base)]
     own = [owner for owner in every if hasattr(vars(owner).get("__init__"), "__code__")]

@@ -64,7 +64,7 @@ class RefusedMember(CoreRefusal, NotImplementedError):
 
 
 class WrongAction(ValueError):
-    """An action that does not fit the task. `problem` is a sentence without its subject: the action."""
+    """An action that does not fit the task. `problem` is a sentence without its subject, "the action"."""
 
     def __init__(self, problem: str) -> None:
         super().__init__(f"the action {problem}")

@@ -23,10 +23,11 @@ MAX_KEPT_NUMBERS = 1024
 """Maximum count of numbers in a whole-batch value that is kept as numbers. Of a larger value only type, shape
 and count are kept."""
 MAX_ENTRIES = 1000
-"""Maximum number of leaves; the others are only counted."""
+"""Maximum number of leaves that are kept; further leaves are only counted."""
 _MAX_NAME_CHARACTERS = 200
 _MAX_READ_NUMBERS = 1 << 26
-"""Largest tensor or list that is read: a sparse tensor, made dense, may exceed the memory."""
+"""Maximum count of numbers in a tensor or list that is read: a sparse tensor, made dense, may exceed the
+memory."""
 _NOT_EVALUATED = ("elapsed_steps", "reconfigure")
 """ManiSkill's own entries of ``info``."""
 _REAL_KINDS = "biuf"
@@ -50,9 +51,10 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
 
     All are copies.
 
-    ManiSkill reads only ``success`` and ``fail`` and passes the rest on: None, a string, ``progress.mean()``, an object. A
-    tensor, array or list has rows if its first dimension is N. With one env, shape (1,) has a row and () has none, except
-    for ``success`` and ``fail``, as in ManiSkill. A nested dict is split into its leaves, named by their keys.
+    ManiSkill reads only ``success`` and ``fail`` and passes the rest on: None, a string, ``progress.mean()``,
+    an object. A tensor, array or list has rows if its first dimension is N. So with one env, a value of shape
+    (1,) has a row and one of shape () has none; but ``success`` and ``fail`` may have either shape, as in
+    ManiSkill. A nested dict is split into its leaves, named by their keys.
     """
     columns: dict[str, NDArray] = {}
     others: dict[str, OtherEntry] = {}
@@ -104,8 +106,8 @@ def _key(key: Any) -> str:
 
 
 def _name(path: str, columns: Mapping[str, Any], others: Mapping[str, Any]) -> str:
-    """`path`, made unique and fit for a file: ``a/b`` may stand for the key ``a/b``, and for ``b`` in the
-    dict ``a``."""
+    """`path`, made fit for a file, and unique: the key ``a/b`` and the key ``b`` of a dict ``a`` have the
+    same path."""
     name = plain = _clean_name(path)
     number = 2
     while name in columns or name in others:
@@ -235,7 +237,7 @@ def clean_text(text: str) -> str:
     return _UNPRINTABLE.sub("\ufffd", text)
 
 
-# --- what is wrong with them -------------------------------------------------------------------------
+# --- what is wrong with return values ----------------------------------------------------------------
 
 
 def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:

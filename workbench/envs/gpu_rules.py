@@ -15,9 +15,9 @@ from typing import Literal, get_args
 from workbench.machine.parse_python import parse_python
 
 Degree = Literal["stop", "warn", "off"]
-"""*stop* raises at the line that broke the rule; *warn* reports the line, and the operation continues as
-without rules, to the last bit. By default a rule stops if its breach makes every later number wrong, as when
-the state of other envs is overwritten."""
+"""*stop* raises at the line that broke the rule. *warn* reports the line, and the task continues: its numbers
+are those that it has without rules, to the last bit. By default a rule stops if its breach makes every later
+number wrong, as when the state of other envs is overwritten."""
 DEGREES: tuple[Degree, ...] = get_args(Degree)
 FailOn = Literal["stop", "warn", "never"]
 """The lowest degree of a finding that makes a command's exit code 1."""
@@ -47,7 +47,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class DeclaredRule(Rule):
-    """A rule with its page, at the place in the code that declares it."""
+    """A rule with its page, as the code declares it."""
 
     page: str
     """The sections *Why*, *Mend* and *How it is checked*, as Markdown."""

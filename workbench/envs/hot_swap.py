@@ -22,7 +22,8 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
 
     Args:
         env: an unwrapped env, batched on the CPU or on the GPU.
-        task: the author's class. The caller ensures that it builds the same scene (`workbench.task.reload_level`).
+        task: the author's class. The caller ensures that this class builds the same scene
+            (`workbench.task.reload_level`).
     """
     own: Any = type(env)
     if not issubclass(own, BatchedCpuMixin):

@@ -30,8 +30,8 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
     """Read these sections of one env; what cannot be read is named in `Inspection.refused`.
 
     The numbers come from where the task takes them: the last observation, ``get_state_dict()``, ManiSkill's
-    batched tensors. Costs about 1 ms per section for a Panda on a table, and does not change how the episode
-    continues.
+    batched tensors. Reading takes about 1 ms per section for a Panda on a table, and does not change how the
+    episode continues.
 
     Raises:
         IndexError: there is no such env.
@@ -105,7 +105,7 @@ def read_joints(task: TaskEnv, env: int) -> tuple[JointReadings, ...]:
         count = len(joints)
         if not count:
             continue
-        # SAPIEN's own names carry the env's number.
+        # Not SAPIEN's own names, which carry the env's number.
         names = tuple(joint.name for joint in articulation.active_joints)
         limits = to_numpy(articulation.get_qlimits()[row])[:count]
         stiff = np.array([joint.stiffness > 0 for joint in joints])
@@ -191,11 +191,12 @@ def _floats(value: torch.Tensor) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Contact:
-    """One pair of collision shapes in the last substep, with K points; float32, the env's own world frame.
+    """Contact of two collision shapes in the last substep, at K points; float32, in the env's own world
+    frame.
 
-    PhysX lists every two shapes that are nearer than their contact offsets (1 cm each by default). So a pair
-    of bodies may be listed more than once, and two shapes with positive `separations` and no impulse do not
-    touch.
+    PhysX lists every pair of shapes that are nearer to each other than their contact offsets (1 cm each by
+    default). So a pair of bodies may be listed more than once, and two shapes with positive `separations` and
+    no impulse do not touch.
     """
 
     bodies: tuple[str, str]
@@ -218,7 +219,8 @@ class Contact:
 
     @property
     def force(self) -> NDArray[np.float32]:
-        """(3,) newtons on the first body, the mean over the last substep. On the second: its negative."""
+        """(3,) newtons on the first body, the mean over the last substep. The force on the second is its
+        negative."""
         return self.impulse / np.float32(self.timestep)
 
 

@@ -30,7 +30,8 @@ class Leaf:
 
 @dataclass(frozen=True)
 class JointReadings:
-    """The active joints of one articulation. J joints; radians for revolute ones, metres for prismatic."""
+    """The J active joints of one articulation; in radians for revolute joints, in metres for prismatic
+    joints."""
 
     articulation: str
     names: tuple[str, ...]

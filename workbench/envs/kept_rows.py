@@ -34,8 +34,8 @@ _ITEM = re.compile(r"\[(\d+)\]")
 
 
 class KeptRows:
-    """Copy of the values that a task keeps for each env, to find rows that a partial reset changed for other
-    envs.
+    """Copy of the values that a task keeps for each env, to find rows that a partial reset changed for envs
+    that it does not reset.
 
     A partial reset must change only the rows of ``env_idx``, in the task's tensors, arrays, lists and Poses,
     and in those inside its dicts and own objects. Nothing raises if other rows change: ``self.target =
@@ -64,7 +64,7 @@ class KeptRows:
         return {path: envs for path, envs in found.items() if envs is not None}
 
     def changed_paths(self, seen: dict[str, tuple[Any, int, bool]]) -> set[str]:
-        """The paths whose rows of other envs changed.
+        """The paths at which rows of other envs changed.
 
         Args:
             seen: values at the last call; this call updates them. A tensor that was not written since the
@@ -168,9 +168,9 @@ def _same(a: Any, b: Any) -> bool:
 class _Lines:
     """Compares the rows after each line of the author's code, and keeps the line after which they differ.
 
-    Lines are traced in the first partial reset of a class, and in the reset after one that changed a value at
-    a line that was not found (`_MAX_TRACED_RESETS` in all). If a debugger is already tracing,
-    `find_assignment` reads the line from the source instead.
+    Lines are traced in the first partial reset of a class. If the line of a change is not found, they are
+    traced in the next reset too, but in at most `_MAX_TRACED_RESETS` resets in all. If a debugger is already
+    tracing, `find_assignment` reads the line from the source instead.
     """
 
     def __init__(self, rows: KeptRows) -> None:
@@ -187,7 +187,7 @@ class _Lines:
             return  # a debugger or coverage is tracing
         self._files = files_of_task(task_class(self.rows.env))
         frame: FrameType | None = sys._getframe(1)
-        while frame is not None:  # the reset's callers, such as the task's own `reset`, continue after it
+        while frame is not None:  # trace the callers too: a task's own `reset` runs more lines later
             if self._runs_task_code(frame):
                 frame.f_trace = self._traced
                 self._at = self._at or (frame, frame.f_lasti, frame.f_lineno)
@@ -250,7 +250,7 @@ class ResetWatch:
         self._chosen: tuple[int, ...] = ()
         self._task: type | None = None
         self._tries = 0
-        """Remaining attempts of `_MAX_TRACED_RESETS`."""
+        """Number of resets in which lines may still be traced, of `_MAX_TRACED_RESETS`."""
         self._seeks = False
         """Whether to trace lines in the next reset."""
         self.whole = False

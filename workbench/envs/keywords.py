@@ -137,7 +137,8 @@ def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
 
 
 def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parameter]]:
-    """Named parameters of ``__init__`` of the class, then of its bases, up to the first without ``**kwargs``.
+    """Named parameters of the class's ``__init__``, then of those of its bases, up to the first without
+    ``**kwargs``.
 
     Args:
         stop: the base class at which to stop: its parameters and those of its bases are left out.
@@ -164,7 +165,8 @@ def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Paramete
 
 
 def _annotation(parameter: inspect.Parameter, init: Any) -> Any:
-    """The annotated type. With ``from __future__ import annotations`` it is a string, which may contain undefined names."""
+    """The annotated type. A string (``from __future__ import annotations``) is evaluated; `empty` if that
+    fails."""
     if not isinstance(parameter.annotation, str):
         return parameter.annotation
     names = getattr(inspect.unwrap(init), "__globals__", {})

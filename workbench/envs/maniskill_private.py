@@ -91,8 +91,8 @@ PRIVATE_NAMES = (
     *_all(_ENV, WRITING, "_default_sensor_configs _default_human_render_camera_configs"),
     *_all("mani_skill.agents.base_agent:BaseAgent", WRITING, "_sensor_configs"),
 )
-"""Private names that the workbench uses. If a name is missing, its feature is off; if the name has no feature
-(""), no task can be opened."""
+"""Private names that the workbench uses. If a name is missing, its feature is off; if the name has no
+feature (""), no task can be opened."""
 
 
 @cache
@@ -105,7 +105,7 @@ def why_not(feature: str) -> str:
     """Why the installed ManiSkill does not allow a feature; empty if it does.
 
     Args:
-        feature: `PLACING`, ...; empty for opening any task.
+        feature: one of the names above, such as `PLACING`; empty for opening any task.
     """
     return _with_advice(each for each in moved_names() if each.disables == feature)
 
@@ -174,7 +174,8 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
             _set_ee_action_of_each_env(self, action)
 
     def check_frame(stock: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Skip ManiSkill's check for a controller's ``frame`` that GPU simulation does not support.
+        """Skip, in batched scenes, ManiSkill's check for a controller's ``frame`` that GPU simulation does
+        not support.
 
         To detect GPU simulation, nightly builds read ``scene.gpu_sim_enabled``; release 3.0.1 reads the
         device.
@@ -194,8 +195,8 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
         return stock_get_contacts(self) if system is None else system.get_contacts()
 
     def find_rows(owner: type, name: str, things: str, find: str, dtype: torch.dtype) -> None:
-        """Replace the cached property `name`: for a batched CPU scene it returns the row of each of `things`,
-        an attribute of the struct."""
+        """Replace the cached property `name` of a struct: for a batched CPU scene it returns the row of each
+        object in the struct's attribute `things`."""
         stock = owner.__dict__[name].func
 
         @wraps(stock)
@@ -249,9 +250,9 @@ def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
 
     ManiSkill has two inverse kinematics: on the CPU a solver that iterates until the pose is reached, for one
     env; on the GPU one damped step along the Jacobian, for all. Their targets for one ``pd_ee_delta_pos``
-    action differ by 1.3 cm (mean of 30 random ones, 3.8 cm at most), and the second ignores the config's
-    ``frame``. An env here must equal a stock env, so the CPU solver is called for each env: 0.1 ms per env
-    and control step.
+    action differ by 1.3 cm (mean of 30 random actions; 3.8 cm at most), and the one on the GPU ignores the
+    config's ``frame``. An env here must equal a stock env, so the CPU solver is called for each env: 0.1 ms
+    per env and control step.
     """
     action = controller._preprocess_action(action)
     controller._step = 0
@@ -334,8 +335,8 @@ _WORKBENCH_ARGUMENTS = ("num_envs", "render_backend", "reward_mode")
 def base_arguments(env: Any, task: type, kwargs: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Context in which ``BaseEnv``'s constructor simulates on the CPU, whatever the task's constructor passes on.
 
-    Yields the arguments for the task's constructor: `kwargs` without those of the workbench's arguments that
-    the constructor does not take.
+    Yields the arguments for the task's constructor: `kwargs` without the `_WORKBENCH_ARGUMENTS` that this
+    constructor does not take.
     """
     taken = inspect.signature(task.__init__).parameters
     any_name = any(each.kind is each.VAR_KEYWORD for each in taken.values())
@@ -373,8 +374,9 @@ def hook_of_base_env(env: Any, caller: FrameType) -> str:
 def allowed_on_the_cpu(caller: FrameType, laid_out: bool) -> bool:
     """Whether the caller in ManiSkill must see a GPU simulation that is not initialised yet.
 
-    ``before_gpu_init`` refuses setters after initialisation, but a stock CPU env allows them at any time. Meshes of
-    articulations need link poses, which exist at any time.
+    True for ``before_gpu_init``, which refuses setters after initialisation: a stock CPU env allows them at
+    any time. False for the methods that make an articulation's meshes: the link poses that they need exist at
+    any time. For all other callers, True until the scene is laid out.
     """
     if caller.f_code in _NEED_LINK_POSES:
         return False
@@ -421,8 +423,9 @@ def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> Non
 def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
     """Context in which ``_episode_rng``, from which the robot's initial joints are drawn, is the generator of env `index`.
 
-    In ManiSkill it is always env 0's: a partial reset of env 3 would draw from env 0's generator and ignore the seed of env
-    3. Also stops ``enhanced_determinism`` from drawing new seeds, as it does in a reset without a seed.
+    In ManiSkill ``_episode_rng`` is always the generator of env 0: a partial reset of env 3 would draw from
+    that one and ignore the seed of env 3. Also stops ``enhanced_determinism`` from drawing new seeds, as it
+    does in a reset without a seed.
     """
     env._episode_rng = env._batched_episode_rng[index]
     draws_seeds, env._enhanced_determinism = env._enhanced_determinism, False
@@ -605,8 +608,8 @@ def flatten_observation(env: Any, obs: Any) -> Any:
 def camera_components(camera: Any) -> list[Any]:
     """The ``RenderCameraComponent`` of every env behind a ManiSkill camera: ``camera._render_cameras``.
 
-    Empty for other sensors: of a task's own class, or the stereo depth camera (which ManiSkill 3.0.1 cannot build: its
-    constructor needs an argument that BaseEnv does not pass).
+    Empty for a sensor of a task's own class, and for the stereo depth camera (which ManiSkill 3.0.1 cannot
+    build: its constructor needs an argument that BaseEnv does not pass).
     """
     inner = camera.camera if isinstance(camera, Camera) else None
     return inner._render_cameras if isinstance(inner, RenderCamera) else []

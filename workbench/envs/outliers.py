@@ -233,7 +233,7 @@ class OutlierSighting:
 
 class OutlierWatch:
     """Checks the control steps of one task, in order, for outliers: NaN and infinite numbers, bodies that fly off or fall,
-    rewards out of range. The limits are wide, so that a working task has none."""
+    rewards out of range. The limits are wide, so that a working task has no outliers."""
 
     def __init__(
         self, geometry: SceneGeometry, first: StepResult, control_dt: float, reward_mode: str
@@ -263,7 +263,7 @@ class OutlierWatch:
 
     def check(self, step: StepResult) -> list[OutlierSighting]:
         """The kinds of outlier in a control step, each with at least one env."""
-        # With `reconfiguration_freq` a reset may change the bodies without notice: poses are skipped then.
+        # With `reconfiguration_freq` a reset may change the bodies without notice: then skip their poses.
         found = self._check_poses(step) if step.poses.shape[:2] == self._present.shape else []
         for kind, name, values in _numbers(step):
             wrong: Any = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)

@@ -93,8 +93,8 @@ def in_ascending_order(
         seeds: the ``seed`` argument of ``reset``.
 
     Returns:
-        The options; and the seeds in the same order, or None unless `seeds` has one for each env of a partial
-        reset.
+        The options; and the seeds in the same order, or None if the reset is of all envs or `seeds` does not
+        have one seed for each env to reset.
 
     Raises:
         TypeError, IndexError, ValueError: ``env_idx`` is a mask of the wrong length, or names an unknown env,
@@ -109,8 +109,8 @@ def in_ascending_order(
     made = {**options, "env_idx": rows}
     states = options.get("reset_to_env_states", {})
     if "obs" in states:
-        # ManiSkill assigns rows of observations in the order of `env_idx`, but rows of states lowest env
-        # first.
+        # ManiSkill assigns rows of observations in the order of `env_idx`, but rows of states in ascending
+        # order of the envs.
         made["reset_to_env_states"] = {**states, "obs": _rows(states["obs"], order)}
     return made, [int(seeds[k]) for k in order] if one_each else None
 

@@ -116,7 +116,7 @@ class _Part:
     """The element's own name, or that of an element around it; empty if none has a name."""
     line: int | None = None
     attributes: Mapping[str, str] | None = None
-    """All attributes of the element, where the line is not known."""
+    """All attributes of the element, if its line must be found by them."""
 
 
 def _part_at_fault(frames: list[FrameType]) -> _Part | None:

@@ -29,9 +29,9 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
 
     ``state/actors/cube`` (N, 13) and ``state/articulations/panda`` (N, 13 + 2 * joints) as ``get_state_dict``
     lays them out, ``obs/agent/qpos`` (N, ...) by the task's names. Unlike in ManiSkill, the row of a body
-    that an env lacks is NaN (ManiSkill's tensor has fewer rows, and ``RecordEpisode`` records no state). A
-    flattened observation is split by its names, or is one column ``obs/`` if they are not known. Pictures are
-    left out: a recording stores them separately.
+    that an env lacks is NaN (ManiSkill's tensor has fewer rows, and ``RecordEpisode`` then records no state).
+    A flattened observation is split by its names, or is one column ``obs/`` if they are not known. Pictures
+    are left out: a recording stores them separately.
 
     Raises:
         Exception: raised by the task's own ``get_state_dict``.
@@ -143,8 +143,8 @@ def flat_names(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str
     """Name, shape and dtype of each part of a flattened observation (N, D), or None if they are not known.
 
     ManiSkill drops the names, so the env is observed once more without flattening. That runs the author's
-    hooks, which may count or draw random numbers. So it happens once per version of the task, and the task's
-    memory is restored afterwards.
+    hooks, which may count or draw random numbers. So the env is observed only once per version of the task,
+    and the task's memory is restored afterwards.
     """
     env = task.env
     if not isinstance(flat, torch.Tensor) or flat.ndim != 2 or not env.obs_mode_struct.state:

@@ -51,8 +51,8 @@ class StrictMixin:
     * what the GPU refuses: state touched while the scene is built, static actors moved, masses set once it
       is built (`accessors`);
     * SAPIEN's own setters, which the GPU ignores (`accessors`);
-    * in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or changed (here,
-      and `kept_rows`);
+    * in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or
+      changed (this module and `kept_rows`);
     * return values of ``evaluate``, the reward and the observation hooks that lack a row for each env
       (`evaluate_entries`).
 

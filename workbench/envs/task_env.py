@@ -99,7 +99,7 @@ def make_env(
     asset_ids: Sequence[str] = (),
     default_kwargs: Mapping[str, Any] | None = None,
 ) -> BaseEnv:
-    """Make the task class with N envs, unwrapped, in the class's `default_reward_mode`.
+    """Make N envs of the task class, unwrapped, in the class's `default_reward_mode`.
 
     Raises:
         MissingAssets: the task or its robot needs a download; the message has its name and the command.
@@ -118,7 +118,7 @@ def build_env(
     asset_ids: Sequence[str] = (),
     default_kwargs: Mapping[str, Any] | None = None,
 ) -> BaseEnv:
-    """Make the task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` does; raises like `make_env`.
+    """Make N envs of the task class, unwrapped, as ``gym.make(...).unwrapped`` does; raises like `make_env`.
 
     The class decides what the keyword arguments leave open. Without ``reward_mode`` it takes the first of its
     ``SUPPORTED_REWARD_MODES``, even if it does not implement that mode.
@@ -219,10 +219,10 @@ class TaskEnv:
         """Start new episodes in all envs, or in those of `env_idx`.
 
         A reset of all envs is ManiSkill's own ``reset(seed=[...])``. For a subset ManiSkill seeds torch with
-        the seed of env 0, so a seed given for env 3 has no effect. Here a partial reset draws from the seed
-        of the lowest env in `env_idx`: ``reset(seed=7, env_idx=[3])`` starts the same episode as
-        ``reset(seed=7)`` of a single stock env. Listing the envs, with their seeds, in another order makes no
-        difference.
+        the seed of env 0, so a seed given for env 3 has no effect. Here a partial reset takes its random
+        numbers from the seed of the lowest env in `env_idx`: ``reset(seed=7, env_idx=[3])`` starts the same
+        episode as ``reset(seed=7)`` of a single stock env. Listing the envs, with their seeds, in another
+        order makes no difference.
 
         Args:
             seed: one seed (the i-th env that is reset gets ``seed + i``), or one for each env that is reset; None

@@ -125,7 +125,7 @@ def _unknown_of_cameras(
 def _unknown_fields(
     path: str, value: Mapping[str, Any], cls: type
 ) -> Iterator[tuple[str, str, Collection[str]]]:
-    """The keys of nested dicts that the dataclass does not have."""
+    """Like `_unknown`, for the keys of nested dicts that the dataclass `cls` does not have."""
     fields = {field.name: field for field in dataclasses.fields(cls)}
     for key, inner in value.items():
         if key not in fields:

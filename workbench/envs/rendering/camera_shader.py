@@ -78,8 +78,8 @@ def made_again(camera: sapien.render.RenderCameraComponent) -> Iterator[None]:
     """Context in which the camera's shader (see `note_shader`) is selected. Add the camera to a scene in this
     context.
 
-    Without the context, a task with a minimal sensor and a default human camera would get a default sensor,
-    which lacks ``PositionSegmentation``.
+    Without the context, a sensor with the minimal shader would get the default shader if the human camera has
+    that one, and would then lack the texture ``PositionSegmentation``.
     """
     before, own = _Selection.now(), _made_with.get(camera)
     if own is None or own == before:

@@ -24,8 +24,8 @@ Edits = tuple[tuple[str, str], ...]
 """Replacements in a shader's text: (old, new); each old passage occurs once."""
 
 # These edits leave out the environment map, which would add black: it costs two cube map look-ups per pixel,
-# and a third in the last pass, which otherwise only copies. They also use that w of a position is 1, and that
-# the transposed inverse equals the cofactor matrix up to scale.
+# and another look-up in the last pass, which otherwise only copies. The edits also use that w of a position
+# is 1, and that the transposed inverse equals the cofactor matrix up to scale.
 _VERTICES: Edits = (
     ("mat3(transpose(inverse(modelView)))", "sign(determinant(m)) * mat3(cross(m[1], m[2]), cross(m[2], m[0]), cross(m[0], m[1]))"),
     ("  mat3 normalMatrix", "  mat3 m = mat3(modelView);\n  mat3 normalMatrix"),

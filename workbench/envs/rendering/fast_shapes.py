@@ -76,10 +76,10 @@ class FastShapes:
     """The simplified shapes of a scene: hidden components next to the exact ones, made at each camera's first fast picture.
 
     How much a body is simplified depends on its distance from the camera at that moment, on the lens and on
-    the size in pixels. Bodies outside the camera's view are not drawn. A body that the camera is fixed to is
-    cut to the triangles in view, since most of its triangles never come into view. The shapes share the
-    materials of the exact ones, so that a later change of colour changes both; a body's id in segmentation
-    pictures is that of its entity.
+    the picture's size in pixels. Bodies outside the camera's view are not drawn. A body that the camera is
+    fixed to is cut to the triangles in view, since most of its triangles never come into view. The shapes
+    share the materials of the exact ones, so that a later change of colour changes both; a body's id in
+    segmentation pictures is that of its entity.
     """
 
     def __init__(self, sub_scenes: Sequence[sapien.Scene]) -> None:

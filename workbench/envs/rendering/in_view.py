@@ -59,8 +59,8 @@ def outside_and_inside(
 
 
 def is_outside(points: NDArray[np.float64], planes: Planes) -> bool:
-    """Whether all points (P, 3), and so everything between them, are outside one plane. All are in one
-    frame."""
+    """Whether all points (P, 3), and so everything between them, are outside the same plane. Points and
+    planes are in the same frame."""
     return bool((planes[:, :3] @ points.T + planes[:, 3:]).max(axis=1).min() < 0)
 
 

@@ -58,8 +58,8 @@ class LeanMaterials:
         """A copy of a body without its constant metallic textures; None if it has none, or has a mesh that is
         not from a file.
 
-        SAPIEN shares the materials of meshes that are not from a file with their copies, and makes the
-        tangents of normal maps only from files.
+        In SAPIEN, a mesh that is not from a file has the same materials as its copies, and no tangents for
+        normal maps.
         """
         parts = [part for shape in body.render_shapes for part in shape.parts]
         if all(self._metallic(part.material) is None for part in parts):

@@ -40,14 +40,16 @@ _SIMPLE_FACES = 150
 """Triangles up to which a mesh stays exact: layered thin discs, such as ManiSkill's targets, would lose a layer (see
 `from_afar`)."""
 _AFAR_FACES = 32, 48, 72, 100, 144, 200, 280, 400, 800, 1600
-"""Triangle counts that `from_afar` tries, fewest first; for each it tries grids of `_AFAR_CELLS` cells."""
+"""Triangle counts that `from_afar` tries, fewest first: each by collapsing edges, then on grids with
+`_AFAR_CELLS` cells along the longest axis."""
 _AFAR_CELLS = 12, 24, 48
 _LARGE_FACES = 20_000
 """Triangles above which a level is made from the previous level: making it from the exact mesh takes too long."""
 _CHECKED_POINTS = 1500
 """Points on the exact surface at which the distance to a level is measured."""
 _SEARCHED_POINTS = 10_000
-"""Maximum points on a level that are searched for the triangle nearest to a point."""
+"""Maximum `count` with which `_points_on` draws points on a level. The triangles of the points nearest to a
+checked point are tried as the nearest."""
 _MAX_MESHES = 500
 """Maximum number of meshes in memory."""
 _MAX_CACHE_BYTES = 512 << 20
@@ -211,8 +213,8 @@ def _points_on(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Random points (P, 3) on the surface, and their triangles.
 
-    One is on each triangle; `count` are on triangles drawn by their longest edge, and `count` on triangles
-    drawn by area.
+    One is on each triangle. `count` are on triangles drawn in proportion to their longest edge, and `count`
+    on triangles drawn in proportion to their area.
     """
     triangles = mesh.vertices[mesh.faces].astype(np.float64)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

@@ -24,7 +24,7 @@ _NEIGHBOURS = 8
 _MIN_FACING_COSINE = 0.3
 _SHARED_DEGREES = 20.0
 """Faces of a coarse mesh share one normal at a vertex if their normals there differ by less than this.
-Sharing saves a seventh of the vertices, at the price of a twentieth of the shading error."""
+Sharing saves a seventh of the vertices, and makes the shading error a twentieth larger."""
 _OWN_WEIGHT = 0.02
 """Weight of a vertex's own normal, relative to the normals of the exact surface around it. The own normal
 matters only where the surface determines none."""
@@ -125,8 +125,8 @@ class ShadedSurface:
         near = np.asarray(self._tree.query(points, k=count)[1]).reshape(-1, count)
         candidates = self._normals[near]
         alike = np.einsum("skd,sd->sk", candidates, facing)
-        # Take the nearest point that faces the same way. On a folded face there is none: take the most
-        # similar.
+        # Take the nearest point that faces the same way. On a folded face there is none: take the point whose
+        # normal is most similar.
         agrees = alike > _MIN_FACING_COSINE
         choice = np.where(agrees.any(axis=1), agrees.argmax(axis=1), alike.argmax(axis=1))
         every = np.arange(len(points))

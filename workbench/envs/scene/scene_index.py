@@ -42,10 +42,11 @@ def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
 class SceneIndex:
     """The bodies of one built scene.
 
-    A getter for one body's pose takes 2 us, so 64 envs of 16 bodies would take 2 ms a frame. The index finds once which row
-    of ``px.cuda_rigid_body_data`` belongs to which (env, body), and a frame is then one gather. Static bodies are not in
-    that tensor: `fixed` has their poses. In GPU simulation a hidden body was moved 99999 m away; `hidden_poses` has its true
-    pose. Objects that differ between envs (`Actor.merge`) are one body with the merged name.
+    A getter for one body's pose takes 2 us, so 64 envs of 16 bodies would take 2 ms a frame. The index finds
+    once which row of ``px.cuda_rigid_body_data`` belongs to which (env, body); one gather then reads all
+    poses of a frame. Static bodies are not in that tensor: `fixed` has their poses. In GPU simulation a
+    hidden body was moved 99999 m away; `hidden_poses` has its true pose. Objects that differ between envs
+    (`Actor.merge`) are one body with the merged name.
     """
 
     names: tuple[str, ...]
@@ -61,8 +62,8 @@ class SceneIndex:
     states: dict[str, Any]
     """ManiSkill's structs by their names in its state dict: ``actors/cube`` (no static ones), ``articulations/panda``."""
     actors: tuple[tuple[Any, NDArray[np.int64]], ...]
-    """Every Actor (merged ones, and their parts too), each with the slots of its entities: their positions in
-    the flattened (N * B) array of bodies, -1 for an entity that is not there."""
+    """Every Actor (merged actors and their parts too), each with the slots of its entities. A slot is a
+    position in the flattened (N * B) array of bodies; -1 for an entity that is not in the array."""
     fixed: NDArray[np.float32]
     """(N, B, 7) poses of static bodies; NaN for all other bodies. Not needed where `rows` is None."""
     rows: Any
@@ -82,7 +83,8 @@ class SceneIndex:
 def scene_index(env: Any) -> SceneIndex:
     """The index of the present scene of a ManiSkill env (unwrapped, reset at least once).
 
-    Bodies are all actors, then all links of all articulations, by the name of their merged view if there is one.
+    The bodies are all actors, then all links of all articulations. A body in a merged view has the view's
+    name.
 
     Raises:
         NotImplementedError: the env was made with ``parallel_in_single_scene``.

@@ -78,7 +78,7 @@ class SceneGeometry:
 
     num_envs: int
     body_names: tuple[str, ...]
-    """(B,) an actor's name, or ``articulation/link``. Merged actors go by the merged name."""
+    """(B,) an actor's name, or ``articulation/link``. Merged actors have the merged name."""
     body_kinds: tuple[BodyKind, ...]
     """(B,)"""
     body_hidden: tuple[bool, ...]

@@ -253,7 +253,7 @@ def _collapse_whole(
 def _collapse_pieces(
     points: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int, growth: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Collapse each connected piece by itself, with a share of the triangles by its area.
+    """Collapse each connected piece by itself, to a share of the triangles in proportion to its area.
 
     The quadric error of losing a flat disc is zero: in a collapse of a whole round housing, its lid would
     vanish first.

@@ -493,9 +493,9 @@ def guard_scenes(system: BatchedCpuSystem) -> None:
 
     ``actor._objs[0].set_pose(...)`` moves a body on a stock CPU env and does nothing in GPU simulation. Here
     it moves the body, unless a partial reset is under way and the body's env is not being reset: a stock env
-    would not run this reset at all. All scenes of a process share SAPIEN's classes, so the setters are
-    replaced once. They work as before for objects of other scenes, before a scene is complete, and when the
-    core calls them.
+    that is not being reset would not run this code at all. All scenes of a process share SAPIEN's classes, so
+    the setters are replaced once. They work as before for objects of other scenes, before a scene is
+    complete, and when the core calls them.
     """
     _install()
     _systems.add(system)

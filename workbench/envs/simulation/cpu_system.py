@@ -432,7 +432,8 @@ class BatchedCpuSystem:
         self._fetch("links")
 
     def gpu_fetch_articulation_link_velocity(self) -> None:
-        """Do nothing: roots are fetched by `gpu_fetch_articulation_link_pose`, others by `fetch_link_velocities`."""
+        """Do nothing: `gpu_fetch_articulation_link_pose` fetches velocities of roots, `fetch_link_velocities`
+        those of all other links."""
 
     def gpu_fetch_articulation_qpos(self) -> None:
         self._fetch("joints")
@@ -456,7 +457,7 @@ class BatchedCpuSystem:
         """Do nothing: on the CPU, links follow when qpos or the root pose is set."""
 
     def _unread(self, what: str, things: Iterable[Any]) -> Iterable[Any]:
-        """`things`, or none if `what` was read since the last change."""
+        """`things`; empty if `what` was read since the last change."""
         if self._read_at.get(what) == self._version:
             return ()
         self._read_at[what] = self._version

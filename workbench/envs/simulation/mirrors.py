@@ -41,11 +41,11 @@ class Mirror:
     ) -> None:
         """
         Args:
-            what: name for messages.
+            what: name of the values in messages.
             whole: (R, W) the tensor, and the last known values of the simulation.
             names, envs: (R,) body name and env of each row.
             rows: (K,) rows of this mirror; None for all.
-            sources: sources that a fetch reads; `behind` compares with the first.
+            sources: what a fetch reads; `behind` compares the tensor with the first source.
             owners: (K,) SAPIEN's objects, for `put`.
             put: called with an owner, its row (W,) and a mask of the numbers to set.
         """
@@ -106,8 +106,8 @@ class Mirror:
         """Whether to write these numbers of a row to the simulation.
 
         PhysX does not check them: a NaN pose spreads to every body that it touches and may crash the process.
-        If the env's state already contains a NaN, all numbers computed from it are NaN: they are skipped
-        until a reset repairs the env.
+        If the env's state already contains a NaN, all numbers computed from it are NaN: such numbers are
+        skipped until a reset repairs the env.
 
         Raises:
             ValueError: a number is NaN or infinite, and all known state of the env is finite. Writes that
@@ -137,8 +137,8 @@ class DriveTargets(Mirror):
 
     Setting a target wakes a sleeping articulation even if the value stays, and ManiSkill's CPU controllers
     set targets at every control step. So targets that were set since the last apply are written even if they
-    have not changed; otherwise a robot at rest would fall asleep here but not in stock ManiSkill. These are
-    1200 calls per control step for 64 Pandas, so the thread that steps an env makes them, just before the
+    have not changed; otherwise a robot at rest would fall asleep here but not in stock ManiSkill. For 64
+    Pandas these are 1200 calls per control step, so the thread that steps an env makes them, just before the
     step.
     """
 
@@ -152,8 +152,8 @@ class DriveTargets(Mirror):
         """
         Args:
             setters: for each articulation and active joint, the function that sets the target in PhysX.
-            later: called with a function that writes the targets of one env; calls that function before the
-                env's next step.
+            later: called with a function that writes the targets of one env; it must call that function
+                before the env's next step.
         """
         super().__init__("targets", *mirror, sources=sources)
         self._set = np.zeros(len(self.now), dtype=bool)

@@ -13,7 +13,7 @@ import sapien.physx as physx
 from numpy.typing import NDArray
 
 BODY = 13
-"""Floats of a body in ``pack()``: quaternion wxyz, position, linear and angular velocity."""
+"""Number of floats of a body in ``pack()``: quaternion wxyz, position, linear and angular velocity."""
 _FROM_PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
 """Position of each column of ManiSkill's row [p, q, v, w] in a packed body [q, p, v, w]."""
 _IN_ENV = re.compile(r"^scene-\d+[-_]")
@@ -28,7 +28,7 @@ class StateLayout:
     velocity; then each articulation as the same 13 numbers of its root, its qpos, its qvel, and target position and target
     velocity of each joint in turn. ``sapien.Scene.pack_poses()`` gives quaternion and position of each entity. Neither is
     documented (found by measuring, sapien 3.0.3), so `check_layout` compares both with the getters. Envs need not have the
-    same bodies: each env's rows follow those of the env before, and missing joints read a zero.
+    same bodies: each env's rows follow those of the env before, and joints that are missing read a zero.
     """
 
     bodies: list[Any]
@@ -68,7 +68,7 @@ class StateLayout:
 def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:
     rows: list[Any] = []  # the component of each row
     env_of_row, body_at, joints_at = [], [], []
-    roots: dict[int, tuple[int, Any]] = {}  # of each articulation: row of its first link, and itself
+    roots: dict[int, tuple[int, Any]] = {}  # by id of each articulation: row of its first link, articulation
     packed = 0
     parts: list[list[slice]] = []
     for env, system in enumerate(systems):

@@ -68,7 +68,7 @@ def _numbers(pose: Any) -> list[float]:
 
 
 def _setter(owner: type, name: str) -> Callable[[Any, Any], None]:
-    """SAPIEN's own setter, without the guard with which `accessors` replaces it later."""
+    """SAPIEN's own setter, which `accessors` later replaces on the class by a guarded one."""
     return vars(owner)[name].fset
 
 

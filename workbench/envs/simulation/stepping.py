@@ -33,7 +33,8 @@ class Stepper:
     the cache. ManiSkill runs hooks between substeps, so an env's substeps are done in a row only when no hook
     can notice (`merging`).
 
-    The thread that stepped an env also packs it, while it is in that core's cache (12 us cold, 3 us warm).
+    The thread that stepped an env also packs its state, while that is in the core's cache (12 us cold, 3 us
+    warm).
     """
 
     def __init__(

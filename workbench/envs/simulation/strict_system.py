@@ -25,7 +25,7 @@ _OWN_CODE = (*OWN_CODE, "mani_skill.")
 
 @dataclass(frozen=True)
 class _Write:
-    """A write to rows of a group; it was not applied yet."""
+    """A write to rows of a group that is not applied yet."""
 
     group: Group
     rows: NDArray[np.int64] | None
@@ -52,7 +52,8 @@ class Writes:
         self._kept.append(_Write(group, rows, frames_of_the_task()))
 
     def note_handed_out(self, tensor: str, reader: FrameType) -> bool:
-        """Note the code that reads a whole tensor, unless it is the core's own; returns whether it was noted."""
+        """Note the code that reads a whole tensor. Returns False, and notes nothing, for code of the core or
+        ManiSkill."""
         if reader.f_globals.get("__name__", "").startswith(_OWN_CODE):
             return False
         frames = frames_of_the_task(reader)
@@ -109,8 +110,8 @@ class StrictCpuSystem(BatchedCpuSystem):
         self.being_reset: torch.Tensor | None = None
         """(N,) bool while ``_initialize_episode`` runs for some envs only."""
         self.reported_elsewhere: set[str] = set()
-        """Names of bodies whose writes in envs that are not being reset were already reported in this partial
-        reset."""
+        """Names of bodies for which this partial reset has already reported a write in envs that are not
+        being reset."""
         self._outdated: set[int] = set()
         """Indices of articulations whose link poses in a GPU's tensor would be older than a write of qpos or
         root pose."""
@@ -214,7 +215,7 @@ class StrictCpuSystem(BatchedCpuSystem):
         super().refresh(group)
         for mirror, was in before:
             held = self._held.get(id(mirror.now))
-            if held is not None:  # a number that was not written has the moved value on a GPU too
+            if held is not None:  # on a GPU too, a number that was not written follows
                 held[...] = np.where(differ(was, held), held, mirror.now)
             if group in self._stale and group not in self._moved_unfetched:
                 moved = differ(mirror.now[mirror.at], was[mirror.at]).any(axis=1)
@@ -412,7 +413,7 @@ def _by_name(rows: NDArray[np.int64], names: list[str]) -> Iterator[tuple[str, N
 
 
 def envs_named(envs: Any) -> str:
-    """``env 3``, or ``envs 0, 1, 2``, at most eight of them."""
+    """``env 3``, or ``envs 0, 1, 2``; after eight numbers, only the count of further envs."""
     numbers = sorted({int(env) for env in envs})
     named = ", ".join(str(env) for env in numbers[:MAX_NAMED_ENVS])
     more = f" and {len(numbers) - MAX_NAMED_ENVS} more" if len(numbers) > MAX_NAMED_ENVS else ""

@@ -22,7 +22,7 @@ from workbench.envs.simulation.state_layout import BODY
 _ROOT_POSE_ATTEMPTS = 4
 """Maximum attempts to set a root pose; two were enough in all tasks that were tried."""
 _EXACT_POINT_ATTEMPTS = 40
-"""Maximum attempts to find a state that reads back as written; all but some humanoids need one."""
+"""Maximum attempts to find a state that reads back as written; one is enough for all but some humanoids."""
 _LAST_BIT = np.float32(2**-24)
 """Last bit (2**-24) of the numbers of a quaternion, and of a position of about a metre."""
 
@@ -52,7 +52,8 @@ Contents = tuple[PackedPart, ...]
 class CpuState:
     """The simulation state of n envs, as columns.
 
-    ``PhysxCpuSystem.pack()`` has pose and velocity of every body, qpos, qvel and drive targets. In addition:
+    ``PhysxCpuSystem.pack()`` has pose and velocity of every body, qpos, qvel and drive targets. This state
+    adds:
 
     * *Names*: bytes of two envs mean the same only if the envs have the same parts, which `Contents` lists.
       Where the parts differ, the bytes to write are assembled from those of the env that is restored and
@@ -82,12 +83,12 @@ class CpuState:
     """(n,) poses (7,) of static actors, by name; empty if no static actor was ever moved."""
 
     def articulations(self, k: int) -> slice:
-        """Rows of `qf` of env k's articulations."""
+        """Rows of `qf` of the articulations of the k-th of the n envs."""
         first = sum(_articulations(contents) for contents in self.contents[:k])
         return slice(first, first + _articulations(self.contents[k]))
 
     def essence(self, k: int) -> tuple[Any, ...]:
-        """A value that is equal for equal PhysX states of env k."""
+        """A value for the k-th of the n envs; equal PhysX states give equal values."""
         rows = self.articulations(k)
         return self.contents[k], self.packed[k], self.asleep[k], self.qf[rows].tobytes(), self.statics[k]
 
@@ -255,9 +256,9 @@ def write_cpu_state(
 def make_cpu_exact_point(env: Any, env_idx: list[int]) -> None:
     """Give these envs a new PhysX scene with their present state.
 
-    Restoring a snapshot taken now and repeating the actions then gives the same run to the last bit. If PhysX
-    returns an articulation's root pose with other last bits than were set, these bits are changed until PhysX
-    returns what is set.
+    Restoring a snapshot that is taken right after this call, and repeating the actions, gives the same run to
+    the last bit. If PhysX returns an articulation's root pose with other last bits than were set, these bits
+    are changed until PhysX returns what is set.
     """
     left, state, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
     positions = list(range(len(env_idx)))
@@ -304,7 +305,12 @@ def _write_joint_forces(
     matches: dict[int, Sequence[int | None]],
     fresh_physics: bool,
 ) -> None:
-    """Write ``set_qf``'s forces into each env; `matches` as returned by `_joined`."""
+    """Write the forces of ``set_qf`` into each env.
+
+    Args:
+        sources: by env, the position in `state` of the env whose forces it gets.
+        matches: by env, as returned by `_joined`.
+    """
     rows, theirs = [], []
     firsts = list(accumulate(map(_articulations, state.contents), initial=0))
     for i, k in sources.items():
@@ -428,7 +434,7 @@ def renew_physics(scene: Any, env_idx: list[int]) -> list[int]:
 
     Returns:
         Envs that were left unchanged: entities were removed from them since they were built, so SAPIEN would renumber the
-        others, and ManiSkill's segmentation pictures name bodies by number.
+        remaining entities, and ManiSkill's segmentation pictures name bodies by number.
     """
     px: BatchedCpuSystem = scene.px
     px.packs()  # makes the old systems do their pending substeps
@@ -455,7 +461,8 @@ def _keeps_entity_ids(scene: sapien.Scene) -> bool:
 
 
 def _moved(old: sapien.Scene, physics: physx.PhysxCpuSystem) -> sapien.Scene:
-    """A scene over `physics` that has all entities of `old`, in their order, and its render system."""
+    """A scene with the system `physics`, and with all entities of `old`, in their order, and its render
+    system."""
     entities = old.entities
     systems = _render_systems(old)
     cameras = [camera for system in systems for camera in system.cameras]

@@ -51,10 +51,10 @@ class SnapshotPacker:
     """Packs the snapshots of one env, one after the other.
 
     Most of a snapshot stays the same from step to step (generators, goal poses). These *parts* are pickled
-    when they change, get a number that no other part of this packer has, and are sent once; the *body* is the
-    snapshot pickled without them, with pickle's persistent ids. Parts are compared by identity first, then by
-    bytes. The server keeps bodies and parts, and imports neither torch nor ManiSkill; a worker joins them and
-    unpickles a plain `Snapshot`.
+    when they change, get a number that no other part of this packer has, and are sent once. The *body* is the
+    snapshot, pickled with a persistent id in place of each part. Parts are compared by identity first, then
+    by bytes. The server keeps bodies and parts, and imports neither torch nor ManiSkill; a worker joins them
+    and unpickles a plain `Snapshot`.
 
     PickCube-v1, random actions, two cores (``tests/benchmarks/history_cost.py``): for 16 envs the body of a
     step has 8.8 KB and the whole pickled snapshot 107 KB; for 64 envs 32 KB and 380 KB. Taking the
@@ -77,7 +77,7 @@ class SnapshotPacker:
         for name, value in self._parts_of(snapshot).items():
             places[id(value)] = len(self._kept)
             kept = before.get(name)
-            # Saves two calls for each generator of each env.
+            # This comparison saves two calls for each generator of each env.
             stays = kept is not None and kept.value is value
             self._kept[name] = kept if stays else self._part(kept, value, new)  # type: ignore[assignment]
         self._buffers = snapshot.memory.task.buffers
@@ -105,7 +105,7 @@ class SnapshotPacker:
     def _part(self, kept: _SentPart | None, value: Any, new: dict[int, bytes]) -> _SentPart:
         """The part with this value: that of the previous snapshot, or a new one.
 
-        Never an older one, since the server drops parts that no stored moment needs.
+        Never the part of an older snapshot, since the server drops parts that no stored moment needs.
         """
         if kept is not None and _is_the_same(kept.value, value):
             return kept

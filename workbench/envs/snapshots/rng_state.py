@@ -12,9 +12,9 @@ import torch
 
 _KEY = 624
 _WORDS = ctypes.c_char * 16
-"""Words 1 to 4 of the key in numpy's ``mt19937_state``: 624 words of 4 bytes, then the position in the key. A
-draw advances the position; the last draw of a key regenerates all words. Word 0 is the same for every
-seed."""
+"""Words 1 to 4 of the key in numpy's ``mt19937_state``. The key is 624 words of 4 bytes; the position in it
+follows. A draw advances the position; the last draw of a key regenerates all words. Word 0 is the same for
+every seed."""
 _POSITION = ctypes.c_char * 4
 _HAS_GAUSS = 3
 """Index in ``RandomState.get_state()`` of the flag for a cached normal number."""
@@ -26,8 +26,8 @@ RngState = tuple[Any, ...]
 class SharedRng(NamedTuple):
     """The generators of the process: torch's, numpy's and Python's.
 
-    They belong to no env, and to the author's training loop as much as to the task. So they are restored only together with
-    all envs.
+    They belong to no env: the author's training loop uses them as much as the task does. So they are restored
+    only together with all envs.
     """
 
     torch_cpu: np.ndarray

@@ -161,7 +161,8 @@ def restore_snapshot(
 
 
 def begin_anew(env: Any, env_idx: list[int]) -> None:
-    """Make the present an exact point of these envs, in new PhysX scenes whose state reads back as written.
+    """Make the present state an exact point of these envs, in new PhysX scenes whose state reads back as
+    written.
 
     From an exact point, a snapshot and the same actions give the same bits as the uninterrupted run.
 

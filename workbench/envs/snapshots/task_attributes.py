@@ -27,7 +27,8 @@ _ENTERED_TYPES = (
     *(torch.Tensor, np.ndarray, Pose, dict, list, tuple),
     *(torch.nn.Module, torch.Generator, np.random.Generator, np.random.RandomState, set, bytearray),
 )
-"""Types that may hold state; the types in the last row cannot be copied, and are reported."""
+"""Types that may hold state; the types in the last row cannot be copied: `Walk.omitted` lists
+such objects."""
 _SKIPPED_PACKAGES = (
     *("mani_skill", "sapien", "gymnasium", "torch", "numpy", "trimesh", "transforms3d", "builtins"),
     *("_thread", "weakref", "functools", "pathlib", "workbench"),
@@ -51,11 +52,11 @@ class Walk:
 
     env: BaseEnv
     author: str
-    """Module of the task's class: objects whose class is from this module are entered."""
+    """Module of the task's class: attributes of objects whose class is from this module are searched too."""
     leaves: list[TaskValue] = field(default_factory=list)
     omitted: dict[str, str] = field(default_factory=dict)
     entered: dict[int, Any] = field(default_factory=dict)
-    """Objects entered, by ``id``, kept alive and not entered again."""
+    """Objects that were searched, by ``id``: kept alive, and not searched again."""
     owners: dict[str, Any] = field(default_factory=dict)
     """Objects whose attributes were read, by path."""
     simulation: frozenset[int] = frozenset()
@@ -151,7 +152,8 @@ def _putter(container: Any, key: Any) -> Callable[[Any], None]:
 
 @lru_cache(maxsize=4096)
 def _has_members(cls: type, author: str) -> bool:
-    """Whether an object's attributes are entered: robots, controllers, the author's classes, dataclasses."""
+    """Whether an object's attributes are searched: those of robots, controllers, the author's classes,
+    dataclasses."""
     if issubclass(cls, (BaseAgent, BaseController)):
         return True
     if issubclass(cls, (type, torch.nn.Module)) or not cls.__dictoffset__:
@@ -177,7 +179,7 @@ def base_env_members() -> frozenset[str]:
     """The attributes that ManiSkill's BaseEnv sets on itself, read from its code: ``self.NAME = ...``.
 
     These are options, spaces, sensors, last observation and generators. They are not state, or are restored
-    separately (elapsed steps, generators). ``agent`` is entered.
+    separately (elapsed steps, generators). ``agent`` is left out, since its attributes are searched.
     """
     names: set[str] = set()
     for member in vars(BaseEnv).values():

@@ -39,9 +39,10 @@ class TaskState(NamedTuple):
     of chosen envs are copied. Everything else (a counter, a threshold) holds for the whole batch, and is
     restored only when all envs are restored.
 
-    *State or scene*: ``self.peg_half_sizes`` has a row per env too, but describes pegs that were built. What has not changed
-    since the scene was built (`note_scene`) belongs to the scene: it is not copied, and a restore gives it the value that it
-    was built with. In GPU simulation nothing is noted, and everything counts as state.
+    *State or scene*: ``self.peg_half_sizes`` has a row per env too, but describes pegs that were built. What
+    has not changed since the scene was built (`note_scene`) belongs to the scene: it is not copied, and a
+    restore sets it to the value that it had then. In GPU simulation nothing is noted, and everything counts
+    as state.
 
     *New tensors*: a value is restored as a new tensor, since something else may use the old one (a
     controller's target is often the caller's action). Two attributes that shared one tensor still share one.
@@ -94,7 +95,7 @@ def note_scene(env: BaseEnv) -> None:
 
 
 def note_constructed(env: BaseEnv) -> None:
-    """Mark the plain values that the task's ``__init__`` set after BaseEnv's as part of the scene.
+    """Mark as part of the scene: the plain values that the task's ``__init__`` set after it called BaseEnv's.
 
     Without this, a restore into an env of the edited file would write the old file's ``self.threshold = 0.02``.
     """
@@ -214,7 +215,7 @@ def _with_rows(
     kind: Any = list if listed else np.ndarray if kept.dtype is None else torch.Tensor
     shape = (env.num_envs, *np.shape(kept.values)[1:])
     fits = isinstance(value, kind) and is_per_env(value, env.num_envs) and (listed or value.shape == shape)
-    # If all envs are restored the value may be replaced, except a tensor of another shape.
+    # If all envs are restored, the value may be replaced, unless it is a tensor of another shape.
     if not fits and (not all_envs or (kind is torch.Tensor and isinstance(value, kind))):
         if listed:
             return "it is no list with an entry for each env now"
