@@ -101,7 +101,8 @@ def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
 
 
 def _hint(name: str, attribute: str, task_folder: Path | None) -> str:
-    """End of the message for a missing function: how to name a file that a library's module hides."""
+    """End of the message for a missing function. If a file of this name exists, but a library's module of the same
+    name was imported instead, it says how to refer to the file."""
     for folder in (Path.cwd(), task_folder or Path.cwd()):
         file = folder / f"{name}.py"
         if file.is_file() and is_library(name):

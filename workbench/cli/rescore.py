@@ -113,7 +113,8 @@ def rescore_all(
     Args:
         on_progress: called with the number of rescored episodes, the number of all episodes, and the number
             of control steps so far.
-        clearances: decides which code that recordings name may run; None never asks.
+        clearances: decides for the code named in recordings whether it may run; with None nobody is asked, and every
+            answer is no.
         on_notice: called before the tasks are opened, with a sentence for each module next to a task's file
             that cannot be imported because a library has the same name.
         run: where the work runs; the verdicts do not depend on it.

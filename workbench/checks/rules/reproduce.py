@@ -163,10 +163,9 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
 
     ## How it is checked
     The rule resets at most four seeds, keeps the state, resets other seeds, and sets the state. `evaluate()`,
-    the reward for an action of zeros and the observation must be as before, to 0.001. The rule leaves out
-    what also differs if only the simulation is moved away and back (velocities of links, noise), and the
-    robot's own sensors. It makes no step, since contacts are in no state; so it does not see counters that
-    only grow in steps.
+    the reward for an action of zeros and the observation must be as before, to 0.001. The rule ignores the robot's own sensors. It also ignores every number that already changes when only the
+    simulation's state is set to another state and back, without a reset (velocities of links, noise). It makes no step, because no state contains the contacts. So it does not notice counters that change only in
+    a step.
     """
     seeds = next(checkup.batches())[: min(4, checkup.num_envs)]
     others = [seed + 5000 for seed in seeds]
