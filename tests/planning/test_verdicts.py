@@ -66,8 +66,8 @@ def test_a_higher_reward_without_success_is_an_exploit() -> None:
     held = replace(unsolved(1.0, seed=7), evaluate={"success": 0.0, "height": 0.2})
     (verdict,) = of_episodes([rises(0), held])
     assert (verdict.rule, verdict.seeds) == ("reward-exploited", (7,))
-    assert "earned 1.000 a step at their end without success" in verdict.message
-    assert "evaluate at the end of seed 7: success 0, height 0.2" in verdict.message
+    assert "ended without success and earned 1.000 a step at their end" in verdict.message
+    assert "at the end of seed 7, evaluate() returned success 0, height 0.2" in verdict.message
     assert rules(rises(0), unsolved(0.99)) == []
     # Without a success, its reward is unknown.
     assert rules(held) == []

@@ -473,15 +473,15 @@ GPU_RULES: Mapping[str, DeclaredRule] = {
             "not-applied",
             "warn",
             "step",
-            """State that is set outside _initialize_episode is applied (scene._gpu_apply_all(), then
-            scene._gpu_fetch_all()) before the next fetch.
+            """State that is set outside _initialize_episode is applied with scene._gpu_apply_all() before anything is
+            fetched; scene._gpu_fetch_all() follows.
 
             Physics never sees the state; pictures do.
 
             ## Why
             On the GPU a setter writes into a tensor, and physics reads that tensor when it is applied.
-            Between resets only the task applies it. The body is drawn at its new pose and collides at its old
-            one, and the next fetch resets the picture too. On the CPU of stock ManiSkill the same line works,
+            Between resets only the task applies it. The body is drawn at its new pose but collides at its old
+            one; after the next fetch it is drawn at its old pose again. On the CPU of stock ManiSkill the same line works,
             so the mistake shows first on the cluster.
 
             ## Mend

@@ -109,12 +109,12 @@ def exploited(episodes: PlannedEpisodes) -> RewardVerdict | None:
     if not found:
         return None
     entries = ", ".join(f"{name} {value:.4g}" for name, value in found[0].evaluate.items())
-    at_end = f"; evaluate at the end of seed {found[0].seed}: {entries}" if entries else ""
+    at_end = f"; at the end of seed {found[0].seed}, evaluate() returned {entries}" if entries else ""
     rate = float(np.median([_end(one).mean() for one in found]))
     return RewardVerdict(
         "reward-exploited",
-        f"{len(found)} of {len(episodes.all)} episodes earned {rate:.3f} a step at their end without success, and successful "
-        f"ones {episodes.at_success:.3f} at success{at_end}",
+        f"{len(found)} of {len(episodes.all)} episodes ended without success and earned {rate:.3f} a step at their end; "
+        f"successful ones earned {episodes.at_success:.3f} at success{at_end}",
         _seeds(found),
     )
 

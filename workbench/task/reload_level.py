@@ -206,7 +206,7 @@ class _Comparison:
             for symbol in self._versions.by_key.get((owner[0], f"{owner[1]}.__init__"), ()):
                 if _goes_on_after_super(symbol.nodes):
                     raise _NeedsRebuild(
-                        f"{symbol.name} continues after super().__init__(), which has run a reset"
+                        f"{symbol.name} has code after super().__init__(), and that call has already reset the env"
                     )
         rewards = self._versions.members(family, REWARD_HOOKS)
         for key in self._versions.changed:
