@@ -197,9 +197,10 @@ class Page:
         self._add_left_dock()
         banner = Banner(server, self._link, self._is_own)
         busy_banner = BusyBanner(server, self._link)
-        floating = self._envs, self._record, self._timeline, log, self._icons, banner, busy_banner
+        floating = self._envs, self._record, log, self._icons, banner, busy_banner
         opening = () if self._opening is None else (self._opening,)
-        self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
+        # The transport first: a press on Play must not wait for the table of envs.
+        self._parts = Parts((status, self._timeline, marks, *in_tabs, *floating, *opening), clock)
         for part in self._reward:
             self._parts.add(part, lambda view: self._is_shown(REWARD, view))
         self._parts.add(self._studio, lambda view: self._is_shown(CAMERAS, view))
