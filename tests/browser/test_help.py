@@ -74,8 +74,10 @@ def test_help_opens_the_docs_from_both_pages(example_without_pictures: At, brows
         def leads_to_help(press: str, title: str = "Workbench", of_palette: str = "help: open") -> None:
             with desk.page.expect_popup() as opened:
                 if press == "palette":
+                    search = desk.page.get_by_placeholder("Search commands...")
+                    expect(search).to_have_count(0)  # the palette of before is closing
                     desk.press("Control+k")
-                    desk.page.get_by_placeholder("Search commands...").fill(of_palette)
+                    search.fill(of_palette)
                     expect(desk.page.get_by_role("button", name=re.compile("^Help")).last).to_be_visible()
                     desk.press("Enter")
                 else:

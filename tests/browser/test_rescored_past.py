@@ -50,7 +50,7 @@ def test_an_edited_reward_is_drawn_over_the_recorded_one_and_differences_are_lis
     desk.edit(REWARD, f"{REWARD} * 2")
     says(desk, r"(\d+) of \1 episodes differ\.")
     says(desk, "mean return: .* → ")
-    says(desk, "to the last bit")
+    says(desk, "exactly where it was recorded")
     expect(desk.page.get_by_text("reward of env 0, before and now")).to_be_visible()
     expect(desk.page.get_by_text("rescored", exact=True)).to_be_visible()
     until(lambda: rows(desk).count() >= 6, "the list")

@@ -311,7 +311,7 @@ def test_measuring_seeds_and_searching_run_in_a_separate_process(session: Sessio
     session.do(StopMeasuring())
     wait_until(session, in_studio(lambda s: s.progress is None and not s.results.measuring), "its end")
     session.happen(SuggestionsWanted(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1))
-    wait_until(session, in_studio(lambda s: "no object nothing" in s.problem), "why not")
+    wait_until(session, in_studio(lambda s: "'nothing' is not an object" in s.problem), "why not")
 
 
 def test_an_installed_task_is_copied_and_the_placement_planned_in_the_copy(
