@@ -50,7 +50,9 @@ class Opened:
         self.page.redraw()
 
     def load(self) -> SessionView:
-        view = wait_until(self.session, lambda view: view.task is not None, "the load")
+        # The heartbeat of a slow load is read for a moment longer.
+        loaded = lambda view: view.task is not None and view.busy is None  # noqa: E731
+        view = wait_until(self.session, loaded, "the load")
         self.draw()
         return view
 
