@@ -87,7 +87,7 @@ def pack_worker_files(folders: Iterable[Path], files: Iterable[Path] = ()) -> Wo
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:
-    """Those of the folders that are not inside another of them."""
+    """The folders that are not inside another one of the list."""
     kept: list[Path] = []
     for folder in sorted(set(folders)):
         if not any(folder.is_relative_to(one) for one in kept):

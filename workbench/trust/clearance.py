@@ -378,7 +378,7 @@ def _is_unchanged(content: TaskContent) -> bool:
 
 
 def paths_in_arguments(info: EpisodeInfo) -> list[str]:
-    """Those texts in an env's recorded arguments that look like a path; a task may open such a path."""
+    """The texts in an env's recorded arguments that look like a path; a task may open such a path."""
     found: list[str] = []
     waiting: list[Any] = [info.env_kwargs, info.reset_options, info.control_mode]
     while waiting:

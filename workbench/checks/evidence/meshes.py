@@ -15,8 +15,7 @@ _RAYS = 162
 """Number of directions in which walls are looked for."""
 _MAX_TRIANGLES = 50_000
 _MIN_WALL_SHARE, _MIN_OPEN_SHARE = 0.6, 0.03
-"""Of the rays from inside a hollow mesh: minimum share that meets a wall, and minimum share that meets
-nothing."""
+"""Minimum share of the rays from inside a hollow mesh that meet a wall, and minimum share that meet nothing."""
 
 
 def triangles_in(file: str, more_than: int) -> int | None:

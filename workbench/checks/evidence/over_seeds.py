@@ -66,6 +66,6 @@ def tried(seen: Iterable[Seen], *names: str) -> int:
 
 
 def first_kind(seen: Iterable[Seen]) -> Seen | None:
-    """Of rows that are named by kinds of episodes: the row of the first kind with a breach; None if no kind
+    """The row of the first kind of episodes with a breach, among rows that are named by kinds; None if no kind
     has a breach."""
     return next((row for row in together(seen) if row.count), None)

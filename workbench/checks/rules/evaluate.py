@@ -22,8 +22,7 @@ from workbench.machine.text import listed, of
 READ_BY_MANISKILL = ("success", "fail", "elapsed_steps")
 """Entries of ``evaluate()`` that ManiSkill reads."""
 FLICKER_SHARE = 0.25
-"""Of the steps at which success becomes true: the maximum share that may be followed by a step without
-success."""
+"""Maximum share of the steps at which success becomes true that may be followed by a step without success."""
 
 
 def see_success_at_reset(checkup: Checkup) -> Iterator[Seen]:
