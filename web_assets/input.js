@@ -8,6 +8,7 @@
 //     data-twice='["open_row", {...}]'         command of a double press
 //     data-place                               its fields x and y: the position in the element, 0 to 1 from the upper left corner
 //     data-along='["step", 0, 99]'             its field for the position along the element: an integer between these
+//   data-hover='["hover_body", {"body": "cube"}]'  command while the pointer is on this element; then again with empty fields
 //   data-copy="text"                         a press copies this text
 //   data-tell='["tell_unfolded", {...}]'     command when the element is added (data-only: only if <html> has data-…)
 //   data-into-sight                          scroll the parent into view when added; data-follow="7": the library's row with that number
@@ -218,6 +219,15 @@
     if (!navigator.clipboard) return prompt("Copy with Ctrl+C", from.dataset.copy);
     navigator.clipboard.writeText(from.dataset.copy);
     from.textContent = "copied";
+  }, true);
+
+  let hovered = ""; // data-hover of the element under the pointer
+  addEventListener("pointerover", (event) => {
+    const now = part(event, "data-hover")?.dataset.hover ?? "";
+    if (now === hovered) return;
+    const [name, fields] = JSON.parse(now || hovered);
+    hovered = now;
+    sendNewest("hover", [name, now ? fields : Object.fromEntries(Object.keys(fields).map((field) => [field, ""]))]);
   }, true);
 
   // --- keys -------------------------------------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ from workbench.page.commands import (
     ToggleTimeline,
 )
 from workbench.page.scene.bodies import DrawStyle
-from workbench.page.scene.body_pick import BodyMark, body_under_ray
+from workbench.page.scene.body_pick import HOVER_COLOUR, BodyMark, body_under_ray
 from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.page.scene.frames import BodyFrames
 from workbench.page.scene.viewpoint import FOV_RADIANS, View3D, Viewpoint, frame_all, frame_one
@@ -164,7 +164,7 @@ class Page:
         self._panels_due = DrawThrottle(PANELS_PERIOD_SECONDS, clock)
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
-        self._built: tuple[bool, DrawStyle] | None = None
+        self._built: tuple[bool, DrawStyle, bool] | None = None
         self._waits_for_human = False
         stage = stage or View3D(server)
         self._scene, self._framing, self._view_choice = stage.scene, stage.framing, stage.choice
@@ -206,6 +206,7 @@ class Page:
         self._parts.add(self._studio, lambda view: self._is_shown(CAMERAS, view))
 
         self._mark, self._body_mark = SelectionMark(server), BodyMark(server)
+        self._hover_mark = BodyMark(server, "/hovered_body", HOVER_COLOUR)
         self._frames, self._frustums = BodyFrames(server), CameraFrustums(server)
         self._forces = ForceArrows(server)
         self._parts.add(TaskCommands(server, visitors))
@@ -444,11 +445,14 @@ class Page:
             self._scene_serial = view.scene_serial
             self._layout = lay_out(task.geometry, step.poses)
             self._built = None
-        looks = self._in_software.looks(self._view_panel.looks, task.geometry, self._layout, one)
-        built = (one, looks)
+        geometry = task.geometry
+        if collisions := self._view_choice.collisions and len(geometry.collisions) > 0:
+            geometry = geometry.as_collisions
+        looks = self._in_software.looks(self._view_panel.looks, geometry, self._layout, one)
+        built = (one, looks, collisions)
         if built != self._built:
             self._built = built
-            self._scene.build(task.geometry, self._layout, step.poses, env if one else None, looks)
+            self._scene.build(geometry, self._layout, step.poses, env if one else None, looks)
         self._scene.move(step.poses, self._layout, env if one else None)
         self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
         pictures = self._cameras.shown_pictures(seen) if self._view_choice.frustums else {}
@@ -461,6 +465,8 @@ class Page:
         self._forces.draw(self._inspect.forces(view), offset)
         selected = task.geometry, step.poses, env, self._inspect.body, offset
         self._body_mark.draw(*selected)
+        hovered = self._inspect.hovered if self._inspect.hovered != self._inspect.body else ""
+        self._hover_mark.draw(task.geometry, step.poses, env, hovered, offset)
         if self._view_choice.frames:
             self._frames.draw(*selected)
         else:

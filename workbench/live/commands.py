@@ -173,6 +173,12 @@ class SelectBody(Command, frozen=True):
     body: str
 
 
+class HoverBody(Command, frozen=True):
+    """Light this body of the selected env in the view while the pointer is on its row; empty for none."""
+
+    body: str
+
+
 class ShowForces(Command, frozen=True):
     """Show the contact forces of the selected env, as arrows in the 3D view."""
 

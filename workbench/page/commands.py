@@ -71,6 +71,12 @@ class ShowFrames(Command, frozen=True):
     on: bool
 
 
+class ShowCollisions(Command, frozen=True):
+    """Show the collision shapes in place of the visuals: robot blue, objects orange, kinematic violet."""
+
+    on: bool
+
+
 class ShowFrustums(Command, frozen=True):
     """Show or hide the camera frustums with their pictures in the 3D view."""
 

@@ -290,5 +290,9 @@ def test_without_a_renderer_the_collision_shapes_are_drawn() -> None:
     np.testing.assert_allclose(hull.vertices.min(0), link.min(0), atol=0.02)
     np.testing.assert_allclose(hull.vertices.max(0), link.max(0), atol=0.02)
     assert trimesh.Trimesh(hull.vertices, hull.faces).volume > 0
+    assert not geometry.collisions
+    beside = {v.name: v.mesh for v in whole.as_collisions.visuals}
+    np.testing.assert_array_equal(beside["panda/panda_link2/0"].vertices, hull.vertices)
+    assert "goal_site/0" in {v.name for v in whole.visuals} and "goal_site/0" not in beside
     env.close()
     rendered.close()

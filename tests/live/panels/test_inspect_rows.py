@@ -9,7 +9,7 @@ import pytest
 from tests.drive.live import Live
 from tests.drive.scenes import running
 from workbench.envs.inspection import Inspection, JointReadings, Leaf, Touching
-from workbench.live.commands import SelectBody
+from workbench.live.commands import HoverBody, SelectBody
 from workbench.live.panels.inspect_panel import (
     CHOICES,
     MAX_ARROW_METRES,
@@ -62,7 +62,7 @@ PRESSED = Touching(
 def test_a_contact_is_shown_in_newtons_with_its_position() -> None:
     html = inspect_html("contacts", running(1), Inspection(0, 5, contacts=(PRESSED,)), None)
     for words in (
-        "<b>cube</b> ← &lt;i&gt;table&lt;/i&gt;",
+        ">cube</b> ← &lt;i&gt;table&lt;/i&gt;",
         ">5 N<",
         "force 0.000, 3.000, 4.000; impulse 0.05 N s",
         "at 0.100, 0.000, 0.000; 2 points, 1.00 mm deep",
@@ -147,12 +147,30 @@ def test_the_selected_body_is_shown_first_with_its_pose_and_its_contacts(live_pa
     assert "contacts" in live_page.asked[-1].sections
     live_page.show(view)
     body = inspect.html("wb-body")
-    assert 'data-copy="sapien.Pose(p=[' in body and "touches &lt;i&gt;table" in body and "5 N" in body
+    assert 'data-copy="sapien.Pose(p=[' in body and "touches <span" in body and "&lt;i&gt;table" in body and "5 N" in body
     live_page.show(running(2, selected_env=0, inspection=reading))
     assert "5 N" not in inspect.html("wb-body"), "the contacts are of another env"
     live_page.do(SelectBody(body="gone"))
     live_page.show(view)
     assert "wb-body" not in inspect.html()
+
+
+def test_the_body_of_the_row_under_the_pointer_is_marked_in_the_view(live_page: Live) -> None:
+    view = running(2)
+    live_page.show(view)
+
+    def marked() -> list[str]:
+        live_page.show(view)
+        return [node.name for node in live_page.nodes("/hovered_body/")]
+
+    assert not marked()
+    live_page.do(HoverBody(body="cube"))
+    assert marked()
+    live_page.do(SelectBody(body="cube"))
+    assert not marked(), "it has the mark of the selected body"
+    live_page.do(SelectBody(body=""))
+    live_page.do(HoverBody(body=""))
+    assert not marked()
 
 
 def test_only_chosen_quantities_are_read_and_contacts_for_the_arrows(live_page: Live) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import viser
 import websockets.sync.client
@@ -13,7 +15,7 @@ from tests.drive.waiting import until
 from workbench.envs.camera_data import Picture
 from workbench.live.env_commands import ShowEnvs, ToggleOnlySelected
 from workbench.live.panels.view_panel import ViewIcons, ViewPanel
-from workbench.page.commands import ShowFrames, ShowFrustums, ToggleTheme
+from workbench.page.commands import ShowCollisions, ShowFrames, ShowFrustums, ToggleTheme
 from workbench.page.scene.bodies import DrawStyle
 from workbench.page.scene.env_grid import lay_out
 from workbench.page.scene.viewpoint import (
@@ -150,3 +152,11 @@ def test_the_selected_env_or_all_envs_are_shown_as_chosen_for_the_task(panels: P
     assert not choice.frustums
     panels.ask(ShowFrames(on=True))
     assert choice.frames
+    assert "Collision shapes" not in panels.html("wb-view-icons"), "the scene has none besides its visuals"
+    bare = running(4)
+    assert bare.task is not None
+    geometry = replace(bare.task.geometry, collisions=bare.task.geometry.visuals[:1])
+    icons.draw(replace(bare, task=replace(bare.task, geometry=geometry)))
+    assert "Collision shapes" in panels.html("wb-view-icons")
+    panels.ask(ShowCollisions(on=True))
+    assert choice.collisions

@@ -19,7 +19,7 @@ from PIL import Image
 from workbench.envs import maniskill_private
 from workbench.envs.scene.mesh_levels import reduced_mesh
 from workbench.envs.scene.normals import with_normals
-from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.scene.scene_index import SceneIndex, scene_index
 from workbench.envs.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual, srgb
 from workbench.envs.scene.simplify import drop_uvs, flat_rectangle, share_vertices
 from workbench.envs.simulation.hiding import shown_visibility
@@ -33,8 +33,13 @@ MAX_SIDE_TEXELS = 1024
 """Maximum texels on the longest side of a texture."""
 
 
-_LINEAR_GREY: dict[BodyKind, float] = {"link": 0.55, "dynamic": 0.32, "kinematic": 0.22, "static": 0.12}
-"""Linear grey: moving bodies are lighter than static ones."""
+_COLLISION_COLOURS: dict[BodyKind, tuple[float, float, float]] = {
+    "link": (0.12, 0.3, 0.75),
+    "dynamic": (0.85, 0.3, 0.05),
+    "kinematic": (0.35, 0.12, 0.6),
+    "static": (0.12, 0.12, 0.12),
+}
+"""Linear RGB of collision shapes by the kind of their body: robot blue, objects orange, kinematic bodies violet."""
 _PLANE_HALF_SIZE_METRES = 50.0
 """Half size at which PhysX's infinite planes are drawn: half the default width of ManiSkill's ground."""
 _X_FROM_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -56,19 +61,34 @@ def read_geometry(env: Any, max_faces: int = MAX_FACES, max_texels: int = MAX_SI
     Panda cost little more than one. Reduced meshes of files are cached for the life of the process, for the next reload.
 
     Bodies that are hidden now are included; `SceneGeometry.body_hidden` marks those that the task
-    hides from its sensors. Without a render device the collision shapes are returned, in grey; bodies without
-    collision shapes (goal markers) are then missing.
+    hides from its sensors. Without a render device the visuals are the collision shapes; bodies without collision
+    shapes (goal markers) are then missing.
     """
     index = scene_index(env)
     walk = _RenderWalk(max_faces, max_texels, maniskill_private.hidden_objects(env))
+    collisions = _visuals(index, _collision_parts)
     rendered = env.scene.can_render()
+    return SceneGeometry(
+        num_envs=env.num_envs,
+        body_names=index.names,
+        body_kinds=index.kinds,
+        body_hidden=index.hidden,
+        visuals=_visuals(index, lambda entity, kind: walk.parts(entity)) if rendered else collisions,
+        collisions=collisions if rendered else (),
+    )
+
+
+def _visuals(
+    index: SceneIndex, parts_of: Callable[[Any, BodyKind], Iterator[MeshPart]]
+) -> tuple[Visual, ...]:
+    """One visual for each distinct part of all entities, with the envs and bodies that have it."""
     instances: dict[Hashable, list[tuple[int, int]]] = {}
     first: dict[Hashable, MeshPart] = {}
     for body, kind in enumerate(index.kinds):
         for env_index, entity in enumerate(index.entities[:, body]):
             if entity is None:
                 continue
-            for part in walk.parts(entity) if rendered else _collision_parts(entity, kind):
+            for part in parts_of(entity, kind):
                 first.setdefault(part.key, part)
                 instances.setdefault(part.key, []).append((env_index, body))
     visuals = []
@@ -89,19 +109,12 @@ def read_geometry(env: Any, max_faces: int = MAX_FACES, max_texels: int = MAX_SI
                 bodies=where[:, 1].copy(),
             )
         )
-    return SceneGeometry(
-        num_envs=env.num_envs,
-        body_names=index.names,
-        body_kinds=index.kinds,
-        body_hidden=index.hidden,
-        visuals=tuple(visuals),
-    )
+    return tuple(visuals)
 
 
 def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[MeshPart]:
     body = entity.find_component_by_type(physx.PhysxRigidBaseComponent)
-    grey = _LINEAR_GREY[kind]
-    material = Material((grey, grey, grey, 1.0), roughness=0.8)
+    material = Material((*_COLLISION_COLOURS[kind], 1.0), roughness=0.8)
     for shape in () if body is None else body.collision_shapes:
         place = _Placement.of(shape)
         key, make = _collision_shape(shape)

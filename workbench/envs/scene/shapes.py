@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -84,6 +85,14 @@ class SceneGeometry:
     body_hidden: tuple[bool, ...]
     """(B,) whether the task hides the body from sensors (goal markers: ``_hidden_objects``)."""
     visuals: tuple[Visual, ...]
+    collisions: tuple[Visual, ...] = ()
+    """Collision shapes, coloured by the kind of their body. Empty for a recording, and where `visuals` already
+    are collision shapes."""
+
+    @cached_property
+    def as_collisions(self) -> SceneGeometry:
+        """This scene with the collision shapes in place of the visuals."""
+        return replace(self, visuals=self.collisions)
 
     @property
     def hidden_names(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.envs.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section
-from workbench.live.commands import ChooseInspected, SelectBody, ShowForces
+from workbench.live.commands import ChooseInspected, HoverBody, SelectBody, ShowForces
 from workbench.live.events import ReadingChosen
 from workbench.live.inspect_polling import READ_PERIOD_SECONDS
 from workbench.live.session_protocol import LiveSession
@@ -157,7 +157,7 @@ class InspectPanel(PagePart[SessionView]):
         tabs: The open tab of each page.
     """
 
-    does = (ChooseInspected, SelectBody, ShowForces)
+    does = (ChooseInspected, SelectBody, HoverBody, ShowForces)
 
     def __init__(
         self,
@@ -171,6 +171,8 @@ class InspectPanel(PagePart[SessionView]):
         self._forces_on: ShownOn = "off"
         self.body = ""
         """Name of the selected body; empty for none."""
+        self.hovered = ""
+        """Name of the body on whose row the pointer is; empty for none."""
         self._of_body = server.gui.add_html("", visible=False)
         self._show = choice(
             server,
@@ -217,6 +219,8 @@ class InspectPanel(PagePart[SessionView]):
                 self.choose_sections()
             case SelectBody(body=body):
                 self.select(body)
+            case HoverBody(body=body):
+                self.hovered = body
             case ShowForces(where=where):
                 self._forces_on = where
                 self.choose_sections()
@@ -318,6 +322,7 @@ def inspect_html(
         contacts=contacts,
         poses=poses,
         select=lambda name: SelectBody(body=name),
+        hover=lambda name: HoverBody(body=name),
         vector=vector,
         strength=strength,
     )
@@ -351,6 +356,8 @@ def body_html(body: str, view: SessionView, now: Inspection | None) -> str:
         pose=poses[0] if poses else None,
         contacts=contacts,
         clear=SelectBody(body=""),
+        select=lambda name: SelectBody(body=name),
+        hover=lambda name: HoverBody(body=name),
     )
 
 

@@ -11,6 +11,7 @@ from workbench.page.commands import (
     ChooseDetail,
     ChooseTheme,
     FrameScene,
+    ShowCollisions,
     ShowFrames,
     ShowFrustums,
     ToggleTheme,
@@ -31,15 +32,15 @@ BRAND = (28, 112, 190)
 
 
 class ViewIcons(PagePart[object]):
-    """Icons that choose what the 3-D view shows: the selected env or all envs, cameras, frames, the whole
-    scene.
+    """Icons that choose what the 3-D view shows: the selected env or all envs, cameras, frames, collision
+    shapes, the whole scene.
 
     Args:
         choice: the choices; they outlive the page.
         task: key of the open task among the choices.
     """
 
-    does = (ShowEnvs, ToggleOnlySelected, ShowFrames, ShowFrustums)
+    does = (ShowEnvs, ToggleOnlySelected, ShowFrames, ShowFrustums, ShowCollisions)
 
     def __init__(self, server: viser.ViserServer, choice: ViewChoice, task: str = "") -> None:
         self._choice, self._task = choice, task
@@ -72,6 +73,10 @@ class ViewIcons(PagePart[object]):
         frames = self._choice.frames
         axes = Tool("Frames", ShowFrames(on=not frames), ShowFrames.help(), on=frames)
         icons += [("cameras", shown), ("frames", axes), ("home", tool("Frame the scene", FrameScene()))]
+        if isinstance(view, SessionView) and view.task is not None and view.task.geometry.collisions:
+            on = self._choice.collisions
+            shapes = Tool("Collision shapes", ShowCollisions(on=not on), ShowCollisions.help(), on=on)
+            icons.insert(-1, ("collisions", shapes))
         env = f"env {view.selected_env}" if isinstance(view, SessionView) and several else ""
         self._html.content = render("toolbar", kind="view-icons", label="View", tools=icons, text=env)
 
@@ -87,6 +92,8 @@ class ViewIcons(PagePart[object]):
                 self._choice.frustums = on
             case ShowFrames(on=on):
                 self._choice.frames = on
+            case ShowCollisions(on=on):
+                self._choice.collisions = on
 
 
 class ViewPanel(PagePart[object]):

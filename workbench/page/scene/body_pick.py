@@ -76,12 +76,25 @@ def box_of_body(geometry: SceneGeometry, env: int, body: int) -> NDArray[np.floa
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
-class BodyMark:
-    """The mark of the selected body: the edges of its box, and its name."""
+HOVER_COLOUR = (255, 196, 61)
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._edges = line_set(server, "/selected_body/box", COLOUR, 2.5)
-        self._label = view_label(server, "/selected_body/label", "bottom-left")
+
+class BodyMark:
+    """The mark of a body: the edges of its box, and its name.
+
+    Args:
+        name: name of the mark's nodes in the view.
+        colour: RGB of the edges.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        name: str = "/selected_body",
+        colour: tuple[int, int, int] = COLOUR,
+    ) -> None:
+        self._edges = line_set(server, f"{name}/box", colour, 2.5)
+        self._label = view_label(server, f"{name}/label", "bottom-left")
         self._box_of: tuple[int, int, int] | None = None
         self._box: NDArray[np.float32] | None = None
 

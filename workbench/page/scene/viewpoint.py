@@ -277,6 +277,8 @@ class ViewChoice:
     """Whether the cameras are drawn in the view."""
     frames: bool = False
     """Whether the coordinate frames are drawn in the view."""
+    collisions: bool = False
+    """Whether collision shapes are drawn in place of the visuals, where the scene has them."""
     detail: str = "normal"
     table: bool | None = None
     """Whether the table of envs is open; None before it was opened or closed."""
